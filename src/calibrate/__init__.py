@@ -1,0 +1,30 @@
+"""Bayesian calibration of soft-tissue models.
+
+A forward map (emulator, FEM, ...) and an observation make a :func:`model`; :func:`sample` draws
+its posterior; :func:`certify` checks it against FEM.
+"""
+
+import emulator  # noqa: F401 - turns on float64 before anything else touches JAX
+from calibrate.certify import Certificate, certify
+from calibrate.model import Model, model
+from calibrate.noise import GaussianNoise
+from calibrate.observations import landmarks, nodal_displacements
+from calibrate.posterior import Posterior, sample
+from calibrate.priors import box_prior
+from calibrate.samplers import NUTSOptions
+
+__version__ = emulator.__version__
+
+__all__ = [
+    "Certificate",
+    "GaussianNoise",
+    "Model",
+    "NUTSOptions",
+    "Posterior",
+    "box_prior",
+    "certify",
+    "landmarks",
+    "model",
+    "nodal_displacements",
+    "sample",
+]

@@ -1,0 +1,155 @@
+r"""Is a posterior made with a cheap forward map the one FEM would give?
+
+Draws :math:`\theta_s` are pushed through FEM and reweighted by the ratio of likelihoods
+
+.. math:: \log w_s = \log p_\text{FEM}(y \mid \theta_s) - \log p_\text{cheap}(y \mid \theta_s)
+
+with Pareto-smoothed importance sampling (Vehtari et al. 2024). The shape :math:`\hat k` of the
+ratios' tail says whether the reweighted posterior can be trusted; the shift of its means, in
+posterior standard deviations, says whether reweighting is needed at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+from tqdm import tqdm
+
+from calibrate.model import NOISE_SD
+from calibrate.posterior import Posterior
+from emulator.fem import Simulator
+from emulator.errors import InputError
+
+Verdict = Literal["accepted", "reweight", "not certified"]
+
+# Below this spread (in log) all weights are equal to a tenth of a percent and the tail has no
+# shape to fit.
+_EQUAL_WEIGHTS = 1e-3
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Outcome of a check against FEM.
+
+    verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use ``mean_fem``), or
+        ``not certified`` (the FEM posterior is too far away to be reached by reweighting).
+    k_hat, k_threshold : Pareto shape of the weights' tail, and the most it may be.
+    ess : effective number of reweighted draws.
+    shift : per parameter, mean under FEM less mean under the cheap map, in posterior sd.
+    mean_fem : per parameter, the reweighted mean.
+    draws, failed : FEM runs made, and how many did not converge.
+    """
+
+    verdict: Verdict
+    k_hat: float
+    k_threshold: float
+    ess: float
+    shift: dict[str, float]
+    mean_fem: dict[str, float]
+    draws: int
+    failed: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON."""
+        return asdict(self)
+
+
+def pareto_threshold(draws: int) -> float:
+    """Largest shape at which ``draws`` weighted draws are enough (Vehtari et al. 2024, Eq. 13)."""
+    return min(1.0 - 1.0 / np.log10(draws), 0.7)
+
+
+def judge(
+    log_ratios: np.ndarray,
+    draws: dict[str, np.ndarray],
+    *,
+    largest_shift: float = 0.25,
+    largest_failure_rate: float = 0.02,
+) -> Certificate:
+    """The certificate from log likelihood ratios (s,) and the draws (s,) they belong to.
+
+    Parameters
+    ----------
+    log_ratios : FEM less cheap; ``-inf`` where FEM failed.
+    largest_shift : of a mean, in posterior sd, for the posterior to stand as it is. At 0.25 a
+        90 % interval still covers 88.7 %.
+    largest_failure_rate : fraction of FEM runs that may fail.
+    """
+    log_ratios = np.asarray(log_ratios, dtype=float)
+    fine = np.isfinite(log_ratios)
+    threshold = pareto_threshold(len(log_ratios))
+    failed = int((~fine).sum())
+    if failed == len(log_ratios):
+        nothing = dict.fromkeys(draws, float("nan"))
+        return Certificate(
+            "not certified", float("inf"), threshold, 0.0, nothing, nothing, failed, failed
+        )
+    ratios = log_ratios[fine] - log_ratios[fine].max()
+    if np.ptp(ratios) < _EQUAL_WEIGHTS:
+        log_weights, k_hat = np.full(ratios.shape, -np.log(len(ratios))), 0.0
+    else:
+        log_weights, k_hat = array_stats.psislw(ratios)
+    weights = np.exp(np.asarray(log_weights) - np.max(log_weights))
+    weights /= weights.sum()
+    k_hat = float(k_hat)
+    mean = {name: float(weights @ values[fine]) for name, values in draws.items()}
+    shift = {
+        name: float((mean[name] - values.mean()) / values.std(ddof=1))
+        for name, values in draws.items()
+    }
+    verdict: Verdict = "accepted"
+    if max(abs(value) for value in shift.values()) > largest_shift:
+        verdict = "reweight"
+    # NaN must not pass: compare so that it fails.
+    if not k_hat < threshold or failed > largest_failure_rate * len(log_ratios):
+        verdict = "not certified"
+    ess = float(1.0 / np.sum(weights**2))
+    return Certificate(verdict, k_hat, threshold, ess, shift, mean, len(log_ratios), failed)
+
+
+def certify(
+    posterior: Posterior, simulator: Simulator, *, draws: int = 200, progress: bool = False
+) -> Certificate:
+    """Check ``posterior`` against FEM at ``draws`` of its draws, evenly spaced along the chains.
+
+    Each FEM solve starts from the cheap map's own prediction.
+
+    Raises
+    ------
+    InputError
+        The simulator is for another scene, or too few draws are asked for.
+    """
+    model, data = posterior.model, posterior.data
+    if simulator.scene.fingerprint != model.forward.scene.fingerprint:
+        raise InputError("certify: the simulator's scene is not the posterior's")
+    everything = posterior.draws()
+    available = len(next(iter(everything.values())))
+    if not 25 <= draws <= available:
+        raise InputError(f"certify: {draws} draws asked for; give 25 to {available}")
+    rows = np.linspace(0, available - 1, draws).astype(int)
+    chosen = {name: values[rows] for name, values in everything.items()}
+    ratio = _log_ratio(posterior, simulator)
+    sds = chosen.get(NOISE_SD, np.full(draws, model.noise.sd))
+    thetas = posterior.thetas()[rows]
+    bar = tqdm(range(draws), "FEM check", disable=not progress, unit="run")
+    log_ratios = np.array([float(ratio(thetas[s], sds[s], data)) for s in bar])
+    return judge(log_ratios, chosen)
+
+
+def _log_ratio(posterior: Posterior, simulator: Simulator) -> Any:
+    """Jitted log likelihood ratio of one draw, ``-inf`` where FEM fails."""
+    model = posterior.model
+
+    @jax.jit
+    def ratio(theta: jax.Array, sd: jax.Array, data: jax.Array) -> jax.Array:
+        solution = simulator.solve(theta, model.full(theta))
+        fem = model.log_likelihood(solution.displacement[model.observe.nodes], sd, data)
+        cheap = model.log_likelihood(model.forward(theta), sd, data)
+        return jnp.where(solution.converged, fem - cheap, -jnp.inf)
+
+    return ratio

@@ -1,0 +1,38 @@
+"""The command line: ``calibrate <command>``.
+
+Exit codes: 0 done, 1 ran but failed its check, 2 bad input with one clear line.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from calibrate.cli import emulators, inference, scenes, verification
+from calibrate.cli.common import BAD_INPUT, FAILED, Parser
+from emulator.errors import InputError, SolverError
+
+
+def build_parser() -> Parser:
+    """The parser with every command."""
+    parser = Parser(prog="calibrate", description="Bayesian calibration of soft-tissue models.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    for group in (inference, scenes, emulators, verification):
+        group.register(commands)
+    return parser
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    try:
+        arguments = build_parser().parse_args(words)
+        return arguments.run(arguments)
+    except InputError as error:
+        print(f"calibrate: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except SolverError as error:
+        print(f"calibrate: {error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("calibrate: interrupted", file=sys.stderr)
+        return FAILED

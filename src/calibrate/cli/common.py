@@ -1,0 +1,84 @@
+"""What the commands share."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any, NoReturn
+
+from emulator.errors import InputError
+
+DONE, FAILED, BAD_INPUT = 0, 1, 2
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose complaints are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Leave with the message as an :class:`InputError`."""
+        raise InputError(f"{message} (see {self.prog} --help)")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Every command can answer in JSON."""
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def add_scene(parser: argparse.ArgumentParser) -> None:
+    """The scene and, for published ones, the folder of the data."""
+    parser.add_argument("scene", metavar="SCENE", help="built-in name, .toml file, or published:<Model>")
+    parser.add_argument("--root", metavar="DIR", help="folder of the published data")
+
+
+def assignments(words: Sequence[str]) -> dict[str, float]:
+    """``name=value`` words as a dict; :class:`InputError` names the one that is not."""
+    values: dict[str, float] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        try:
+            values[name] = float(text)
+        except ValueError as error:
+            raise InputError(f"'{word}' is not name=number, e.g. mu=73") from error
+    return values
+
+
+def seconds(text: str) -> float:
+    """A duration such as ``90``, ``90s``, ``15m`` or ``2h`` in seconds."""
+    factor = {"s": 1.0, "m": 60.0, "h": 3600.0}.get(text[-1:])
+    try:
+        value = float(text[:-1] if factor else text) * (factor or 1.0)
+    except ValueError as error:
+        raise InputError(f"duration '{text}' is not a number with s, m or h, e.g. 15m") from error
+    if not 0.0 < value < float("inf"):
+        raise InputError(f"duration '{text}' must be above 0")
+    return value
+
+
+def emit(result: Any, *, as_json: bool, text: str) -> None:
+    """Print ``result`` as JSON or ``text`` for people."""
+    print(json.dumps(result, indent=2) if as_json else text)
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Columns aligned: the first to the left, numbers to the right."""
+    lines = [list(header), *([_cell(value) for value in row] for row in rows)]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
+    out = []
+    for line in lines:
+        cells = [line[0].ljust(widths[0])]
+        cells += [cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)]
+        out.append("  ".join(cells).rstrip())
+    return "\n".join(out)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "" if value is None else str(value)
+
+
+def show_progress(arguments: argparse.Namespace) -> bool:
+    """Progress bars unless JSON is asked for or nobody is watching."""
+    return not arguments.json and sys.stderr.isatty()

@@ -1,0 +1,137 @@
+"""``calibrate demo``, ``infer`` and ``certify``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from calibrate.cli.common import (
+    DONE,
+    FAILED,
+    add_json,
+    add_scene,
+    assignments,
+    emit,
+    show_progress,
+    table,
+)
+
+_FORWARDS = ("emulator", "corrected", "reduced", "fem")
+
+
+def register(commands: Any) -> None:
+    """Add the commands."""
+    parser = commands.add_parser("demo", help="the whole job on a built-in beam, in under a minute")
+    parser.add_argument("--out", default="demo-output", metavar="DIR")
+    add_json(parser)
+    parser.set_defaults(run=demo)
+
+    parser = commands.add_parser("infer", help="sample a posterior")
+    add_scene(parser)
+    parser.add_argument("--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm")
+    parser.add_argument("--truth", nargs="+", default=[], metavar="NAME=VALUE", help="of synthetic data")
+    parser.add_argument("--observe", default="nodes:20", metavar="WHAT", help="nodes:N, landmarks:N, all, a node set, 3,14,15")
+    noise = parser.add_mutually_exclusive_group()
+    noise.add_argument("--noise", type=float, metavar="MM", help="standard deviation, known (default 0.2)")
+    parser.add_argument("--noise-scale", type=float, metavar="MM", help="infer the noise; scale of its half-normal prior")
+    parser.add_argument("--forward", choices=_FORWARDS, default="emulator")
+    parser.add_argument("--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene")
+    parser.add_argument("--fem-runs", type=int, default=30, help="that the reduced model is fitted to")
+    parser.add_argument("--sampler", choices=("nuts",), default="nuts")
+    parser.add_argument("--draws", type=int, default=1000)
+    parser.add_argument("--warmup", type=int, default=1000)
+    parser.add_argument("--chains", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", required=True, metavar="DIR")
+    add_json(parser)
+    parser.set_defaults(run=infer)
+
+    parser = commands.add_parser("certify", help="check a posterior against FEM")
+    parser.add_argument("folder", metavar="DIR", help="written by calibrate infer")
+    parser.add_argument("--draws", type=int, default=200, help="FEM runs")
+    add_json(parser)
+    parser.set_defaults(run=certify)
+
+
+def demo(arguments: argparse.Namespace) -> int:
+    """Run the demo and show what came out."""
+    import time
+
+    started = time.perf_counter()
+    from calibrate.demo import demo as run_demo
+
+    report = run_demo(arguments.out, progress=show_progress(arguments))
+    report["seconds"] = round(time.perf_counter() - started, 1)
+    report["files"] = [f"{arguments.out}/{name}" for name in ("posterior.nc", "certificate.json", "beam.png")]
+    text = f"{summary(report)}\nwritten: {', '.join(report['files'])} ({report['seconds']:.0f} s)"
+    emit(report, as_json=arguments.json, text=text)
+    return DONE if report["verdict"] == "accepted" else FAILED
+
+
+def infer(arguments: argparse.Namespace) -> int:
+    """Sample and keep a posterior."""
+    from calibrate.run import Run, report
+    from calibrate.run import infer as run_inference
+
+    synthetic = arguments.data == "synthetic"
+    known = arguments.noise if arguments.noise is not None else 0.2
+    run = Run(
+        scene=arguments.scene,
+        root=arguments.root,
+        data=arguments.data,
+        truth=assignments(arguments.truth),
+        observe=arguments.observe,
+        noise_sd=known if synthetic or arguments.noise_scale is None else None,
+        noise_scale=arguments.noise_scale,
+        forward=arguments.forward,
+        emulator=arguments.emulator,
+        fem_runs=arguments.fem_runs,
+        sampler=arguments.sampler,
+        warmup=arguments.warmup,
+        draws=arguments.draws,
+        chains=arguments.chains,
+        seed=arguments.seed,
+    )
+    posterior = run_inference(run, arguments.out, progress=show_progress(arguments))
+    result = report(run, posterior, None)
+    text = f"{summary(result)}\nwritten to {arguments.out}; check it with: calibrate certify {arguments.out}"
+    emit(result, as_json=arguments.json, text=text)
+    return DONE
+
+
+def certify(arguments: argparse.Namespace) -> int:
+    """Check a kept posterior against FEM."""
+    from calibrate.run import certify_and_keep, read_posterior, report
+
+    progress = show_progress(arguments)
+    run, posterior = read_posterior(arguments.folder, progress=progress)
+    certificate = certify_and_keep(posterior, arguments.folder, draws=arguments.draws, progress=progress)
+    result = report(run, posterior, certificate)
+    emit(result, as_json=arguments.json, text=summary(result))
+    return DONE if certificate.verdict == "accepted" else FAILED
+
+
+def summary(report: dict[str, Any]) -> str:
+    """The parameter table and the verdict for people."""
+    parameters = report["parameters"]
+    columns = ["mean", "sd", "low", "high", "r_hat", "ess_bulk"]
+    titles = ["mean", "sd", "5 %", "95 %", "R-hat", "ESS"]
+    if any("truth" in row for row in parameters.values()):
+        columns, titles = ["truth", *columns], ["truth", *titles]
+    shift = report.get("certificate", {}).get("shift")
+    rows = []
+    for name, row in parameters.items():
+        cells: list[object] = [row.get(column) for column in columns]
+        rows.append((name, *cells, *([shift[name]] if shift else [])))
+    lines = [table(("parameter", *titles, *(["FEM shift / sd"] if shift else [])), rows)]
+    lines.append(
+        f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences, "
+        f"forward map: {report['forward']}"
+    )
+    if "verdict" in report:
+        c = report["certificate"]
+        lines.append(
+            f"verdict: {report['verdict']} (Pareto k {c['k_hat']:.2f}, at most {c['k_threshold']:.2f}; "
+            f"{c['draws']} FEM runs, {c['failed']} failed)"
+        )
+    return "\n".join(lines)

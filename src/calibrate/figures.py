@@ -1,0 +1,116 @@
+"""Pictures of results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from calibrate.certify import Certificate
+from calibrate.posterior import Posterior
+from emulator.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def pyplot() -> Any:
+    """matplotlib.pyplot drawing to files; :class:`InputError` when it is not installed."""
+    try:
+        import matplotlib as mpl
+    except ImportError as error:
+        raise InputError("figures need matplotlib: pip install 'soft-tissue-calibrate[plot]'") from error
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
+
+
+def displacement_draws(posterior: Posterior, count: int = 200) -> np.ndarray:
+    """Full displacement fields (count, n, 3) mm at evenly spaced draws, from the forward map."""
+    thetas = posterior.thetas()
+    rows = np.linspace(0, len(thetas) - 1, count).astype(int)
+    return np.asarray(jax.jit(lambda t: jax.lax.map(posterior.model.full, t))(thetas[rows]))
+
+
+def beam_figure(
+    posterior: Posterior,
+    truth: jax.Array,
+    theta: Mapping[str, float],
+    certificate: Certificate,
+    path: str | Path,
+) -> None:
+    """The deformed body seen from the side, true and inferred, and the posterior of theta.
+
+    Parameters
+    ----------
+    truth : (n, 3) mm, the displacement the data was made from.
+    theta : the parameters behind it.
+    """
+    plt = pyplot()
+    fields = displacement_draws(posterior)
+    figure, (side, joint) = plt.subplots(
+        1, 2, figsize=(12.5, 4.8), width_ratios=(1.9, 1.0), layout="constrained"
+    )
+    scatter = _draw_side(side, posterior, np.asarray(truth), fields)
+    figure.colorbar(scatter, ax=side, label="posterior sd of the position (mm)", shrink=0.85)
+    _draw_joint(joint, posterior, theta)
+    figure.suptitle(
+        f"{posterior.model.forward.scene.name}: posterior by {posterior.model.forward.kind}, "
+        f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"
+    )
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=140)
+    plt.close(figure)
+
+
+def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.ndarray) -> Any:
+    """x-z view: reference and true outline as lines, posterior mean as points coloured by its sd."""
+    mesh = posterior.model.forward.scene.mesh
+    face = mesh.nodes[:, 1] == mesh.nodes[:, 1].min()
+    mean, spread = fields.mean(axis=0), np.sqrt(fields.var(axis=0, ddof=1).sum(axis=-1))
+    for displacement, style, label in (
+        (np.zeros_like(truth), {"color": "0.8", "lw": 0.8}, "reference"),
+        (truth, {"color": "black", "lw": 0.9}, "truth (FEM)"),
+    ):
+        for k, (a, b) in enumerate(_face_edges(mesh.elements, face)):
+            points = mesh.nodes[[a, b]] + displacement[[a, b]]
+            axes.plot(points[:, 0], points[:, 2], label=label if k == 0 else None, zorder=1, **style)
+    place = mesh.nodes[face] + mean[face]
+    scatter = axes.scatter(
+        place[:, 0], place[:, 2], c=spread[face], cmap="viridis", s=26, zorder=3, label="posterior mean"
+    )
+    observe = posterior.model.observe
+    data = observe.points + np.asarray(posterior.data)
+    axes.scatter(data[:, 0], data[:, 2], marker="x", c="tab:red", s=30, lw=1.2, zorder=4, label="data")
+    axes.set(xlabel="x (mm)", ylabel="z (mm)", aspect="equal")
+    axes.legend(loc="lower left", frameon=False)
+    return scatter
+
+
+def _face_edges(elements: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Mesh edges (e, 2) with both ends on the face, (n,) bool."""
+    from emulator.network.graph import mesh_edges
+
+    edges = mesh_edges(elements)
+    return edges[face[edges].all(axis=1)]
+
+
+def _draw_joint(axes: Axes, posterior: Posterior, theta: Mapping[str, float]) -> None:
+    """Draws of the first two parameters, the truth, and the box the prior covers."""
+    scene = posterior.model.forward.scene
+    first, second = scene.parameters[:2]
+    draws = posterior.draws()
+    axes.scatter(draws[first.name], draws[second.name], s=4, alpha=0.25, lw=0, label="posterior draws")
+    axes.plot(theta[first.name], theta[second.name], "k+", ms=14, mew=2, label="truth")
+    axes.set(
+        xlabel=f"{first.name} ({first.unit})",
+        ylabel=f"{second.name} ({second.unit})",
+        xlim=(first.low, first.high),
+        ylim=(second.low, second.high),
+        title="prior box and posterior",
+    )
+    axes.legend(loc="upper right", frameon=False)

@@ -1,0 +1,177 @@
+"""A posterior: draws as an ArviZ DataTree, with the model and data they came from."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import arviz_base
+import arviz_stats
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from calibrate.model import Model
+from calibrate.samplers import NUTSOptions, nuts
+from emulator.errors import InputError
+from emulator.network import CachedEmulator
+
+_VERSIONS = ("jax", "jaxlib", "flax", "numpyro", "numpy", "scikit-fem", "sparsax", "arviz")
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Draws and what they are draws of.
+
+    tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; attributes
+        hold the provenance.
+    model, data : the model and the data (d, 3) mm it was conditioned on.
+    """
+
+    tree: xr.DataTree
+    model: Model
+    data: jnp.ndarray
+
+    def draws(self) -> dict[str, np.ndarray]:
+        """All draws by name, chains joined, each (s,)."""
+        return {n: self.tree["posterior"][n].values.reshape(-1) for n in self.model.names}
+
+    def thetas(self) -> jnp.ndarray:
+        """All draws of theta, (s, p)."""
+        draws = self.draws()
+        return jnp.stack([draws[name] for name in self.model.forward.scene.parameter_names], axis=1)
+
+    def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
+        """Per parameter: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
+        draws = self.tree["posterior"].to_dataset()
+        rhat = arviz_stats.rhat(draws)
+        bulk, tail = arviz_stats.ess(draws, method="bulk"), arviz_stats.ess(draws, method="tail")
+        edge = 0.5 * (1.0 - probability)
+        table = {}
+        for name, values in self.draws().items():
+            low, high = np.quantile(values, [edge, 1.0 - edge])
+            table[name] = {
+                "mean": float(values.mean()),
+                "sd": float(values.std(ddof=1)),
+                "low": float(low),
+                "high": float(high),
+                "r_hat": float(rhat[name]),
+                "ess_bulk": float(bulk[name]),
+                "ess_tail": float(tail[name]),
+            }
+        return table
+
+    @property
+    def divergences(self) -> int:
+        """Number of divergent transitions."""
+        return int(self.tree["sample_stats"]["diverging"].sum())
+
+    def save(self, path: str | Path) -> None:
+        """Write the DataTree as netCDF, whole or not at all."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(suffix=".nc", dir=path.parent)
+        os.close(handle)
+        try:
+            self.tree.to_netcdf(temporary, engine="h5netcdf")
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+
+def read_tree(path: str | Path) -> xr.DataTree:
+    """The DataTree in a netCDF file, in memory; :class:`InputError` when it is not one."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"posterior file {path} does not exist")
+    try:
+        with xr.open_datatree(path, engine="h5netcdf") as tree:
+            return tree.load()
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"posterior file {path} is truncated or not netCDF") from error
+
+
+def provenance(model: Model, seed: int, sampler: str) -> dict[str, Any]:
+    """What is needed to know, and to repeat, how a posterior was made; plain JSON values."""
+    scene = model.forward.scene
+    record: dict[str, Any] = {
+        "scene": dict(scene.recipe),
+        "scene_name": scene.name,
+        "scene_fingerprint": scene.fingerprint,
+        "forward": model.forward.kind,
+        "observe": model.observe.describe(),
+        "noise": model.noise.describe(),
+        "prior": {name: repr_distribution(d) for name, d in model.prior.items()},
+        "sampler": sampler,
+        "seed": seed,
+        "versions": {name: version(name) for name in _VERSIONS},
+    }
+    if isinstance(model.full, CachedEmulator):
+        record["emulator_fingerprint"] = model.full.emulator.fingerprint
+    return record
+
+
+def repr_distribution(distribution: Any) -> str:
+    """A distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
+    arguments = ", ".join(
+        f"{name}={float(getattr(distribution, name))!r}" for name in distribution.arg_constraints
+    )
+    return f"{type(distribution).__name__}({arguments})"
+
+
+def sample(
+    model: Model,
+    data: np.ndarray,
+    *,
+    sampler: str = "nuts",
+    options: NUTSOptions = NUTSOptions(),
+    seed: int = 0,
+    progress: bool = False,
+) -> Posterior:
+    """Draw from the posterior of ``model`` given ``data`` (d, 3) mm.
+
+    Raises
+    ------
+    InputError
+        Unknown sampler, data of the wrong shape or with values that are not finite.
+    """
+    if sampler != "nuts":
+        raise InputError(f"sampler '{sampler}' is unknown; known: nuts")
+    data = model.check_data(data)
+    draws, stats = nuts(model, data, options, seed, progress=progress)
+    tree = _tree(model, data, draws, stats)
+    tree.attrs.update(
+        {
+            key: value if isinstance(value, str | int) else json.dumps(value)
+            for key, value in provenance(model, seed, sampler).items()
+        }
+    )
+    return Posterior(tree, model, data)
+
+
+def _tree(
+    model: Model,
+    data: jnp.ndarray,
+    draws: Mapping[str, np.ndarray],
+    stats: Mapping[str, np.ndarray],
+) -> xr.DataTree:
+    groups: dict[str, Any] = {
+        "posterior": dict(draws),
+        "sample_stats": dict(stats),
+        "observed_data": {"displacement": np.asarray(data)},
+        "constant_data": {"position": model.observe.points},
+    }
+    labelled = ["point", "component"]
+    return arviz_base.from_dict(
+        groups,
+        dims={"displacement": labelled, "position": labelled},
+        coords={"component": ["x", "y", "z"], "point": np.arange(len(data))},
+    )

@@ -1,0 +1,190 @@
+"""One calibration from start to end: data, forward map, posterior, certificate, files.
+
+A :class:`Run` is plain JSON, kept as ``run.json`` beside its results, so that any result can be
+certified again or repeated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.certify import Certificate, certify
+from calibrate.data import read_data, write_data
+from calibrate.model import Model, model
+from calibrate.noise import GaussianNoise
+from calibrate.observations import (
+    Observation,
+    landmarks,
+    nodal_displacements,
+    spread_landmarks,
+    spread_nodes,
+)
+from calibrate.posterior import Posterior, read_tree, sample
+from calibrate.samplers import NUTSOptions
+from emulator.correct import corrected
+from emulator.errors import InputError
+from emulator.fem import Simulator
+from emulator.forward import ForwardMap, fem_forward
+from emulator.network import load
+from emulator.reduced import fit_reduced
+from emulator.scenes import find_scene
+from emulator.scenes.scene import Scene
+from emulator.store import read_json, write_json
+from emulator.training import run_campaign, sobol
+
+FORWARDS = ("emulator", "corrected", "reduced", "fem")
+RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What to calibrate and how.
+
+    scene, root : a scene's name or file; where published data is.
+    data : a file, or ``synthetic``: FEM at ``truth`` plus noise.
+    truth : named parameters of synthetic data.
+    observe : of synthetic data: ``nodes:20``, ``landmarks:24``, ``all``, a node set, or ``3,14,15``.
+    noise_sd : mm, known; or ``noise_scale``, the scale of its prior, when it is to be inferred.
+    forward : one of :data:`FORWARDS`; ``emulator`` a shipped name or folder; ``fem_runs`` those
+        the reduced model is fitted to.
+    """
+
+    scene: str
+    root: str | None = None
+    data: str = "synthetic"
+    truth: dict[str, float] = field(default_factory=dict)
+    observe: str = "nodes:20"
+    noise_sd: float | None = 0.2
+    noise_scale: float | None = None
+    forward: str = "emulator"
+    emulator: str | None = None
+    fem_runs: int = 30
+    sampler: str = "nuts"
+    warmup: int = 1000
+    draws: int = 1000
+    chains: int = 4
+    seed: int = 0
+
+    @property
+    def noise(self) -> GaussianNoise:
+        """The noise model."""
+        return GaussianNoise(self.noise_sd, self.noise_scale)
+
+
+def build_forward(run: Run, scene: Scene, *, progress: bool = False) -> ForwardMap:
+    """The forward map a run asks for, over all nodes."""
+    if run.forward not in FORWARDS:
+        raise InputError(f"forward map '{run.forward}' is unknown; known: {', '.join(FORWARDS)}")
+    if run.forward == "reduced":
+        thetas = sobol(scene, run.fem_runs, run.seed)
+        return fit_reduced(scene, run_campaign(Simulator(scene), thetas, progress=progress))
+    if run.forward == "fem":
+        return fem_forward(Simulator(scene))
+    cached = load(run.emulator or scene.name, scene).cache()
+    return cached if run.forward == "emulator" else corrected(cached, Simulator(scene))
+
+
+def parse_observation(scene: Scene, text: str, seed: int) -> Observation:
+    """The observation a word stands for; see :class:`Run`."""
+    kind, _, count = text.partition(":")
+    if kind in ("nodes", "landmarks") and count:
+        if not count.isdigit() or int(count) < 1:
+            raise InputError(f"observe '{text}': '{count}' is not a number of {kind}")
+        if kind == "nodes":
+            return nodal_displacements(scene, spread_nodes(scene, int(count), seed))
+        return landmarks(scene, spread_landmarks(scene, int(count), seed))
+    if text == "all" or text in scene.mesh.node_sets:
+        return nodal_displacements(scene, text)
+    try:
+        nodes = [int(word) for word in text.split(",")]
+    except ValueError as error:
+        raise InputError(
+            f"observe '{text}': give nodes:N, landmarks:N, all, node numbers like 3,14,15, "
+            f"or a node set: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
+        ) from error
+    return nodal_displacements(scene, nodes)
+
+
+def make_data(run: Run, scene: Scene) -> tuple[Observation, np.ndarray]:
+    """The observation and data (d, 3) mm of a run, read from a file or made by FEM."""
+    if run.data != "synthetic":
+        return read_data(scene, run.data)
+    theta = scene.theta(**run.truth)
+    if run.noise_sd is None:
+        raise InputError("synthetic data needs a noise standard deviation: --noise MM")
+    observe = parse_observation(scene, run.observe, run.seed)
+    exact = observe(Simulator(scene)(theta)[observe.nodes])
+    noise = np.random.default_rng([run.seed, 1]).normal(0.0, run.noise_sd, exact.shape)
+    return observe, np.asarray(exact) + noise
+
+
+def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
+    """Sample the posterior of a run; with ``folder``, keep run.json, data.csv and posterior.nc there."""
+    scene = find_scene(run.scene, run.root)
+    observe, data = make_data(run, scene)
+    # Synthetic data always has a known noise when made; it is inferred only if a scale is given.
+    noise = GaussianNoise(None, run.noise_scale) if run.noise_scale is not None else run.noise
+    built = model(build_forward(run, scene, progress=progress), observe, noise)
+    options = NUTSOptions(run.warmup, run.draws, run.chains)
+    posterior = sample(
+        built, data, sampler=run.sampler, options=options, seed=run.seed, progress=progress
+    )
+    if folder is not None:
+        folder = Path(folder)
+        posterior.save(folder / POSTERIOR)
+        write_data(folder / DATA, observe, data)
+        write_json(folder / RUN, asdict(run))
+        (folder / CERTIFICATE).unlink(missing_ok=True)  # it was of an earlier posterior
+    return posterior
+
+
+def read_posterior(folder: str | Path, *, progress: bool = False) -> tuple[Run, Posterior]:
+    """The run kept in ``folder`` and its posterior, ready to be certified."""
+    folder = Path(folder)
+    text = read_json(folder / RUN)
+    try:
+        run = Run(**text)
+    except TypeError as error:
+        raise InputError(f"{folder / RUN} does not describe a run: {error}") from error
+    scene = find_scene(run.scene, run.root)
+    tree = read_tree(folder / POSTERIOR)
+    if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
+        raise InputError(f"{folder / POSTERIOR} was made for another scene than '{run.scene}'")
+    observe, data = read_data(scene, folder / DATA)
+    noise = GaussianNoise(None, run.noise_scale) if run.noise_scale is not None else run.noise
+    built: Model = model(build_forward(run, scene, progress=progress), observe, noise)
+    return run, Posterior(tree, built, jnp.asarray(data))
+
+
+def certify_and_keep(
+    posterior: Posterior, folder: str | Path, *, draws: int = 200, progress: bool = False
+) -> Certificate:
+    """Check a posterior against FEM and write certificate.json."""
+    simulator = Simulator(posterior.model.forward.scene)
+    certificate = certify(posterior, simulator, draws=draws, progress=progress)
+    write_json(Path(folder) / CERTIFICATE, certificate.to_json())
+    return certificate
+
+
+def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> dict[str, Any]:
+    """The result as plain JSON: parameter table, diagnostics, verdict."""
+    table = posterior.summary()
+    for name, value in run.truth.items() if run.data == "synthetic" else ():
+        table[name]["truth"] = value
+    result: dict[str, Any] = {
+        "scene": run.scene,
+        "forward": run.forward,
+        "parameters": table,
+        "divergences": posterior.divergences,
+        "draws": int(posterior.tree["posterior"].sizes["draw"]),
+        "chains": int(posterior.tree["posterior"].sizes["chain"]),
+    }
+    if certificate is not None:
+        result.update(verdict=certificate.verdict, k_hat=certificate.k_hat)
+        result["certificate"] = certificate.to_json()
+    return result

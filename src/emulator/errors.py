@@ -1,0 +1,9 @@
+"""Errors meant for people: one line that names the thing, what was found, and what would be right."""
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used. The command line prints it and exits with code 2."""
+
+
+class SolverError(RuntimeError):
+    """A simulation did not converge; the message names how it failed."""

@@ -1,0 +1,117 @@
+r"""Residual and tangent of a scene's potential energy over its free degrees of freedom.
+
+.. math::
+    r = \frac{\partial \Pi}{\partial u}, \qquad
+    K = \frac{\partial^2 \Pi}{\partial u^2}
+      = \sum_{e,q} w_{eq}\, B^T \frac{\partial^2 W}{\partial H^2} B
+
+with :math:`B` the shape-function gradients. Dead loads have no tangent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.fem.sparse import Factorisation, Pattern, element_pattern
+from emulator.mechanics.energy import (
+    displacement_gradient,
+    nodal_dead_force,
+    point_energy,
+    strain_energy,
+)
+from emulator.scenes.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """The discrete equations of a scene; vectors of free displacements have shape (f,)."""
+
+    scene: Scene
+    factorisation: Factorisation = "umfpack"
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """Flat indices of the free degrees of freedom, (f,)."""
+        free = np.flatnonzero(~self.scene.held.ravel())
+        if not len(free):
+            raise InputError(f"scene '{self.scene.name}': every node is held, nothing to solve")
+        return free
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """Sparsity of the tangent."""
+        nodes = self.scene.discretisation.connectivity
+        dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
+        free_index = np.full(self.scene.held.size, -1)
+        free_index[self.free] = np.arange(len(self.free))
+        return element_pattern(dofs, free_index, symmetric=self.factorisation == "cholmod")
+
+    @cached_property
+    def dead_force(self) -> np.ndarray:
+        """Nodal forces of the dead loads, (n, 3) in mN; zero when there are none."""
+        force = nodal_dead_force(self.scene)
+        return np.zeros(self.scene.held.shape) if force is None else force
+
+    def restrict(self, field: jax.Array) -> jax.Array:
+        """Free entries (f,) of a nodal field (n, 3)."""
+        return field.reshape(-1)[self.free]
+
+    def extend(self, free_values: jax.Array) -> jax.Array:
+        """Nodal field (n, 3) with ``free_values`` (f,), zero where held."""
+        flat = jnp.zeros(self.scene.held.size, dtype=free_values.dtype)
+        return flat.at[self.free].set(free_values, unique_indices=True).reshape(-1, 3)
+
+    def internal_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Gradient of the strain energy, (n, 3) in mN, reactions included."""
+        return jax.grad(strain_energy(self.scene))(u, theta)
+
+    def residual(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
+        """Free part (f,) of the force out of balance in mN, with ``load`` times the dead loads."""
+        return self.restrict(self.internal_force(u, theta) - load * self.dead_force)
+
+    def tangent(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Nonzeros (nnz,) of the tangent over the free degrees of freedom, mN/mm."""
+        grid = self.scene.discretisation
+        moduli = jax.vmap(jax.vmap(jax.hessian(point_energy(self.scene, theta))))
+        A = moduli(displacement_gradient(self.scene, u)) * grid.weights[:, :, None, None, None, None]
+        blocks = jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
+        k = 3 * grid.connectivity.shape[1]
+        return self.pattern.sum(blocks.reshape(len(blocks), k, k))
+
+    def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
+        """Solve ``K x = rhs`` over the free degrees of freedom, shape (f,)."""
+        return self.pattern.solve(tangent, rhs, self.factorisation)
+
+
+def relative_residual(
+    system: System, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
+) -> jax.Array:
+    """Force out of balance relative to the forces at work, reactions included, shape ()."""
+    return balance(system, u, theta, load)[1]
+
+
+def balance(
+    system: System,
+    u: jax.Array,
+    theta: jax.Array,
+    load: jax.Array | float = 1.0,
+    negligible: float = 0.0,
+) -> tuple[jax.Array, jax.Array]:
+    """Free residual (f,) in mN, and its norm relative to the forces at work, shape ().
+
+    ``negligible`` is a norm in mN that counts as none. A body at rest without loads has no forces
+    at all, and its relative residual is 0 too. NaN stays NaN.
+    """
+    internal = system.internal_force(u, theta)
+    external = load * system.dead_force
+    residual = system.restrict(internal - external)
+    norm = jnp.sqrt(jnp.sum(residual**2))
+    scale = jnp.sqrt(jnp.sum(internal**2)) + jnp.sqrt(jnp.sum(external**2))
+    relative = norm / jnp.where(scale > 0.0, scale, 1.0)
+    return residual, jnp.where(norm <= negligible, 0.0, relative)

@@ -1,0 +1,196 @@
+r"""Newton's method with adaptive load steps, as one loop inside ``jax.jit``.
+
+At load level :math:`s \in (0, 1]` the dead loads are :math:`s f` and the held displacements
+:math:`s \bar u`. Each iteration solves
+
+.. math::
+    K(u)\, \Delta u = -\left[r_s(u) + K(u)\, \Delta \bar u\right], \qquad
+    \Delta \bar u = s \bar u - u|_\text{held}
+
+and steps by the largest :math:`\alpha \in \{1, \tfrac12, \tfrac14, \dots\}` that keeps every
+element's :math:`J` above a fraction of its present least value. Full steps may raise the energy on
+their way (a bending beam first stretches, then contracts), so descent is not asked for; a level
+that does not converge is tried again with half the load increment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from emulator.fem.assembly import System, balance
+from emulator.fem.solution import Solution, Status
+from emulator.mechanics.energy import volume_ratio
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """Controls of the solver.
+
+    tolerance : residual relative to the internal forces, reactions included.
+    round_off : a residual below this that Newton no longer reduces has met round-off, and will do.
+    absolute : residual in mN that is small enough whatever the forces; 0 asks for the others.
+    max_iterations : over all load levels.
+    level_iterations : after which a load level is given up and its increment halved.
+    min_increment : smallest load increment, as a fraction of the whole.
+    shrink : least fraction of the present smallest ``J`` that a step may leave.
+    """
+
+    tolerance: float = 1e-11
+    round_off: float = 1e-8
+    absolute: float = 0.0
+    max_iterations: int = 200
+    level_iterations: int = 25
+    min_increment: float = 1.0 / 256.0
+    shrink: float = 0.2
+
+
+class _State(NamedTuple):
+    u: jax.Array  # (n, 3) current iterate
+    level: jax.Array  # load level being solved
+    u_reached: jax.Array  # (n, 3) solution at the last level that converged
+    reached: jax.Array  # that level
+    increment: jax.Array
+    at_level: jax.Array  # iterations spent at this level
+    iterations: jax.Array
+    error: jax.Array  # residual relative to the tolerance's scale at `u`, of level `level`
+    status: jax.Array
+
+
+def newton(
+    system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array
+) -> Solution:
+    """Minimise the potential energy of ``system``.
+
+    Parameters
+    ----------
+    theta : (p,) parameters.
+    start : (n, 3) mm, where to start; its held entries need not fit the supports yet.
+
+    Returns
+    -------
+    Solution, whose status is CONVERGED or names the failure; its displacement is always finite.
+    """
+    held = jnp.asarray(system.scene.held)
+    held_values = jnp.asarray(system.scene.held_displacement)
+
+    def balanced(u: jax.Array, level: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return balance(system, u, theta, level, options.absolute)
+
+    def step(state: _State) -> _State:
+        residual, _ = balanced(state.u, state.level)
+        tangent = system.tangent(state.u, theta)
+        move_held = jnp.where(held, state.level * held_values - state.u, 0.0)
+        # K times the held displacement, without assembling the held columns.
+        _, pull = jax.jvp(
+            lambda v: system.restrict(system.internal_force(v, theta)), (state.u,), (move_held,)
+        )
+        solvable = jnp.all(jnp.isfinite(tangent))
+        move = system.extend(system.solve(system.pattern.safe_values(tangent), -(residual + pull)))
+        u, admissible = _guarded_step(system, state.u, move + move_held, options.shrink)
+        admissible &= solvable
+        u = jnp.where(admissible, u, state.u)
+        placed = jnp.all(jnp.where(held, jnp.abs(state.level * held_values - u), 0.0) == 0.0)
+        _, error = balanced(u, state.level)
+        error = jnp.where(placed & admissible & jnp.isfinite(error), error, jnp.inf)
+        return _next_level(options, state, u, admissible, error)
+
+    def running(state: _State) -> jax.Array:
+        return state.status == Status.RUNNING
+
+    _, error = balanced(start, jnp.array(1.0))
+    placed = jnp.all(jnp.where(held, start == held_values, True))
+    fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(theta))
+    inverted = ~(jnp.min(volume_ratio(system.scene, start)) > 0.0)
+    status = jnp.where(
+        ~fine,
+        Status.INVALID_INPUT,
+        jnp.where(placed & (error <= options.tolerance), Status.CONVERGED, Status.RUNNING),
+    )
+    # An inverted start is no start: begin at rest.
+    u = jnp.where(fine & ~inverted, start, 0.0)
+    state = _State(
+        u=u,
+        level=jnp.array(1.0),
+        u_reached=jnp.zeros_like(u),
+        reached=jnp.array(0.0),
+        increment=jnp.array(1.0),
+        at_level=jnp.array(0),
+        iterations=jnp.array(0),
+        error=jnp.where(fine & placed, error, jnp.inf),
+        status=jnp.asarray(status, dtype=jnp.int64),
+    )
+    state = jax.lax.while_loop(running, step, state)
+    converged = state.status == Status.CONVERGED
+    u = jnp.where(converged, state.u, state.u_reached)
+    return Solution(
+        displacement=u,
+        status=state.status,
+        iterations=state.iterations,
+        residual=state.error,
+        load_reached=jnp.where(converged, 1.0, state.reached),
+    )
+
+
+def _guarded_step(
+    system: System, u: jax.Array, move: jax.Array, shrink: float
+) -> tuple[jax.Array, jax.Array]:
+    """``u`` plus as much of ``move`` as no element minds, and whether any of it could be made."""
+    floor = shrink * jnp.min(volume_ratio(system.scene, u))
+
+    def inverts(fraction: jax.Array) -> jax.Array:
+        J = volume_ratio(system.scene, u + fraction * move)
+        return ~(jnp.min(J) > floor)  # written so that NaN counts as inverted
+
+    def unfinished(fraction: jax.Array) -> jax.Array:
+        return (fraction > 2.0**-12) & inverts(fraction)
+
+    fraction = jax.lax.while_loop(unfinished, lambda fraction: 0.5 * fraction, jnp.array(1.0))
+    return u + fraction * move, fraction > 2.0**-12
+
+
+def _next_level(
+    options: NewtonOptions,
+    state: _State,
+    u: jax.Array,
+    admissible: jax.Array,
+    error: jax.Array,
+) -> _State:
+    """Stay, move on to a higher load level, or fall back to a lower one."""
+    iterations, at_level = state.iterations + 1, state.at_level + 1
+    stalled = (error <= options.round_off) & (error > 0.3 * state.error) & (at_level > 1)
+    solved = (error <= options.tolerance) | stalled
+    complete = solved & (state.level >= 1.0)
+    failed = ~solved & (~admissible | (at_level >= options.level_iterations))
+    # Easy levels earn a longer next step, failures a shorter one.
+    increment = jnp.where(solved & (at_level <= 8), 2.0 * state.increment, state.increment)
+    increment = jnp.where(failed, 0.5 * (state.level - state.reached), increment)
+    reached = jnp.where(solved, state.level, state.reached)
+    u_reached = jnp.where(solved, u, state.u_reached)
+    status = jnp.where(
+        complete,
+        Status.CONVERGED,
+        jnp.where(
+            failed & (increment < options.min_increment),
+            Status.LOAD_LIMIT,
+            jnp.where(
+                iterations >= options.max_iterations, Status.ITERATION_LIMIT, Status.RUNNING
+            ),
+        ),
+    )
+    moved = solved | failed
+    level = jnp.where(moved & ~complete, jnp.minimum(1.0, reached + increment), state.level)
+    return _State(
+        u=jnp.where(failed, u_reached, u),
+        level=level,
+        u_reached=u_reached,
+        reached=reached,
+        increment=increment,
+        at_level=jnp.where(moved, 0, at_level),
+        iterations=iterations,
+        error=error,
+        status=jnp.asarray(status, dtype=state.status.dtype),
+    )

@@ -1,0 +1,114 @@
+r"""The FEM simulator: theta to displacement, differentiable through the equilibrium it solves.
+
+At equilibrium :math:`r(u(\theta), \theta) = 0`, so
+
+.. math::
+    K\, \frac{\partial u}{\partial \theta} = -\frac{\partial r}{\partial \theta}
+
+gives forward derivatives by one more solve with the tangent, and reverse ones by its transpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import jax
+import jax.numpy as jnp
+
+from emulator.fem.assembly import System
+from emulator.fem.newton import NewtonOptions, newton
+from emulator.fem.solution import Solution
+from emulator.fem.sparse import Factorisation, quiet_blas
+from emulator.scenes.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Simulator:
+    """Finite elements for a scene; use it alone, under ``jit``, ``vmap`` or ``grad``.
+
+    Parameters
+    ----------
+    scene : what to simulate.
+    options : controls of Newton's method.
+    factorisation : ``umfpack`` (any tangent) or ``cholmod`` (faster; raises where the tangent is
+        indefinite, as it often is on the way from rest).
+    """
+
+    scene: Scene
+    options: NewtonOptions = NewtonOptions()
+    factorisation: Factorisation = "umfpack"
+
+    def __post_init__(self) -> None:
+        quiet_blas()
+
+    @cached_property
+    def system(self) -> System:
+        """Residual and tangent of the scene."""
+        return System(self.scene, self.factorisation)
+
+    @property
+    def rest(self) -> jax.Array:
+        """The undeformed state, (n, 3)."""
+        return jnp.zeros(self.scene.held.shape)
+
+    def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:
+        """Equilibrium at ``theta`` (p,), from ``start`` (n, 3) mm or from rest.
+
+        The displacement is differentiable in ``theta``; ``start`` only affects the time taken.
+        Never raises on a hard case: read ``status``.
+        """
+        start = self.rest if start is None else start
+        return self._solve(jnp.asarray(theta, dtype=float), jax.lax.stop_gradient(start))
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Displacement (n, 3) in mm; :class:`SolverError` when it does not converge.
+
+        Inside ``jit`` nothing can be raised; use :meth:`solve` and its status there.
+        """
+        solution = self.solve(theta)
+        if isinstance(solution.status, jax.core.Tracer):
+            return solution.displacement
+        return solution.require_converged().displacement
+
+    def campaign(self, thetas: jax.Array, starts: jax.Array | None = None) -> Solution:
+        """Solutions for many theta (c, p), one after the other; fields gain a leading axis."""
+        if starts is None:
+            starts = jnp.zeros((len(thetas), *self.scene.held.shape))
+        return self._campaign(jnp.asarray(thetas, dtype=float), starts)
+
+    @cached_property
+    def _solve(self):  # noqa: ANN202 - a jitted closure, private
+        equilibrium = jax.custom_jvp(partial(newton, self.system, self.options))
+
+        @equilibrium.defjvp
+        def derivative(primals, tangents):  # noqa: ANN001, ANN202
+            theta, start = primals
+            solution = equilibrium(theta, start)
+            moved = displacement_derivative(self.system, solution.displacement, theta, tangents[0])
+            return solution, _inert(solution)._replace(displacement=moved)
+
+        return jax.jit(equilibrium)
+
+    @cached_property
+    def _campaign(self):  # noqa: ANN202
+        return jax.jit(lambda thetas, starts: jax.lax.map(lambda x: self._solve(*x), (thetas, starts)))
+
+
+def displacement_derivative(
+    system: System, u: jax.Array, theta: jax.Array, direction: jax.Array
+) -> jax.Array:
+    """Derivative (n, 3) of the equilibrium ``u`` along ``direction`` (p,) in theta."""
+    _, force = jax.jvp(lambda t: system.residual(u, t), (theta,), (direction,))
+    tangent = system.pattern.safe_values(system.tangent(u, theta))
+    return system.extend(-system.solve(tangent, force))
+
+
+def _inert(solution: Solution) -> Solution:
+    """Zero tangents of a solution: float0 for its integers."""
+    return jax.tree.map(
+        lambda x: jnp.zeros_like(x)
+        if jnp.issubdtype(x.dtype, jnp.floating)
+        else jnp.zeros(x.shape, dtype=jax.dtypes.float0),
+        solution,
+    )

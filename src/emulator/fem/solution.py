@@ -1,0 +1,70 @@
+"""What a simulation returns: a displacement, and whether and how far to believe it."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from emulator.errors import SolverError
+
+
+class Status(IntEnum):
+    """How a simulation ended."""
+
+    CONVERGED = 0
+    ITERATION_LIMIT = 1
+    LOAD_LIMIT = 2
+    INVALID_INPUT = 3
+    RUNNING = 9
+
+    @property
+    def text(self) -> str:
+        """One line for people."""
+        return _TEXT[self]
+
+
+_TEXT = {
+    Status.CONVERGED: "converged",
+    Status.ITERATION_LIMIT: "iteration limit reached",
+    Status.LOAD_LIMIT: "load limit reached: no equilibrium found at the full load",
+    Status.INVALID_INPUT: "theta or the starting displacement is not finite",
+    Status.RUNNING: "still running",
+}
+
+
+class Solution(NamedTuple):
+    """Result of a simulation; every field gains leading axes under ``vmap``.
+
+    displacement : (n, 3) mm; when not converged, that of the largest load that was.
+    status : a :class:`Status` as an integer.
+    iterations : Newton iterations over all load levels.
+    residual : force out of balance relative to the forces at work.
+    load_reached : largest fraction of the load with a converged solution.
+    """
+
+    displacement: jax.Array
+    status: jax.Array
+    iterations: jax.Array
+    residual: jax.Array
+    load_reached: jax.Array
+
+    @property
+    def converged(self) -> jax.Array:
+        """Boolean of the status' shape."""
+        return self.status == Status.CONVERGED
+
+    def require_converged(self, what: str = "simulation") -> Solution:
+        """This solution, or :class:`~emulator.errors.SolverError` naming the failure."""
+        status = np.atleast_1d(np.asarray(self.status)).ravel()
+        failed = np.flatnonzero(status != Status.CONVERGED)
+        if failed.size:
+            reached = float(np.atleast_1d(np.asarray(self.load_reached)).ravel()[failed[0]])
+            which = f" {failed[0]} of {status.size}" if status.size > 1 else ""
+            raise SolverError(
+                f"{what}{which}: {Status(int(status[failed[0]])).text} "
+                f"(converged up to {100 * reached:.3g} % of it)"
+            )
+        return self

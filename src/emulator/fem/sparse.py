@@ -1,0 +1,89 @@
+"""Sparse direct solves inside ``jax.jit``, and the pattern that assembled tangents share.
+
+The factorisations are SuiteSparse's, through sparsax: CHOLMOD for positive definite tangents,
+UMFPACK for any. CHOLMOD raises on an indefinite matrix, even inside ``jit``, so it is a choice for
+callers who know theirs is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import sparsax
+from threadpoolctl import ThreadpoolController
+
+Factorisation = Literal["umfpack", "cholmod"]
+
+
+def quiet_blas() -> None:
+    """Hold the BLAS inside the sparse solver to one thread.
+
+    Beside XLA's own threads a second pool oversubscribes the cores: a factorisation of 2.5 ms has
+    been seen to take 250 ms. Only the library bundled with sparsax is touched, not NumPy's.
+    """
+    for library in ThreadpoolController().lib_controllers:
+        if "sparsax" in library.filepath:
+            library.set_num_threads(1)
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Nonzeros of a matrix over the free degrees of freedom, fixed for a mesh.
+
+    rows, columns : (nnz,) int32 position of each nonzero.
+    source : (k,) which entries of the flattened element blocks are used.
+    target : (k,) the nonzero each of them is added to.
+    size : number of free degrees of freedom.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    source: np.ndarray
+    target: np.ndarray
+    size: int
+
+    def sum(self, blocks: jax.Array) -> jax.Array:
+        """Values (nnz,) from element blocks (m, k, k)."""
+        entries = blocks.reshape(-1)[self.source]
+        return jax.ops.segment_sum(entries, self.target, num_segments=len(self.rows))
+
+    def solve(self, values: jax.Array, rhs: jax.Array, method: Factorisation) -> jax.Array:
+        """``x`` with ``A x = rhs``, shape (size,); differentiable, usable under ``vmap``."""
+        solver = sparsax.solve if method == "cholmod" else sparsax.umf_solve
+        return solver(self.rows, self.columns, values, rhs)
+
+    def safe_values(self, values: jax.Array) -> jax.Array:
+        """``values``, or the identity's where any is not finite: the solver raises on NaN."""
+        identity = jnp.asarray(self.rows == self.columns, dtype=values.dtype)
+        return jnp.where(jnp.all(jnp.isfinite(values)), values, identity)
+
+
+def element_pattern(dofs: np.ndarray, free_index: np.ndarray, *, symmetric: bool) -> Pattern:
+    """Pattern of element blocks.
+
+    Parameters
+    ----------
+    dofs : (m, k) global degree of freedom of each block row.
+    free_index : (n_dofs,) position among the free ones, -1 where held.
+    symmetric : keep only the upper triangle, as CHOLMOD wants.
+    """
+    local = free_index[dofs]
+    size = int(free_index.max()) + 1
+    rows = np.broadcast_to(local[:, :, None], (*local.shape, local.shape[1])).ravel()
+    columns = np.broadcast_to(local[:, None, :], (*local.shape, local.shape[1])).ravel()
+    keep = (rows >= 0) & (columns >= 0)
+    if symmetric:
+        keep &= rows <= columns
+    source = np.flatnonzero(keep)
+    keys, target = np.unique(rows[source] * size + columns[source], return_inverse=True)
+    return Pattern(
+        rows=(keys // size).astype(np.int32),
+        columns=(keys % size).astype(np.int32),
+        source=source.astype(np.int32),
+        target=target.astype(np.int32),
+        size=size,
+    )

@@ -1,0 +1,112 @@
+"""Forward maps: whatever takes theta to displacement. Calibration sees nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.fem.simulator import Simulator
+from emulator.scenes.scene import Scene
+
+
+class Prediction(NamedTuple):
+    """Displacement (k, 3) in mm of a forward map's nodes, and whether it may be used, () bool."""
+
+    displacement: jax.Array
+    valid: jax.Array
+
+
+class ForwardMap(Protocol):
+    """Theta to displacement, differentiable, usable under ``jit`` and ``vmap``.
+
+    kind : short name, e.g. ``emulator`` or ``fem``.
+    scene : what it maps.
+    nodes : (k,) the nodes it returns, in order.
+    """
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def scene(self) -> Scene: ...
+
+    @property
+    def nodes(self) -> np.ndarray: ...
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Displacement (k, 3) in mm at ``theta`` (p,)."""
+        ...
+
+    def evaluate(self, theta: jax.Array) -> Prediction:
+        """The same with its validity, for use inside a density."""
+        ...
+
+    def at(self, nodes: np.ndarray) -> ForwardMap:
+        """The same map restricted to ``nodes``; a fast map then computes only those."""
+        ...
+
+
+def all_nodes(scene: Scene) -> np.ndarray:
+    """Indices of every node of the scene, (n,)."""
+    return np.arange(len(scene.mesh.nodes))
+
+
+def check_nodes(scene: Scene, nodes: np.ndarray) -> np.ndarray:
+    """``nodes`` as integers; :class:`InputError` unless each is a node of the scene."""
+    nodes = np.atleast_1d(np.asarray(nodes))
+    if nodes.size == 0 or not np.issubdtype(nodes.dtype, np.integer):
+        raise InputError("observed nodes must be a list of whole numbers, not empty")
+    unknown = nodes[(nodes < 0) | (nodes >= len(scene.mesh.nodes))]
+    if unknown.size:
+        raise InputError(
+            f"node {unknown[0]} is unknown; scene '{scene.name}' has nodes 0 to "
+            f"{len(scene.mesh.nodes) - 1}"
+        )
+    return nodes
+
+
+def inside_box(scene: Scene, theta: jax.Array) -> jax.Array:
+    """Whether ``theta`` (..., p) lies in the scene's parameter box, (...) bool."""
+    position = scene.to_unit(theta)
+    return jnp.all((position >= -1e-9) & (position <= 1.0 + 1e-9), axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class FEMForward:
+    """The simulator as a forward map, started at ``start`` each time (``None``: at rest)."""
+
+    simulator: Simulator
+    nodes: np.ndarray
+    start: ForwardMap | None = None
+
+    kind = "fem"
+
+    @cached_property
+    def scene(self) -> Scene:
+        """What is simulated."""
+        return self.simulator.scene
+
+    def evaluate(self, theta: jax.Array) -> Prediction:
+        """Displacement (k, 3) in mm and whether the solve converged."""
+        start = None if self.start is None else self.start(theta)
+        solution = self.simulator.solve(theta, start)
+        return Prediction(solution.displacement[self.nodes], solution.converged)
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Displacement (k, 3) in mm."""
+        return self.evaluate(theta).displacement
+
+    def at(self, nodes: np.ndarray) -> FEMForward:
+        """The same simulator, returning only ``nodes``."""
+        return FEMForward(self.simulator, check_nodes(self.scene, nodes), self.start)
+
+
+def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMForward:
+    """The simulator as a forward map over all nodes; ``start`` predicts where Newton begins."""
+    return FEMForward(simulator, all_nodes(simulator.scene), start)

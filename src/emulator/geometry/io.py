@@ -1,0 +1,64 @@
+"""Meshes in from files, deformed bodies out to VTU, through meshio."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.mesh import Mesh
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """Linear tetrahedra from any file meshio reads, lengths taken as mm.
+
+    Raises
+    ------
+    InputError
+        Missing or unreadable file, no tetrahedra, or a mesh :class:`Mesh` refuses.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"mesh file {path} does not exist")
+    try:
+        found = meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio's readers raise whatever they meet, or exit
+        raise InputError(f"mesh file {path} cannot be read as a mesh: {_line(error)}") from error
+    kinds = sorted({block.type for block in found.cells})
+    tetrahedra = [block.data for block in found.cells if block.type == "tetra"]
+    if not tetrahedra:
+        raise InputError(f"mesh file {path} has no linear tetrahedra, only {', '.join(kinds)}")
+    other = [kind for kind in kinds if kind not in ("tetra", "triangle", "line", "vertex")]
+    if other:
+        raise InputError(f"mesh file {path} also has {', '.join(other)}; only tetra is supported")
+    return Mesh(found.points, np.concatenate(tetrahedra))
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
+def write_displacement(
+    path: str | Path, mesh: Mesh, displacement: np.ndarray, cells: Mapping[str, np.ndarray] = {}
+) -> None:
+    """Write the mesh with its displacement (n, 3) in mm and cell data (m, ...) as VTU, whole or not at all."""
+    output = meshio.Mesh(
+        mesh.nodes,
+        [("tetra", mesh.elements)],
+        point_data={"displacement": np.asarray(displacement)},
+        cell_data={name: [np.asarray(values)] for name, values in cells.items()},
+    )
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(suffix=".vtu", dir=path.parent)
+    os.close(handle)
+    try:
+        meshio.write(temporary, output, file_format="vtu")
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise

@@ -1,0 +1,94 @@
+"""Reader of the data released with Dalton et al. (2023): geometry and FEniCS test solutions.
+
+The folder layout is the release's own, ``<model>/geometryData`` and ``<model>/simulationData/test``,
+so a user's clone works as it is. Lengths become mm, stresses kPa, energies mN mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.mesh import Mesh, orient
+
+
+@dataclass(frozen=True)
+class PublishedUnits:
+    """Factors from a model's own units: length to mm, stress to kPa."""
+
+    length: float
+    stress: float
+
+    @property
+    def energy(self) -> float:
+        """Factor from the model's energy to mN mm (kPa mm3)."""
+        return self.stress * self.length**3
+
+
+_CGS = PublishedUnits(length=10.0, stress=1e-4)
+UNITS = {
+    "OnceClampedBeam": _CGS,
+    "TwiceClampedBeam": _CGS,
+    "TwistingBeam": PublishedUnits(length=1.0, stress=1.0),  # dimensionless
+    "Liver": _CGS,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedTests:
+    """Test solutions of a model.
+
+    theta : (c, p) as stored, in the model's units.
+    energy : (c,) least potential energy, mN mm.
+    displacement : (c, n, 3) mm, or ``None`` where the release has none.
+    """
+
+    theta: np.ndarray
+    energy: np.ndarray
+    displacement: np.ndarray | None
+
+
+def _array(root: str | Path, model: str, part: str, *, optional: bool = False) -> np.ndarray | None:
+    path = Path(root) / model / part
+    if not path.is_file():
+        if optional:
+            return None
+        raise InputError(f"published data: {path} is missing; give the folder that holds {model}/")
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise InputError(f"published data: {path} is not a readable .npy array") from error
+
+
+def units(model: str) -> PublishedUnits:
+    """Units of ``model``; :class:`InputError` lists the models there are."""
+    if model not in UNITS:
+        raise InputError(f"published model '{model}' is unknown; known: {', '.join(UNITS)}")
+    return UNITS[model]
+
+
+def read_mesh(root: str | Path, model: str) -> tuple[Mesh, np.ndarray]:
+    """The mesh in mm, with node set ``held``, and the prescribed displacement of that set, mm."""
+    scale = units(model).length
+    nodes = _array(root, model, "geometryData/reference-coords.npy") * scale
+    elements = _array(root, model, "geometryData/elements.npy")
+    interior = _array(root, model, "geometryData/interior-points.npy").reshape(-1).astype(bool)
+    held = np.flatnonzero(~interior)
+    moved = _array(root, model, "geometryData/disp-add.npy", optional=True)
+    displacement = np.zeros((len(held), 3)) if moved is None else moved[held] * scale
+    # The release leaves the orientation of its elements open.
+    return Mesh(nodes, orient(nodes, elements), {"held": held}), displacement
+
+
+def read_tests(root: str | Path, model: str) -> PublishedTests:
+    """The test solutions of ``model``."""
+    unit = units(model)
+    displacement = _array(root, model, "simulationData/test/displacement.npy", optional=True)
+    return PublishedTests(
+        theta=_array(root, model, "simulationData/test/theta.npy"),
+        energy=_array(root, model, "simulationData/test/pe-values.npy") * unit.energy,
+        displacement=None if displacement is None else displacement * unit.length,
+    )

@@ -1,0 +1,39 @@
+r"""Barriers that keep the training energy finite (Dalton et al. 2023, Eq. 21-23).
+
+An untrained network predicts inverted and absurdly stretched elements. The barriers replace
+:math:`J` below ``J_start`` by :math:`J_{min} + \exp(\beta_1 J + \beta_2)`, which is positive and
+meets :math:`J` with equal value and slope, and replace :math:`I_1` above ``I1_start`` by
+:math:`I_1^* + \tanh(I_1 - I_1^*)`, which grows no further than ``I1_start + 1``.
+
+They belong to training. Reported energies, residuals and likelihoods use the exact invariants.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+
+@dataclass(frozen=True)
+class Barriers:
+    """Where each barrier starts, and the smallest ``J`` it allows (published values)."""
+
+    J_min: float = 0.001
+    J_start: float = 0.05
+    I1_start: float = 10.0
+
+    def limit_J(self, J: jax.Array) -> jax.Array:
+        """``J`` above ``J_start``; below it a positive exponential tail (Eq. 21), shape of ``J``."""
+        width = self.J_start - self.J_min
+        # The clip keeps the branch that is not taken finite, so that its gradient is zero, not NaN.
+        below = jnp.minimum(J, self.J_start)
+        tail = self.J_min + width * jnp.exp((below - self.J_start) / width)
+        return jnp.where(self.J_start < J, J, tail)
+
+    def limit_I1(self, I1: jax.Array) -> jax.Array:
+        """``I1`` below ``I1_start``; above it a saturating tanh (Eq. 22), shape of ``I1``."""
+        return jnp.where(
+            self.I1_start > I1, I1, self.I1_start + jnp.tanh(I1 - self.I1_start)
+        )

@@ -1,0 +1,35 @@
+r"""Compressible Neo-Hookean material.
+
+.. math::
+    W = \frac{\mu}{2}(I_1 - 3) - \mu \ln J + \frac{\lambda}{2} (\ln J)^2
+
+in the Lamé parameters (kPa), Dalton et al. (2023), Section 3.1. The engineering constants give
+:math:`\mu = E / 2(1+\nu)` and :math:`\lambda = E\nu / (1+\nu)(1-2\nu)`.
+"""
+
+from __future__ import annotations
+
+import jax
+
+from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.laws.law import Law
+
+
+def energy_lame(strain: Strain, mu: jax.Array, lam: jax.Array) -> jax.Array:
+    """Strain energy density in kPa from shear modulus ``mu`` and Lamé's first parameter ``lam``."""
+    ln_J = strain.ln_J
+    return 0.5 * mu * strain.I1_minus_3 - mu * ln_J + 0.5 * lam * ln_J**2
+
+
+def lame_from_engineering(E: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """``(mu, lam)`` in the unit of Young's modulus ``E``; Poisson's ratio ``nu`` in (-1, 1/2)."""
+    return E / (2.0 * (1.0 + nu)), E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+
+def energy_engineering(strain: Strain, E: jax.Array, nu: jax.Array) -> jax.Array:
+    """Strain energy density in kPa from Young's modulus ``E`` (kPa) and Poisson's ratio ``nu``."""
+    return energy_lame(strain, *lame_from_engineering(E, nu))
+
+
+NEO_HOOKEAN = Law("neo_hookean", ("mu", "lam"), energy_lame)
+NEO_HOOKEAN_E_NU = Law("neo_hookean_E_nu", ("E", "nu"), energy_engineering)

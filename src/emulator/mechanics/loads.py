@@ -1,0 +1,44 @@
+r"""External loads, each the potential whose negative gradient is the force it exerts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from emulator.errors import InputError
+
+# (1 g/cm3)(1 m/s2) = 1e-6 kg/mm3 m/s2 = 1e-6 N/mm3 = 1e-3 mN/mm3, and 1 mN/mm2 = 1 kPa.
+_KPA_PER_MM = 1.0e-3
+
+
+@dataclass(frozen=True)
+class Gravity:
+    r"""Dead weight, potential :math:`-\int_\Omega b \cdot u\, dX` with :math:`b = \rho g d`.
+
+    Parameters
+    ----------
+    density : mass density rho in g/cm3.
+    direction : three components, made unit length; (0, 0, -1) is down.
+    acceleration : g in m/s2. The published beams use 9.80.
+    """
+
+    density: float = 1.0
+    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    acceleration: float = 9.81
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.density) or self.density < 0.0:
+            raise InputError(f"gravity: density is {self.density} g/cm3; it must be 0 or more")
+        if len(self.direction) != 3 or not np.linalg.norm(self.direction) > 0.0:
+            raise InputError(f"gravity: direction is {self.direction}; give 3 numbers, not all 0")
+
+    @property
+    def body_force(self) -> np.ndarray:
+        """Force per reference volume, kPa/mm, shape (3,)."""
+        direction = np.asarray(self.direction, dtype=float)
+        weight = self.density * self.acceleration * _KPA_PER_MM
+        return weight * direction / np.linalg.norm(direction)
+
+
+Load = Gravity

@@ -1,0 +1,124 @@
+"""The augmented graph: mesh nodes and edges, and coarser layers of virtual nodes above them.
+
+Messages travel one edge a step, so K steps over mesh edges alone reach K elements far. Virtual
+nodes, found by k-means on the layer below and joined to their kappa nearest neighbours, carry
+them across the body (Dalton et al. 2023, Section 2.2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from sklearn.cluster import KMeans
+from sklearn.neighbors import NearestNeighbors
+
+from emulator.errors import InputError
+from emulator.geometry.mesh import frozen_array
+from emulator.scenes.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class AugmentedGraph:
+    """Inputs of the processor. Each pair of joined nodes is stored once, from sender to receiver.
+
+    node_features : (N, d) normalised, real nodes first (Eq. 24-25).
+    edge_features : (E, 4) normalised relative position and distance, receiver minus sender.
+    senders, receivers : (E,) node indices, sender > receiver.
+    real : number of mesh nodes.
+    """
+
+    node_features: np.ndarray
+    edge_features: np.ndarray
+    senders: np.ndarray
+    receivers: np.ndarray
+    real: int
+
+
+@dataclass(frozen=True)
+class GraphOptions:
+    """Shape of the virtual layers.
+
+    cluster : nodes of a layer for each node of the layer above it, on average.
+    smallest : a layer would have fewer nodes than this: stop. The last layer is fully joined.
+    neighbours : kappa, nearest neighbours each virtual node is joined to.
+    """
+
+    cluster: int = 4
+    smallest: int = 8
+    neighbours: int = 4
+
+
+def augment(scene: Scene, options: GraphOptions = GraphOptions()) -> AugmentedGraph:
+    """The augmented graph of a scene's mesh, the same every time."""
+    features = node_inputs(scene)
+    positions = scene.mesh.nodes
+    edges = [mesh_edges(scene.mesh.elements)]
+    all_positions, all_features, offset = [positions], [features], 0
+    while len(positions) // options.cluster >= options.smallest:
+        count = len(positions) // options.cluster
+        parent = KMeans(count, n_init=1, random_state=0).fit(positions).labels_
+        above = offset + len(positions)
+        edges.append(np.column_stack([offset + np.arange(len(positions)), above + parent]))
+        positions, features = (_cluster_means(values, parent, count) for values in (positions, features))
+        last = count // options.cluster < options.smallest
+        edges.append(above + (_all_pairs(count) if last else _nearest(positions, options.neighbours)))
+        all_positions.append(positions)
+        all_features.append(features)
+        offset = above
+    pairs = np.unique(np.sort(np.concatenate(edges), axis=1), axis=0)
+    receivers, senders = pairs[:, 0], pairs[:, 1]
+    positions = np.concatenate(all_positions)
+    relative = positions[receivers] - positions[senders]
+    length = np.linalg.norm(relative, axis=1, keepdims=True)
+    return AugmentedGraph(
+        node_features=frozen_array(_normalise(np.concatenate(all_features)), np.float32),
+        edge_features=frozen_array(_normalise(np.hstack([relative, length])), np.float32),
+        senders=frozen_array(senders, np.int32),
+        receivers=frozen_array(receivers, np.int32),
+        real=len(scene.mesh.nodes),
+    )
+
+
+def node_inputs(scene: Scene) -> np.ndarray:
+    """Raw features of the mesh nodes, (n, d): where held, the held displacement if any, position.
+
+    Positions are relative to the body's middle, so moving the body changes nothing.
+    """
+    columns = [scene.held.astype(float)]
+    if scene.held_displacement.any():
+        columns.append(scene.held_displacement)
+    columns.append(scene.mesh.nodes - scene.mesh.nodes.mean(axis=0))
+    return np.hstack(columns)
+
+
+def mesh_edges(elements: np.ndarray) -> np.ndarray:
+    """Pairs of nodes (e, 2) joined by an edge of a tetrahedron, each once."""
+    pairs = np.concatenate([elements[:, list(pair)] for pair in combinations(range(4), 2)])
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def _cluster_means(values: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+    sums = np.zeros((count, values.shape[1]))
+    np.add.at(sums, labels, values)
+    sizes = np.bincount(labels, minlength=count)
+    if not sizes.all():
+        raise InputError("graph: a cluster of nodes is empty; are there duplicate nodes?")
+    return sums / sizes[:, None]
+
+
+def _all_pairs(count: int) -> np.ndarray:
+    return np.array(list(combinations(range(count), 2)))
+
+
+def _nearest(positions: np.ndarray, neighbours: int) -> np.ndarray:
+    count = min(neighbours, len(positions) - 1) + 1
+    _, index = NearestNeighbors(n_neighbors=count).fit(positions).kneighbors(positions)
+    return np.column_stack([np.repeat(index[:, 0], count - 1), index[:, 1:].ravel()])
+
+
+def _normalise(values: np.ndarray) -> np.ndarray:
+    """Each column with mean 0 and standard deviation 1; a constant column becomes 0."""
+    spread = values.std(axis=0)
+    return (values - values.mean(axis=0)) / np.where(spread > 1e-12, spread, 1.0)

@@ -1,0 +1,68 @@
+"""The multilayer perceptron every stage is made of."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+
+class MLP(nnx.Module):
+    """Dense layers with CELU between them, on an input that is several parts side by side.
+
+    The first layer of a concatenation is the sum of one product a part,
+    ``[a, b] @ W = a @ W_a + b @ W_b``, so a part shared by many rows (theta by all nodes, a node
+    by all its edges) is multiplied once and then spread: :meth:`project`, then :meth:`finish`.
+
+    Parameters
+    ----------
+    parts : width of each part of the input.
+    hidden : widths of the hidden layers.
+    out : width of the output.
+    layer_norm : normalise the output (encoders and processor; not decoders).
+    zero_last : start the last layer at zero.
+    """
+
+    def __init__(
+        self,
+        parts: tuple[int, ...],
+        hidden: tuple[int, ...],
+        out: int,
+        *,
+        layer_norm: bool,
+        zero_last: bool = False,
+        rngs: nnx.Rngs,
+    ) -> None:
+        self.parts = parts
+        widths = (sum(parts), *hidden, out)
+        layers = [
+            nnx.Linear(a, b, param_dtype=jnp.float32, rngs=rngs)
+            for a, b in zip(widths[:-1], widths[1:], strict=True)
+        ]
+        if zero_last:
+            layers[-1] = nnx.Linear(
+                widths[-2],
+                out,
+                kernel_init=nnx.initializers.zeros_init(),
+                param_dtype=jnp.float32,
+                rngs=rngs,
+            )
+        self.layers = nnx.List(layers)
+        self.norm = nnx.LayerNorm(out, param_dtype=jnp.float32, rngs=rngs) if layer_norm else None
+
+    def project(self, part: int, values: jax.Array) -> jax.Array:
+        """What part ``part`` adds to the first layer, (..., hidden[0])."""
+        start = sum(self.parts[:part])
+        kernel = self.layers[0].kernel[start : start + self.parts[part]]
+        return values.astype(kernel.dtype) @ kernel
+
+    def finish(self, first: jax.Array) -> jax.Array:
+        """The output (..., out) from the summed projections."""
+        x = first + self.layers[0].bias[...]
+        for layer in self.layers[1:]:
+            x = layer(jax.nn.celu(x))
+        return x if self.norm is None else self.norm(x)
+
+    def __call__(self, *values: jax.Array) -> jax.Array:
+        """The output (..., out) from the parts themselves."""
+        return self.finish(sum(self.project(k, part) for k, part in enumerate(values)))

@@ -1,0 +1,37 @@
+"""Beams under gravity (Dalton et al. 2023, Section 3.1)."""
+
+from __future__ import annotations
+
+from emulator.geometry.generators import box
+from emulator.mechanics.laws import find_law
+from emulator.mechanics.loads import Gravity
+from emulator.scenes.parameters import Parameter
+from emulator.scenes.scene import Scene, Support
+
+
+def _beam(name: str, cells: tuple[int, int, int], clamped: tuple[str, ...]) -> Scene:
+    return Scene(
+        name=name,
+        mesh=box((100.0, 10.0, 10.0), cells),
+        law=find_law("neo_hookean"),
+        parameters=(
+            Parameter("mu", "kPa", 50.0, 100.0, "log"),
+            Parameter("lam", "kPa", 50.0, 100.0, "log"),
+        ),
+        loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80),),
+        supports=tuple(Support(face) for face in clamped),
+        recipe={"scene": name, "cells": list(cells)},
+    )
+
+
+def once_clamped_beam(cells: tuple[int, int, int] = (12, 4, 5)) -> Scene:
+    """A 100 x 10 x 10 mm beam held at its left end, bending under its own weight.
+
+    Density 1 g/cm3 and g = 9.80 m/s2 as published; theta = (mu, lam), each 50 to 100 kPa.
+    """
+    return _beam("once_clamped_beam", cells, ("left",))
+
+
+def twice_clamped_beam(cells: tuple[int, int, int] = (12, 4, 5)) -> Scene:
+    """The same beam held at both ends."""
+    return _beam("twice_clamped_beam", cells, ("left", "right"))

@@ -1,0 +1,206 @@
+"""A scene: everything that is simulated, frozen."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.discretisation import Discretisation, linear_tetrahedra
+from emulator.geometry.mesh import Mesh, frozen_array
+from emulator.mechanics.laws import Law
+from emulator.mechanics.loads import Load
+from emulator.scenes.parameters import Parameter
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """Displacement of a node set held at a value.
+
+    Parameters
+    ----------
+    node_set : name of the set.
+    displacement : (3,) or (k, 3) in mm, one row a node of the set; zero clamps it.
+    """
+
+    node_set: str
+    displacement: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "displacement", frozen_array(self.displacement))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Geometry, law, loads, supports and parameters of one problem.
+
+    Frozen, arrays included: an energy traced from it means the same for ever.
+
+    Parameters
+    ----------
+    name : for people.
+    mesh : geometry in mm.
+    law : hyperelastic law.
+    parameters : entries of theta, in order.
+    loads : external loads; none is a body deformed by its supports alone.
+    supports : where the displacement is known.
+    constants : law parameters that do not vary.
+    recipe : how a built-in scene was made, so that a file can make it again.
+    """
+
+    name: str
+    mesh: Mesh
+    law: Law
+    parameters: tuple[Parameter, ...]
+    loads: tuple[Load, ...] = ()
+    supports: tuple[Support, ...] = ()
+    constants: Mapping[str, float] = field(default_factory=dict)
+    recipe: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
+        object.__setattr__(self, "recipe", MappingProxyType(dict(self.recipe)))
+        given = list(self.parameter_names) + list(self.constants)
+        for name in given:
+            if name not in self.law.parameters:
+                raise InputError(
+                    f"scene '{self.name}': parameter '{name}' is not one of law "
+                    f"'{self.law.name}': {', '.join(self.law.parameters)}"
+                )
+            if given.count(name) > 1:
+                raise InputError(f"scene '{self.name}': parameter '{name}' is given twice")
+        for name in self.law.parameters:
+            if name not in given:
+                raise InputError(f"scene '{self.name}': law '{self.law.name}' needs '{name}'")
+        if not self.supports:
+            raise InputError(f"scene '{self.name}': no support, the body could move freely")
+        _ = self.prescribed  # checks the supports against the mesh
+
+    # ---- parameters -------------------------------------------------------------------------
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the entries of theta, in order."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def centre(self) -> jax.Array:
+        """Theta in the middle of its box, on each parameter's scale, shape (p,)."""
+        return self.from_unit(jnp.full(len(self.parameters), 0.5))
+
+    def theta(self, **values: float) -> jax.Array:
+        """Theta from named values in the parameters' units, shape (p,).
+
+        Raises
+        ------
+        InputError
+            Unknown, missing or out-of-range value.
+        """
+        for name in values:
+            if name not in self.parameter_names:
+                raise InputError(
+                    f"scene '{self.name}' has no parameter '{name}'; "
+                    f"it has {', '.join(self.parameter_names)}"
+                )
+        missing = [name for name in self.parameter_names if name not in values]
+        if missing:
+            raise InputError(f"scene '{self.name}': no value for parameter '{missing[0]}'")
+        theta = jnp.array([float(values[name]) for name in self.parameter_names])
+        self.check_theta(theta)
+        return theta
+
+    def check_theta(self, theta: jax.Array) -> None:
+        """Raise :class:`InputError` unless every row of ``theta`` (..., p) is inside the box."""
+        rows = np.atleast_2d(np.asarray(theta))
+        if rows.shape[-1] != len(self.parameters):
+            raise InputError(
+                f"scene '{self.name}': theta has {rows.shape[-1]} values; "
+                f"expected {len(self.parameters)}: {', '.join(self.parameter_names)}"
+            )
+        for k, parameter in enumerate(self.parameters):
+            slack = 1e-9 * (parameter.high - parameter.low)
+            inside = (rows[:, k] >= parameter.low - slack) & (rows[:, k] <= parameter.high + slack)
+            if not inside.all():
+                value = rows[np.flatnonzero(~inside)[0], k]
+                raise InputError(
+                    f"parameter '{parameter.name}' is {value:g} {parameter.unit}; scene "
+                    f"'{self.name}' covers {parameter.low:g} to {parameter.high:g}"
+                )
+
+    def to_unit(self, theta: jax.Array) -> jax.Array:
+        """Theta (..., p) as positions in its box, 0 to 1 inside."""
+        columns = [p.to_unit(theta[..., k]) for k, p in enumerate(self.parameters)]
+        return jnp.stack(columns, axis=-1)
+
+    def from_unit(self, position: jax.Array) -> jax.Array:
+        """Inverse of :meth:`to_unit`."""
+        columns = [p.from_unit(position[..., k]) for k, p in enumerate(self.parameters)]
+        return jnp.stack(columns, axis=-1)
+
+    def resolve(self, theta: jax.Array) -> dict[str, jax.Array]:
+        """Every law parameter by name, from theta (p,) and the constants."""
+        values: dict[str, Any] = dict(self.constants)
+        values.update({name: theta[k] for k, name in enumerate(self.parameter_names)})
+        return values
+
+    # ---- discretisation and supports ----------------------------------------------------------
+    @cached_property
+    def discretisation(self) -> Discretisation:
+        """Shape functions and quadrature of the mesh."""
+        return linear_tetrahedra(self.mesh)
+
+    @cached_property
+    def prescribed(self) -> tuple[np.ndarray, np.ndarray]:
+        """``(held, values)``: where the displacement is known, (n, 3) bool, and it, (n, 3) mm."""
+        held = np.zeros(self.mesh.nodes.shape, dtype=bool)
+        values = np.zeros(self.mesh.nodes.shape)
+        for support in self.supports:
+            nodes = self.mesh.node_set(support.node_set)
+            if support.displacement.shape not in ((3,), (len(nodes), 3)):
+                raise InputError(
+                    f"support on '{support.node_set}': displacement has shape "
+                    f"{support.displacement.shape}; expected (3,) or ({len(nodes)}, 3)"
+                )
+            wanted = np.broadcast_to(support.displacement, (len(nodes), 3))
+            if (held[nodes] & (values[nodes] != wanted)).any():
+                raise InputError(
+                    f"support on '{support.node_set}' contradicts another one on a shared node"
+                )
+            held[nodes], values[nodes] = True, wanted
+        return frozen_array(held, bool), frozen_array(values)
+
+    @property
+    def held(self) -> np.ndarray:
+        """Where the displacement is known, (n, 3) bool."""
+        return self.prescribed[0]
+
+    @property
+    def held_displacement(self) -> np.ndarray:
+        """Known displacement in mm, zero elsewhere, (n, 3)."""
+        return self.prescribed[1]
+
+    # ---- identity ------------------------------------------------------------------------------
+    @cached_property
+    def fingerprint(self) -> str:
+        """Short hash of all that shapes the solution; equal scenes have equal fingerprints."""
+        digest = hashlib.sha256()
+        digest.update(np.round(self.mesh.nodes, 9).tobytes())
+        digest.update(np.sort(self.mesh.elements, axis=1).tobytes())
+        digest.update(self.held.tobytes())
+        digest.update(np.round(self.held_displacement, 9).tobytes())
+        description = {
+            "law": self.law.name,
+            "constants": dict(sorted(self.constants.items())),
+            "parameters": [[p.name, p.low, p.high, p.scale] for p in self.parameters],
+            "loads": [repr(load) for load in self.loads],
+        }
+        digest.update(json.dumps(description, sort_keys=True).encode())
+        return digest.hexdigest()[:16]

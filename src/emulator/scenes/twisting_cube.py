@@ -1,0 +1,48 @@
+"""A cube twisted at one face (Dalton et al. 2023, Section 3.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emulator.geometry.generators import box
+from emulator.mechanics.laws import find_law
+from emulator.scenes.parameters import Parameter
+from emulator.scenes.scene import Scene, Support
+
+
+def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
+    """Displacement (k, 3) that turns ``points`` (k, 3) about the x axis through ``centre`` (3,)."""
+    angle = np.deg2rad(degrees)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    displacement = np.zeros_like(points)
+    arm = points[:, 1:] - centre[1:]
+    displacement[:, 1:] = arm @ rotation.T - arm
+    return displacement
+
+
+def twisting_cube(cells: int = 6, edge: float = 10.0, degrees: float = 60.0) -> Scene:
+    """A cube clamped at its left face, its right face turned by ``degrees`` and pulled nowhere.
+
+    The right face moves by half the rigid rotation, as published: each of its points goes halfway
+    along the chord to where the rotation would take it. theta = (E, nu), 1 to 25 kPa and 0.1 to 0.4.
+
+    Parameters
+    ----------
+    cells : cells along each edge.
+    edge : length in mm.
+    degrees : angle of the rotation whose half chord is prescribed.
+    """
+    mesh = box((edge,) * 3, (cells,) * 3)
+    right = mesh.nodes[mesh.node_set("right")]
+    displacement = 0.5 * twist(right, np.full(3, edge / 2.0), degrees)
+    return Scene(
+        name="twisting_cube",
+        mesh=mesh,
+        law=find_law("neo_hookean_E_nu"),
+        parameters=(
+            Parameter("E", "kPa", 1.0, 25.0, "log"),
+            Parameter("nu", "", 0.1, 0.4, "log"),
+        ),
+        supports=(Support("left"), Support("right", displacement)),
+        recipe={"scene": "twisting_cube", "cells": cells, "edge": edge, "degrees": degrees},
+    )

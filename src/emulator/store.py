@@ -1,0 +1,97 @@
+"""Weights and checkpoints on disk: safetensors for arrays, JSON beside them; never pickle.
+
+A file is written whole or not at all: to a temporary name first, then renamed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from emulator.errors import InputError
+
+Tree = TypeVar("Tree")
+
+
+def write_atomically(path: str | Path, content: bytes) -> None:
+    """Put ``content`` at ``path``, or leave what was there; folders are made as needed."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)  # mkstemp's 0600 would keep colleagues out
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write ``content`` as indented JSON."""
+    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def read_json(path: str | Path) -> Any:
+    """Content of a JSON file; :class:`InputError` when missing or malformed."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path} does not exist")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not valid JSON: {error}") from error
+
+
+def _leaves(tree: Any) -> dict[str, Any]:
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, str] = {}) -> str:
+    """Write a pytree of arrays; returns the SHA-256 of the file."""
+    arrays = {name: np.ascontiguousarray(leaf) for name, leaf in _leaves(tree).items()}
+    content = save(arrays, metadata=dict(metadata))
+    write_atomically(path, content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Arrays and metadata of a file; :class:`InputError` when missing, truncated or not one."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"weights file {path} does not exist")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            arrays = {name: file.get_tensor(name) for name in file.keys()}
+            return arrays, file.metadata() or {}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(
+            f"weights file {path} is truncated or not a safetensors file ({error})"
+        ) from error
+
+
+def fill_tree(template: Tree, arrays: Mapping[str, np.ndarray], what: str) -> Tree:
+    """``template`` with its leaves replaced by ``arrays``; shapes must agree."""
+    named = _leaves(template)
+    for name, leaf in named.items():
+        if name not in arrays:
+            raise InputError(f"{what}: array {name} is missing")
+        if arrays[name].shape != np.shape(leaf):
+            raise InputError(
+                f"{what}: array {name} has shape {arrays[name].shape}; expected {np.shape(leaf)}"
+            )
+    leaves = [arrays[name] for name in named]
+    return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(template), leaves)

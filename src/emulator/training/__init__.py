@@ -1,0 +1,7 @@
+"""Training of emulators."""
+
+from emulator.training.campaign import Runs, run_campaign
+from emulator.training.sampling import sobol, uniform
+from emulator.training.trainer import Plan, train
+
+__all__ = ["Plan", "Runs", "run_campaign", "sobol", "train", "uniform"]
