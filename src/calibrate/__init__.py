@@ -4,7 +4,7 @@ A forward map (emulator, FEM, ...) and an observation make a :func:`model`; :fun
 its posterior; :func:`certify` checks it against FEM.
 """
 
-import emulator  # noqa: F401 - turns on float64 before anything else touches JAX
+import emulator
 from calibrate.certify import Certificate, certify
 from calibrate.model import Model, model
 from calibrate.noise import GaussianNoise

@@ -1,4 +1,4 @@
-r"""Is a posterior made with a cheap forward map the one FEM would give?
+r"""Certificates: is a posterior made with a cheap forward map the one FEM would give.
 
 Draws :math:`\theta_s` are pushed through FEM and reweighted by the ratio of likelihoods
 
@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from calibrate.model import NOISE_SD
 from calibrate.posterior import Posterior
-from emulator.fem import Simulator
 from emulator.errors import InputError
+from emulator.fem import Simulator
 
 Verdict = Literal["accepted", "reweight", "not certified"]
 

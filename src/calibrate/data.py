@@ -41,12 +41,16 @@ def read_data(scene: Scene, path: str | Path) -> tuple[Observation, np.ndarray]:
         raise InputError(f"data file {path} does not exist")
     where, values = _read_csv(path) if path.suffix.lower() == ".csv" else _read_netcdf(path)
     if values.ndim != 2 or values.shape[1] != 3 or not len(values):
-        raise InputError(f"data file {path}: displacements have shape {values.shape}; expected (d, 3)")
+        raise InputError(
+            f"data file {path}: displacements have shape {values.shape}; expected (d, 3)"
+        )
     for what, array in (("position", where), ("displacement", values)):
         bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
-            raise InputError(f"data file {path}: row {row + 1} has a {what} that is not finite; remove or repair it")
+            raise InputError(
+                f"data file {path}: row {row + 1} has a {what} that is not finite; repair it"
+            )
     try:
         if where.ndim == 1:
             if (where != np.round(where)).any():
@@ -67,9 +71,12 @@ def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
     missing = [name for name in (*names, *_U) if name not in columns]
     if missing:
         raise InputError(
-            f"data file {path}: column '{missing[0]}' is missing; expected node,ux,uy,uz or x,y,z,ux,uy,uz"
+            f"data file {path}: column '{missing[0]}' is missing; "
+            "expected node,ux,uy,uz or x,y,z,ux,uy,uz"
         )
-    table = np.array([[_number(path, k, row, name) for name in (*names, *_U)] for k, row in enumerate(rows)])
+    table = np.array(
+        [[_number(path, k, row, name) for name in (*names, *_U)] for k, row in enumerate(rows)]
+    )
     where = table[:, : len(names)]
     return (where[:, 0] if names == ["node"] else where), table[:, len(names) :]
 
@@ -91,8 +98,12 @@ def _read_netcdf(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(f"data file {path} is neither CSV (.csv) nor readable netCDF") from error
     for name in ("node", "position"):
         if name in data.variables and "displacement" in data.variables:
-            return np.asarray(data[name], dtype=float), np.asarray(data["displacement"], dtype=float)
-    raise InputError(f"data file {path}: needs variables displacement and node, or displacement and position")
+            return np.asarray(data[name], dtype=float), np.asarray(
+                data["displacement"], dtype=float
+            )
+    raise InputError(
+        f"data file {path}: needs variables displacement and node, or displacement and position"
+    )
 
 
 def write_data(path: str | Path, observe: Observation, values: np.ndarray) -> None:

@@ -21,7 +21,7 @@ DEMO = Run(
 
 
 def demo(folder: str | Path, *, progress: bool = False) -> dict[str, Any]:
-    """Run the demo, leave posterior.nc, certificate.json and a picture in ``folder``, return the report."""
+    """Run the demo, leave posterior, certificate and picture in ``folder``; returns the report."""
     folder = Path(folder)
     posterior = infer(DEMO, folder, progress=progress)
     certificate = certify_and_keep(posterior, folder, progress=progress)

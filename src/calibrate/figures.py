@@ -12,6 +12,7 @@ import numpy as np
 from calibrate.certify import Certificate
 from calibrate.posterior import Posterior
 from emulator.errors import InputError
+from emulator.network.graph import mesh_edges
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +23,9 @@ def pyplot() -> Any:
     try:
         import matplotlib as mpl
     except ImportError as error:
-        raise InputError("figures need matplotlib: pip install 'soft-tissue-calibrate[plot]'") from error
+        raise InputError(
+            "figures need matplotlib: pip install 'soft-tissue-calibrate[plot]'"
+        ) from error
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
@@ -68,35 +71,40 @@ def beam_figure(
 
 
 def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.ndarray) -> Any:
-    """x-z view: reference and true outline as lines, posterior mean as points coloured by its sd."""
+    """x-z view: reference and truth as lines, posterior mean as points coloured by its sd."""
+    from matplotlib.collections import LineCollection
+
     mesh = posterior.model.forward.scene.mesh
     face = mesh.nodes[:, 1] == mesh.nodes[:, 1].min()
     mean, spread = fields.mean(axis=0), np.sqrt(fields.var(axis=0, ddof=1).sum(axis=-1))
-    for displacement, style, label in (
-        (np.zeros_like(truth), {"color": "0.8", "lw": 0.8}, "reference"),
-        (truth, {"color": "black", "lw": 0.9}, "truth (FEM)"),
+    edges = mesh_edges(mesh.elements)
+    edges = edges[face[edges].all(axis=1)]
+    for displacement, colour, label in (
+        (np.zeros_like(truth), "0.8", "reference"),
+        (truth, "black", "truth (FEM)"),
     ):
-        for k, (a, b) in enumerate(_face_edges(mesh.elements, face)):
-            points = mesh.nodes[[a, b]] + displacement[[a, b]]
-            axes.plot(points[:, 0], points[:, 2], label=label if k == 0 else None, zorder=1, **style)
+        ends = (mesh.nodes + displacement)[edges][:, :, [0, 2]]
+        axes.add_collection(
+            LineCollection(list(ends), colors=colour, lw=0.9, zorder=1, label=label)
+        )
     place = mesh.nodes[face] + mean[face]
     scatter = axes.scatter(
-        place[:, 0], place[:, 2], c=spread[face], cmap="viridis", s=26, zorder=3, label="posterior mean"
+        place[:, 0],
+        place[:, 2],
+        c=spread[face],
+        cmap="viridis",
+        s=26,
+        zorder=3,
+        label="posterior mean",
     )
     observe = posterior.model.observe
     data = observe.points + np.asarray(posterior.data)
-    axes.scatter(data[:, 0], data[:, 2], marker="x", c="tab:red", s=30, lw=1.2, zorder=4, label="data")
+    axes.scatter(
+        data[:, 0], data[:, 2], marker="x", c="tab:red", s=30, lw=1.2, zorder=4, label="data"
+    )
     axes.set(xlabel="x (mm)", ylabel="z (mm)", aspect="equal")
     axes.legend(loc="lower left", frameon=False)
     return scatter
-
-
-def _face_edges(elements: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Mesh edges (e, 2) with both ends on the face, (n,) bool."""
-    from emulator.network.graph import mesh_edges
-
-    edges = mesh_edges(elements)
-    return edges[face[edges].all(axis=1)]
 
 
 def _draw_joint(axes: Axes, posterior: Posterior, theta: Mapping[str, float]) -> None:
@@ -104,7 +112,9 @@ def _draw_joint(axes: Axes, posterior: Posterior, theta: Mapping[str, float]) ->
     scene = posterior.model.forward.scene
     first, second = scene.parameters[:2]
     draws = posterior.draws()
-    axes.scatter(draws[first.name], draws[second.name], s=4, alpha=0.25, lw=0, label="posterior draws")
+    axes.scatter(
+        draws[first.name], draws[second.name], s=4, alpha=0.25, lw=0, label="posterior draws"
+    )
     axes.plot(theta[first.name], theta[second.name], "k+", ms=14, mew=2, label="truth")
     axes.set(
         xlabel=f"{first.name} ({first.unit})",

@@ -53,7 +53,9 @@ class Model:
     def __call__(self, data: jax.Array | None = None) -> None:
         """The NumPyro program; ``data`` (d, 3) mm."""
         scene = self.forward.scene
-        theta = jnp.stack([numpyro.sample(name, self.prior[name]) for name in scene.parameter_names])
+        theta = jnp.stack(
+            [numpyro.sample(name, self.prior[name]) for name in scene.parameter_names]
+        )
         prediction = self.forward.evaluate(theta)
         # Where the forward map has no answer, the density is zero, not NaN.
         numpyro.factor("valid", jnp.where(prediction.valid, 0.0, -jnp.inf))
@@ -68,7 +70,7 @@ class Model:
         return jnp.sum(dist.Normal(self.observe(displacement), sd).log_prob(data))
 
     def check_data(self, data: np.ndarray) -> jax.Array:
-        """``data`` as (d, 3) float64; :class:`InputError` on a wrong shape or a value not finite."""
+        """``data`` as (d, 3) float64; :class:`InputError` on a wrong shape or value."""
         values = np.asarray(data, dtype=float)
         expected = (len(self.observe.points), 3)
         if values.shape != expected:

@@ -23,10 +23,14 @@ class Observation(Protocol):
     """
 
     @property
-    def nodes(self) -> np.ndarray: ...
+    def nodes(self) -> np.ndarray:
+        """Nodes a forward map must return, (k,)."""
+        ...
 
     @property
-    def points(self) -> np.ndarray: ...
+    def points(self) -> np.ndarray:
+        """Reference positions of the data's rows, (d, 3) mm."""
+        ...
 
     def __call__(self, displacement: jax.Array) -> jax.Array:
         """Observed displacements (..., d, 3) in mm from those of ``nodes`` (..., k, 3)."""
@@ -76,7 +80,9 @@ class Landmarks:
         return {"kind": "landmarks", "points": self.points.tolist()}
 
 
-def nodal_displacements(scene: Scene, nodes: str | np.ndarray | list[int] = "all") -> NodalDisplacements:
+def nodal_displacements(
+    scene: Scene, nodes: str | np.ndarray | list[int] = "all"
+) -> NodalDisplacements:
     """Observe ``nodes``: ``all``, the name of a node set, or indices.
 
     Raises
@@ -113,7 +119,9 @@ def landmarks(scene: Scene, points: np.ndarray) -> Landmarks:
         try:
             elements.append(int(finder(*point[:, None])[0]))
         except ValueError as error:
-            raise InputError(f"landmark {k} at {point.tolist()} mm lies outside the body") from error
+            raise InputError(
+                f"landmark {k} at {point.tolist()} mm lies outside the body"
+            ) from error
     corners = mesh.elements[elements]
     local = skfem_mesh.mapping().invF(points.T[:, :, None], tind=np.array(elements))[:, :, 0].T
     weights = np.column_stack([1.0 - local.sum(axis=1), local])
@@ -134,7 +142,9 @@ def spread_nodes(scene: Scene, count: int, seed: int) -> np.ndarray:
     """``count`` nodes drawn without replacement from those with a free component, sorted."""
     candidates = np.flatnonzero(~scene.held.all(axis=1))
     if not 0 < count <= len(candidates):
-        raise InputError(f"cannot observe {count} nodes; scene '{scene.name}' has {len(candidates)} free")
+        raise InputError(
+            f"cannot observe {count} nodes; scene '{scene.name}' has {len(candidates)} free"
+        )
     return np.sort(np.random.default_rng(seed).choice(candidates, count, replace=False))
 
 

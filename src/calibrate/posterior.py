@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -13,6 +11,7 @@ from typing import Any
 
 import arviz_base
 import arviz_stats
+import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -21,6 +20,7 @@ from calibrate.model import Model
 from calibrate.samplers import NUTSOptions, nuts
 from emulator.errors import InputError
 from emulator.network import CachedEmulator
+from emulator.store import replacing
 
 _VERSIONS = ("jax", "jaxlib", "flax", "numpyro", "numpy", "scikit-fem", "sparsax", "arviz")
 
@@ -36,13 +36,13 @@ class Posterior:
 
     tree: xr.DataTree
     model: Model
-    data: jnp.ndarray
+    data: jax.Array
 
     def draws(self) -> dict[str, np.ndarray]:
         """All draws by name, chains joined, each (s,)."""
-        return {n: self.tree["posterior"][n].values.reshape(-1) for n in self.model.names}
+        return {n: np.asarray(self.tree["posterior"][n]).reshape(-1) for n in self.model.names}
 
-    def thetas(self) -> jnp.ndarray:
+    def thetas(self) -> jax.Array:
         """All draws of theta, (s, p)."""
         draws = self.draws()
         return jnp.stack([draws[name] for name in self.model.forward.scene.parameter_names], axis=1)
@@ -74,17 +74,8 @@ class Posterior:
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(suffix=".nc", dir=path.parent)
-        os.close(handle)
-        try:
+        with replacing(path) as temporary:
             self.tree.to_netcdf(temporary, engine="h5netcdf")
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
 
 
 def read_tree(path: str | Path) -> xr.DataTree:
@@ -145,21 +136,21 @@ def sample(
     """
     if sampler != "nuts":
         raise InputError(f"sampler '{sampler}' is unknown; known: nuts")
-    data = model.check_data(data)
-    draws, stats = nuts(model, data, options, seed, progress=progress)
-    tree = _tree(model, data, draws, stats)
+    checked = model.check_data(data)
+    draws, stats = nuts(model, checked, options, seed, progress=progress)
+    tree = _tree(model, checked, draws, stats)
     tree.attrs.update(
         {
             key: value if isinstance(value, str | int) else json.dumps(value)
             for key, value in provenance(model, seed, sampler).items()
         }
     )
-    return Posterior(tree, model, data)
+    return Posterior(tree, model, checked)
 
 
 def _tree(
     model: Model,
-    data: jnp.ndarray,
+    data: jax.Array,
     draws: Mapping[str, np.ndarray],
     stats: Mapping[str, np.ndarray],
 ) -> xr.DataTree:

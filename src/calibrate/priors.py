@@ -24,7 +24,9 @@ def check_prior(scene: Scene, prior: Prior) -> Prior:
     """``prior``, or :class:`InputError` unless it names exactly the scene's parameters."""
     for name in prior:
         if name not in scene.parameter_names:
-            raise InputError(f"prior names '{name}'; scene '{scene.name}' has {', '.join(scene.parameter_names)}")
+            raise InputError(
+                f"prior names '{name}'; scene '{scene.name}' has {', '.join(scene.parameter_names)}"
+            )
     for name in scene.parameter_names:
         if name not in prior:
             raise InputError(f"prior has no distribution for parameter '{name}'")

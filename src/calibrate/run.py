@@ -48,7 +48,7 @@ class Run:
     scene, root : a scene's name or file; where published data is.
     data : a file, or ``synthetic``: FEM at ``truth`` plus noise.
     truth : named parameters of synthetic data.
-    observe : of synthetic data: ``nodes:20``, ``landmarks:24``, ``all``, a node set, or ``3,14,15``.
+    observe : of synthetic data: ``nodes:20``, ``landmarks:24``, ``all``, a node set, ``3,14,15``.
     noise_sd : mm, known; or ``noise_scale``, the scale of its prior, when it is to be inferred.
     forward : one of :data:`FORWARDS`; ``emulator`` a shipped name or folder; ``fem_runs`` those
         the reduced model is fitted to.
@@ -124,7 +124,7 @@ def make_data(run: Run, scene: Scene) -> tuple[Observation, np.ndarray]:
 
 
 def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
-    """Sample the posterior of a run; with ``folder``, keep run.json, data.csv and posterior.nc there."""
+    """Sample the posterior of a run; with ``folder``, keep run, data and posterior there."""
     scene = find_scene(run.scene, run.root)
     observe, data = make_data(run, scene)
     # Synthetic data always has a known noise when made; it is inferred only if a scale is given.

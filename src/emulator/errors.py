@@ -1,4 +1,4 @@
-"""Errors meant for people: one line that names the thing, what was found, and what would be right."""
+"""Errors meant for people: one line that names the thing, what was found, what would be right."""
 
 
 class InputError(ValueError):

@@ -39,7 +39,9 @@ def field_errors(
     """
     Pi = potential_energy(scene)
     H, H_reference = displacement_gradient(scene, u), displacement_gradient(scene, reference)
-    I1, I1_reference = (2.0 * jnp.trace(h, axis1=-2, axis2=-1) + jnp.sum(h * h, (-2, -1)) for h in (H, H_reference))
+    I1, I1_reference = (
+        2.0 * jnp.trace(h, axis1=-2, axis2=-1) + jnp.sum(h * h, (-2, -1)) for h in (H, H_reference)
+    )
     least = Pi(reference, theta)
     return {
         "err_u": jnp.sqrt(jnp.sum((u - reference) ** 2, axis=-1)),

@@ -31,13 +31,19 @@ class ForwardMap(Protocol):
     """
 
     @property
-    def kind(self) -> str: ...
+    def kind(self) -> str:
+        """Short name."""
+        ...
 
     @property
-    def scene(self) -> Scene: ...
+    def scene(self) -> Scene:
+        """What is mapped."""
+        ...
 
     @property
-    def nodes(self) -> np.ndarray: ...
+    def nodes(self) -> np.ndarray:
+        """Nodes returned, (k,)."""
+        ...
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (k, 3) in mm at ``theta`` (p,)."""

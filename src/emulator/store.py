@@ -9,9 +9,10 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,24 +21,32 @@ from safetensors.numpy import save
 
 from emulator.errors import InputError
 
-Tree = TypeVar("Tree")
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A temporary file beside ``path`` to write to; it takes its place if nothing goes wrong.
+
+    Folders are made as needed. The temporary name keeps the suffix, which some writers go by.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o644)  # mkstemp's 0600 would keep colleagues out
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:
-    """Put ``content`` at ``path``, or leave what was there; folders are made as needed."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)  # mkstemp's 0600 would keep colleagues out
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    """Put ``content`` at ``path``, or leave what was there."""
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def write_json(path: str | Path, content: Any) -> None:
@@ -57,7 +66,9 @@ def read_json(path: str | Path) -> Any:
 
 
 def _leaves(tree: Any) -> dict[str, Any]:
-    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+    return {
+        jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    }
 
 
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, str] = {}) -> str:
@@ -75,7 +86,7 @@ def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]
         raise InputError(f"weights file {path} does not exist")
     try:
         with safe_open(path, framework="numpy") as file:
-            arrays = {name: file.get_tensor(name) for name in file.keys()}
+            arrays = {name: file.get_tensor(name) for name in list(file.keys())}
             return arrays, file.metadata() or {}
     except (SafetensorError, OSError, ValueError) as error:
         raise InputError(
@@ -83,7 +94,7 @@ def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]
         ) from error
 
 
-def fill_tree(template: Tree, arrays: Mapping[str, np.ndarray], what: str) -> Tree:
+def fill_tree[Tree](template: Tree, arrays: Mapping[str, np.ndarray], what: str) -> Tree:
     """``template`` with its leaves replaced by ``arrays``; shapes must agree."""
     named = _leaves(template)
     for name, leaf in named.items():

@@ -16,7 +16,9 @@ from emulator.errors import InputError, SolverError
 def build_parser() -> Parser:
     """The parser with every command."""
     parser = Parser(prog="calibrate", description="Bayesian calibration of soft-tissue models.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", parser_class=Parser
+    )
     for group in (inference, scenes, emulators, verification):
         group.register(commands)
     return parser

@@ -28,7 +28,9 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
     """The scene and, for published ones, the folder of the data."""
-    parser.add_argument("scene", metavar="SCENE", help="built-in name, .toml file, or published:<Model>")
+    parser.add_argument(
+        "scene", metavar="SCENE", help="built-in name, .toml file, or published:<Model>"
+    )
     parser.add_argument("--root", metavar="DIR", help="folder of the published data")
 
 

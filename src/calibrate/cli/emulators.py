@@ -26,18 +26,24 @@ def register(commands: Any) -> None:
     add_scene(parser)
     parser.add_argument("--objective", choices=("energy", "simulations", "both"), default="both")
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--budget", metavar="TIME", help="time for everything, e.g. 10m (default 10m)")
+    length.add_argument(
+        "--budget", metavar="TIME", help="time for everything, e.g. 10m (default 10m)"
+    )
     length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
     parser.add_argument("--simulations", type=int, help="FEM runs to train on")
     parser.add_argument("--batch", type=int, help="theta a step")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in --out")
+    parser.add_argument(
+        "--resume", action="store_true", help="continue from the checkpoint in --out"
+    )
     parser.add_argument("--out", required=True, metavar="DIR")
     add_json(parser)
     parser.set_defaults(run=train)
     parser = commands.add_parser("evaluate", help="errors of an emulator against FEM")
     parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
-    parser.add_argument("--against", required=True, metavar="DIR|fem", help="a published model's folder, or our FEM")
+    parser.add_argument(
+        "--against", required=True, metavar="DIR|fem", help="a published model's folder, or our FEM"
+    )
     parser.add_argument("--cases", type=int, default=50, help="FEM runs when against fem")
     add_json(parser)
     parser.set_defaults(run=evaluate)
@@ -63,13 +69,22 @@ def train(arguments: argparse.Namespace) -> int:
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     budget = None if arguments.steps else seconds(arguments.budget or "10m")
     result = train_emulator(
-        scene, plan, arguments.out, budget=budget, resume=arguments.resume, progress=show_progress(arguments)
+        scene,
+        plan,
+        arguments.out,
+        budget=budget,
+        resume=arguments.resume,
+        progress=show_progress(arguments),
     )
-    machine = {**hardware(), "accelerator": None if jax.default_backend() == "cpu" else jax.devices()[0].device_kind}
+    machine = {
+        **hardware(),
+        "accelerator": None if jax.default_backend() == "cpu" else jax.devices()[0].device_kind,
+    }
     record = {**result.record, "command": command_line(arguments), "hardware": machine}
     result = replace(result, record=record)
     save_emulator(result, arguments.out)
-    text = f"trained {scene.name} in {record['seconds']:.0f} s ({record['plan']['steps']} steps); written to {arguments.out}"
+    steps = record["plan"]["steps"]
+    text = f"trained {scene.name}: {steps} steps, {record['seconds']:.0f} s, in {arguments.out}"
     emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
     return DONE
 
@@ -106,7 +121,11 @@ def evaluate(arguments: argparse.Namespace) -> int:
     text = table(
         (f"{report['cases']} cases", "median", "mean", "97.5 %", "max", "unit"),
         [
-            (name, *(report[name][q] for q in ("median", "mean", "q97_5", "max")), report["units"][name])
+            (
+                name,
+                *(report[name][q] for q in ("median", "mean", "q97_5", "max")),
+                report["units"][name],
+            )
             for name in names
         ],
     )
@@ -135,12 +154,14 @@ def _published(emulator: Any, folder: Path) -> Any:
     )
     if not same:
         raise InputError(
-            f"published model '{model}' is not the scene '{ours.name}' the emulator was trained for "
+            f"published model '{model}' is not the scene '{ours.name}' of the emulator "
             "(mesh, supports, law and loads must agree)"
         )
     thetas, tests = published_tests(model, root)
     if tests.displacement is None:
-        raise InputError(f"published model '{model}' comes without displacements; use --against fem")
+        raise InputError(
+            f"published model '{model}' comes without displacements; use --against fem"
+        )
     order = [scene.parameter_names.index(name) for name in ours.parameter_names]
     return thetas[:, jnp.array(order)], jnp.asarray(tests.displacement)
 

@@ -28,15 +28,35 @@ def register(commands: Any) -> None:
 
     parser = commands.add_parser("infer", help="sample a posterior")
     add_scene(parser)
-    parser.add_argument("--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm")
-    parser.add_argument("--truth", nargs="+", default=[], metavar="NAME=VALUE", help="of synthetic data")
-    parser.add_argument("--observe", default="nodes:20", metavar="WHAT", help="nodes:N, landmarks:N, all, a node set, 3,14,15")
+    parser.add_argument(
+        "--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm"
+    )
+    parser.add_argument(
+        "--truth", nargs="+", default=[], metavar="NAME=VALUE", help="of synthetic data"
+    )
+    parser.add_argument(
+        "--observe",
+        default="nodes:20",
+        metavar="WHAT",
+        help="nodes:N, landmarks:N, all, a node set, 3,14,15",
+    )
     noise = parser.add_mutually_exclusive_group()
-    noise.add_argument("--noise", type=float, metavar="MM", help="standard deviation, known (default 0.2)")
-    parser.add_argument("--noise-scale", type=float, metavar="MM", help="infer the noise; scale of its half-normal prior")
+    noise.add_argument(
+        "--noise", type=float, metavar="MM", help="standard deviation, known (default 0.2)"
+    )
+    parser.add_argument(
+        "--noise-scale",
+        type=float,
+        metavar="MM",
+        help="infer the noise; scale of its half-normal prior",
+    )
     parser.add_argument("--forward", choices=_FORWARDS, default="emulator")
-    parser.add_argument("--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene")
-    parser.add_argument("--fem-runs", type=int, default=30, help="that the reduced model is fitted to")
+    parser.add_argument(
+        "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
+    )
+    parser.add_argument(
+        "--fem-runs", type=int, default=30, help="that the reduced model is fitted to"
+    )
     parser.add_argument("--sampler", choices=("nuts",), default="nuts")
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--warmup", type=int, default=1000)
@@ -62,7 +82,9 @@ def demo(arguments: argparse.Namespace) -> int:
 
     report = run_demo(arguments.out, progress=show_progress(arguments))
     report["seconds"] = round(time.perf_counter() - started, 1)
-    report["files"] = [f"{arguments.out}/{name}" for name in ("posterior.nc", "certificate.json", "beam.png")]
+    report["files"] = [
+        f"{arguments.out}/{name}" for name in ("posterior.nc", "certificate.json", "beam.png")
+    ]
     text = f"{summary(report)}\nwritten: {', '.join(report['files'])} ({report['seconds']:.0f} s)"
     emit(report, as_json=arguments.json, text=text)
     return DONE if report["verdict"] == "accepted" else FAILED
@@ -94,7 +116,7 @@ def infer(arguments: argparse.Namespace) -> int:
     )
     posterior = run_inference(run, arguments.out, progress=show_progress(arguments))
     result = report(run, posterior, None)
-    text = f"{summary(result)}\nwritten to {arguments.out}; check it with: calibrate certify {arguments.out}"
+    text = f"{summary(result)}\nwritten; check it with: calibrate certify {arguments.out}"
     emit(result, as_json=arguments.json, text=text)
     return DONE
 
@@ -105,7 +127,9 @@ def certify(arguments: argparse.Namespace) -> int:
 
     progress = show_progress(arguments)
     run, posterior = read_posterior(arguments.folder, progress=progress)
-    certificate = certify_and_keep(posterior, arguments.folder, draws=arguments.draws, progress=progress)
+    certificate = certify_and_keep(
+        posterior, arguments.folder, draws=arguments.draws, progress=progress
+    )
     result = report(run, posterior, certificate)
     emit(result, as_json=arguments.json, text=summary(result))
     return DONE if certificate.verdict == "accepted" else FAILED
@@ -125,13 +149,13 @@ def summary(report: dict[str, Any]) -> str:
         rows.append((name, *cells, *([shift[name]] if shift else [])))
     lines = [table(("parameter", *titles, *(["FEM shift / sd"] if shift else [])), rows)]
     lines.append(
-        f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences, "
-        f"forward map: {report['forward']}"
+        f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
+        f", forward map: {report['forward']}"
     )
     if "verdict" in report:
         c = report["certificate"]
         lines.append(
-            f"verdict: {report['verdict']} (Pareto k {c['k_hat']:.2f}, at most {c['k_threshold']:.2f}; "
-            f"{c['draws']} FEM runs, {c['failed']} failed)"
+            f"verdict: {report['verdict']} (Pareto k {c['k_hat']:.2f}, "
+            f"at most {c['k_threshold']:.2f}; {c['draws']} FEM runs, {c['failed']} failed)"
         )
     return "\n".join(lines)

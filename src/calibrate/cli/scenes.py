@@ -24,7 +24,9 @@ def register(commands: Any) -> None:
     parser.set_defaults(run=scenes)
     parser = commands.add_parser("simulate", help="solve a scene by finite elements")
     add_scene(parser)
-    parser.add_argument("--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre")
+    parser.add_argument(
+        "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
+    )
     parser.add_argument("--out", metavar="FILE.vtu", help="write the deformed body")
     add_json(parser)
     parser.set_defaults(run=simulate)
@@ -36,7 +38,7 @@ def scenes(arguments: argparse.Namespace) -> int:
     from emulator.scenes import BUILT_IN
 
     available = shipped()
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, make in sorted(BUILT_IN.items()):
         scene = make()
         rows.append(
@@ -60,7 +62,10 @@ def scenes(arguments: argparse.Namespace) -> int:
                 r["nodes"],
                 r["elements"],
                 r["law"],
-                ", ".join(f"{p['name']} {p['low']:g}-{p['high']:g} {p['unit']}".strip() for p in r["parameters"]),
+                ", ".join(
+                    f"{p['name']} {p['low']:g}-{p['high']:g} {p['unit']}".strip()
+                    for p in r["parameters"]
+                ),
                 "shipped" if r["emulator_shipped"] else "train it",
             )
             for r in rows
@@ -102,10 +107,16 @@ def simulate(arguments: argparse.Namespace) -> int:
         "J_range": [float(J.min()), float(J.max())],
     }
     if arguments.out and status is Status.CONVERGED:
-        write_displacement(arguments.out, scene.mesh, solution.displacement, {"J": J.mean(axis=1)})
+        u = np.asarray(solution.displacement)
+        write_displacement(arguments.out, scene.mesh, u, {"J": J.mean(axis=1)})
         result["out"] = arguments.out
     lines = [f"{scene.name}: {status.text}, {result['iterations']} Newton iterations"]
-    lines.append(f"largest displacement {result['max_displacement']:.6g} mm, energy {result['energy']:.8g} mN mm")
-    lines.append(f"J from {J.min():.4f} to {J.max():.4f}, relative residual {result['residual']:.1e}")
+    lines.append(
+        f"largest displacement {result['max_displacement']:.6g} mm, "
+        f"energy {result['energy']:.8g} mN mm"
+    )
+    lines.append(
+        f"J from {J.min():.4f} to {J.max():.4f}, relative residual {result['residual']:.1e}"
+    )
     emit(result, as_json=arguments.json, text="\n".join(lines))
     return DONE if status is Status.CONVERGED else FAILED

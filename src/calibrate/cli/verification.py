@@ -11,7 +11,9 @@ from calibrate.cli.common import DONE, FAILED, add_json, emit, table
 def register(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser("verify", help="measured / reference / tolerance tables")
-    parser.add_argument("name", choices=("published",), help="published: FEM against released FEniCS solutions")
+    parser.add_argument(
+        "name", choices=("published",), help="published: FEM against released FEniCS solutions"
+    )
     parser.add_argument("folder", metavar="DIR", help="folder of the released data")
     add_json(parser)
     parser.set_defaults(run=verify)

@@ -74,7 +74,11 @@ def _verify_model(root: str | Path, model: str) -> list[Row]:
     add("relative energy error", jnp.abs(energy / tests.energy - 1.0), ENERGY_TOLERANCE)
     if tests.displacement is not None:
         balance = jax.jit(jax.vmap(lambda u, theta: relative_residual(simulator.system, u, theta)))
-        add("force out of balance in the stored fields", balance(reference, thetas), BALANCE_TOLERANCE)
+        add(
+            "force out of balance in the stored fields",
+            balance(reference, thetas),
+            BALANCE_TOLERANCE,
+        )
     return rows
 
 

@@ -79,7 +79,10 @@ class System:
         """Nonzeros (nnz,) of the tangent over the free degrees of freedom, mN/mm."""
         grid = self.scene.discretisation
         moduli = jax.vmap(jax.vmap(jax.hessian(point_energy(self.scene, theta))))
-        A = moduli(displacement_gradient(self.scene, u)) * grid.weights[:, :, None, None, None, None]
+        A = (
+            moduli(displacement_gradient(self.scene, u))
+            * grid.weights[:, :, None, None, None, None]
+        )
         blocks = jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
         k = 3 * grid.connectivity.shape[1]
         return self.pattern.sum(blocks.reshape(len(blocks), k, k))

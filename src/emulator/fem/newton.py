@@ -60,9 +60,7 @@ class _State(NamedTuple):
     status: jax.Array
 
 
-def newton(
-    system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array
-) -> Solution:
+def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array) -> Solution:
     """Minimise the potential energy of ``system``.
 
     Parameters
@@ -176,9 +174,7 @@ def _next_level(
         jnp.where(
             failed & (increment < options.min_increment),
             Status.LOAD_LIMIT,
-            jnp.where(
-                iterations >= options.max_iterations, Status.ITERATION_LIMIT, Status.RUNNING
-            ),
+            jnp.where(iterations >= options.max_iterations, Status.ITERATION_LIMIT, Status.RUNNING),
         ),
     )
     moved = solved | failed

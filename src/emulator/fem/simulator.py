@@ -10,7 +10,7 @@ gives forward derivatives by one more solve with the tangent, and reverse ones b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 import jax
@@ -36,7 +36,7 @@ class Simulator:
     """
 
     scene: Scene
-    options: NewtonOptions = NewtonOptions()
+    options: NewtonOptions = field(default_factory=NewtonOptions)
     factorisation: Factorisation = "umfpack"
 
     def __post_init__(self) -> None:
@@ -92,7 +92,9 @@ class Simulator:
 
     @cached_property
     def _campaign(self):  # noqa: ANN202
-        return jax.jit(lambda thetas, starts: jax.lax.map(lambda x: self._solve(*x), (thetas, starts)))
+        return jax.jit(
+            lambda thetas, starts: jax.lax.map(lambda x: self._solve(*x), (thetas, starts))
+        )
 
 
 def displacement_derivative(
@@ -107,8 +109,10 @@ def displacement_derivative(
 def _inert(solution: Solution) -> Solution:
     """Zero tangents of a solution: float0 for its integers."""
     return jax.tree.map(
-        lambda x: jnp.zeros_like(x)
-        if jnp.issubdtype(x.dtype, jnp.floating)
-        else jnp.zeros(x.shape, dtype=jax.dtypes.float0),
+        lambda x: (
+            jnp.zeros_like(x)
+            if jnp.issubdtype(x.dtype, jnp.floating)
+            else jnp.zeros(x.shape, dtype=jax.dtypes.float0)
+        ),
         solution,
     )

@@ -57,7 +57,7 @@ class Solution(NamedTuple):
         return self.status == Status.CONVERGED
 
     def require_converged(self, what: str = "simulation") -> Solution:
-        """This solution, or :class:`~emulator.errors.SolverError` naming the failure."""
+        """The solution itself, or :class:`~emulator.errors.SolverError` naming the failure."""
         status = np.atleast_1d(np.asarray(self.status)).ravel()
         failed = np.flatnonzero(status != Status.CONVERGED)
         if failed.size:

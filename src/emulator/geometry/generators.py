@@ -8,7 +8,14 @@ from skfem import MeshTet
 from emulator.errors import InputError
 from emulator.geometry.mesh import Mesh, orient
 
-_FACES = (("left", 0, 0), ("right", 0, 1), ("front", 1, 0), ("back", 1, 1), ("bottom", 2, 0), ("top", 2, 1))
+_FACES = (
+    ("left", 0, 0),
+    ("right", 0, 1),
+    ("front", 1, 0),
+    ("back", 1, 1),
+    ("bottom", 2, 0),
+    ("top", 2, 1),
+)
 
 
 def box(lengths: tuple[float, float, float], cells: tuple[int, int, int]) -> Mesh:
@@ -25,7 +32,9 @@ def box(lengths: tuple[float, float, float], cells: tuple[int, int, int]) -> Mes
     """
     if min(lengths) <= 0.0 or min(cells) < 1:
         raise InputError(f"box: lengths {lengths} and cells {cells} must be positive")
-    axes = [np.linspace(0.0, length, count + 1) for length, count in zip(lengths, cells, strict=True)]
+    axes = [
+        np.linspace(0.0, length, count + 1) for length, count in zip(lengths, cells, strict=True)
+    ]
     grid = MeshTet.init_tensor(*axes)
     nodes, elements = grid.p.T, grid.t.T
     order = np.lexsort(nodes.T)  # the last key, z, is the slowest

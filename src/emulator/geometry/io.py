@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.mesh import Mesh
+from emulator.store import replacing
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -46,19 +45,12 @@ def _line(error: BaseException) -> str:
 def write_displacement(
     path: str | Path, mesh: Mesh, displacement: np.ndarray, cells: Mapping[str, np.ndarray] = {}
 ) -> None:
-    """Write the mesh with its displacement (n, 3) in mm and cell data (m, ...) as VTU, whole or not at all."""
+    """Write mesh, displacement (n, 3) mm and cell data (m, ...) as VTU, whole or not at all."""
     output = meshio.Mesh(
         mesh.nodes,
         [("tetra", mesh.elements)],
         point_data={"displacement": np.asarray(displacement)},
         cell_data={name: [np.asarray(values)] for name, values in cells.items()},
     )
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(suffix=".vtu", dir=path.parent)
-    os.close(handle)
-    try:
+    with replacing(path) as temporary:
         meshio.write(temporary, output, file_format="vtu")
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise

@@ -18,7 +18,7 @@ _FLAT = 1e-10
 
 def frozen_array(values: object, dtype: type = float) -> np.ndarray:
     """A read-only copy of ``values``, so that what holds it cannot change under a trace."""
-    array = np.array(values, dtype=dtype)
+    array: np.ndarray = np.array(values, dtype=dtype)
     array.flags.writeable = False
     return array
 

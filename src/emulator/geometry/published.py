@@ -1,7 +1,8 @@
 """Reader of the data released with Dalton et al. (2023): geometry and FEniCS test solutions.
 
-The folder layout is the release's own, ``<model>/geometryData`` and ``<model>/simulationData/test``,
-so a user's clone works as it is. Lengths become mm, stresses kPa, energies mN mm.
+The folder layout is the release's own, ``<model>/geometryData`` and
+``<model>/simulationData/test``, so a user's clone works as it is. Lengths become mm,
+stresses kPa, energies mN mm.
 """
 
 from __future__ import annotations
@@ -51,16 +52,18 @@ class PublishedTests:
     displacement: np.ndarray | None
 
 
-def _array(root: str | Path, model: str, part: str, *, optional: bool = False) -> np.ndarray | None:
+def _array(root: str | Path, model: str, part: str) -> np.ndarray:
     path = Path(root) / model / part
     if not path.is_file():
-        if optional:
-            return None
         raise InputError(f"published data: {path} is missing; give the folder that holds {model}/")
     try:
         return np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise InputError(f"published data: {path} is not a readable .npy array") from error
+
+
+def _array_if_there(root: str | Path, model: str, part: str) -> np.ndarray | None:
+    return _array(root, model, part) if (Path(root) / model / part).is_file() else None
 
 
 def units(model: str) -> PublishedUnits:
@@ -77,7 +80,7 @@ def read_mesh(root: str | Path, model: str) -> tuple[Mesh, np.ndarray]:
     elements = _array(root, model, "geometryData/elements.npy")
     interior = _array(root, model, "geometryData/interior-points.npy").reshape(-1).astype(bool)
     held = np.flatnonzero(~interior)
-    moved = _array(root, model, "geometryData/disp-add.npy", optional=True)
+    moved = _array_if_there(root, model, "geometryData/disp-add.npy")
     displacement = np.zeros((len(held), 3)) if moved is None else moved[held] * scale
     # The release leaves the orientation of its elements open.
     return Mesh(nodes, orient(nodes, elements), {"held": held}), displacement
@@ -86,7 +89,7 @@ def read_mesh(root: str | Path, model: str) -> tuple[Mesh, np.ndarray]:
 def read_tests(root: str | Path, model: str) -> PublishedTests:
     """The test solutions of ``model``."""
     unit = units(model)
-    displacement = _array(root, model, "simulationData/test/displacement.npy", optional=True)
+    displacement = _array_if_there(root, model, "simulationData/test/displacement.npy")
     return PublishedTests(
         theta=_array(root, model, "simulationData/test/theta.npy"),
         energy=_array(root, model, "simulationData/test/pe-values.npy") * unit.energy,

@@ -25,7 +25,7 @@ class Barriers:
     I1_start: float = 10.0
 
     def limit_J(self, J: jax.Array) -> jax.Array:
-        """``J`` above ``J_start``; below it a positive exponential tail (Eq. 21), shape of ``J``."""
+        """``J`` above ``J_start``, below it a positive exponential tail (Eq. 21); shape kept."""
         width = self.J_start - self.J_min
         # The clip keeps the branch that is not taken finite, so that its gradient is zero, not NaN.
         below = jnp.minimum(J, self.J_start)
@@ -33,7 +33,5 @@ class Barriers:
         return jnp.where(self.J_start < J, J, tail)
 
     def limit_I1(self, I1: jax.Array) -> jax.Array:
-        """``I1`` below ``I1_start``; above it a saturating tanh (Eq. 22), shape of ``I1``."""
-        return jnp.where(
-            self.I1_start > I1, I1, self.I1_start + jnp.tanh(I1 - self.I1_start)
-        )
+        """``I1`` below ``I1_start``, above it a saturating tanh (Eq. 22); shape kept."""
+        return jnp.where(self.I1_start > I1, I1, self.I1_start + jnp.tanh(I1 - self.I1_start))

@@ -3,7 +3,8 @@ r"""Strain measures of one material point, from the displacement gradient.
 With :math:`H = \partial u/\partial X` and :math:`F = I + H`,
 
 .. math::
-    J - 1   &= \operatorname{tr} H + \tfrac12\left[(\operatorname{tr} H)^2 - \operatorname{tr} H^2\right] + \det H \\
+    J - 1 &= \operatorname{tr} H + \det H
+        + \tfrac12\left[(\operatorname{tr} H)^2 - \operatorname{tr} H^2\right] \\
     I_1 - 3 &= 2 \operatorname{tr} H + H : H
 
 Written in ``H``, small strains lose no digits to cancellation, which matters in float32. Nothing

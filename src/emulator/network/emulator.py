@@ -80,7 +80,9 @@ class Emulator:
         """Displacements (b, n, 3) at ``thetas`` (b, p) with one pass of the processor."""
         network = nnx.merge(self.definition, weights)
         prepared = network.decoder.prepare(network.processor(self.graph))
-        return self.displace(network.decoder(prepared, self.normalise(thetas)), all_nodes(self.scene))
+        return self.displace(
+            network.decoder(prepared, self.normalise(thetas)), all_nodes(self.scene)
+        )
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (n, 3) at ``theta`` (p,), processor included; for many theta, cache."""
@@ -90,11 +92,11 @@ class Emulator:
         """Run the processor once and return the forward map over ``nodes`` (all by default)."""
         nodes = all_nodes(self.scene) if nodes is None else check_nodes(self.scene, nodes)
         network = nnx.merge(self.definition, self.weights)
-        prepared = jax.jit(lambda g: network.decoder.prepare(network.processor(self.graph)))(0)
+        prepared = jax.jit(lambda: network.decoder.prepare(network.processor(self.graph)))()
         return CachedEmulator(self, network.decoder, prepared[:, nodes], nodes)
 
     def require_scene(self, scene: Scene) -> Emulator:
-        """This emulator, or :class:`InputError` when it was trained for another scene."""
+        """The emulator itself, or :class:`InputError` when it was trained for another scene."""
         if scene.fingerprint != self.scene.fingerprint:
             raise InputError(
                 f"the emulator was trained for scene '{self.scene.name}' "

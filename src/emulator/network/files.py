@@ -1,4 +1,4 @@
-"""Emulators on disk: ``emulator.json`` says what it is, ``weights.safetensors`` holds the arrays."""
+"""Emulators on disk: ``emulator.json`` describes, ``weights.safetensors`` holds the arrays."""
 
 from __future__ import annotations
 
@@ -76,7 +76,8 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
     try:
         if description["format"] != FORMAT:
             raise InputError(
-                f"{folder}/emulator.json has format {description['format']}; this version reads {FORMAT}"
+                f"{folder}/emulator.json has format {description['format']}; "
+                f"this version reads {FORMAT}"
             )
         sizes = description["architecture"]
         architecture = Architecture(sizes["steps"], sizes["latent"], tuple(sizes["hidden"]))
@@ -99,9 +100,8 @@ def _read(
     arrays, _ = read_arrays(path)
     if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
         raise InputError(f"{path} is not the file emulator.json was written with")
-    graph = AugmentedGraph(
-        *(arrays[f"['graph']['{name}']"] for name in _GRAPH), real=len(scene.mesh.nodes)
-    )
+    stored = {name: arrays[f"['graph']['{name}']"] for name in _GRAPH}
+    graph = AugmentedGraph(**stored, real=len(scene.mesh.nodes))
     state = nnx.state(nnx.eval_shape(lambda: build(architecture, graph, len(scene.parameters), 0)))
     pure = fill_tree({"weights": nnx.to_pure_dict(state)}, arrays, str(path))["weights"]
     nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))

@@ -61,9 +61,13 @@ def augment(scene: Scene, options: GraphOptions = GraphOptions()) -> AugmentedGr
         parent = KMeans(count, n_init=1, random_state=0).fit(positions).labels_
         above = offset + len(positions)
         edges.append(np.column_stack([offset + np.arange(len(positions)), above + parent]))
-        positions, features = (_cluster_means(values, parent, count) for values in (positions, features))
+        positions, features = (
+            _cluster_means(values, parent, count) for values in (positions, features)
+        )
         last = count // options.cluster < options.smallest
-        edges.append(above + (_all_pairs(count) if last else _nearest(positions, options.neighbours)))
+        edges.append(
+            above + (_all_pairs(count) if last else _nearest(positions, options.neighbours))
+        )
         all_positions.append(positions)
         all_features.append(features)
         offset = above

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
@@ -35,10 +38,7 @@ class MLP(nnx.Module):
     ) -> None:
         self.parts = parts
         widths = (sum(parts), *hidden, out)
-        layers = [
-            nnx.Linear(a, b, param_dtype=jnp.float32, rngs=rngs)
-            for a, b in zip(widths[:-1], widths[1:], strict=True)
-        ]
+        layers = [nnx.Linear(a, b, param_dtype=jnp.float32, rngs=rngs) for a, b in pairwise(widths)]
         if zero_last:
             layers[-1] = nnx.Linear(
                 widths[-2],
@@ -58,11 +58,12 @@ class MLP(nnx.Module):
 
     def finish(self, first: jax.Array) -> jax.Array:
         """The output (..., out) from the summed projections."""
-        x = first + self.layers[0].bias[...]
+        bias = self.layers[0].bias
+        x = first if bias is None else first + bias
         for layer in self.layers[1:]:
             x = layer(jax.nn.celu(x))
         return x if self.norm is None else self.norm(x)
 
     def __call__(self, *values: jax.Array) -> jax.Array:
         """The output (..., out) from the parts themselves."""
-        return self.finish(sum(self.project(k, part) for k, part in enumerate(values)))
+        return self.finish(reduce(jnp.add, (self.project(k, v) for k, v in enumerate(values))))

@@ -77,7 +77,9 @@ def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> Reduce
         raise InputError(f"a reduced model needs 3 FEM runs or more; there are {len(runs.theta)}")
     snapshots = np.asarray(runs.displacement)
     mean = snapshots.mean(axis=0)
-    left, size, right = np.linalg.svd((snapshots - mean).reshape(len(snapshots), -1), full_matrices=False)
+    left, size, right = np.linalg.svd(
+        (snapshots - mean).reshape(len(snapshots), -1), full_matrices=False
+    )
     kept = size > truncation * size[0]
     inputs = np.asarray(scene.to_unit(runs.theta))
     fits = [_fit_one(inputs, column) for column in (left[:, kept] * np.sqrt(len(snapshots))).T]
@@ -96,7 +98,9 @@ def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> Reduce
 def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Length scales (p,) and prediction weights (c,) of one coefficient (c,) of unit variance."""
     kernel = ConstantKernel(10.0, (1e-2, 1e8)) * RBF(np.ones(inputs.shape[1]), (5e-2, 1e2))
-    process = GaussianProcessRegressor(kernel, alpha=_JITTER, n_restarts_optimizer=1, random_state=0)
+    process = GaussianProcessRegressor(
+        kernel, alpha=_JITTER, n_restarts_optimizer=1, random_state=0
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a bound reached is no failure here
         process.fit(inputs, values)

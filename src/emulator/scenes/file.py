@@ -64,7 +64,9 @@ def read_scene(path: str | Path) -> Scene:
         raise InputError(f"scene file {path} is not valid TOML: {error}") from error
     unknown = sorted(set(text) - _KEYS)
     if unknown:
-        raise InputError(f"scene file {path}: unknown key '{unknown[0]}'; known: {', '.join(sorted(_KEYS))}")
+        raise InputError(
+            f"scene file {path}: unknown key '{unknown[0]}'; known: {', '.join(sorted(_KEYS))}"
+        )
     for key in ("law", "mesh", "parameters", "supports"):
         if key not in text:
             raise InputError(f"scene file {path}: key '{key}' is missing")
@@ -83,10 +85,7 @@ def _scene(path: Path, text: dict[str, Any]) -> Scene:
         name=path.stem,
         mesh=replace(mesh, node_sets=sets),
         law=find_law(text["law"]),
-        parameters=tuple(
-            Parameter(name, p.get("unit", ""), *map(float, p["range"]), p.get("scale", "uniform"))
-            for name, p in text["parameters"].items()
-        ),
+        parameters=tuple(_parameter(name, entry) for name, entry in text["parameters"].items()),
         loads=tuple(_load(load) for load in text.get("loads", [])),
         supports=tuple(
             Support(support["node_set"], np.asarray(support.get("displacement", (0.0, 0.0, 0.0))))
@@ -97,9 +96,16 @@ def _scene(path: Path, text: dict[str, Any]) -> Scene:
     )
 
 
+def _parameter(name: str, entry: dict[str, Any]) -> Parameter:
+    low, high = map(float, entry["range"])
+    return Parameter(name, entry.get("unit", ""), low, high, entry.get("scale", "uniform"))
+
+
 def _on_plane(mesh: Mesh, name: str, plane: dict[str, Any]) -> np.ndarray:
     if plane.get("axis") not in _AXES or "at" not in plane:
-        raise InputError(f"node set '{name}' needs axis = \"x\", \"y\" or \"z\" and at = a coordinate in mm")
+        raise InputError(
+            f'node set \'{name}\' needs axis = "x", "y" or "z" and at = a coordinate in mm'
+        )
     distance = np.abs(mesh.nodes[:, _AXES[plane["axis"]]] - float(plane["at"]))
     nodes = np.flatnonzero(distance <= 1e-8 * mesh.size)
     if not nodes.size:

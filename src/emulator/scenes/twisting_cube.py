@@ -24,7 +24,7 @@ def twisting_cube(cells: int = 6, edge: float = 10.0, degrees: float = 60.0) -> 
     """A cube clamped at its left face, its right face turned by ``degrees`` and pulled nowhere.
 
     The right face moves by half the rigid rotation, as published: each of its points goes halfway
-    along the chord to where the rotation would take it. theta = (E, nu), 1 to 25 kPa and 0.1 to 0.4.
+    along the chord to where the rotation would take it. theta = (E, nu), 1 to 25 kPa, 0.1 to 0.4.
 
     Parameters
     ----------

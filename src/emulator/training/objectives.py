@@ -26,11 +26,11 @@ Objective = Literal["energy", "simulations", "both"]
 
 
 class Batch(NamedTuple):
-    """theta (b, p); FEM displacement (b, n, 3) mm and energy (b,) mN mm, ``None`` without FEM."""
+    """theta (b, p); FEM displacement (b, n, 3) mm and energy (b,) mN mm, empty without FEM."""
 
     theta: jax.Array
-    displacement: jax.Array | None = None
-    energy: jax.Array | None = None
+    displacement: jax.Array
+    energy: jax.Array
 
 
 def make_loss(

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,9 @@ from emulator.training.objectives import Batch, Objective, make_loss
 from emulator.training.sampling import sobol, uniform
 
 CHECKPOINT = "checkpoint.safetensors"
+WARMUP = 100
+# Without FEM runs the spread of the displacements is unknown; this much of the centre's will do.
+_GUESS = 0.2
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class Plan:
     simulations: int = 256
     batch: int = 16
     learning_rate: float = 1e-3
-    energy_weight: float = 0.02
+    energy_weight: float = 0.3
     centred: bool = True
     checkpoint_every: int = 500
     seed: int = 0
@@ -69,65 +72,84 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What the steps of a plan share: an untrained emulator, FEM runs and the step itself."""
+    """What training works on: an untrained emulator, FEM runs, and one optimiser step.
 
-    plan: Plan
+    ``step(weights, state, number, total) -> (weights, state, loss)``; its batch and its learning
+    rate follow from ``number`` and ``total`` alone, so that a resumed run repeats them.
+    """
+
     emulator: Emulator
     runs: Runs
-    step: Callable
     optimiser: optax.GradientTransformation
+    step: Callable[..., tuple[nnx.State, Any, jax.Array]]
 
 
 def prepare(
-    scene: Scene, plan: Plan, architecture: Architecture = Architecture(), *, progress: bool = False
+    scene: Scene,
+    plan: Plan,
+    architecture: Architecture | None = None,
+    *,
+    progress: bool = False,
 ) -> Problem:
     """Run the FEM solutions a plan needs and set up its emulator; the same for equal inputs."""
-    simulator = Simulator(scene)
     wanted = 0 if plan.objective == "energy" else plan.simulations
     centre = scene.centre[None]
     thetas = jnp.concatenate([centre, sobol(scene, wanted, plan.seed)]) if wanted else centre
-    runs = run_campaign(simulator, thetas, progress=progress)
+    runs = run_campaign(Simulator(scene), thetas, progress=progress)
     offset = np.asarray(runs.displacement[0])
-    deviation = np.asarray(runs.displacement[1:]) - offset if wanted else 0.2 * offset[None]
+    deviation = np.asarray(runs.displacement[1:]) - offset if wanted else _GUESS * offset[None]
     free = ~scene.held
     component = [float(np.sqrt(np.mean(deviation[:, free[:, k], k] ** 2))) for k in range(3)]
     spread = float(np.sqrt(np.mean(np.sum(deviation**2, axis=-1))))
     scale = np.maximum(component, 1e-3 * max(component))
     if not plan.centred:
         offset, scale = np.zeros_like(offset), np.full(3, np.sqrt(np.mean(offset**2)))
-    emulator = fresh(scene, augment(scene), architecture, offset, scale, plan.seed)
+    emulator = fresh(
+        scene, augment(scene), architecture or Architecture(), offset, scale, plan.seed
+    )
     energy_scale = float(jnp.abs(runs.energy[0]))
     loss = make_loss(scene, plan.objective, spread, energy_scale, plan.energy_weight)
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0),
-        optax.adam(optax.warmup_cosine_decay_schedule(0.0, plan.learning_rate, 100, plan.steps)),
-    )
-    step = _make_step(emulator, plan, runs, loss, optimiser)
-    return Problem(plan, emulator, runs, step, optimiser)
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
+    return Problem(emulator, runs, optimiser, _make_step(emulator, plan, runs, loss, optimiser))
 
 
 def _make_step(
-    emulator: Emulator, plan: Plan, runs: Runs, loss: Callable, optimiser: Any
-) -> Callable:
-    """``step(weights, state, number) -> (weights, state, loss)``; the batch follows from ``number``."""
-
+    emulator: Emulator,
+    plan: Plan,
+    runs: Runs,
+    loss: Callable[[jax.Array, Batch], jax.Array],
+    optimiser: optax.GradientTransformation,
+) -> Callable[..., tuple[nnx.State, Any, jax.Array]]:
     def draw(number: jax.Array) -> Batch:
         key = jax.random.fold_in(jax.random.key(plan.seed), number)
         if plan.objective == "energy":
-            return Batch(uniform(emulator.scene, plan.batch, key))
+            nothing = jnp.zeros(0)
+            return Batch(uniform(emulator.scene, plan.batch, key), nothing, nothing)
         rows = jax.random.choice(key, len(runs.theta), (plan.batch,), replace=False)
         return Batch(runs.theta[rows], runs.displacement[rows], runs.energy[rows])
 
-    def step(weights: nnx.State, state: Any, number: jax.Array) -> tuple[nnx.State, Any, jax.Array]:
+    def step(
+        weights: nnx.State, state: Any, number: jax.Array, total: jax.Array
+    ) -> tuple[nnx.State, Any, jax.Array]:
         batch = draw(number)
-        value, slope = jax.value_and_grad(lambda w: loss(emulator.predict(w, batch.theta), batch))(weights)
-        # A step with a gradient that is not finite is skipped, and shows in the progress bar.
+        value, slope = jax.value_and_grad(lambda w: loss(emulator.predict(w, batch.theta), batch))(
+            weights
+        )
+        # A step whose gradient is not finite is skipped.
         fine = jnp.isfinite(optax.global_norm(slope))
         slope = jax.tree.map(lambda g: jnp.where(fine, g, 0.0), slope)
         updates, state = optimiser.update(slope, state, weights)
+        rate = learning_rate(plan.learning_rate, number, total)
+        updates = jax.tree.map(lambda d: (-rate * d).astype(d.dtype), updates)
         return optax.apply_updates(weights, updates), state, value
 
     return jax.jit(step, donate_argnums=(0, 1))
+
+
+def learning_rate(peak: float, number: jax.Array, total: jax.Array) -> jax.Array:
+    """Linear warm-up over ``WARMUP`` steps to ``peak``, then a cosine to zero at ``total``."""
+    warm = jnp.minimum(1.0, (number + 1) / WARMUP)
+    return peak * warm * 0.5 * (1.0 + jnp.cos(jnp.pi * number / total))
 
 
 def train(
@@ -135,7 +157,7 @@ def train(
     plan: Plan,
     folder: str | Path,
     *,
-    architecture: Architecture = Architecture(),
+    architecture: Architecture | None = None,
     budget: float | None = None,
     progress: bool = False,
     resume: bool = False,
@@ -147,81 +169,90 @@ def train(
     folder : where checkpoints go. The finished emulator is returned, not written.
     budget : seconds for everything (FEM runs, compilation, training); replaces ``plan.steps`` by
         as many as fit.
-    resume : continue from the checkpoint in ``folder``; the result equals that of a run that was
-        never interrupted.
+    resume : continue from the checkpoint in ``folder``, under the plan it was written with; the
+        result equals that of a run that was never interrupted.
     """
     started = time.perf_counter()
-    folder = Path(folder)
-    checkpoint = folder / CHECKPOINT
-    spent, saved = 0.0, None
-    if resume:
-        saved, metadata = read_arrays(checkpoint)
-        plan, spent = _resumed_plan(plan, metadata, scene, checkpoint)
-    elif budget is not None:
-        plan = replace(plan, steps=_steps_within(budget, scene, plan, architecture, started, progress))
+    checkpoint = Path(folder) / CHECKPOINT
+    saved = _read_checkpoint(checkpoint, scene) if resume else None
+    plan = saved.plan if saved else plan
+    spent = saved.seconds if saved else 0.0
     problem = prepare(scene, plan, architecture, progress=progress)
-    weights, state, first = problem.emulator.weights, problem.optimiser.init(problem.emulator.weights), 0
-    if saved is not None:
-        template = {"weights": weights, "state": state}
-        tree = fill_tree(template, saved, str(checkpoint))
+    weights, first = problem.emulator.weights, 0
+    state = problem.optimiser.init(weights)
+    if saved:
+        tree = fill_tree({"weights": weights, "state": state}, saved.arrays, str(checkpoint))
         weights, state = jax.tree.map(jnp.asarray, (tree["weights"], tree["state"]))
-        first = int(saved["['step']"])
-    bar = tqdm(range(first, plan.steps), "train", initial=first, total=plan.steps, disable=not progress)
-    losses = []
-    for number in bar:
-        weights, state, value = problem.step(weights, state, jnp.asarray(number))
-        if (number + 1) % 50 == 0 or number + 1 == plan.steps:
-            losses.append(float(value))
-            bar.set_postfix(loss=f"{losses[-1]:.3e}")
-        if (number + 1) % plan.checkpoint_every == 0 and number + 1 < plan.steps:
-            elapsed = spent + time.perf_counter() - started
-            _write_checkpoint(checkpoint, problem, weights, state, number + 1, elapsed)
-    seconds = spent + time.perf_counter() - started
-    checkpoint.unlink(missing_ok=True)
-    record = {"plan": asdict(plan), "seconds": round(seconds, 1), "final_loss": losses[-1]}
-    if not np.isfinite(losses[-1]):
+        first = int(saved.arrays["['step']"])
+    elif budget is not None:
+        left = budget - (time.perf_counter() - started)
+        plan = replace(plan, steps=_steps_within(left, problem, plan.steps))
+    numbers = tqdm(
+        range(first, plan.steps), "train", initial=first, total=plan.steps, disable=not progress
+    )
+    total, loss = jnp.asarray(plan.steps), float("nan")
+    for number in numbers:
+        weights, state, value = problem.step(weights, state, jnp.asarray(number), total)
+        done = number + 1
+        if done % 50 == 0 or done == plan.steps:
+            loss = float(value)
+            numbers.set_postfix(loss=f"{loss:.3e}")
+        if done % plan.checkpoint_every == 0 and done < plan.steps:
+            seconds = spent + time.perf_counter() - started
+            _write_checkpoint(checkpoint, scene, plan, (weights, state, done), seconds)
+    if not np.isfinite(loss):
         raise InputError("training ended in a loss that is not finite; lower the learning rate")
+    checkpoint.unlink(missing_ok=True)
+    seconds = round(spent + time.perf_counter() - started, 1)
+    record = {"plan": asdict(plan), "seconds": seconds, "final_loss": loss}
     return replace(problem.emulator, weights=weights, record=record)
 
 
-def _steps_within(
-    budget: float, scene: Scene, plan: Plan, architecture: Architecture, started: float, progress: bool
-) -> int:
-    """How many steps fit in what is left of ``budget`` seconds once set-up has been paid for."""
-    problem = prepare(scene, replace(plan, steps=1000), architecture, progress=progress)
-    weights, state = problem.emulator.weights, problem.optimiser.init(problem.emulator.weights)
-    set_up = time.perf_counter() - started
+def _steps_within(seconds: float, problem: Problem, total: int) -> int:
+    """How many steps fit into ``seconds``, from a few of them; their effect is thrown away."""
+    started = time.perf_counter()
+    weights = jax.tree.map(jnp.copy, problem.emulator.weights)  # a step consumes its arguments
+    state = problem.optimiser.init(weights)
     durations = []
     for number in range(8):
         begin = time.perf_counter()
-        weights, state, value = problem.step(weights, state, jnp.asarray(number))
+        arguments = (jnp.asarray(number), jnp.asarray(total))
+        weights, state, value = problem.step(weights, state, *arguments)
         value.block_until_ready()
         durations.append(time.perf_counter() - begin)
-    compile_time = durations[0]
-    # Set-up and compilation come once more: the plan with its true length is prepared afresh.
-    left = 0.98 * budget - (time.perf_counter() - started) - set_up - compile_time
-    steps = int(left / float(np.median(durations[1:])))
-    if steps < 100:
+    one = float(np.median(durations[1:]))
+    left = 0.98 * seconds - (time.perf_counter() - started)
+    steps = int(left / one)
+    if steps < WARMUP:
         raise InputError(
-            f"a budget of {budget:.0f} s leaves {max(steps, 0)} training steps; give at least "
-            f"{budget - left + 100 * float(np.median(durations[1:])):.0f} s"
+            f"the budget leaves {max(steps, 0)} training steps of {1e3 * one:.0f} ms after FEM "
+            f"runs and compilation; give at least {WARMUP * one - left:.0f} s more"
         )
     return steps
 
 
+class _Checkpoint(NamedTuple):
+    plan: Plan
+    seconds: float
+    arrays: dict[str, np.ndarray]
+
+
 def _write_checkpoint(
-    path: Path, problem: Problem, weights: Any, state: Any, step: int, seconds: float
+    path: Path, scene: Scene, plan: Plan, progress: tuple[Any, Any, int], seconds: float
 ) -> None:
+    weights, state, step = progress
     metadata = {
-        "plan": json.dumps(asdict(problem.plan)),
-        "fingerprint": problem.emulator.scene.fingerprint,
+        "plan": json.dumps(asdict(plan)),
+        "fingerprint": scene.fingerprint,
         "seconds": repr(seconds),
     }
     save_tree(path, {"weights": weights, "state": state, "step": np.asarray(step)}, metadata)
 
 
-def _resumed_plan(plan: Plan, metadata: dict, scene: Scene, path: Path) -> tuple[Plan, float]:
-    """The plan a checkpoint was written under, and the seconds already spent."""
+def _read_checkpoint(path: Path, scene: Scene) -> _Checkpoint:
+    if not path.is_file():
+        raise InputError(f"nothing to resume: checkpoint {path} does not exist")
+    arrays, metadata = read_arrays(path)
     if metadata.get("fingerprint") != scene.fingerprint:
         raise InputError(f"{path} belongs to another scene than '{scene.name}'; train afresh")
-    return Plan(**json.loads(metadata["plan"])), float(metadata["seconds"])
+    return _Checkpoint(Plan(**json.loads(metadata["plan"])), float(metadata["seconds"]), arrays)

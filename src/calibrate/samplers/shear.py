@@ -1,0 +1,90 @@
+r"""A change of variables that straightens the curved ridges of calibration posteriors.
+
+Displacements often fix one combination of the elastic parameters sharply and the rest hardly at
+all: the posterior is a thin, bent sheet, and a sampler with one metric crawls along it. In
+unconstrained coordinates :math:`z`, ordered from the least to the best determined, take
+
+.. math:: z_k = \zeta_k + c_k \cdot \varphi(s(z_1), \dots, s(z_{k-1})), \qquad s = \text{sigmoid}
+
+with :math:`\varphi` all monomials up to a degree. The map is triangular with unit diagonal, so its
+Jacobian determinant is 1 and the density of :math:`\zeta` is that of :math:`z`: *any* coefficients
+leave the posterior exact, good ones make it round. They are fitted to a pilot run by least squares.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Shear(NamedTuple):
+    """order : (p,) coordinates from least to best determined. coefficients : (p, features)."""
+
+    order: jax.Array
+    coefficients: jax.Array
+
+
+def _degree(count: int) -> int:
+    return 3 if count <= 3 else 2
+
+
+def monomials(values: jax.Array, count: int) -> jax.Array:
+    """Monomials (..., f) of the first ``count`` columns of ``values`` (..., p), centred on 1/2."""
+    centred = [values[..., k] - 0.5 for k in range(count)]
+    terms = []
+    for degree in range(1, _degree(count) + 1):
+        for chosen in combinations_with_replacement(range(count), degree):
+            product = centred[chosen[0]]
+            for k in chosen[1:]:
+                product = product * centred[k]
+            terms.append(product)
+    return jnp.stack(terms, axis=-1)
+
+
+def identity(dimension: int) -> Shear:
+    """The map that changes nothing."""
+    if dimension == 1:
+        width = 0
+    else:
+        width = max(monomials(jnp.zeros(dimension), k).size for k in range(1, dimension))
+    return Shear(jnp.arange(dimension), jnp.zeros((dimension, width)))
+
+
+def apply(shear: Shear, zeta: jax.Array) -> jax.Array:
+    """``z`` (p,) from ``zeta`` (p,)."""
+    ordered = zeta[shear.order]
+    squashed = jax.nn.sigmoid(ordered)
+    columns = [ordered[0]]
+    for k in range(1, len(zeta)):
+        terms = monomials(squashed, k)
+        z = ordered[k] + shear.coefficients[k, : terms.size] @ terms
+        squashed = squashed.at[k].set(jax.nn.sigmoid(z))
+        columns.append(z)
+    return jnp.zeros_like(zeta).at[shear.order].set(jnp.stack(columns), unique_indices=True)
+
+
+def fit(draws: np.ndarray) -> Shear:
+    """The map fitted to pilot draws (s, p) of ``z``."""
+    dimension = draws.shape[1]
+    squashed = 1.0 / (1.0 + np.exp(-draws))
+    order = np.argsort(-squashed.std(axis=0), kind="stable")
+    start = identity(dimension)
+    coefficients = np.array(start.coefficients)
+    for k in range(1, dimension):
+        terms = np.asarray(monomials(jnp.asarray(squashed[:, order]), k))
+        target = draws[:, order[k]]
+        # A touch of ridge: a short pilot must not buy wild coefficients for features it hardly saw.
+        spread = np.maximum(terms.std(axis=0), 1e-12)
+        design = np.vstack(
+            [
+                (terms - terms.mean(axis=0)) / spread,
+                1e-3 * np.eye(terms.shape[1]) * len(terms) ** 0.5,
+            ]
+        )
+        wanted = np.concatenate([target - target.mean(), np.zeros(terms.shape[1])])
+        coefficients[k, : terms.shape[1]] = np.linalg.lstsq(design, wanted, rcond=None)[0] / spread
+    return Shear(jnp.asarray(order), jnp.asarray(coefficients))
