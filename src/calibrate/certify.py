@@ -11,7 +11,9 @@ posterior standard deviations, says whether reweighting is needed at all.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import jax
@@ -20,7 +22,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 from tqdm import tqdm
 
-from calibrate.model import NOISE_SD
+from calibrate.model import NOISE_SD, Model
 from calibrate.posterior import Posterior
 from emulator.errors import InputError
 from emulator.fem import Simulator
@@ -133,7 +135,7 @@ def certify(
         raise InputError(f"certify: {draws} draws asked for; give 25 to {available}")
     rows = np.linspace(0, available - 1, draws).astype(int)
     chosen = {name: values[rows] for name, values in everything.items()}
-    ratio = _log_ratio(posterior, simulator)
+    ratio = _log_ratio(model, simulator)
     sds = chosen.get(NOISE_SD, np.full(draws, model.noise.sd))
     thetas = posterior.thetas()[rows]
     bar = tqdm(range(draws), "FEM check", disable=not progress, unit="run")
@@ -141,9 +143,9 @@ def certify(
     return judge(log_ratios, chosen)
 
 
-def _log_ratio(posterior: Posterior, simulator: Simulator) -> Any:
-    """Jitted log likelihood ratio of one draw, ``-inf`` where FEM fails."""
-    model = posterior.model
+@lru_cache(maxsize=4)
+def _log_ratio(model: Model, simulator: Simulator) -> Callable[..., jax.Array]:
+    """Jitted log likelihood ratio of one draw, ``-inf`` where FEM fails; compiled once a model."""
 
     @jax.jit
     def ratio(theta: jax.Array, sd: jax.Array, data: jax.Array) -> jax.Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,11 @@ import numpy as np
 import xarray as xr
 
 from calibrate.model import Model
+from calibrate.provenance import versions
 from calibrate.samplers import NUTSOptions, nuts
 from emulator.errors import InputError
 from emulator.network import CachedEmulator
 from emulator.store import replacing
-
-_VERSIONS = ("jax", "jaxlib", "flax", "numpyro", "numpy", "scikit-fem", "sparsax", "arviz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +101,7 @@ def provenance(model: Model, seed: int, sampler: str) -> dict[str, Any]:
         "prior": {name: repr_distribution(d) for name, d in model.prior.items()},
         "sampler": sampler,
         "seed": seed,
-        "versions": {name: version(name) for name in _VERSIONS},
+        "versions": versions(),
     }
     if isinstance(model.full, CachedEmulator):
         record["emulator_fingerprint"] = model.full.emulator.fingerprint

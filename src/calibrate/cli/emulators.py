@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import platform
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,15 +47,9 @@ def register(commands: Any) -> None:
     parser.set_defaults(run=evaluate)
 
 
-def hardware() -> dict[str, Any]:
-    """The machine a figure was measured on."""
-    return {"cpu_cores": os.cpu_count(), "machine": platform.machine(), "accelerator": None}
-
-
 def train(arguments: argparse.Namespace) -> int:
     """Train and write an emulator."""
-    import jax
-
+    from calibrate.provenance import hardware, versions
     from emulator.network import save_emulator
     from emulator.scenes import find_scene
     from emulator.training import Plan
@@ -76,11 +68,12 @@ def train(arguments: argparse.Namespace) -> int:
         resume=arguments.resume,
         progress=show_progress(arguments),
     )
-    machine = {
-        **hardware(),
-        "accelerator": None if jax.default_backend() == "cpu" else jax.devices()[0].device_kind,
+    record = {
+        **result.record,
+        "command": command_line(arguments),
+        "hardware": hardware(),
+        "versions": versions(),
     }
-    record = {**result.record, "command": command_line(arguments), "hardware": machine}
     result = replace(result, record=record)
     save_emulator(result, arguments.out)
     steps = record["plan"]["steps"]

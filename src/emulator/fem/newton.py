@@ -25,6 +25,8 @@ from emulator.fem.assembly import System, balance
 from emulator.fem.solution import Solution, Status
 from emulator.mechanics.energy import volume_ratio
 
+_LEAST_FRACTION = 2.0**-12
+
 
 @dataclass(frozen=True)
 class NewtonOptions:
@@ -88,10 +90,12 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
         )
         solvable = jnp.all(jnp.isfinite(tangent))
         move = system.extend(system.solve(system.pattern.safe_values(tangent), -(residual + pull)))
-        u, admissible = _guarded_step(system, state.u, move + move_held, options.shrink)
-        admissible &= solvable
-        u = jnp.where(admissible, u, state.u)
-        placed = jnp.all(jnp.where(held, jnp.abs(state.level * held_values - u), 0.0) == 0.0)
+        fraction = _largest_fraction(system, state.u, move + move_held, options.shrink)
+        admissible = solvable & (fraction > 0.0)
+        u = jnp.where(admissible, state.u + fraction * (move + move_held), state.u)
+        # After a full step the supports are met; setting them avoids the last bit of round-off.
+        u = jnp.where(held & admissible & (fraction == 1.0), state.level * held_values, u)
+        placed = jnp.all(jnp.where(held, u == state.level * held_values, True))
         _, error = balanced(u, state.level)
         error = jnp.where(placed & admissible & jnp.isfinite(error), error, jnp.inf)
         return _next_level(options, state, u, admissible, error)
@@ -133,10 +137,8 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     )
 
 
-def _guarded_step(
-    system: System, u: jax.Array, move: jax.Array, shrink: float
-) -> tuple[jax.Array, jax.Array]:
-    """``u`` plus as much of ``move`` as no element minds, and whether any of it could be made."""
+def _largest_fraction(system: System, u: jax.Array, move: jax.Array, shrink: float) -> jax.Array:
+    """Most of ``move`` that no element minds, among 1, 1/2, 1/4, ...; 0 where none will do."""
     floor = shrink * jnp.min(volume_ratio(system.scene, u))
 
     def inverts(fraction: jax.Array) -> jax.Array:
@@ -144,10 +146,10 @@ def _guarded_step(
         return ~(jnp.min(J) > floor)  # written so that NaN counts as inverted
 
     def unfinished(fraction: jax.Array) -> jax.Array:
-        return (fraction > 2.0**-12) & inverts(fraction)
+        return (fraction > _LEAST_FRACTION) & inverts(fraction)
 
     fraction = jax.lax.while_loop(unfinished, lambda fraction: 0.5 * fraction, jnp.array(1.0))
-    return u + fraction * move, fraction > 2.0**-12
+    return jnp.where(fraction > _LEAST_FRACTION, fraction, 0.0)
 
 
 def _next_level(

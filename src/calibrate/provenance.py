@@ -1,0 +1,72 @@
+"""Where a number came from: machine, versions, commit."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+
+PACKAGES = (
+    "soft-tissue-calibrate",
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "numpyro",
+    "numpy",
+    "scipy",
+    "scikit-fem",
+    "scikit-learn",
+    "sparsax",
+    "arviz",
+)
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of those its numbers depend on."""
+    return {name: version(name) for name in PACKAGES}
+
+
+def hardware() -> dict[str, Any]:
+    """Processor, cores, and accelerator if JAX uses one."""
+    accelerator = None if jax.default_backend() == "cpu" else jax.devices()[0].device_kind
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+        "accelerator": accelerator,
+    }
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or "unknown"
+
+
+def commit(folder: str | Path) -> str | None:
+    """Commit checked out at ``folder``, with ``+`` when changed; ``None`` without git."""
+    try:
+        words = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=12"]
+        done = subprocess.run(words, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def study_header(folder: str | Path, seed: int) -> dict[str, Any]:
+    """What every study's results.json begins with."""
+    return {
+        "hardware": hardware(),
+        "versions": versions(),
+        "commit": commit(folder),
+        "seed": seed,
+    }

@@ -1,0 +1,179 @@
+"""What accuracy costs in time on the once-clamped beam: FEM, emulator, polish, reduced model.
+
+Run from anywhere: ``python studies/accuracy_vs_time/run.py``. Writes results.json and pareto.png
+beside itself and asserts what the README of the study says.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.figures import pyplot
+from calibrate.observations import spread_nodes
+from calibrate.provenance import study_header
+from emulator import Simulator, load
+from emulator.correct import corrected
+from emulator.evaluation import quantiles
+from emulator.forward import ForwardMap, fem_forward
+from emulator.reduced import fit_reduced
+from emulator.store import write_json
+from emulator.training import run_campaign, sobol
+
+HERE = Path(__file__).parent
+SEED = 4
+
+
+def timed(function: Callable[[jax.Array], Any], thetas: jax.Array) -> float:
+    """Median seconds of one call, theta different in each: direct solvers skip repeated work."""
+    jax.block_until_ready(function(thetas[0]))
+    durations = []
+    for theta in thetas[1:]:
+        begin = time.perf_counter()
+        jax.block_until_ready(function(theta))
+        durations.append(time.perf_counter() - begin)
+    return float(np.median(durations))
+
+
+def measure(
+    name: str,
+    forward: ForwardMap,
+    tests: jax.Array,
+    reference: jax.Array,
+    offline: float,
+    fem_runs: int,
+) -> dict[str, Any]:
+    """Error at the nodes ``forward`` returns, time of a value and of a value with gradient."""
+    value = jax.jit(lambda theta: forward(theta))
+    # What a sampler needs: one scalar and its gradient in theta.
+    gradient = jax.jit(jax.value_and_grad(lambda theta: jnp.sum(forward(theta) ** 2)))
+    error = jnp.stack([value(theta) for theta in tests]) - reference[:, forward.nodes]
+    case = {
+        "name": name,
+        "status": "done",
+        "nodes": len(forward.nodes),
+        "fem_runs": fem_runs,
+        "err_u_mm": quantiles(jnp.sqrt(jnp.sum(error**2, axis=-1))),
+        "value_s": timed(value, tests),
+        "gradient_s": timed(gradient, tests),
+        "offline_s": offline,
+    }
+    print(
+        f"{name:38s} err_u median {case['err_u_mm']['median']:.2e} mm   "
+        f"value {1e3 * case['value_s']:8.3f} ms   gradient {1e3 * case['gradient_s']:8.3f} ms   "
+        f"offline {offline:7.1f} s",
+        flush=True,
+    )
+    return case
+
+
+def study(count: int) -> list[dict[str, Any]]:
+    """Every method on ``count`` theta none of them has seen."""
+    trained = load("once_clamped_beam")
+    scene, cached = trained.scene, trained.cache()
+    simulator = Simulator(scene)
+    tests = sobol(scene, count, seed=90_210)
+    # The reference is FEM taken two Newton steps beyond its own tolerance.
+    exact = corrected(fem_forward(simulator), simulator, steps=2)
+    reference = jnp.stack([jax.jit(exact)(theta) for theta in tests])
+    observed = spread_nodes(scene, 20, SEED)
+    seconds = float(trained.record["seconds"])
+    runs_used = trained.record["plan"]["simulations"] + 1
+    cases = [
+        measure("FEM from rest", fem_forward(simulator), tests, reference, 0.0, 0),
+        measure(
+            "FEM started by the emulator",
+            fem_forward(simulator, start=cached),
+            tests,
+            reference,
+            seconds,
+            runs_used,
+        ),
+        measure("emulator, full field", cached, tests, reference, seconds, runs_used),
+        measure(
+            "emulator, 20 observed nodes", cached.at(observed), tests, reference, seconds, runs_used
+        ),
+        measure(
+            "emulator + 1 Newton step",
+            corrected(cached, simulator, steps=1),
+            tests,
+            reference,
+            seconds,
+            runs_used,
+        ),
+    ]
+    for runs in (10, 30, 60):
+        begin = time.perf_counter()
+        campaign = run_campaign(simulator, sobol(scene, runs, SEED))
+        reduced = fit_reduced(scene, campaign)
+        offline = time.perf_counter() - begin
+        cases.append(
+            measure(f"POD + GP, {runs} FEM runs", reduced, tests, reference, offline, runs)
+        )
+    cases.append(
+        measure("POD + GP (60), 20 nodes", reduced.at(observed), tests, reference, offline, 60)
+    )
+    return cases
+
+
+def pareto(points: np.ndarray) -> np.ndarray:
+    """Which rows (time, error) no other row beats in both, (c,) bool."""
+    return np.array([not (points < row).all(axis=1).any() for row in points])
+
+
+def draw(cases: list[dict[str, Any]], path: Path) -> None:
+    """Error against time of a value and of a gradient, the fronts joined."""
+    plt = pyplot()
+    figure, panels = plt.subplots(1, 2, figsize=(13.5, 5.6), sharey=True, layout="constrained")
+    families = {"FEM": "tab:green", "emu": "tab:blue", "POD": "tab:orange"}
+    for axes, key, title in zip(
+        panels, ("value_s", "gradient_s"), ("one value", "one value with its gradient"), strict=True
+    ):
+        points = np.array([[1e3 * case[key], case["err_u_mm"]["median"]] for case in cases])
+        best = points[pareto(points)]
+        best = best[np.argsort(best[:, 0])]
+        axes.step(best[:, 0], best[:, 1], where="post", color="0.6", lw=1, label="Pareto front")
+        for case, (x, y) in zip(cases, points, strict=True):
+            axes.plot(x, y, "o", color=families[case["name"][:3]], ms=8)
+            note = f"{case['name']}\noffline {case['offline_s']:.0f} s"
+            axes.annotate(note, (x, y), xytext=(7, 4), textcoords="offset points", fontsize=7.5)
+        axes.set(xscale="log", yscale="log", xlabel=f"time of {title} (ms)")
+        axes.set_xlim(points[:, 0].min() / 2, points[:, 0].max() * 8)
+        axes.grid(alpha=0.25)
+        axes.legend(loc="lower left", frameon=False)
+    panels[0].set_ylabel("median displacement error (mm)")
+    figure.suptitle("once-clamped beam, 390 nodes, 2 parameters: what accuracy costs in time")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def check(cases: list[dict[str, Any]]) -> None:
+    """The claims of the study's README."""
+    by_name = {case["name"]: case for case in cases}
+    error = {name: case["err_u_mm"]["median"] for name, case in by_name.items()}
+    assert error["FEM from rest"] < 1e-6
+    assert error["emulator, full field"] < 2e-2
+    assert error["emulator + 1 Newton step"] < 0.1 * error["emulator, full field"]
+    assert error["POD + GP, 30 FEM runs"] < error["emulator, full field"], "the rival wins here"
+    fast = by_name["emulator, 20 observed nodes"]["gradient_s"]
+    assert fast < 0.1 * by_name["FEM started by the emulator"]["gradient_s"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=50, help="test theta")
+    parser.add_argument("--out", type=Path, default=HERE)
+    arguments = parser.parse_args()
+    cases = study(arguments.cases)
+    write_json(arguments.out / "results.json", {**study_header(HERE, SEED), "cases": cases})
+    draw(cases, arguments.out / "pareto.png")
+    check(cases)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""Shared fixtures. Importing emulator turns on float64 before any test touches JAX."""
+
+from pathlib import Path
+
+import jax
+import pytest
+
+import emulator as em
+from emulator.scenes import Scene
+
+PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "published"
+
+
+@pytest.fixture(scope="session")
+def published() -> Path:
+    """Folder of the released data; the test is skipped where it is absent."""
+    if not PUBLISHED.is_dir():
+        pytest.skip(f"the released data is not at {PUBLISHED.parent.name}/{PUBLISHED.name}")
+    return PUBLISHED
+
+
+@pytest.fixture(scope="session")
+def beam() -> Scene:
+    """A coarse once-clamped beam: 45 nodes, 96 tetrahedra."""
+    return em.scenes.once_clamped_beam(cells=(4, 2, 2))
+
+
+@pytest.fixture(scope="session")
+def cube() -> Scene:
+    """A coarse twisting cube."""
+    return em.scenes.twisting_cube(cells=3)
+
+
+@pytest.fixture(scope="session")
+def simulator(beam: Scene) -> em.Simulator:
+    return em.Simulator(beam)
+
+
+@pytest.fixture
+def strict():
+    """JAX as strict as it can be: no silent promotion of rank or dtype."""
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield

@@ -1,0 +1,106 @@
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.errors import InputError
+from emulator.mechanics.loads import Gravity
+from emulator.scenes import BUILT_IN, Parameter, Support, find_scene, scene_from_recipe
+from tests_support import block
+
+
+@pytest.mark.parametrize("name", sorted(BUILT_IN))
+def test_built_in_scenes_are_made_again_by_their_recipe(name):
+    scene = find_scene(name)
+    assert scene.name == name
+    assert scene_from_recipe(scene.recipe).fingerprint == scene.fingerprint
+
+
+def test_any_resolution():
+    assert len(em.scenes.twisting_cube(cells=9).mesh.nodes) == 1000
+    assert len(em.scenes.once_clamped_beam(cells=(3, 1, 2)).mesh.elements) == 36
+
+
+def test_the_centre_and_the_corners_of_a_log_box():
+    scene = em.scenes.once_clamped_beam(cells=(1, 1, 1))
+    np.testing.assert_allclose(scene.centre, np.sqrt(50.0 * 100.0))
+    corners = scene.from_unit(jnp.array([[0.0, 1.0], [1.0, 0.0]]))
+    np.testing.assert_allclose(corners, [[50.0, 100.0], [100.0, 50.0]])
+    theta = jnp.array([57.0, 83.0])
+    np.testing.assert_allclose(scene.from_unit(scene.to_unit(theta)), theta)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"mu": 60.0}, "no value for parameter 'lam'"),
+        ({"mu": 60.0, "lam": 60.0, "nu": 0.3}, "has no parameter 'nu'; it has mu, lam"),
+        ({"mu": 60.0, "lam": 101.0}, "parameter 'lam' is 101 kPa; scene .* covers 50 to 100"),
+        ({"mu": float("nan"), "lam": 60.0}, "parameter 'mu' is nan kPa"),
+        ({"mu": -60.0, "lam": 60.0}, "parameter 'mu' is -60 kPa"),
+    ],
+)
+def test_bad_theta(beam, values, message):
+    with pytest.raises(InputError, match=message):
+        beam.theta(**values)
+
+
+def test_supports_that_contradict_each_other():
+    moved = Support("bottom", np.array([0.0, 0.0, 1.0]))
+    with pytest.raises(InputError, match="support on 'bottom' contradicts another one"):
+        block(supports=(Support("left"), moved))
+    block(supports=(Support("left"), Support("bottom")))  # agreeing is fine
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"supports": ()}, "no support, the body could move freely"),
+        ({"parameters": (Parameter("mu", "kPa", 1.0, 2.0),)}, "law 'neo_hookean' needs 'lam'"),
+        ({"constants": {"mu": 1.0}}, "parameter 'mu' is given twice"),
+        ({"constants": {"kappa": 1.0}}, "parameter 'kappa' is not one of law 'neo_hookean'"),
+        ({"supports": (Support("apex"),)}, "node set 'apex' is not in the mesh"),
+        ({"supports": (Support("left", np.zeros((2, 3))),)}, r"displacement has shape \(2, 3\)"),
+    ],
+)
+def test_scenes_that_make_no_sense(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(block(), **change)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "scale", "message"),
+    [
+        (2.0, 1.0, "uniform", "range .* is empty"),
+        (0.0, 1.0, "log", "a log scale needs a lower bound above 0"),
+        (1.0, 2.0, "cubic", "scale 'cubic'; use log or uniform"),
+    ],
+)
+def test_bad_parameters(low, high, scale, message):
+    with pytest.raises(InputError, match=message):
+        Parameter("mu", "kPa", low, high, scale)
+
+
+def test_the_fingerprint_sees_every_part():
+    scene = block(loads=(Gravity(),))
+    changed = [
+        block(),
+        block(loads=(Gravity(density=1.1),)),
+        block(loads=(Gravity(),), cells=(2, 2, 3)),
+        replace(scene, supports=(Support("right"),)),
+        replace(scene, parameters=(Parameter("mu", "kPa", 1.0, 11.0, "log"), scene.parameters[1])),
+    ]
+    prints = [scene.fingerprint, *(other.fingerprint for other in changed)]
+    assert len(set(prints)) == len(prints)
+    assert block(loads=(Gravity(),)).fingerprint == scene.fingerprint
+
+
+def test_constants_take_the_place_of_parameters():
+    scene = replace(block(), parameters=block().parameters[:1], constants={"lam": 4.0})
+    whole = block()
+    u = 0.01 * jnp.asarray(np.random.default_rng(0).normal(size=scene.held.shape))
+    assert em.potential_energy(scene)(u, jnp.array([3.0])) == pytest.approx(
+        float(em.potential_energy(whole)(u, jnp.array([3.0, 4.0])))
+    )

@@ -1,0 +1,40 @@
+"""What several test modules build with."""
+
+import numpy as np
+
+from emulator.geometry.generators import box
+from emulator.mechanics.laws import find_law
+from emulator.mechanics.loads import Gravity
+from emulator.scenes import Parameter, Scene, Support
+
+
+def block(
+    *,
+    loads: tuple[Gravity, ...] = (),
+    supports: tuple[Support, ...] = (Support("left"),),
+    cells=(2, 2, 2),
+) -> Scene:
+    """A small Neo-Hookean block with whatever loads and supports a test wants."""
+    return Scene(
+        name="block",
+        mesh=box((2.0, 3.0, 4.0), cells),
+        law=find_law("neo_hookean"),
+        parameters=(
+            Parameter("mu", "kPa", 1.0, 10.0, "log"),
+            Parameter("lam", "kPa", 1.0, 10.0, "log"),
+        ),
+        loads=loads,
+        supports=supports,
+    )
+
+
+def rotation(seed: int = 0) -> np.ndarray:
+    """A proper rotation, far from the identity."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def slope(steps: np.ndarray, errors: np.ndarray) -> float:
+    """Order of convergence: slope of log error over log step."""
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
