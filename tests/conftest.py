@@ -5,6 +5,7 @@ from pathlib import Path
 import jax
 import pytest
 
+import calibrate  # noqa: F401 - with all it imports, before pytest turns warnings into errors
 import emulator as em
 from emulator.scenes import Scene
 

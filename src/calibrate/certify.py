@@ -95,7 +95,8 @@ def judge(
     if np.ptp(ratios) < _EQUAL_WEIGHTS:
         log_weights, k_hat = np.full(ratios.shape, -np.log(len(ratios))), 0.0
     else:
-        log_weights, k_hat = array_stats.psislw(ratios)
+        # ArviZ takes log likelihoods, whose importance ratios are their inverse.
+        log_weights, k_hat = array_stats.psislw(-ratios)
     weights = np.exp(np.asarray(log_weights) - np.max(log_weights))
     weights /= weights.sum()
     k_hat = float(k_hat)

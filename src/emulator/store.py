@@ -73,7 +73,7 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, str] = {}) -> str:
     """Write a pytree of arrays; returns the SHA-256 of the file."""
-    arrays = {name: np.ascontiguousarray(leaf) for name, leaf in _leaves(tree).items()}
+    arrays = {name: np.asarray(leaf, order="C") for name, leaf in _leaves(tree).items()}
     content = save(arrays, metadata=dict(metadata))
     write_atomically(path, content)
     return hashlib.sha256(content).hexdigest()

@@ -136,7 +136,7 @@ def _make_step(
             weights
         )
         # A step whose gradient is not finite is skipped.
-        fine = jnp.isfinite(optax.global_norm(slope))
+        fine = jnp.isfinite(optax.tree.norm(slope))
         slope = jax.tree.map(lambda g: jnp.where(fine, g, 0.0), slope)
         updates, state = optimiser.update(slope, state, weights)
         rate = learning_rate(plan.learning_rate, number, total)

@@ -10,7 +10,7 @@ from emulator.errors import InputError, SolverError
 from emulator.fem.assembly import relative_residual
 from emulator.mechanics.loads import Gravity
 from emulator.scenes import Support
-from tests_support import block, slope
+from scene_support import block, slope
 
 
 def test_patch_test():
@@ -69,7 +69,7 @@ def test_tangent_is_the_derivative_of_the_residual(simulator, beam):
 def test_gradient_in_theta_against_central_differences(beam, simulator):
     theta = beam.theta(mu=63.0, lam=88.0)
     weights = jnp.asarray(np.random.default_rng(2).normal(size=beam.held.shape))
-    f = lambda t: jnp.vdot(weights, simulator.solve(t).displacement)  # noqa: E731
+    f = lambda t: jnp.vdot(weights, simulator.solve(t).displacement)
     h = 1e-3
     central = [(f(theta.at[k].add(h)) - f(theta.at[k].add(-h))) / (2 * h) for k in range(2)]
     reverse = jax.grad(f)(theta)

@@ -11,7 +11,7 @@ def test_the_built_in_beam_is_the_released_one(published):
     ours, theirs = em.scenes.once_clamped_beam(), published_scene("OnceClampedBeam", published)
     np.testing.assert_allclose(ours.mesh.nodes, theirs.mesh.nodes, atol=1e-6)
     np.testing.assert_array_equal(ours.held, theirs.held)
-    as_set = lambda scene: np.unique(np.sort(scene.mesh.elements, axis=1), axis=0)  # noqa: E731
+    as_set = lambda scene: np.unique(np.sort(scene.mesh.elements, axis=1), axis=0)
     np.testing.assert_array_equal(as_set(ours), as_set(theirs))
 
 

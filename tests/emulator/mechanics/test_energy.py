@@ -5,7 +5,7 @@ import pytest
 
 from emulator.mechanics.energy import nodal_dead_force, potential_energy, strain_energy
 from emulator.mechanics.loads import Gravity
-from tests_support import block, rotation
+from scene_support import block, rotation
 
 VOLUME = 2.0 * 3.0 * 4.0
 

@@ -8,7 +8,7 @@ from emulator.errors import InputError
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS, find_law
 from emulator.mechanics.laws.neo_hookean import lame_from_engineering
-from tests_support import rotation, slope
+from scene_support import rotation, slope
 
 MU, LAM = 3.0, 7.0
 ARGUMENTS = {"neo_hookean": (MU, LAM), "neo_hookean_E_nu": (8.0, 0.3)}
@@ -52,7 +52,7 @@ def test_frame_indifference(name):
 def test_stress_and_tangent_are_the_derivatives_taylor(name):
     rng = np.random.default_rng(5)
     H, D = 0.1 * rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
-    W = lambda h: energy(name, h)  # noqa: E731
+    W = lambda h: energy(name, h)
     stress, tangent = jax.grad(W)(jnp.asarray(H)), jax.hessian(W)(jnp.asarray(H))
     steps = 0.1 / 2.0 ** np.arange(5)
     first = [abs(W(H + h * D) - W(H) - h * np.sum(stress * D)) for h in steps]

@@ -8,7 +8,7 @@ import emulator as em
 from emulator.errors import InputError
 from emulator.mechanics.loads import Gravity
 from emulator.scenes import BUILT_IN, Parameter, Support, find_scene, scene_from_recipe
-from tests_support import block
+from scene_support import block
 
 
 @pytest.mark.parametrize("name", sorted(BUILT_IN))

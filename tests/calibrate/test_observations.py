@@ -1,0 +1,75 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import calibrate as cal
+from calibrate.observations import observation_from, spread_landmarks, spread_nodes
+from emulator.errors import InputError
+
+
+def test_nodes(beam):
+    u = np.random.default_rng(0).normal(size=beam.mesh.nodes.shape)
+    for what, index in (
+        ("all", np.arange(45)),
+        ("right", beam.mesh.node_set("right")),
+        ([4, 2], [4, 2]),
+    ):
+        observe = cal.nodal_displacements(beam, what)
+        np.testing.assert_array_equal(observe(jnp.asarray(u[observe.nodes])), u[index])
+        np.testing.assert_array_equal(observe.points, beam.mesh.nodes[index])
+
+
+def test_landmarks_are_exact_for_linear_fields(beam):
+    H = np.random.default_rng(0).normal(size=(3, 3))
+    points = spread_landmarks(beam, 30, seed=1)
+    observe = cal.landmarks(beam, points)
+    u = beam.mesh.nodes @ H.T + [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(
+        observe(jnp.asarray(u[observe.nodes])), points @ H.T + [1, 2, 3], atol=1e-10
+    )
+    np.testing.assert_allclose(observe.weights.sum(axis=1), 1.0)
+    assert observe.weights.min() > -1e-12
+    assert len(observe.nodes) < len(beam.mesh.nodes) or len(observe.nodes) == 45
+
+
+def test_a_landmark_on_a_node_is_that_node(beam):
+    observe = cal.landmarks(beam, beam.mesh.nodes[[7]])
+    u = np.random.default_rng(0).normal(size=beam.mesh.nodes.shape)
+    np.testing.assert_allclose(observe(jnp.asarray(u[observe.nodes])), u[[7]], atol=1e-9)
+
+
+def test_descriptions_make_the_same_operator(beam):
+    for observe in (cal.nodal_displacements(beam, [3, 9]), cal.landmarks(beam, [[10.0, 5.0, 5.0]])):
+        again = observation_from(beam, observe.describe())
+        np.testing.assert_array_equal(again.nodes, observe.nodes)
+        np.testing.assert_array_equal(again.points, observe.points)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda s: cal.nodal_displacements(s, [3, 99]),
+            "node 99 is unknown; scene .* has nodes 0 to 44",
+        ),
+        (lambda s: cal.nodal_displacements(s, [-1]), "node -1 is unknown"),
+        (lambda s: cal.nodal_displacements(s, [3, 3]), "node 3 is observed twice"),
+        (lambda s: cal.nodal_displacements(s, [0.5]), "must be a list of whole numbers"),
+        (lambda s: cal.nodal_displacements(s, []), "must be a list of whole numbers, not empty"),
+        (lambda s: cal.nodal_displacements(s, "apex"), "node set 'apex' is not in the mesh"),
+        (lambda s: cal.landmarks(s, [[1, 1, 1], [500.0, 0, 0]]), "landmark 1 at .* lies outside"),
+        (lambda s: cal.landmarks(s, [[np.nan, 1, 1]]), "expected .*finite"),
+        (lambda s: spread_nodes(s, 1000, 0), "cannot observe 1000 nodes"),
+        (lambda s: observation_from(s, {"kind": "smell"}), "observation kind 'smell' is unknown"),
+    ],
+)
+def test_what_cannot_be_observed(beam, make, message):
+    with pytest.raises(InputError, match=message):
+        make(beam)
+
+
+def test_spread_nodes_are_free_and_repeatable(beam):
+    nodes = spread_nodes(beam, 20, seed=3)
+    assert not beam.held[nodes].any()
+    np.testing.assert_array_equal(nodes, spread_nodes(beam, 20, seed=3))
+    assert len(set(nodes)) == 20

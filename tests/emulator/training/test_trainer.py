@@ -1,0 +1,128 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.errors import InputError
+from emulator.evaluation import evaluate
+from emulator.network import Architecture
+from emulator.training import Plan, run_campaign, sobol, train, uniform
+from emulator.training.objectives import Batch, make_loss
+from emulator.training.trainer import CHECKPOINT, WARMUP, learning_rate
+
+SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
+
+
+@pytest.fixture(scope="module")
+def tests(beam, simulator):
+    return run_campaign(simulator, sobol(beam, 6, seed=5))
+
+
+# Energy alone leaves the soft modes behind and takes longer.
+@pytest.mark.parametrize(
+    ("objective", "factor"), [("energy", 0.8), ("simulations", 0.5), ("both", 0.5)]
+)
+def test_training_lowers_the_error(beam, tests, objective, factor, tmp_path):
+    plan = Plan(objective=objective, steps=300, simulations=16, batch=8, learning_rate=3e-3)
+    emulator = train(beam, plan, tmp_path, architecture=SMALL)
+    centre = em.Simulator(beam)(beam.centre)
+    before = np.median(np.linalg.norm(tests.displacement - centre, axis=-1))
+    after = evaluate(emulator.cache(), tests.theta, tests.displacement)
+    assert after["err_u"]["median"] < factor * before
+    assert emulator.record["plan"]["objective"] == objective
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
+def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
+    plan = Plan(steps=30, simulations=8, batch=4, checkpoint_every=10)
+    whole = train(beam, plan, tmp_path / "whole", architecture=SMALL)
+
+    from emulator.training import trainer
+
+    write, kept = trainer._write_checkpoint, []
+
+    def kill_after_second(*arguments):
+        write(*arguments)
+        kept.append(arguments)
+        if len(kept) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(trainer, "_write_checkpoint", kill_after_second)
+    with pytest.raises(KeyboardInterrupt):
+        train(beam, plan, tmp_path / "killed", architecture=SMALL)
+    monkeypatch.setattr(trainer, "_write_checkpoint", write)
+    # The plan comes from the checkpoint, not from the call.
+    resumed = train(beam, Plan(), tmp_path / "killed", architecture=SMALL, resume=True)
+    for a, b in zip(jax.tree.leaves(whole.weights), jax.tree.leaves(resumed.weights), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert resumed.record["plan"] == whole.record["plan"]
+
+
+def test_resuming_needs_a_checkpoint_of_this_scene(beam, cube, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="nothing to resume"):
+        train(beam, Plan(), tmp_path, resume=True)
+    plan = Plan(steps=3, simulations=4, batch=2, checkpoint_every=2)
+    monkeypatch.setattr("pathlib.Path.unlink", lambda *a, **k: None)  # keep the checkpoint
+    train(beam, plan, tmp_path, architecture=SMALL)
+    with pytest.raises(InputError, match="belongs to another scene than 'twisting_cube'"):
+        train(cube, plan, tmp_path, architecture=SMALL, resume=True)
+    path = tmp_path / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="is truncated or not a safetensors file"):
+        train(beam, plan, tmp_path, architecture=SMALL, resume=True)
+
+
+def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
+    with pytest.raises(InputError, match=r"the budget leaves \d+ training steps .* give at least"):
+        train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"objective": "luck"}, "objective 'luck': use energy"),
+        ({"steps": 0}, "steps is 0; it must be 1 or more"),
+        ({"simulations": 4}, "4 simulations are fewer than a batch of 16"),
+    ],
+)
+def test_plans_that_cannot_work(options, message):
+    with pytest.raises(InputError, match=message):
+        Plan(**options)
+
+
+def test_learning_rate_rises_then_falls():
+    rates = np.array([learning_rate(1e-3, jnp.asarray(k), jnp.asarray(1000)) for k in range(1000)])
+    assert rates[0] == pytest.approx(1e-3 / WARMUP)
+    assert 90 < rates.argmax() < 110
+    assert rates.max() < 1e-3
+    assert rates[-1] < 1e-8
+
+
+def test_objectives_by_hand(beam, tests):
+    u = tests.displacement + 0.1
+    batch = Batch(*tests)
+    Pi = em.potential_energy(beam)
+    values = np.array([Pi(v, t) for v, t in zip(u, tests.theta, strict=True)])
+    misfit = 3 * 0.1**2 / 4.0
+    gap = np.mean((values - tests.energy) / np.abs(tests.energy))
+    expected = {
+        "energy": values.mean() / 7.0,
+        "simulations": misfit,
+        "both": misfit + 0.5 * gap,
+    }
+    for objective, value in expected.items():
+        loss = make_loss(beam, objective, spread=2.0, energy_scale=7.0, weight=0.5)
+        assert float(loss(u, batch)) == pytest.approx(float(value), rel=1e-12)
+    # At the solutions nothing is left but round-off.
+    assert abs(make_loss(beam, "both", 2.0, 7.0, 0.5)(tests.displacement, batch)) < 1e-12
+
+
+def test_samples_fill_the_box(beam):
+    for thetas in (sobol(beam, 64, 0), uniform(beam, 64, jax.random.key(0))):
+        position = np.asarray(beam.to_unit(thetas))
+        assert position.min() >= 0.0
+        assert position.max() <= 1.0
+        counts = np.histogram2d(*position.T, bins=2, range=[[0, 1], [0, 1]])[0]
+        assert counts.min() >= 8
+    np.testing.assert_array_equal(sobol(beam, 5, 3), sobol(beam, 8, 3)[:5])

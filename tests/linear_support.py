@@ -1,0 +1,46 @@
+"""A forward map linear in theta, whose posterior is known in closed form."""
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.forward import Prediction, all_nodes
+
+
+@dataclass(frozen=True, eq=False)
+class LinearForward:
+    """u = A theta + b at every node; ``limit`` makes theta above it invalid."""
+
+    scene: object
+    nodes: np.ndarray
+    matrix: np.ndarray
+    shift: np.ndarray
+    limit: float = np.inf
+
+    kind = "linear"
+
+    def __call__(self, theta):
+        return jnp.tensordot(self.matrix, theta, axes=1) + self.shift
+
+    def evaluate(self, theta):
+        return Prediction(self(theta), jnp.all(theta < self.limit))
+
+    def at(self, nodes):
+        return replace(self, nodes=nodes, matrix=self.matrix[nodes], shift=self.shift[nodes])
+
+
+def linear_forward(scene, seed=0, size=0.01, bias=0.0) -> LinearForward:
+    rng = np.random.default_rng(seed)
+    count = len(scene.mesh.nodes)
+    matrix = size * rng.normal(size=(count, 3, len(scene.parameters)))
+    return LinearForward(scene, all_nodes(scene), matrix, np.full((count, 3), bias))
+
+
+def closed_form(forward, nodes, data, sd, mean, prior_sd):
+    """Mean and covariance of theta given data under a Gaussian prior."""
+    A = forward.matrix[nodes].reshape(-1, len(mean))
+    y = (np.asarray(data) - forward.shift[nodes]).ravel()
+    precision = A.T @ A / sd**2 + np.diag(1.0 / prior_sd**2)
+    covariance = np.linalg.inv(precision)
+    return covariance @ (A.T @ y / sd**2 + mean / prior_sd**2), covariance
