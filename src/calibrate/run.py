@@ -49,7 +49,7 @@ class Run:
     data : a file, or ``synthetic``: FEM at ``truth`` plus noise.
     truth : named parameters of synthetic data.
     observe : of synthetic data: ``nodes:20``, ``landmarks:24``, ``all``, a node set, ``3,14,15``.
-    noise_sd : mm, known; or ``noise_scale``, the scale of its prior, when it is to be inferred.
+    noise_sd : mm; known unless ``noise_scale``, the scale of its prior, asks to infer it.
     forward : one of :data:`FORWARDS`; ``emulator`` a shipped name or folder; ``fem_runs`` those
         the reduced model is fitted to.
     """
@@ -72,8 +72,10 @@ class Run:
 
     @property
     def noise(self) -> GaussianNoise:
-        """The noise model."""
-        return GaussianNoise(self.noise_sd, self.noise_scale)
+        """The noise of the likelihood; that of synthetic data is always ``noise_sd``."""
+        if self.noise_scale is not None:
+            return GaussianNoise(None, self.noise_scale)
+        return GaussianNoise(self.noise_sd)
 
 
 def build_forward(run: Run, scene: Scene, *, progress: bool = False) -> ForwardMap:
@@ -125,10 +127,8 @@ def make_data(run: Run, scene: Scene) -> tuple[Observation, np.ndarray]:
 
 def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
     """Sample the posterior of a run; with ``folder``, keep run, data and posterior there."""
-    scene = find_scene(run.scene, run.root)
+    scene, noise = find_scene(run.scene, run.root), run.noise
     observe, data = make_data(run, scene)
-    # Synthetic data always has a known noise when made; it is inferred only if a scale is given.
-    noise = GaussianNoise(None, run.noise_scale) if run.noise_scale is not None else run.noise
     built = model(build_forward(run, scene, progress=progress), observe, noise)
     options = NUTSOptions(run.warmup, run.draws, run.chains)
     posterior = sample(
@@ -156,8 +156,7 @@ def read_posterior(folder: str | Path, *, progress: bool = False) -> tuple[Run, 
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{folder / POSTERIOR} was made for another scene than '{run.scene}'")
     observe, data = read_data(scene, folder / DATA)
-    noise = GaussianNoise(None, run.noise_scale) if run.noise_scale is not None else run.noise
-    built: Model = model(build_forward(run, scene, progress=progress), observe, noise)
+    built: Model = model(build_forward(run, scene, progress=progress), observe, run.noise)
     return run, Posterior(tree, built, jnp.asarray(data))
 
 

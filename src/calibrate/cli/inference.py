@@ -40,9 +40,8 @@ def register(commands: Any) -> None:
         metavar="WHAT",
         help="nodes:N, landmarks:N, all, a node set, 3,14,15",
     )
-    noise = parser.add_mutually_exclusive_group()
-    noise.add_argument(
-        "--noise", type=float, metavar="MM", help="standard deviation, known (default 0.2)"
+    parser.add_argument(
+        "--noise", type=float, metavar="MM", default=0.2, help="standard deviation (default 0.2)"
     )
     parser.add_argument(
         "--noise-scale",
@@ -95,15 +94,13 @@ def infer(arguments: argparse.Namespace) -> int:
     from calibrate.run import Run, report
     from calibrate.run import infer as run_inference
 
-    synthetic = arguments.data == "synthetic"
-    known = arguments.noise if arguments.noise is not None else 0.2
     run = Run(
         scene=arguments.scene,
         root=arguments.root,
         data=arguments.data,
         truth=assignments(arguments.truth),
         observe=arguments.observe,
-        noise_sd=known if synthetic or arguments.noise_scale is None else None,
+        noise_sd=arguments.noise,
         noise_scale=arguments.noise_scale,
         forward=arguments.forward,
         emulator=arguments.emulator,

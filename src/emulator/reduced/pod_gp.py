@@ -105,4 +105,4 @@ def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
         warnings.simplefilter("ignore", ConvergenceWarning)  # a bound reached is no failure here
         process.fit(inputs, values)
     fitted = process.kernel_
-    return np.asarray(fitted.k2.length_scale), fitted.k1.constant_value * process.alpha_
+    return np.atleast_1d(fitted.k2.length_scale), fitted.k1.constant_value * process.alpha_

@@ -187,19 +187,27 @@ def train(
     elif budget is not None:
         left = budget - (time.perf_counter() - started)
         plan = replace(plan, steps=_steps_within(left, problem, plan.steps))
-    numbers = tqdm(
-        range(first, plan.steps), "train", initial=first, total=plan.steps, disable=not progress
-    )
-    total, loss = jnp.asarray(plan.steps), float("nan")
-    for number in numbers:
-        weights, state, value = problem.step(weights, state, jnp.asarray(number), total)
-        done = number + 1
+    deadline = None if budget is None or saved else started + 0.99 * budget
+    bar = tqdm(desc="train", initial=first, total=plan.steps, disable=not progress)
+    done, loss, began = first, float("nan"), time.perf_counter()
+    while done < plan.steps:
+        arguments = (jnp.asarray(done), jnp.asarray(plan.steps))
+        weights, state, value = problem.step(weights, state, *arguments)
+        done += 1
+        bar.update()
         if done % 50 == 0 or done == plan.steps:
             loss = float(value)
-            numbers.set_postfix(loss=f"{loss:.3e}")
+            bar.set_postfix(loss=f"{loss:.3e}")
+        if deadline is not None and done % 200 == 0:
+            # The machine may have become busier, or less so: aim again at the deadline.
+            now = time.perf_counter()
+            left = int((deadline - now) / ((now - began) / (done - first)))
+            plan = replace(plan, steps=done + max(left, 0))
+            bar.total = plan.steps
         if done % plan.checkpoint_every == 0 and done < plan.steps:
             seconds = spent + time.perf_counter() - started
             _write_checkpoint(checkpoint, scene, plan, (weights, state, done), seconds)
+    bar.close()
     if not np.isfinite(loss):
         raise InputError("training ended in a loss that is not finite; lower the learning rate")
     checkpoint.unlink(missing_ok=True)

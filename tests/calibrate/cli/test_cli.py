@@ -1,0 +1,207 @@
+"""The command line in process: results as JSON, and one line with exit code 2 for bad input."""
+
+import json
+import shutil
+
+import meshio
+import numpy as np
+import pytest
+
+from calibrate.cli import main
+from emulator.geometry.generators import box
+from emulator.network.files import SHIPPED
+
+SCENE = """
+law = "neo_hookean"
+mesh = "block.vtu"
+[node_sets.left]
+axis = "x"
+at = 0.0
+[[supports]]
+node_set = "left"
+[[loads]]
+kind = "gravity"
+[parameters.mu]
+unit = "kPa"
+range = [5, 20]
+[constants]
+lam = 30.0
+"""
+
+
+@pytest.fixture
+def block(tmp_path):
+    mesh = box((20.0, 10.0, 10.0), (2, 1, 1))
+    meshio.write(tmp_path / "block.vtu", meshio.Mesh(mesh.nodes, [("tetra", mesh.elements)]))
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return tmp_path / "scene.toml"
+
+
+def answer(capsys, *words):
+    code = main([*map(str, words), "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def complaint(capsys, *words):
+    """The one line a bad call prints."""
+    assert main(list(map(str, words))) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("calibrate: ")
+    return lines[0]
+
+
+def test_scenes(capsys):
+    code, rows = answer(capsys, "scenes")
+    assert code == 0
+    beam = next(row for row in rows if row["name"] == "once_clamped_beam")
+    assert (beam["nodes"], beam["elements"], beam["emulator_shipped"]) == (390, 1440, True)
+    assert main(["scenes"]) == 0
+    assert "once_clamped_beam" in capsys.readouterr().out
+
+
+def test_simulate(capsys, block, tmp_path):
+    out = tmp_path / "u.vtu"
+    code, result = answer(capsys, "simulate", block, "--theta", "mu=7", "--out", out)
+    assert code == 0
+    assert result["status"] == "converged"
+    assert result["theta"] == {"mu": 7.0}
+    field = meshio.read(out).point_data["displacement"]
+    assert np.linalg.norm(field, axis=1).max() == pytest.approx(result["max_displacement"])
+    # Half the stiffness, about twice the sag.
+    _, soft = answer(capsys, "simulate", block, "--theta", "mu=14")
+    assert 1.3 < result["max_displacement"] / soft["max_displacement"] < 2.2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["simulate", "beam"], "scene 'beam' is unknown"),
+        (["simulate", "missing.toml"], "missing.toml does not exist"),
+        (
+            ["simulate", "once_clamped_beam", "--theta", "mu=500", "lam=60"],
+            "parameter 'mu' is 500 kPa",
+        ),
+        (["simulate", "once_clamped_beam", "--theta", "mu"], "'mu' is not name=number"),
+        (["simulate", "once_clamped_beam", "--theta", "mu=60"], "no value for parameter 'lam'"),
+        (["simulate", "once_clamped_beam", "--out", "u.png"], "must end in .vtu"),
+        (
+            ["simulate", "once_clamped_beam", "--out", "/no/where/u.vtu"],
+            "its folder does not exist",
+        ),
+        (["simulate", "published:OnceClampedBeam"], "with --root DIR"),
+        (["simulate"], "SCENE"),
+        (["dance"], "invalid choice: 'dance'"),
+        (
+            ["train", "once_clamped_beam", "--budget", "soon", "--out", "x"],
+            "duration 'soon' is not",
+        ),
+        (["train", "once_clamped_beam", "--steps", "0", "--out", "x"], "steps is 0"),
+        (["evaluate", "nothing", "--against", "fem"], "emulator 'nothing' is neither"),
+        (["evaluate", "once_clamped_beam", "--against", "/no/OnceClampedBeam"], "is missing"),
+        (["verify", "published", "/no/where"], "does not exist"),
+        (["certify", "/no/where"], "run.json does not exist"),
+    ],
+)
+def test_bad_calls(capsys, monkeypatch, tmp_path, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in complaint(capsys, *words)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--data", "missing.csv"], "data file missing.csv does not exist"),
+        (["--data", "nan.csv"], "row 2 has a displacement that is not finite"),
+        (["--data", "node.csv"], "node 4000 is unknown"),
+        (["--truth", "mu=73"], "no value for parameter 'lam'"),
+        (["--truth", "mu=73", "lam=10"], "parameter 'lam' is 10 kPa"),
+        (["--truth", "mu=73", "lam=61", "--observe", "4000"], "node 4000 is unknown"),
+        (["--truth", "mu=73", "lam=61", "--observe", "apex"], "observe 'apex': give nodes:N"),
+        (["--truth", "mu=73", "lam=61", "--observe", "nodes:x"], "'x' is not a number of nodes"),
+        (["--truth", "mu=73", "lam=61", "--noise", "-1"], "noise: standard deviation is -1.0 mm"),
+        (
+            ["--truth", "mu=73", "lam=61", "--emulator", "broken"],
+            "is truncated or not a safetensors",
+        ),
+        (["--truth", "mu=73", "lam=61", "--emulator", "other"], "was trained for a scene"),
+    ],
+)
+def test_bad_inference_leaves_nothing_behind(capsys, monkeypatch, tmp_path, words, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nan.csv").write_text("node,ux,uy,uz\n30,0,0,0\n31,0,nan,0\n")
+    (tmp_path / "node.csv").write_text("node,ux,uy,uz\n4000,0,0,0\n")
+    for name in ("broken", "other"):
+        shutil.copytree(SHIPPED / "once_clamped_beam", tmp_path / name)
+    weights = tmp_path / "broken" / "weights.safetensors"
+    weights.write_bytes(weights.read_bytes()[:5000])
+    text = json.loads((tmp_path / "other" / "emulator.json").read_text())
+    text["fingerprint"] = "0" * 16
+    (tmp_path / "other" / "emulator.json").write_text(json.dumps(text))
+    assert message in complaint(capsys, "infer", "once_clamped_beam", *words, "--out", "result")
+    assert not (tmp_path / "result").exists()
+
+
+def test_a_scene_without_a_shipped_emulator_says_so(capsys, block, tmp_path):
+    line = complaint(
+        capsys, "infer", block, "--truth", "mu=7", "--observe", "all", "--out", tmp_path / "r"
+    )
+    assert "emulator 'scene' is neither a folder with emulator.json nor shipped" in line
+
+
+def test_a_mesh_with_an_inverted_element(capsys, block):
+    mesh = box((20.0, 10.0, 10.0), (2, 1, 1))
+    elements = mesh.elements.copy()
+    elements[5] = elements[5][[0, 2, 1, 3]]
+    meshio.write(block.parent / "block.vtu", meshio.Mesh(mesh.nodes, [("tetra", elements)]))
+    assert "element 5 has a negative volume (inverted), 1 such of 12" in complaint(
+        capsys, "simulate", block
+    )
+
+
+def test_train_evaluate_infer_certify(capsys, block, tmp_path):
+    """The whole path on a scene of the user's own."""
+    out = tmp_path / "e"
+    code, record = answer(
+        capsys, "train", block, "--steps", 150, "--simulations", 16, "--batch", 8, "--out", out
+    )
+    assert code == 0
+    assert record["command"].startswith("calibrate train ")
+    code, errors = answer(capsys, "evaluate", out, "--against", "fem", "--cases", 5)
+    assert code == 0
+    assert errors["cases"] == 5
+    assert errors["err_u"]["median"] < 0.1 * errors["max_u"]["median"]
+    # A forward map made of FEM runs needs no training at all.
+    words = ["--truth", "mu=9", "--observe", "landmarks:6", "--noise", "0.02"]
+    run = [*words, "--forward", "reduced", "--fem-runs", 8, "--warmup", 200, "--draws", 200]
+    code, result = answer(capsys, "infer", block, *run, "--out", tmp_path / "r")
+    assert code == 0
+    row = result["parameters"]["mu"]
+    assert abs(row["mean"] - 9.0) < 4 * row["sd"]
+    names = {path.name for path in (tmp_path / "r").iterdir()}
+    assert names == {"run.json", "data.csv", "posterior.nc"}
+    code, result = answer(capsys, "certify", tmp_path / "r", "--draws", 50)
+    assert (code, result["verdict"]) == (0, "accepted")
+    assert json.loads((tmp_path / "r" / "certificate.json").read_text())["verdict"] == "accepted"
+    # The kept data is data like any other.
+    code, again = answer(
+        capsys, "infer", block, "--data", tmp_path / "r" / "data.csv", "--noise", "0.02",
+        *run[5:], "--out", tmp_path / "s",
+    )  # fmt: skip
+    assert again["parameters"]["mu"]["mean"] == pytest.approx(row["mean"], abs=row["sd"])
+
+
+def test_evaluate_against_the_released_solutions(capsys, published):
+    folder = published / "OnceClampedBeam"
+    code, report = answer(capsys, "evaluate", "once_clamped_beam", "--against", folder)
+    assert code == 0
+    assert report["cases"] == 50
+    # The paper's medians after a million steps on a GPU (Dalton et al. 2023, Table 1).
+    assert report["err_u"]["median"] <= 2.0e-2
+    assert report["err_Pi"]["median"] <= 6.6e-2
+    assert "is not the scene 'once_clamped_beam'" in complaint(
+        capsys, "evaluate", "once_clamped_beam", "--against", published / "TwistingBeam"
+    )

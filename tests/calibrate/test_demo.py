@@ -1,0 +1,42 @@
+import json
+
+import numpy as np
+import pytest
+
+from calibrate.cli import main
+from calibrate.demo import DEMO
+from calibrate.posterior import read_tree
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("demo")
+
+
+def test_the_demo_ends_accepted(folder, capsys):
+    assert main(["demo", "--out", str(folder), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["verdict"] == "accepted"
+    assert report["k_hat"] < report["certificate"]["k_threshold"]
+    for name, truth in DEMO.truth.items():
+        row = report["parameters"][name]
+        assert row["truth"] == truth
+        assert row["r_hat"] < 1.01
+        assert abs(row["mean"] - truth) < 3 * row["sd"]
+    # mu is found, lam hardly: bending depends on it little.
+    assert report["parameters"]["mu"]["sd"] < 2.0
+    assert report["parameters"]["lam"]["sd"] > 5.0
+    tree = read_tree(folder / "posterior.nc")
+    assert tree.attrs["emulator_fingerprint"]
+    assert json.loads(tree.attrs["observe"])["kind"] == "nodes"
+    picture = (folder / "beam.png").read_bytes()
+    assert picture[:4] == b"\x89PNG"
+    assert len(picture) > 30_000
+
+
+def test_a_kept_run_can_be_certified_again(folder, capsys):
+    before = json.loads((folder / "certificate.json").read_text())
+    assert main(["certify", str(folder), "--draws", "100", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["certificate"]["draws"] == 100
+    assert np.isclose(report["certificate"]["mean_fem"]["mu"], before["mean_fem"]["mu"], atol=0.5)
