@@ -1,0 +1,22 @@
+"""Every notebook runs from start to end; its own assertions hold."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.filterwarnings("default")  # Jupyter's own, in the process that runs it
+def test_notebook(path, tmp_path):
+    notebook = nbformat.read(path, as_version=4)
+    assert any("assert" in cell.source for cell in notebook.cells if cell.cell_type == "code")
+    resources = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=600, kernel_name="python3", resources=resources).execute()

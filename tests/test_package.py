@@ -1,0 +1,54 @@
+"""The package as a whole: what importing it does, and what never gets in."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import calibrate
+import emulator
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
+
+
+def test_what_the_readme_imports_is_there():
+    for module in (calibrate, emulator):
+        for name in module.__all__:
+            assert getattr(module, name) is not None
+
+
+def test_importing_turns_on_float64_and_nothing_else():
+    code = (
+        "import os, jax; before = dict(os.environ); import emulator;"
+        "assert jax.config.jax_enable_x64; assert dict(os.environ) == before;"
+        "import sys; assert 'matplotlib' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_emulator_never_imports_calibrate():
+    for path in (ROOT / "src" / "emulator").rglob("*.py"):
+        assert not re.search(r"^\s*(from|import) calibrate", path.read_text(), re.M), path
+
+
+def test_no_pickle_no_batched_lapack_no_clock_seeds():
+    forbidden = re.compile(
+        r"import pickle|allow_pickle=True|jnp\.linalg\.(inv|det|solve)\(|seed=(int\()?time"
+    )
+    for path in SOURCES:
+        assert not forbidden.search(path.read_text()), path
+
+
+def test_constraints_hold_names_and_versions_only():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [line for line in lines if not line.startswith("#")]
+    assert all(re.fullmatch(r"[A-Za-z0-9_.-]+==[A-Za-z0-9_.!+-]+", line) for line in pins)
+    for name in ("jax", "numpyro", "sparsax", "h5py", "pytest"):
+        assert any(line.startswith(f"{name}==") for line in pins)
+
+
+def test_versions_agree():
+    text = (ROOT / "pyproject.toml").read_text()
+    assert f'version = "{emulator.__version__}"' in text
+    assert f"version: {emulator.__version__}" in (ROOT / "CITATION.cff").read_text()

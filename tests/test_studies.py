@@ -1,0 +1,46 @@
+"""Studies run from a clean clone with one command; here on a few cases."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+STUDIES = Path(__file__).parents[1] / "studies"
+
+
+def run(name: str, *words: object) -> dict:
+    out = words[words.index("--out") + 1]
+    command = [sys.executable, STUDIES / name / "run.py", *map(str, words)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=dict(os.environ), check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads((Path(out) / "results.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "folder", sorted(p.parent for p in STUDIES.glob("*/run.py")), ids=lambda p: p.name
+)
+def test_every_study_is_complete(folder):
+    results = json.loads((folder / "results.json").read_text())
+    assert {"hardware", "versions", "commit", "seed", "cases"} <= set(results)
+    assert all({"name", "status"} <= set(case) for case in results["cases"])
+    readme = (folder / "README.md").read_text()
+    assert list(folder.glob("*.png"))
+    for figure in folder.glob("*.png"):
+        assert figure.name in readme
+
+
+def test_accuracy_vs_time(tmp_path):
+    results = run("accuracy_vs_time", "--cases", 4, "--out", tmp_path)
+    assert len(results["cases"]) >= 8
+    assert (tmp_path / "pareto.png").stat().st_size > 10_000
+
+
+def test_beam_coverage(tmp_path, published):
+    results = run("beam_coverage", published, "--cases", 1, "--out", tmp_path)
+    assert results["cases"][0]["status"] == "accepted"
+    assert results["summary"]["largest_r_hat"] < 1.01
