@@ -29,8 +29,10 @@ study: $(STAMP)
 	$(BIN)/python studies/accuracy_vs_time/run.py
 
 $(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null || \
-	{ echo "Python 3.12 or newer is needed; '$(PYTHON)' is $$($(PYTHON) -V 2>&1 || echo missing). Name one: make $(or $(MAKECMDGOALS),demo) PYTHON=python3.12"; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null || { \
+	found=$$($(PYTHON) -V 2>/dev/null || echo missing); \
+	echo "Python 3.12 or newer is needed, '$(PYTHON)' is $$found; name one: make $(or $(MAKECMDGOALS),demo) PYTHON=python3.12"; \
+	exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'

@@ -32,6 +32,8 @@ Verdict = Literal["accepted", "reweight", "not certified"]
 # Below this spread (in log) all weights are equal to a tenth of a percent and the tail has no
 # shape to fit.
 _EQUAL_WEIGHTS = 1e-3
+# Beyond this there is no one posterior to certify; for use, look for 1.01.
+LARGEST_R_HAT = 1.05
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,9 @@ class Certificate:
     """Outcome of a check against FEM.
 
     verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use ``mean_fem``), or
-        ``not certified`` (the FEM posterior is too far away to be reached by reweighting).
+        ``not certified`` (the FEM posterior is too far away to be reached by reweighting, or the
+        chains do not agree on the cheap one).
+    reason : of the verdict, for people.
     k_hat, k_threshold : Pareto shape of the weights' tail, and the most it may be.
     ess : effective number of reweighted draws.
     shift : per parameter, mean under FEM less mean under the cheap map, in posterior sd.
@@ -48,6 +52,7 @@ class Certificate:
     """
 
     verdict: Verdict
+    reason: str
     k_hat: float
     k_threshold: float
     ess: float
@@ -72,6 +77,7 @@ def judge(
     *,
     largest_shift: float = 0.25,
     largest_failure_rate: float = 0.02,
+    r_hat: float = 1.0,
 ) -> Certificate:
     """The certificate from log likelihood ratios (s,) and the draws (s,) they belong to.
 
@@ -81,6 +87,7 @@ def judge(
     largest_shift : of a mean, in posterior sd, for the posterior to stand as it is. At 0.25 a
         90 % interval still covers 88.7 %.
     largest_failure_rate : fraction of FEM runs that may fail.
+    r_hat : largest of the parameters'; above :data:`LARGEST_R_HAT` nothing is certified.
     """
     log_ratios = np.asarray(log_ratios, dtype=float)
     fine = np.isfinite(log_ratios)
@@ -88,8 +95,9 @@ def judge(
     failed = int((~fine).sum())
     if failed == len(log_ratios):
         nothing = dict.fromkeys(draws, float("nan"))
+        reason = "no FEM run converged"
         return Certificate(
-            "not certified", float("inf"), threshold, 0.0, nothing, nothing, failed, failed
+            "not certified", reason, np.inf, threshold, 0.0, nothing, nothing, failed, failed
         )
     ratios = log_ratios[fine] - log_ratios[fine].max()
     if np.ptp(ratios) < _EQUAL_WEIGHTS:
@@ -101,18 +109,33 @@ def judge(
     weights /= weights.sum()
     k_hat = float(k_hat)
     mean = {name: float(weights @ values[fine]) for name, values in draws.items()}
-    shift = {
-        name: float((mean[name] - values.mean()) / values.std(ddof=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = _shift(mean, draws)
+    largest = max(abs(value) for value in shift.values())
+    verdict: Verdict = "not certified"
+    # Every comparison is written so that NaN fails it.
+    if not r_hat <= LARGEST_R_HAT:
+        reason = f"the chains disagree, R-hat {r_hat:.3f}"
+    elif not failed <= largest_failure_rate * len(log_ratios):
+        reason = f"{failed} FEM runs failed"
+    elif not k_hat < threshold:
+        reason = "the weights' tail is too heavy to reweight"
+    elif not np.isfinite(largest):
+        reason = "a parameter has no spread"
+    elif largest > largest_shift:
+        verdict, reason = "reweight", f"a mean moves by {largest:.2f} posterior sd"
+    else:
+        verdict, reason = "accepted", f"no mean moves by more than {largest_shift} posterior sd"
+    ess = float(1.0 / np.sum(weights**2))
+    return Certificate(verdict, reason, k_hat, threshold, ess, shift, mean, len(log_ratios), failed)
+
+
+def _shift(mean: dict[str, float], draws: dict[str, np.ndarray]) -> dict[str, float]:
+    """Reweighted less plain means in sd of the draws; NaN where they have none."""
+    return {
+        name: float(np.float64(mean[name] - values.mean()) / values.std(ddof=1))
         for name, values in draws.items()
     }
-    verdict: Verdict = "accepted"
-    if max(abs(value) for value in shift.values()) > largest_shift:
-        verdict = "reweight"
-    # NaN must not pass: compare so that it fails.
-    if not k_hat < threshold or failed > largest_failure_rate * len(log_ratios):
-        verdict = "not certified"
-    ess = float(1.0 / np.sum(weights**2))
-    return Certificate(verdict, k_hat, threshold, ess, shift, mean, len(log_ratios), failed)
 
 
 def certify(
@@ -141,7 +164,8 @@ def certify(
     thetas = posterior.thetas()[rows]
     bar = tqdm(range(draws), "FEM check", disable=not progress, unit="run")
     log_ratios = np.array([float(ratio(thetas[s], sds[s], data)) for s in bar])
-    return judge(log_ratios, chosen)
+    worst = max(row["r_hat"] for row in posterior.summary().values())
+    return judge(log_ratios, chosen, r_hat=worst)
 
 
 @lru_cache(maxsize=4)

@@ -63,7 +63,7 @@ def read_data(scene: Scene, path: str | Path) -> tuple[Observation, np.ndarray]:
 
 def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
-        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"data file {path} is not a CSV file: {error}") from error
     columns = set(rows[0]) if rows else set()

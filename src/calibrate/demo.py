@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calibrate.figures import beam_figure
+from calibrate.figures import beam_figure, pyplot
 from calibrate.run import Run, certify_and_keep, infer, report
 from emulator.fem import Simulator
+from emulator.store import check_folder
 
 # Between the training set's Sobol points, and not the centre the emulator is built around.
 DEMO = Run(
@@ -22,7 +23,8 @@ DEMO = Run(
 
 def demo(folder: str | Path, *, progress: bool = False) -> dict[str, Any]:
     """Run the demo, leave posterior, certificate and picture in ``folder``; returns the report."""
-    folder = Path(folder)
+    folder = check_folder(folder)
+    pyplot()  # a missing plotting package is better found out now
     posterior = infer(DEMO, folder, progress=progress)
     certificate = certify_and_keep(posterior, folder, progress=progress)
     scene = posterior.model.forward.scene

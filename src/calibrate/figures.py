@@ -13,6 +13,7 @@ from calibrate.certify import Certificate
 from calibrate.posterior import Posterior
 from emulator.errors import InputError
 from emulator.network.graph import mesh_edges
+from emulator.store import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,8 +66,8 @@ def beam_figure(
         f"{posterior.model.forward.scene.name}: posterior by {posterior.model.forward.kind}, "
         f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"
     )
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=140)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=140)
     plt.close(figure)
 
 

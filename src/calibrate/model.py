@@ -62,7 +62,7 @@ class Model:
         sd = self.noise.sd
         if sd is None:
             sd = numpyro.sample(NOISE_SD, dist.HalfNormal(self.noise.sd_scale))
-        mean = self.observe(prediction.displacement)
+        mean = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0))
         numpyro.sample("observed", dist.Normal(mean, sd).to_event(2), obs=data)
 
     def log_likelihood(self, displacement: jax.Array, sd: jax.Array, data: jax.Array) -> jax.Array:

@@ -8,11 +8,13 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from skfem import MeshTet
 
 from emulator.errors import InputError
 from emulator.forward import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
+
+# How far outside its element a point may lie, as a fraction of the element's height.
+_SLACK = 1e-2
 
 
 class Observation(Protocol):
@@ -106,27 +108,37 @@ def landmarks(scene: Scene, points: np.ndarray) -> Landmarks:
     Raises
     ------
     InputError
-        A point that lies in no element.
+        A point that lies in no element, nor just beside one.
     """
     points = np.atleast_2d(np.asarray(points, dtype=float))
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError(f"landmarks have shape {points.shape}; expected (d, 3), finite, in mm")
-    mesh = scene.mesh
-    skfem_mesh: MeshTet = mesh.to_skfem()
-    finder = skfem_mesh.element_finder()
-    elements = []
-    for k, point in enumerate(points):
-        try:
-            elements.append(int(finder(*point[:, None])[0]))
-        except ValueError as error:
-            raise InputError(
-                f"landmark {k} at {point.tolist()} mm lies outside the body"
-            ) from error
-    corners = mesh.elements[elements]
-    local = skfem_mesh.mapping().invF(points.T[:, :, None], tind=np.array(elements))[:, :, 0].T
-    weights = np.column_stack([1.0 - local.sum(axis=1), local])
+    elements, weights = zip(*(_locate(scene, k, x) for k, x in enumerate(points)), strict=True)
+    corners = scene.mesh.elements[list(elements)]
     nodes, position = np.unique(corners, return_inverse=True)
-    return Landmarks(nodes, points, position.reshape(corners.shape), weights)
+    return Landmarks(nodes, points, position.reshape(corners.shape), np.array(weights))
+
+
+def _locate(scene: Scene, k: int, point: np.ndarray) -> tuple[int, np.ndarray]:
+    """Element of ``point`` (3,) and its barycentric coordinates (4,) there.
+
+    Measured surface points rarely lie on the mesh to the last digit: a point outside by less than
+    ``_SLACK`` of its element's size is moved onto it.
+    """
+    corner = scene.mesh.nodes[scene.mesh.elements]
+    gradients = scene.discretisation.gradients[:, 0]  # constant in a linear tetrahedron
+    # The barycentric coordinate of corner a is 1 there and falls to 0 on the opposite face.
+    coordinates = 1.0 + np.einsum("mai,mai->ma", gradients, point - corner)
+    element = int(np.argmax(coordinates.min(axis=1)))
+    best = coordinates[element]
+    if best.min() < -_SLACK:
+        height = 1.0 / np.linalg.norm(gradients[element, int(np.argmin(best))])
+        raise InputError(
+            f"landmark {k} at {point.tolist()} mm lies outside the body, about "
+            f"{-best.min() * height:.2g} mm from element {element}"
+        )
+    inside = np.maximum(best, 0.0)
+    return element, inside / inside.sum()
 
 
 def observation_from(scene: Scene, description: dict[str, Any]) -> Observation:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,15 @@ import arviz_stats
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 import xarray as xr
 
 from calibrate.model import Model
 from calibrate.provenance import versions
 from calibrate.samplers import NUTSOptions, nuts
+from emulator.correct import CorrectedForward
 from emulator.errors import InputError
+from emulator.forward import ForwardMap
 from emulator.network import CachedEmulator
 from emulator.store import replacing
 
@@ -88,7 +91,7 @@ def read_tree(path: str | Path) -> xr.DataTree:
         raise InputError(f"posterior file {path} is truncated or not netCDF") from error
 
 
-def provenance(model: Model, seed: int, sampler: str) -> dict[str, Any]:
+def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> dict[str, Any]:
     """What is needed to know, and to repeat, how a posterior was made; plain JSON values."""
     scene = model.forward.scene
     record: dict[str, Any] = {
@@ -98,22 +101,39 @@ def provenance(model: Model, seed: int, sampler: str) -> dict[str, Any]:
         "forward": model.forward.kind,
         "observe": model.observe.describe(),
         "noise": model.noise.describe(),
-        "prior": {name: repr_distribution(d) for name, d in model.prior.items()},
+        "prior": {name: describe_distribution(d) for name, d in model.prior.items()},
         "sampler": sampler,
+        "sampler_options": asdict(options),
         "seed": seed,
         "versions": versions(),
     }
-    if isinstance(model.full, CachedEmulator):
-        record["emulator_fingerprint"] = model.full.emulator.fingerprint
+    fingerprint = emulator_fingerprint(model.full)
+    if fingerprint is not None:
+        record["emulator_fingerprint"] = fingerprint
     return record
 
 
-def repr_distribution(distribution: Any) -> str:
+def emulator_fingerprint(forward: ForwardMap) -> str | None:
+    """Fingerprint of the emulator inside a forward map, ``None`` when there is none."""
+    while isinstance(forward, CorrectedForward):
+        forward = forward.base
+    return forward.emulator.fingerprint if isinstance(forward, CachedEmulator) else None
+
+
+def describe_distribution(distribution: dist.Distribution) -> str:
     """A distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
-    arguments = ", ".join(
-        f"{name}={float(getattr(distribution, name))!r}" for name in distribution.arg_constraints
-    )
-    return f"{type(distribution).__name__}({arguments})"
+    parts = {name: getattr(distribution, name, None) for name in distribution.arg_constraints}
+    if isinstance(base := getattr(distribution, "base_dist", None), dist.Distribution):
+        parts["base"] = base
+    words = [
+        f"{name}={describe_distribution(v) if isinstance(v, dist.Distribution) else _plain(v)}"
+        for name, v in parts.items()
+    ]
+    return f"{type(distribution).__name__}({', '.join(words)})"
+
+
+def _plain(value: Any) -> str:
+    return repr(np.asarray(value).tolist())
 
 
 def sample(
@@ -140,7 +160,7 @@ def sample(
     tree.attrs.update(
         {
             key: value if isinstance(value, str | int) else json.dumps(value)
-            for key, value in provenance(model, seed, sampler).items()
+            for key, value in provenance(model, seed, sampler, options).items()
         }
     )
     return Posterior(tree, model, checked)

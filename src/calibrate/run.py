@@ -6,6 +6,7 @@ certified again or repeated.
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,11 @@ from calibrate.observations import (
     Observation,
     landmarks,
     nodal_displacements,
+    observation_from,
     spread_landmarks,
     spread_nodes,
 )
-from calibrate.posterior import Posterior, read_tree, sample
+from calibrate.posterior import Posterior, emulator_fingerprint, read_tree, sample
 from calibrate.samplers import NUTSOptions
 from emulator.correct import corrected
 from emulator.errors import InputError
@@ -65,10 +67,17 @@ class Run:
     emulator: str | None = None
     fem_runs: int = 30
     sampler: str = "nuts"
-    warmup: int = 1000
+    warmup: int = 500
     draws: int = 1000
     chains: int = 4
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("fem_runs", "warmup", "draws", "chains"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be 1 or more")
+        if self.seed < 0:
+            raise InputError(f"seed is {self.seed}; it must be 0 or more")
 
     @property
     def noise(self) -> GaussianNoise:
@@ -136,10 +145,13 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
     )
     if folder is not None:
         folder = Path(folder)
-        posterior.save(folder / POSTERIOR)
+        # An earlier result goes first and the posterior comes last: killed in between, the folder
+        # holds no posterior rather than one beside another's certificate.
+        for name in (CERTIFICATE, POSTERIOR):
+            (folder / name).unlink(missing_ok=True)
         write_data(folder / DATA, observe, data)
         write_json(folder / RUN, asdict(run))
-        (folder / CERTIFICATE).unlink(missing_ok=True)  # it was of an earlier posterior
+        posterior.save(folder / POSTERIOR)
     return posterior
 
 
@@ -155,9 +167,16 @@ def read_posterior(folder: str | Path, *, progress: bool = False) -> tuple[Run, 
     tree = read_tree(folder / POSTERIOR)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{folder / POSTERIOR} was made for another scene than '{run.scene}'")
-    observe, data = read_data(scene, folder / DATA)
+    observe = observation_from(scene, json.loads(tree.attrs["observe"]))
+    data = jnp.asarray(tree["observed_data"]["displacement"].values)
     built: Model = model(build_forward(run, scene, progress=progress), observe, run.noise)
-    return run, Posterior(tree, built, jnp.asarray(data))
+    made_with = tree.attrs.get("emulator_fingerprint")
+    if made_with != (found := emulator_fingerprint(built.full)):
+        raise InputError(
+            f"{folder / POSTERIOR} was made with emulator {made_with}, but "
+            f"'{run.emulator or scene.name}' is now {found}; infer again"
+        )
+    return run, Posterior(tree, built, data)
 
 
 def certify_and_keep(
@@ -180,6 +199,8 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "forward": run.forward,
         "parameters": table,
         "divergences": posterior.divergences,
+        "verdict": "not certified",
+        "k_hat": None,
         "draws": int(posterior.tree["posterior"].sizes["draw"]),
         "chains": int(posterior.tree["posterior"].sizes["chain"]),
     }

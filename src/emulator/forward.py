@@ -83,6 +83,29 @@ def inside_box(scene: Scene, theta: jax.Array) -> jax.Array:
     return jnp.all((position >= -1e-9) & (position <= 1.0 + 1e-9), axis=-1)
 
 
+def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
+    """``forward(theta)``, valid inside the box; outside it the value at the box's centre.
+
+    A map fitted inside the box means nothing outside, and may not even be finite there: its
+    gradient would reach a sampler through the branch not taken.
+    """
+    inside = inside_box(forward.scene, theta)
+    safe = jnp.where(inside[..., None], theta, forward.scene.centre)
+    return Prediction(forward(safe), inside)
+
+
+def rows_of(forward: ForwardMap, nodes: np.ndarray) -> np.ndarray:
+    """Positions of ``nodes`` among those of ``forward``; :class:`InputError` when one is not."""
+    nodes = check_nodes(forward.scene, nodes)
+    position = {int(node): k for k, node in enumerate(forward.nodes)}
+    missing = [int(node) for node in nodes if int(node) not in position]
+    if missing:
+        raise InputError(
+            f"node {missing[0]} is not among the {len(position)} this {forward.kind} map returns"
+        )
+    return np.array([position[int(node)] for node in nodes])
+
+
 @dataclass(frozen=True, eq=False)
 class FEMForward:
     """The simulator as a forward map, started at ``start`` each time (``None``: at rest)."""

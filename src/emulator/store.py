@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -49,9 +50,35 @@ def write_atomically(path: str | Path, content: bytes) -> None:
         os.fsync(file.fileno())
 
 
+def to_json(content: Any) -> str:
+    """``content`` as indented, valid JSON: numbers that are not finite become null."""
+    return json.dumps(_finite(content), indent=2, allow_nan=False)
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content
+
+
 def write_json(path: str | Path, content: Any) -> None:
-    """Write ``content`` as indented JSON."""
-    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+    """Write ``content`` as :func:`to_json` has it."""
+    write_atomically(path, (to_json(content) + "\n").encode())
+
+
+def check_folder(path: str | Path) -> Path:
+    """``path`` as a folder that can be written to, before hours are spent on what goes there."""
+    path = Path(path)
+    existing = path
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise InputError(f"cannot write to {path}: {existing} is not a folder one may write to")
+    return path
 
 
 def read_json(path: str | Path) -> Any:

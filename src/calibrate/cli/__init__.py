@@ -35,6 +35,10 @@ def main(words: Sequence[str] | None = None) -> int:
     except SolverError as error:
         print(f"calibrate: {error}", file=sys.stderr)
         return FAILED
+    except OSError as error:
+        what = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        print(f"calibrate: cannot read or write {what}", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print("calibrate: interrupted", file=sys.stderr)
         return FAILED

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
 from emulator.errors import InputError
+from emulator.store import to_json
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -60,7 +60,7 @@ def seconds(text: str) -> float:
 
 def emit(result: Any, *, as_json: bool, text: str) -> None:
     """Print ``result`` as JSON or ``text`` for people."""
-    print(json.dumps(result, indent=2) if as_json else text)
+    print(to_json(result) if as_json else text)
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -22,7 +22,7 @@ def register(commands: Any) -> None:
     """Add the commands."""
     parser = commands.add_parser("train", help="train an emulator")
     add_scene(parser)
-    parser.add_argument("--objective", choices=("energy", "simulations", "both"), default="both")
+    parser.add_argument("--objective", choices=("energy", "simulations", "both"))
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
         "--budget", metavar="TIME", help="time for everything, e.g. 10m (default 10m)"
@@ -30,7 +30,7 @@ def register(commands: Any) -> None:
     length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
     parser.add_argument("--simulations", type=int, help="FEM runs to train on")
     parser.add_argument("--batch", type=int, help="theta a step")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int)
     parser.add_argument(
         "--resume", action="store_true", help="continue from the checkpoint in --out"
     )
@@ -50,45 +50,51 @@ def register(commands: Any) -> None:
 def train(arguments: argparse.Namespace) -> int:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
+    from emulator.errors import InputError
     from emulator.network import save_emulator
     from emulator.scenes import find_scene
-    from emulator.training import Plan
+    from emulator.store import check_folder
+    from emulator.training import Plan, remove_checkpoint
     from emulator.training import train as train_emulator
 
     scene = find_scene(arguments.scene, arguments.root)
-    plan = Plan(objective=arguments.objective, seed=arguments.seed)
-    given = {name: getattr(arguments, name) for name in ("steps", "simulations", "batch")}
-    plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
-    budget = None if arguments.steps else seconds(arguments.budget or "10m")
+    check_folder(arguments.out)
+    names = ("objective", "steps", "simulations", "batch", "seed")
+    given = {name: getattr(arguments, name) for name in names}
+    given = {name: value for name, value in given.items() if value is not None}
+    if arguments.resume and (given or arguments.budget):
+        option = next(iter(given), "budget")
+        raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
+    fixed = arguments.resume or "steps" in given
     result = train_emulator(
         scene,
-        plan,
+        Plan(**given),
         arguments.out,
-        budget=budget,
+        budget=None if fixed else seconds(arguments.budget or "10m"),
         resume=arguments.resume,
         progress=show_progress(arguments),
     )
     record = {
         **result.record,
-        "command": command_line(arguments),
+        "command": command_line(arguments.scene, result.record["plan"]),
+        "budget": arguments.budget,
         "hardware": hardware(),
         "versions": versions(),
     }
     result = replace(result, record=record)
     save_emulator(result, arguments.out)
+    remove_checkpoint(arguments.out)
     steps = record["plan"]["steps"]
     text = f"trained {scene.name}: {steps} steps, {record['seconds']:.0f} s, in {arguments.out}"
     emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
     return DONE
 
 
-def command_line(arguments: argparse.Namespace) -> str:
-    """The command that repeats this training; folders are left out, they are the user's own."""
-    words = ["calibrate train", arguments.scene, "--objective", arguments.objective]
-    for name in ("budget", "steps", "simulations", "batch"):
-        if getattr(arguments, name) is not None:
-            words += [f"--{name}", str(getattr(arguments, name))]
-    return " ".join([*words, "--seed", str(arguments.seed), "--out", "DIR"])
+def command_line(scene: str, plan: dict[str, Any]) -> str:
+    """The command that repeats a training exactly, whatever interrupted or hurried it."""
+    names = ("objective", "steps", "simulations", "batch", "seed")
+    options = " ".join(f"--{name} {plan[name]}" for name in names)
+    return f"calibrate train {scene} {options} --out DIR"
 
 
 def evaluate(arguments: argparse.Namespace) -> int:

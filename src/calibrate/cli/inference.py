@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from calibrate.cli.common import (
@@ -58,9 +59,12 @@ def register(commands: Any) -> None:
     )
     parser.add_argument("--sampler", choices=("nuts",), default="nuts")
     parser.add_argument("--draws", type=int, default=1000)
-    parser.add_argument("--warmup", type=int, default=1000)
+    parser.add_argument("--warmup", type=int, default=500)
     parser.add_argument("--chains", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--no-certify", action="store_true", help="leave the check against FEM for later"
+    )
     parser.add_argument("--out", required=True, metavar="DIR")
     add_json(parser)
     parser.set_defaults(run=infer)
@@ -91,19 +95,21 @@ def demo(arguments: argparse.Namespace) -> int:
 
 def infer(arguments: argparse.Namespace) -> int:
     """Sample and keep a posterior."""
-    from calibrate.run import Run, report
+    from calibrate.run import Run, certify_and_keep, report
     from calibrate.run import infer as run_inference
+    from emulator.store import check_folder
 
+    folder, progress = check_folder(arguments.out), show_progress(arguments)
     run = Run(
-        scene=arguments.scene,
-        root=arguments.root,
-        data=arguments.data,
+        scene=_absolute(arguments.scene, is_path=arguments.scene.endswith(".toml")),
+        root=arguments.root and _absolute(arguments.root),
+        data=_absolute(arguments.data, is_path=arguments.data != "synthetic"),
         truth=assignments(arguments.truth),
         observe=arguments.observe,
         noise_sd=arguments.noise,
         noise_scale=arguments.noise_scale,
         forward=arguments.forward,
-        emulator=arguments.emulator,
+        emulator=_emulator(arguments.emulator),
         fem_runs=arguments.fem_runs,
         sampler=arguments.sampler,
         warmup=arguments.warmup,
@@ -111,11 +117,25 @@ def infer(arguments: argparse.Namespace) -> int:
         chains=arguments.chains,
         seed=arguments.seed,
     )
-    posterior = run_inference(run, arguments.out, progress=show_progress(arguments))
-    result = report(run, posterior, None)
-    text = f"{summary(result)}\nwritten; check it with: calibrate certify {arguments.out}"
+    posterior = run_inference(run, folder, progress=progress)
+    certificate = None
+    if not arguments.no_certify:
+        certificate = certify_and_keep(posterior, folder, progress=progress)
+    result = report(run, posterior, certificate)
+    text = f"{summary(result)}\nwritten to {arguments.out}"
     emit(result, as_json=arguments.json, text=text)
-    return DONE
+    return DONE if certificate is None or certificate.verdict == "accepted" else FAILED
+
+
+def _absolute(word: str, *, is_path: bool = True) -> str:
+    """A path that still means the same from another folder, kept results being read from any."""
+    return str(Path(word).resolve()) if is_path else word
+
+
+def _emulator(word: str | None) -> str | None:
+    from emulator.network import shipped
+
+    return word if word is None or word in shipped() else _absolute(word)
 
 
 def certify(arguments: argparse.Namespace) -> int:
@@ -149,10 +169,13 @@ def summary(report: dict[str, Any]) -> str:
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
         f", forward map: {report['forward']}"
     )
-    if "verdict" in report:
+    if "certificate" not in report:
+        lines.append("not checked against FEM yet: calibrate certify")
+    else:
         c = report["certificate"]
         lines.append(
             f"verdict: {report['verdict']} (Pareto k {c['k_hat']:.2f}, "
-            f"at most {c['k_threshold']:.2f}; {c['draws']} FEM runs, {c['failed']} failed)"
+            f"at most {c['k_threshold']:.2f}; {c['draws']} FEM runs, {c['failed']} failed): "
+            f"{c['reason']}"
         )
     return "\n".join(lines)

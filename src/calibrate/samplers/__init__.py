@@ -2,6 +2,4 @@
 
 from calibrate.samplers.nuts import NUTSOptions, nuts
 
-SAMPLERS = ("nuts",)
-
-__all__ = ["SAMPLERS", "NUTSOptions", "nuts"]
+__all__ = ["NUTSOptions", "nuts"]

@@ -22,6 +22,7 @@ from numpyro.infer.util import initialize_model
 
 from calibrate.model import Model
 from calibrate.samplers import shear
+from emulator.errors import InputError
 
 _STATS = ("diverging", "accept_prob", "num_steps", "potential_energy", "energy")
 _NAMES = {"accept_prob": "acceptance_rate", "num_steps": "n_steps", "potential_energy": "lp"}
@@ -35,6 +36,13 @@ class NUTSOptions:
     draws: int = 1000
     chains: int = 4
     target_accept: float = 0.85
+
+    def __post_init__(self) -> None:
+        for name in ("warmup", "draws", "chains"):
+            if getattr(self, name) < 1:
+                raise InputError(f"NUTS: {name} is {getattr(self, name)}; it must be 1 or more")
+        if not 0.0 < self.target_accept < 1.0:
+            raise InputError(f"NUTS: target_accept is {self.target_accept}; give one in (0, 1)")
 
 
 class _Compiled(NamedTuple):

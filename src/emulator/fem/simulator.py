@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from emulator.fem.assembly import System
 from emulator.fem.newton import NewtonOptions, newton
-from emulator.fem.solution import Solution
+from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import Factorisation, quiet_blas
 from emulator.scenes.scene import Scene
 
@@ -56,10 +56,30 @@ class Simulator:
         """Equilibrium at ``theta`` (p,), from ``start`` (n, 3) mm or from rest.
 
         The displacement is differentiable in ``theta``; ``start`` only affects the time taken.
-        Never raises on a hard case: read ``status``.
+        Never raises on a hard case: read ``status``. (Inside ``jit`` the direct solver does raise
+        on a tangent that is singular to the last bit.)
         """
         start = self.rest if start is None else start
-        return self._solve(jnp.asarray(theta, dtype=float), jax.lax.stop_gradient(start))
+        theta = jnp.asarray(theta, dtype=float)
+        try:
+            solution = self._solve(theta, jax.lax.stop_gradient(start))
+            if not isinstance(solution.status, jax.core.Tracer):
+                jax.block_until_ready(solution)
+        except jax.errors.JaxRuntimeError as error:
+            if "singular" not in str(error):
+                raise
+            return self._singular()
+        return solution
+
+    def _singular(self) -> Solution:
+        """What the direct solver's refusal of an exactly singular tangent amounts to."""
+        return Solution(
+            displacement=self.rest,
+            status=jnp.asarray(Status.SINGULAR_TANGENT, dtype=jnp.int64),
+            iterations=jnp.asarray(0),
+            residual=jnp.asarray(jnp.inf),
+            load_reached=jnp.asarray(0.0),
+        )
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (n, 3) in mm; :class:`SolverError` when it does not converge.

@@ -18,6 +18,7 @@ class Status(IntEnum):
     ITERATION_LIMIT = 1
     LOAD_LIMIT = 2
     INVALID_INPUT = 3
+    SINGULAR_TANGENT = 4
     RUNNING = 9
 
     @property
@@ -31,6 +32,7 @@ _TEXT = {
     Status.ITERATION_LIMIT: "iteration limit reached",
     Status.LOAD_LIMIT: "load limit reached: no equilibrium found at the full load",
     Status.INVALID_INPUT: "theta or the starting displacement is not finite",
+    Status.SINGULAR_TANGENT: "singular tangent: stiffness vanishes or the supports are too few",
     Status.RUNNING: "still running",
 }
 

@@ -6,7 +6,7 @@ import numpy as np
 from skfem import MeshTet
 
 from emulator.errors import InputError
-from emulator.geometry.mesh import Mesh, orient
+from emulator.geometry.mesh import Mesh, boundary_facets, orient
 
 _FACES = (
     ("left", 0, 0),
@@ -28,7 +28,7 @@ def box(lengths: tuple[float, float, float], cells: tuple[int, int, int]) -> Mes
 
     Returns
     -------
-    Mesh with node sets left/right (x), front/back (y), bottom/top (z).
+    Mesh with node sets and facet sets left/right (x), front/back (y), bottom/top (z).
     """
     if min(lengths) <= 0.0 or min(cells) < 1:
         raise InputError(f"box: lengths {lengths} and cells {cells} must be positive")
@@ -44,4 +44,7 @@ def box(lengths: tuple[float, float, float], cells: tuple[int, int, int]) -> Mes
         name: np.flatnonzero(nodes[:, axis] == (axes[axis][0], axes[axis][-1])[end])
         for name, axis, end in _FACES
     }
-    return Mesh(nodes, orient(nodes, elements), sets)
+    elements = orient(nodes, elements)
+    surface = boundary_facets(elements)
+    facets = {name: surface[np.isin(surface, inside).all(axis=1)] for name, inside in sets.items()}
+    return Mesh(nodes, elements, sets, facets)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import meshio
@@ -24,10 +26,15 @@ def read_mesh(path: str | Path) -> Mesh:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"mesh file {path} does not exist")
+    said = io.StringIO()
     try:
-        found = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio's readers raise whatever they meet, or exit
-        raise InputError(f"mesh file {path} cannot be read as a mesh: {_line(error)}") from error
+        # meshio's readers raise whatever they meet, or print and exit.
+        with redirect_stdout(said), redirect_stderr(said):
+            found = meshio.read(path)
+    except (Exception, SystemExit) as error:
+        reason = said.getvalue() if isinstance(error, SystemExit) else str(error)
+        reason = " ".join(reason.split())[:160] or type(error).__name__
+        raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
     kinds = sorted({block.type for block in found.cells})
     tetrahedra = [block.data for block in found.cells if block.type == "tetra"]
     if not tetrahedra:
@@ -36,10 +43,6 @@ def read_mesh(path: str | Path) -> Mesh:
     if other:
         raise InputError(f"mesh file {path} also has {', '.join(other)}; only tetra is supported")
     return Mesh(found.points, np.concatenate(tetrahedra))
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:160] or type(error).__name__
 
 
 def write_displacement(

@@ -38,6 +38,17 @@ def orient(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
     return elements
 
 
+def boundary_facets(elements: np.ndarray) -> np.ndarray:
+    """Surface triangles (k, 3) of positively oriented tetrahedra, their normals pointing out."""
+    faces = np.concatenate(
+        [elements[:, face] for face in ([1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1])]
+    )
+    _, first, counts = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return faces[first[counts == 1]]
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Linear tetrahedra.
@@ -47,6 +58,7 @@ class Mesh:
     nodes : (n, 3) reference coordinates, mm.
     elements : (m, 4) corner indices, positively oriented.
     node_sets : name -> (k,) node indices.
+    facet_sets : name -> (k, 3) corner indices of surface triangles.
 
     Raises
     ------
@@ -57,14 +69,18 @@ class Mesh:
     nodes: np.ndarray
     elements: np.ndarray
     node_sets: Mapping[str, np.ndarray] = field(default_factory=dict)
+    facet_sets: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", frozen_array(self.nodes))
         object.__setattr__(self, "elements", frozen_array(self.elements, np.int64))
         sets = {name: frozen_array(nodes, np.int64) for name, nodes in self.node_sets.items()}
         object.__setattr__(self, "node_sets", MappingProxyType(sets))
+        facets = {name: frozen_array(rows, np.int64) for name, rows in self.facet_sets.items()}
+        object.__setattr__(self, "facet_sets", MappingProxyType(facets))
         self._check_shapes()
         self._check_volumes()
+        self._check_facets()
 
     def _check_shapes(self) -> None:
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 3:
@@ -99,6 +115,17 @@ class Mesh:
                     f"{len(self.elements)}; repair the mesh or reorder its corners"
                 )
 
+    def _check_facets(self) -> None:
+        if not self.facet_sets:
+            return
+        surface = {tuple(row) for row in np.sort(boundary_facets(self.elements), axis=1).tolist()}
+        for name, facets in self.facet_sets.items():
+            if facets.ndim != 2 or facets.shape[1:] != (3,) or not len(facets):
+                raise InputError(f"mesh: facet set '{name}' has shape {facets.shape}; not (k, 3)")
+            for row in np.sort(facets, axis=1).tolist():
+                if tuple(row) not in surface:
+                    raise InputError(f"mesh: facet {row} of set '{name}' is not on the surface")
+
     @property
     def size(self) -> float:
         """Length of the bounding box's diagonal, mm."""
@@ -110,6 +137,13 @@ class Mesh:
             known = ", ".join(sorted(self.node_sets)) or "none"
             raise InputError(f"node set '{name}' is not in the mesh; its sets: {known}")
         return self.node_sets[name]
+
+    def facet_set(self, name: str) -> np.ndarray:
+        """Corners (k, 3) of the facets in set ``name``; :class:`InputError` lists the sets."""
+        if name not in self.facet_sets:
+            known = ", ".join(sorted(self.facet_sets)) or "none"
+            raise InputError(f"facet set '{name}' is not in the mesh; its sets: {known}")
+        return self.facet_sets[name]
 
     def to_skfem(self) -> MeshTet:
         """The same mesh for scikit-fem (corner order kept, hence no sorting)."""

@@ -32,9 +32,7 @@ class PublishedUnits:
 _CGS = PublishedUnits(length=10.0, stress=1e-4)
 UNITS = {
     "OnceClampedBeam": _CGS,
-    "TwiceClampedBeam": _CGS,
     "TwistingBeam": PublishedUnits(length=1.0, stress=1.0),  # dimensionless
-    "Liver": _CGS,
 }
 
 
@@ -52,18 +50,31 @@ class PublishedTests:
     displacement: np.ndarray | None
 
 
-def _array(root: str | Path, model: str, part: str) -> np.ndarray:
+Shape = tuple[int | None, ...]
+
+
+def _array(root: str | Path, model: str, part: str, shape: Shape | None = None) -> np.ndarray:
+    """A finite array of the given shape, ``None`` standing for any length."""
     path = Path(root) / model / part
     if not path.is_file():
         raise InputError(f"published data: {path} is missing; give the folder that holds {model}/")
     try:
-        return np.load(path, allow_pickle=False)
+        array = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise InputError(f"published data: {path} is not a readable .npy array") from error
+    if shape is not None and (
+        array.ndim != len(shape)
+        or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True))
+    ):
+        wanted = tuple("any" if length is None else length for length in shape)
+        raise InputError(f"published data: {path} has shape {array.shape}; expected {wanted}")
+    if not np.isfinite(array).all():
+        raise InputError(f"published data: {path} has values that are not finite")
+    return array
 
 
-def _array_if_there(root: str | Path, model: str, part: str) -> np.ndarray | None:
-    return _array(root, model, part) if (Path(root) / model / part).is_file() else None
+def _array_if_there(root: str | Path, model: str, part: str, shape: Shape) -> np.ndarray | None:
+    return _array(root, model, part, shape) if (Path(root) / model / part).is_file() else None
 
 
 def units(model: str) -> PublishedUnits:
@@ -76,11 +87,17 @@ def units(model: str) -> PublishedUnits:
 def read_mesh(root: str | Path, model: str) -> tuple[Mesh, np.ndarray]:
     """The mesh in mm, with node set ``held``, and the prescribed displacement of that set, mm."""
     scale = units(model).length
-    nodes = _array(root, model, "geometryData/reference-coords.npy") * scale
-    elements = _array(root, model, "geometryData/elements.npy")
-    interior = _array(root, model, "geometryData/interior-points.npy").reshape(-1).astype(bool)
-    held = np.flatnonzero(~interior)
-    moved = _array_if_there(root, model, "geometryData/disp-add.npy")
+    nodes = _array(root, model, "geometryData/reference-coords.npy", (None, 3)) * scale
+    elements = _array(root, model, "geometryData/elements.npy", (None, 4)).astype(np.int64)
+    if elements.min() < 0 or elements.max() >= len(nodes):
+        raise InputError(f"published data: elements of {model} name nodes there are none of")
+    interior = _array(root, model, "geometryData/interior-points.npy").reshape(-1)
+    if len(interior) != len(nodes):
+        raise InputError(
+            f"published data: {model} marks {len(interior)} nodes but has {len(nodes)}"
+        )
+    held = np.flatnonzero(~interior.astype(bool))
+    moved = _array_if_there(root, model, "geometryData/disp-add.npy", nodes.shape)
     displacement = np.zeros((len(held), 3)) if moved is None else moved[held] * scale
     # The release leaves the orientation of its elements open.
     return Mesh(nodes, orient(nodes, elements), {"held": held}), displacement
@@ -88,10 +105,12 @@ def read_mesh(root: str | Path, model: str) -> tuple[Mesh, np.ndarray]:
 
 def read_tests(root: str | Path, model: str) -> PublishedTests:
     """The test solutions of ``model``."""
-    unit = units(model)
-    displacement = _array_if_there(root, model, "simulationData/test/displacement.npy")
+    unit, folder = units(model), "simulationData/test"
+    theta = _array(root, model, f"{folder}/theta.npy", (None, None))
+    shape = (len(theta), None, 3)
+    displacement = _array_if_there(root, model, f"{folder}/displacement.npy", shape)
     return PublishedTests(
-        theta=_array(root, model, "simulationData/test/theta.npy"),
-        energy=_array(root, model, "simulationData/test/pe-values.npy") * unit.energy,
+        theta=theta,
+        energy=_array(root, model, f"{folder}/pe-values.npy", (len(theta),)) * unit.energy,
         displacement=None if displacement is None else displacement * unit.length,
     )

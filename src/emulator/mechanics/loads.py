@@ -30,8 +30,14 @@ class Gravity:
     def __post_init__(self) -> None:
         if not np.isfinite(self.density) or self.density < 0.0:
             raise InputError(f"gravity: density is {self.density} g/cm3; it must be 0 or more")
-        if len(self.direction) != 3 or not np.linalg.norm(self.direction) > 0.0:
+        if not np.isfinite(self.acceleration):
+            raise InputError(f"gravity: acceleration is {self.acceleration} m/s2")
+        if len(self.direction) != 3 or not 0.0 < np.linalg.norm(self.direction) < np.inf:
             raise InputError(f"gravity: direction is {self.direction}; give 3 numbers, not all 0")
+
+    def describe(self) -> list[object]:
+        """What tells this load from another, however it was written."""
+        return ["gravity", *(float(x) + 0.0 for x in np.round(self.body_force, 12))]
 
     @property
     def body_force(self) -> np.ndarray:

@@ -20,8 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from emulator.errors import InputError
-from emulator.forward import Prediction, all_nodes, check_nodes, inside_box
+from emulator.forward import Prediction, all_nodes, check_nodes, inside_only, rows_of
 from emulator.network.graph import AugmentedGraph
 from emulator.network.pignn import Architecture, Decoder, build
 from emulator.scenes.scene import Scene
@@ -95,16 +94,6 @@ class Emulator:
         prepared = jax.jit(lambda: network.decoder.prepare(network.processor(self.graph)))()
         return CachedEmulator(self, network.decoder, prepared[:, nodes], nodes)
 
-    def require_scene(self, scene: Scene) -> Emulator:
-        """The emulator itself, or :class:`InputError` when it was trained for another scene."""
-        if scene.fingerprint != self.scene.fingerprint:
-            raise InputError(
-                f"the emulator was trained for scene '{self.scene.name}' "
-                f"({self.scene.fingerprint}), not for '{scene.name}' ({scene.fingerprint}); "
-                "train one for this scene"
-            )
-        return self
-
 
 def definition(architecture: Architecture, graph: AugmentedGraph, parameters: int) -> nnx.GraphDef:
     """Structure of the network for these sizes."""
@@ -147,14 +136,9 @@ class CachedEmulator:
 
     def evaluate(self, theta: jax.Array) -> Prediction:
         """Displacement and whether ``theta`` is inside the box the emulator was trained on."""
-        return Prediction(self(theta), inside_box(self.scene, theta))
+        return inside_only(self, theta)
 
     def at(self, nodes: np.ndarray) -> CachedEmulator:
         """The same map decoding only ``nodes``, which must be among those cached."""
-        nodes = check_nodes(self.scene, nodes)
-        position = {int(node): k for k, node in enumerate(self.nodes)}
-        missing = [int(node) for node in nodes if int(node) not in position]
-        if missing:
-            raise InputError(f"node {missing[0]} is not in this cache; cache all nodes first")
-        rows = np.array([position[int(node)] for node in nodes])
-        return replace(self, prepared=self.prepared[:, rows], nodes=nodes)
+        rows = rows_of(self, nodes)
+        return replace(self, prepared=self.prepared[:, rows], nodes=self.nodes[rows])

@@ -56,7 +56,8 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
 
     Parameters
     ----------
-    name : a folder written by :func:`save_emulator`, or one of :func:`shipped`.
+    name : one of :func:`shipped`, else a folder written by :func:`save_emulator`; write ``./name``
+        for a folder called like a shipped one.
     scene : the scene it must match; by default the one it was trained for is made again.
 
     Raises
@@ -64,14 +65,12 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
     InputError
         Missing or damaged files, or a scene that is not the one it was trained for.
     """
-    folder = Path(name)
+    folder = SHIPPED / str(name) if str(name) in shipped() else Path(name)
     if not (folder / "emulator.json").is_file():
-        if str(name) not in shipped():
-            raise InputError(
-                f"emulator '{name}' is neither a folder with emulator.json nor shipped; "
-                f"shipped: {', '.join(shipped()) or 'none'}"
-            )
-        folder = SHIPPED / str(name)
+        raise InputError(
+            f"emulator '{name}' is neither shipped nor a folder with emulator.json; "
+            f"shipped: {', '.join(shipped()) or 'none'}"
+        )
     description = read_json(folder / "emulator.json")
     try:
         if description["format"] != FORMAT:

@@ -19,7 +19,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from emulator.errors import InputError
-from emulator.forward import Prediction, all_nodes, check_nodes, inside_box
+from emulator.forward import Prediction, all_nodes, inside_only, rows_of
 from emulator.scenes.scene import Scene
 from emulator.training.campaign import Runs
 
@@ -53,17 +53,14 @@ class ReducedForward:
 
     def evaluate(self, theta: jax.Array) -> Prediction:
         """Displacement and whether ``theta`` is inside the box of the FEM runs."""
-        return Prediction(self(theta), inside_box(self.scene, theta))
+        return inside_only(self, theta)
 
     def at(self, nodes: np.ndarray) -> ReducedForward:
         """The same map, returning only ``nodes``; all must be among the present ones."""
-        nodes = check_nodes(self.scene, nodes)
-        position = {int(node): k for k, node in enumerate(self.nodes)}
-        missing = [int(node) for node in nodes if int(node) not in position]
-        if missing:
-            raise InputError(f"node {missing[0]} is not in this reduced model")
-        rows = np.array([position[int(node)] for node in nodes])
-        return replace(self, nodes=nodes, mean=self.mean[rows], modes=self.modes[:, rows])
+        rows = rows_of(self, nodes)
+        return replace(
+            self, nodes=self.nodes[rows], mean=self.mean[rows], modes=self.modes[:, rows]
+        )
 
 
 def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> ReducedForward:

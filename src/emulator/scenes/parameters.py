@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,8 +31,10 @@ class Parameter:
     scale: Literal["log", "uniform"] = "uniform"
 
     def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise InputError(f"parameter '{self.name}': range [{self.low}, {self.high}] is empty")
+        if not -math.inf < self.low < self.high < math.inf:
+            raise InputError(
+                f"parameter '{self.name}': range [{self.low}, {self.high}] is empty or not finite"
+            )
         if self.scale not in ("log", "uniform"):
             raise InputError(f"parameter '{self.name}': scale '{self.scale}'; use log or uniform")
         if self.scale == "log" and self.low <= 0.0:

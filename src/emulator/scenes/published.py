@@ -44,14 +44,18 @@ def published_scene(model: str, root: str | Path) -> Scene:
         parameters=parameters,
         loads=loads,
         supports=(Support("held", displacement),),
-        recipe={"scene": f"published:{model}", "root": str(root)},
+        recipe={"scene": f"published:{model}", "root": str(Path(root).resolve())},
     )
 
 
 def published_tests(model: str, root: str | Path) -> tuple[jax.Array, PublishedTests]:
     """Theta (c, p) in the scene's units, and the stored solutions they belong to."""
+    if model not in _MODELS:
+        raise InputError(f"published model '{model}' is unknown; known: {', '.join(MODELS)}")
     tests = read_tests(root, model)
     _, parameters, _ = _MODELS[model]
+    if tests.theta.shape[1] != len(parameters):
+        raise InputError(f"published model '{model}': theta has shape {tests.theta.shape}")
     stress = units(model).stress
     scale = jnp.array([stress if parameter.unit == "kPa" else 1.0 for parameter in parameters])
     return jnp.asarray(tests.theta) * scale, tests

@@ -81,9 +81,24 @@ class Scene:
         for name in self.law.parameters:
             if name not in given:
                 raise InputError(f"scene '{self.name}': law '{self.law.name}' needs '{name}'")
+        if not self.parameters:
+            raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
+        for name, value in self.constants.items():
+            if not np.isfinite(value):
+                raise InputError(f"scene '{self.name}': constant '{name}' is {value}")
+        self._check_supports()
+
+    def _check_supports(self) -> None:
         if not self.supports:
             raise InputError(f"scene '{self.name}': no support, the body could move freely")
-        _ = self.prescribed  # checks the supports against the mesh
+        points = self.mesh.nodes[self.held.all(axis=1)]
+        # A held point leaves three rotations, a held line one.
+        spans = np.linalg.matrix_rank(points - points[:1], tol=1e-9 * self.mesh.size)
+        if spans < 2:
+            raise InputError(
+                f"scene '{self.name}': the {len(points)} held nodes lie on a "
+                f"{'point' if spans == 0 else 'line'}, about which the body could turn freely"
+            )
 
     # ---- parameters -------------------------------------------------------------------------
     @property
@@ -164,6 +179,8 @@ class Scene:
         values = np.zeros(self.mesh.nodes.shape)
         for support in self.supports:
             nodes = self.mesh.node_set(support.node_set)
+            if not np.isfinite(support.displacement).all():
+                raise InputError(f"support on '{support.node_set}': displacement is not finite")
             if support.displacement.shape not in ((3,), (len(nodes), 3)):
                 raise InputError(
                     f"support on '{support.node_set}': displacement has shape "
@@ -192,15 +209,16 @@ class Scene:
     def fingerprint(self) -> str:
         """Short hash of all that shapes the solution; equal scenes have equal fingerprints."""
         digest = hashlib.sha256()
-        digest.update(np.round(self.mesh.nodes, 9).tobytes())
+        # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
+        digest.update((np.round(self.mesh.nodes, 9) + 0.0).tobytes())
         digest.update(np.sort(self.mesh.elements, axis=1).tobytes())
         digest.update(self.held.tobytes())
-        digest.update(np.round(self.held_displacement, 9).tobytes())
+        digest.update((np.round(self.held_displacement, 9) + 0.0).tobytes())
         description = {
             "law": self.law.name,
-            "constants": dict(sorted(self.constants.items())),
-            "parameters": [[p.name, p.low, p.high, p.scale] for p in self.parameters],
-            "loads": [repr(load) for load in self.loads],
+            "constants": {name: float(self.constants[name]) for name in sorted(self.constants)},
+            "parameters": [[p.name, float(p.low), float(p.high), p.scale] for p in self.parameters],
+            "loads": [load.describe() for load in self.loads],
         }
         digest.update(json.dumps(description, sort_keys=True).encode())
         return digest.hexdigest()[:16]

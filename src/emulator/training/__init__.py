@@ -2,6 +2,6 @@
 
 from emulator.training.campaign import Runs, run_campaign
 from emulator.training.sampling import sobol, uniform
-from emulator.training.trainer import Plan, train
+from emulator.training.trainer import Plan, remove_checkpoint, train
 
-__all__ = ["Plan", "Runs", "run_campaign", "sobol", "train", "uniform"]
+__all__ = ["Plan", "Runs", "remove_checkpoint", "run_campaign", "sobol", "train", "uniform"]

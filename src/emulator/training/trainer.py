@@ -16,7 +16,7 @@ import optax
 from flax import nnx
 from tqdm import tqdm
 
-from emulator.errors import InputError
+from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.network.emulator import Emulator, fresh
 from emulator.network.graph import augment
@@ -135,13 +135,14 @@ def _make_step(
         value, slope = jax.value_and_grad(lambda w: loss(emulator.predict(w, batch.theta), batch))(
             weights
         )
-        # A step whose gradient is not finite is skipped.
-        fine = jnp.isfinite(optax.tree.norm(slope))
-        slope = jax.tree.map(lambda g: jnp.where(fine, g, 0.0), slope)
-        updates, state = optimiser.update(slope, state, weights)
+        updates, moved = optimiser.update(slope, state, weights)
         rate = learning_rate(plan.learning_rate, number, total)
         updates = jax.tree.map(lambda d: (-rate * d).astype(d.dtype), updates)
-        return optax.apply_updates(weights, updates), state, value
+        new = optax.apply_updates(weights, updates), moved
+        # A step whose gradient is not finite is not taken.
+        fine = jnp.isfinite(optax.tree.norm(slope))
+        weights, state = jax.tree.map(lambda a, b: jnp.where(fine, a, b), new, (weights, state))
+        return weights, state, value
 
     return jax.jit(step, donate_argnums=(0, 1))
 
@@ -166,11 +167,13 @@ def train(
 
     Parameters
     ----------
-    folder : where checkpoints go. The finished emulator is returned, not written.
+    folder : where checkpoints go. The finished emulator is returned, not written; remove the last
+        checkpoint with :func:`remove_checkpoint` once it is safe.
     budget : seconds for everything (FEM runs, compilation, training); replaces ``plan.steps`` by
-        as many as fit.
-    resume : continue from the checkpoint in ``folder``, under the plan it was written with; the
-        result equals that of a run that was never interrupted.
+        as many as fit, aimed again as the machine gets busier or less so.
+    resume : continue from the checkpoint in ``folder``, under the plan it was written with. For a
+        plan in steps the result equals that of a run never interrupted; one on a budget keeps the
+        number of steps it was aiming at.
     """
     started = time.perf_counter()
     checkpoint = Path(folder) / CHECKPOINT
@@ -209,11 +212,15 @@ def train(
             _write_checkpoint(checkpoint, scene, plan, (weights, state, done), seconds)
     bar.close()
     if not np.isfinite(loss):
-        raise InputError("training ended in a loss that is not finite; lower the learning rate")
-    checkpoint.unlink(missing_ok=True)
+        raise SolverError("training ended in a loss that is not finite; lower the learning rate")
     seconds = round(spent + time.perf_counter() - started, 1)
     record = {"plan": asdict(plan), "seconds": seconds, "final_loss": loss}
     return replace(problem.emulator, weights=weights, record=record)
+
+
+def remove_checkpoint(folder: str | Path) -> None:
+    """Remove the checkpoint in ``folder``, if there is one."""
+    (Path(folder) / CHECKPOINT).unlink(missing_ok=True)
 
 
 def _steps_within(seconds: float, problem: Problem, total: int) -> int:
