@@ -130,15 +130,19 @@ def _locate(scene: Scene, k: int, point: np.ndarray) -> tuple[int, np.ndarray]:
     # The barycentric coordinate of corner a is 1 there and falls to 0 on the opposite face.
     coordinates = 1.0 + np.einsum("mai,mai->ma", gradients, point - corner)
     element = int(np.argmax(coordinates.min(axis=1)))
-    best = coordinates[element]
-    if best.min() < -_SLACK:
-        height = 1.0 / np.linalg.norm(gradients[element, int(np.argmin(best))])
+    best, slopes = coordinates[element], gradients[element]
+    lowest = int(np.argmin(best))
+    inside = best
+    if best[lowest] < 0.0:  # straight back onto the face it lies beyond
+        slope = slopes[lowest]
+        inside = np.maximum(best - best[lowest] * (slopes @ slope) / (slope @ slope), 0.0)
+        inside /= inside.sum()
+    if best[lowest] < -_SLACK:
+        distance = np.linalg.norm(inside @ corner[element] - point)
         raise InputError(
-            f"landmark {k} at {point.tolist()} mm lies outside the body, about "
-            f"{-best.min() * height:.2g} mm from element {element}"
+            f"landmark {k} at {point.tolist()} mm lies outside the body, about {distance:.2g} mm away"
         )
-    inside = np.maximum(best, 0.0)
-    return element, inside / inside.sum()
+    return element, inside
 
 
 def observation_from(scene: Scene, description: dict[str, Any]) -> Observation:

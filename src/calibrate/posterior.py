@@ -123,7 +123,10 @@ def emulator_fingerprint(forward: ForwardMap) -> str | None:
 def describe_distribution(distribution: dist.Distribution) -> str:
     """A distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
     parts = {name: getattr(distribution, name, None) for name in distribution.arg_constraints}
-    if isinstance(base := getattr(distribution, "base_dist", None), dist.Distribution):
+    base = getattr(distribution, "base_dist", None)
+    # A named transform such as LogUniform says it all by its own arguments.
+    named = isinstance(distribution, dist.TransformedDistribution) and parts
+    if isinstance(base, dist.Distribution) and not named:
         parts["base"] = base
     words = [
         f"{name}={describe_distribution(v) if isinstance(v, dist.Distribution) else _plain(v)}"

@@ -58,6 +58,14 @@ def test_failed_fem_runs_count():
     assert judge(ratios, draws).verdict == "not certified"
 
 
+def test_a_stuck_sampler_is_not_accepted():
+    stuck = judge(np.zeros(100), {"x": np.ones(100)})
+    assert (stuck.verdict, stuck.reason) == ("not certified", "a parameter has no spread")
+    apart = judge(*gaussian_case(0.0, 1.0), r_hat=1.2)
+    assert (apart.verdict, apart.reason) == ("not certified", "the chains disagree, R-hat 1.200")
+    assert judge(*gaussian_case(0.0, 1.0), r_hat=float("nan")).verdict == "not certified"
+
+
 def test_threshold():
     # 1 - 1 / log10(100) = 0.5; capped at 0.7 from about 2200 draws on.
     assert pareto_threshold(100) == pytest.approx(0.5)
@@ -92,6 +100,19 @@ def test_certify_sees_the_error_of_the_forward_map(posterior, beam):
     assert cal.certify(posterior, LinearSimulator(near)).verdict == "accepted"
     far = replace(forward, shift=forward.shift + 1.0)  # ten noise sd
     assert cal.certify(posterior, LinearSimulator(far)).verdict == "not certified"
+
+
+def test_certify_with_an_inferred_noise(beam):
+    forward = linear_forward(beam)
+    model = cal.model(
+        forward, cal.nodal_displacements(beam, "all"), cal.GaussianNoise(sd_scale=1.0)
+    )
+    noise = 0.3 * np.random.default_rng(1).normal(size=(45, 3))
+    data = np.asarray(forward(jnp.array([72.0, 68.0]))) + noise
+    posterior = cal.sample(model, data, options=cal.NUTSOptions(200, 300))
+    certificate = cal.certify(posterior, LinearSimulator(forward))
+    assert certificate.verdict == "accepted"
+    assert set(certificate.shift) == {"mu", "lam", "noise_sd"}
 
 
 def test_certify_refuses_what_makes_no_sense(posterior, cube):

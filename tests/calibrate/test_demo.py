@@ -29,6 +29,8 @@ def test_the_demo_ends_accepted(folder, capsys):
     tree = read_tree(folder / "posterior.nc")
     assert tree.attrs["emulator_fingerprint"]
     assert json.loads(tree.attrs["observe"])["kind"] == "nodes"
+    assert json.loads(tree.attrs["sampler_options"])["chains"] == 4
+    assert json.loads(tree.attrs["prior"])["mu"] == "LogUniform(low=50.0, high=100.0)"
     picture = (folder / "beam.png").read_bytes()
     assert picture[:4] == b"\x89PNG"
     assert len(picture) > 30_000

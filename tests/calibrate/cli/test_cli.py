@@ -99,6 +99,15 @@ def test_simulate(capsys, block, tmp_path):
             "duration 'soon' is not",
         ),
         (["train", "once_clamped_beam", "--steps", "0", "--out", "x"], "steps is 0"),
+        (
+            ["train", "once_clamped_beam", "--resume", "--steps", "9", "--out", "x"],
+            "--steps has no effect with --resume",
+        ),
+        (["train", "once_clamped_beam", "--resume", "--out", "x"], "nothing to resume"),
+        (["train", "once_clamped_beam", "--steps", "9", "--seed", "-1", "--out", "x"], "seed -1"),
+        (["train", "once_clamped_beam", "--steps", "9", "--out", "/dev/null/x"], "cannot write to"),
+        (["demo", "--out", "/dev/null"], "cannot write to /dev/null"),
+        (["evaluate", "once_clamped_beam", "--against", "fem", "--cases", "0"], "0 samples"),
         (["evaluate", "nothing", "--against", "fem"], "emulator 'nothing' is neither"),
         (["evaluate", "once_clamped_beam", "--against", "/no/OnceClampedBeam"], "is missing"),
         (["verify", "published", "/no/where"], "does not exist"),
@@ -114,7 +123,7 @@ def test_bad_calls(capsys, monkeypatch, tmp_path, words, message):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--data", "missing.csv"], "data file missing.csv does not exist"),
+        (["--data", "missing.csv"], "missing.csv does not exist"),
         (["--data", "nan.csv"], "row 2 has a displacement that is not finite"),
         (["--data", "node.csv"], "node 4000 is unknown"),
         (["--truth", "mu=73"], "no value for parameter 'lam'"),
@@ -149,7 +158,22 @@ def test_a_scene_without_a_shipped_emulator_says_so(capsys, block, tmp_path):
     line = complaint(
         capsys, "infer", block, "--truth", "mu=7", "--observe", "all", "--out", tmp_path / "r"
     )
-    assert "emulator 'scene' is neither a folder with emulator.json nor shipped" in line
+    assert "is neither shipped nor a folder with emulator.json" in line
+
+
+def test_a_posterior_of_another_emulator_is_not_certified(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    from emulator.network import load, save_emulator
+
+    emulator = load("once_clamped_beam")
+    save_emulator(emulator, "mine")
+    words = ["--truth", "mu=73", "lam=61", "--emulator", "mine", "--warmup", 20, "--draws", 20]
+    code, _ = answer(capsys, "infer", "once_clamped_beam", *words, "--no-certify", "--out", "r")
+    assert code == 0
+    from dataclasses import replace
+
+    save_emulator(replace(emulator, scale=1.01 * emulator.scale), "mine")
+    assert "was made with emulator" in complaint(capsys, "certify", "r", "--draws", "30")
 
 
 def test_a_mesh_with_an_inverted_element(capsys, block):
@@ -169,7 +193,8 @@ def test_train_evaluate_infer_certify(capsys, block, tmp_path):
         capsys, "train", block, "--steps", 150, "--simulations", 16, "--batch", 8, "--out", out
     )
     assert code == 0
-    assert record["command"].startswith("calibrate train ")
+    assert "--objective both --steps 150 --simulations 16 --batch 8 --seed 0" in record["command"]
+    assert {path.name for path in out.iterdir()} == {"emulator.json", "weights.safetensors"}
     code, errors = answer(capsys, "evaluate", out, "--against", "fem", "--cases", 5)
     assert code == 0
     assert errors["cases"] == 5
@@ -177,8 +202,9 @@ def test_train_evaluate_infer_certify(capsys, block, tmp_path):
     # A forward map made of FEM runs needs no training at all.
     words = ["--truth", "mu=9", "--observe", "landmarks:6", "--noise", "0.02"]
     run = [*words, "--forward", "reduced", "--fem-runs", 8, "--warmup", 200, "--draws", 200]
-    code, result = answer(capsys, "infer", block, *run, "--out", tmp_path / "r")
+    code, result = answer(capsys, "infer", block, *run, "--no-certify", "--out", tmp_path / "r")
     assert code == 0
+    assert (result["verdict"], result["k_hat"]) == ("not certified", None)
     row = result["parameters"]["mu"]
     assert abs(row["mean"] - 9.0) < 4 * row["sd"]
     names = {path.name for path in (tmp_path / "r").iterdir()}
@@ -186,11 +212,12 @@ def test_train_evaluate_infer_certify(capsys, block, tmp_path):
     code, result = answer(capsys, "certify", tmp_path / "r", "--draws", 50)
     assert (code, result["verdict"]) == (0, "accepted")
     assert json.loads((tmp_path / "r" / "certificate.json").read_text())["verdict"] == "accepted"
-    # The kept data is data like any other.
+    # The kept data is data like any other, and infer certifies unless told not to.
     code, again = answer(
         capsys, "infer", block, "--data", tmp_path / "r" / "data.csv", "--noise", "0.02",
-        *run[5:], "--out", tmp_path / "s",
+        *run[6:], "--out", tmp_path / "s",
     )  # fmt: skip
+    assert (code, again["verdict"]) == (0, "accepted")
     assert again["parameters"]["mu"]["mean"] == pytest.approx(row["mean"], abs=row["sd"])
 
 

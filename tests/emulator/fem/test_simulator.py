@@ -179,6 +179,23 @@ def test_a_body_at_rest_without_loads():
     assert solution.iterations == 0
 
 
+def test_a_singular_tangent_has_a_name():
+    scene = block(loads=(Gravity(),))
+    solution = em.Simulator(scene).solve(jnp.array([0.0, 0.0]))  # no stiffness at all
+    assert solution.status == em.Status.SINGULAR_TANGENT
+    with pytest.raises(SolverError, match="singular tangent"):
+        solution.require_converged()
+
+
+def test_the_solvers_blas_has_one_thread(simulator):
+    from threadpoolctl import threadpool_info
+
+    simulator(simulator.scene.centre)
+    threads = [p["num_threads"] for p in threadpool_info() if "sparsax" in p["filepath"]]
+    assert threads
+    assert set(threads) == {1}
+
+
 def test_nothing_to_solve_is_said():
     scene = block(supports=(Support("left"), Support("right")), cells=(1, 1, 1))
     with pytest.raises(InputError, match="every node is held"):

@@ -28,12 +28,16 @@ def test_nothing_half_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_unusable_mesh_files_are_named(tmp_path):
+def test_unusable_mesh_files_are_named(tmp_path, capsys):
     with pytest.raises(InputError, match="does not exist"):
         read_mesh(tmp_path / "none.vtu")
     (tmp_path / "broken.vtu").write_text("<not xml")
     with pytest.raises(InputError, match="cannot be read as a mesh"):
         read_mesh(tmp_path / "broken.vtu")
+    (tmp_path / "broken.vtk").write_text("nonsense")
+    with pytest.raises(InputError, match="cannot be read as a mesh: .*header"):
+        read_mesh(tmp_path / "broken.vtk")
+    assert capsys.readouterr() == ("", "")
     cube = np.array(
         [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
     )

@@ -52,6 +52,31 @@ def test_a_mesh_cannot_be_changed():
         mesh.node_sets["new"] = np.array([0])
 
 
+def test_facets_of_a_box_are_its_faces_pointing_out():
+    mesh = box((2.0, 3.0, 4.0), (2, 3, 1))
+    total = np.zeros(3)
+    for name, direction, area in (
+        ("left", [-1, 0, 0], 12.0), ("right", [1, 0, 0], 12.0), ("front", [0, -1, 0], 8.0),
+        ("back", [0, 1, 0], 8.0), ("bottom", [0, 0, -1], 6.0), ("top", [0, 0, 1], 6.0),
+    ):  # fmt: skip
+        corner = mesh.nodes[mesh.facet_set(name)]
+        normal = 0.5 * np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).sum(
+            axis=0
+        )
+        np.testing.assert_allclose(normal, area * np.array(direction), atol=1e-12)
+        total += normal
+    np.testing.assert_allclose(total, 0.0, atol=1e-12)
+
+
+def test_facets_inside_the_body_are_refused():
+    mesh = box((1.0, 1.0, 1.0), (1, 1, 1))
+    inside = np.array([[0, 7, 1]])  # along the diagonal all six tetrahedra share
+    with pytest.raises(InputError, match=r"facet \[0, 1, 7\] of set 'cut' is not on the surface"):
+        Mesh(mesh.nodes, mesh.elements, {}, {"cut": inside})
+    with pytest.raises(InputError, match="facet set 'lid' is not in the mesh; its sets: back"):
+        mesh.facet_set("lid")
+
+
 def test_missing_node_set_lists_the_others():
     with pytest.raises(
         InputError, match="node set 'apex' is not in the mesh; its sets: back, bottom"

@@ -36,6 +36,18 @@ def test_missing_and_damaged_files_are_named(tmp_path):
         read_mesh(tmp_path, "OnceClampedBeam")
     with pytest.raises(InputError, match="published model 'Heart' is unknown"):
         read_mesh(tmp_path, "Heart")
+    geometry = tmp_path / "OnceClampedBeam" / "geometryData"
+    geometry.mkdir(parents=True)
+    np.save(geometry / "reference-coords.npy", np.eye(4, 3))
+    np.save(geometry / "elements.npy", np.array([[0, 1, 2, 9]]))
+    with pytest.raises(InputError, match="name nodes there are none of"):
+        read_mesh(tmp_path, "OnceClampedBeam")
+    np.save(geometry / "elements.npy", np.array([[0, 1, 2]]))
+    with pytest.raises(InputError, match=r"has shape \(1, 3\); expected \('any', 4\)"):
+        read_mesh(tmp_path, "OnceClampedBeam")
+    np.save(geometry / "reference-coords.npy", np.full((4, 3), np.nan))
+    with pytest.raises(InputError, match="has values that are not finite"):
+        read_mesh(tmp_path, "OnceClampedBeam")
     folder = tmp_path / "OnceClampedBeam" / "simulationData" / "test"
     folder.mkdir(parents=True)
     (folder / "theta.npy").write_bytes(b"\x93NUMPY\x01\x00")

@@ -36,7 +36,10 @@ def test_barriers_have_the_published_values_and_no_kink():
     assert barriers.limit_J(jnp.array(0.7)) == 0.7
     assert barriers.limit_I1(jnp.array(9.0)) == 9.0
     assert barriers.limit_I1(jnp.array(1e6)) == pytest.approx(11.0)
-    for function, at in ((barriers.limit_J, 0.05), (barriers.limit_I1, 10.0)):
+    assert barriers.limit_I4f(jnp.array(7.0)) == 7.0
+    assert barriers.limit_I4f(jnp.array(8.5)) == pytest.approx(8.0 + np.tanh(0.5))
+    starts = ((barriers.limit_J, 0.05), (barriers.limit_I1, 10.0), (barriers.limit_I4f, 8.0))
+    for function, at in starts:
         below, above = (jax.grad(function)(jnp.array(at + d)) for d in (-1e-9, 1e-9))
         assert below == pytest.approx(float(above), abs=1e-6)
 

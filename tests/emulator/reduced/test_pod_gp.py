@@ -40,7 +40,7 @@ def test_gradient_and_nodes(beam, runs):
     np.testing.assert_allclose(jax.grad(f)(beam.centre), central, rtol=1e-4)
     nodes = np.array([9, 4])
     np.testing.assert_allclose(reduced.at(nodes)(beam.centre), reduced(beam.centre)[nodes])
-    with pytest.raises(InputError, match="node 5 is not in this reduced model"):
+    with pytest.raises(InputError, match="node 5 is not among the 2 this reduced map returns"):
         reduced.at(nodes).at(np.array([5]))
     assert not reduced.evaluate(2.0 * beam.centre).valid
 

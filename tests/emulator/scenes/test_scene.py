@@ -54,6 +54,12 @@ def test_supports_that_contradict_each_other():
     block(supports=(Support("left"), Support("bottom")))  # agreeing is fine
 
 
+def one_line_held():
+    mesh = block().mesh
+    line = np.flatnonzero((mesh.nodes[:, 0] == 0.0) & (mesh.nodes[:, 1] == 0.0))
+    return replace(mesh, node_sets={"line": line})
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -61,6 +67,19 @@ def test_supports_that_contradict_each_other():
         ({"parameters": (Parameter("mu", "kPa", 1.0, 2.0),)}, "law 'neo_hookean' needs 'lam'"),
         ({"constants": {"mu": 1.0}}, "parameter 'mu' is given twice"),
         ({"constants": {"kappa": 1.0}}, "parameter 'kappa' is not one of law 'neo_hookean'"),
+        ({"parameters": (), "constants": {"mu": 1.0, "lam": 1.0}}, "no parameter varies"),
+        (
+            {"parameters": block().parameters[:1], "constants": {"lam": np.nan}},
+            "constant 'lam' is nan",
+        ),
+        (
+            {"supports": (Support("left", np.array([0.0, np.nan, 0.0])),)},
+            "displacement is not finite",
+        ),
+        (
+            {"mesh": one_line_held(), "supports": (Support("line"),)},
+            "the 3 held nodes lie on a line",
+        ),
         ({"supports": (Support("apex"),)}, "node set 'apex' is not in the mesh"),
         ({"supports": (Support("left", np.zeros((2, 3))),)}, r"displacement has shape \(2, 3\)"),
     ],
@@ -74,6 +93,7 @@ def test_scenes_that_make_no_sense(change, message):
     ("low", "high", "scale", "message"),
     [
         (2.0, 1.0, "uniform", "range .* is empty"),
+        (0.0, np.inf, "uniform", "is empty or not finite"),
         (0.0, 1.0, "log", "a log scale needs a lower bound above 0"),
         (1.0, 2.0, "cubic", "scale 'cubic'; use log or uniform"),
     ],
@@ -94,7 +114,9 @@ def test_the_fingerprint_sees_every_part():
     ]
     prints = [scene.fingerprint, *(other.fingerprint for other in changed)]
     assert len(set(prints)) == len(prints)
-    assert block(loads=(Gravity(),)).fingerprint == scene.fingerprint
+    # However it is written, the same scene.
+    same = Gravity(density=1, direction=(0, 0, -2))
+    assert block(loads=(same,)).fingerprint == scene.fingerprint
 
 
 def test_constants_take_the_place_of_parameters():
