@@ -13,8 +13,8 @@ from emulator.errors import InputError
 from emulator.forward import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
 
-# How far outside its element a point may lie, as a fraction of the element's height.
-_SLACK = 1e-2
+# How far outside the body a point may lie, as a fraction of the body's size.
+_SLACK = 1e-3
 
 
 class Observation(Protocol):
@@ -123,13 +123,16 @@ def _locate(scene: Scene, k: int, point: np.ndarray) -> tuple[int, np.ndarray]:
     """Element of ``point`` (3,) and its barycentric coordinates (4,) there.
 
     Measured surface points rarely lie on the mesh to the last digit: a point outside by less than
-    ``_SLACK`` of its element's size is moved onto it.
+    ``_SLACK`` of the body's size is moved onto it.
     """
     corner = scene.mesh.nodes[scene.mesh.elements]
     gradients = scene.discretisation.gradients[:, 0]  # constant in a linear tetrahedron
     # The barycentric coordinate of corner a is 1 there and falls to 0 on the opposite face.
     coordinates = 1.0 + np.einsum("mai,mai->ma", gradients, point - corner)
-    element = int(np.argmax(coordinates.min(axis=1)))
+    clipped = np.maximum(coordinates, 0.0)
+    clipped /= clipped.sum(axis=1, keepdims=True)
+    distances = np.linalg.norm(np.einsum("ma,mai->mi", clipped, corner) - point, axis=1)
+    element = int(np.argmin(distances))
     best, slopes = coordinates[element], gradients[element]
     lowest = int(np.argmin(best))
     inside = best
@@ -137,10 +140,10 @@ def _locate(scene: Scene, k: int, point: np.ndarray) -> tuple[int, np.ndarray]:
         slope = slopes[lowest]
         inside = np.maximum(best - best[lowest] * (slopes @ slope) / (slope @ slope), 0.0)
         inside /= inside.sum()
-    if best[lowest] < -_SLACK:
-        distance = np.linalg.norm(inside @ corner[element] - point)
+    if distances[element] > _SLACK * scene.mesh.size:
         raise InputError(
-            f"landmark {k} at {point.tolist()} mm lies outside the body, about {distance:.2g} mm away"
+            f"landmark {k} at {point.tolist()} mm lies outside the body, "
+            f"about {distances[element]:.2g} mm away"
         )
     return element, inside
 
