@@ -123,29 +123,28 @@ def _locate(scene: Scene, k: int, point: np.ndarray) -> tuple[int, np.ndarray]:
     """Element of ``point`` (3,) and its barycentric coordinates (4,) there.
 
     Measured surface points rarely lie on the mesh to the last digit: a point outside by less than
-    ``_SLACK`` of the body's size is moved onto it.
+    ``_SLACK`` of the body's size is moved straight onto the nearest element.
     """
     corner = scene.mesh.nodes[scene.mesh.elements]
     gradients = scene.discretisation.gradients[:, 0]  # constant in a linear tetrahedron
     # The barycentric coordinate of corner a is 1 there and falls to 0 on the opposite face.
     coordinates = 1.0 + np.einsum("mai,mai->ma", gradients, point - corner)
-    clipped = np.maximum(coordinates, 0.0)
-    clipped /= clipped.sum(axis=1, keepdims=True)
-    distances = np.linalg.norm(np.einsum("ma,mai->mi", clipped, corner) - point, axis=1)
+    # Beyond a face, go back onto it along its normal; what then still lies outside, is clipped.
+    rows = np.arange(len(coordinates))
+    lowest = np.argmin(coordinates, axis=1)
+    normal = gradients[rows, lowest]
+    beyond = np.minimum(coordinates[rows, lowest], 0.0) / np.sum(normal**2, axis=1)
+    inside = coordinates - beyond[:, None] * np.einsum("mai,mi->ma", gradients, normal)
+    inside = np.maximum(inside, 0.0)
+    inside /= inside.sum(axis=1, keepdims=True)
+    distances = np.linalg.norm(np.einsum("ma,mai->mi", inside, corner) - point, axis=1)
     element = int(np.argmin(distances))
-    best, slopes = coordinates[element], gradients[element]
-    lowest = int(np.argmin(best))
-    inside = best
-    if best[lowest] < 0.0:  # straight back onto the face it lies beyond
-        slope = slopes[lowest]
-        inside = np.maximum(best - best[lowest] * (slopes @ slope) / (slope @ slope), 0.0)
-        inside /= inside.sum()
     if distances[element] > _SLACK * scene.mesh.size:
         raise InputError(
             f"landmark {k} at {point.tolist()} mm lies outside the body, "
             f"about {distances[element]:.2g} mm away"
         )
-    return element, inside
+    return element, inside[element]
 
 
 def observation_from(scene: Scene, description: dict[str, Any]) -> Observation:
