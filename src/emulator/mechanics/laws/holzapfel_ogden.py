@@ -1,0 +1,59 @@
+r"""Holzapfel-Ogden material with one family of fibres (transversely isotropic).
+
+Textbook form (Holzapfel & Ogden 2009; Dalton et al. 2023, Eq. 4 and 6), with isochoric invariants
+:math:`\bar I_1 = J^{-2/3} I_1`, :math:`\bar I_{4f} = J^{-2/3}\, f_0 \cdot C f_0` and fibres that
+resist stretch only, :math:`\langle x \rangle = \max(x, 0)`:
+
+.. math::
+    W = \frac{a}{2b}\left[e^{b(\bar I_1 - 3)} - 1\right]
+      + \frac{a_f}{2b_f}\left[e^{b_f \langle \bar I_{4f} - 1 \rangle^2} - 1\right] + U(J)
+
+The released variant behind the paper's published solutions has no factors 1/2 and no switch; its
+``a`` and ``a_f`` are half the textbook's. Both have their own volumetric part: kappa is a
+parameter like any other.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.laws.law import Law
+from emulator.mechanics.laws.volumetric import quadratic_logarithmic
+
+
+def energy(
+    strain: Strain, a: jax.Array, b: jax.Array, a_f: jax.Array, b_f: jax.Array, kappa: jax.Array
+) -> jax.Array:
+    """Strain energy density in kPa, textbook form; ``a``, ``a_f``, ``kappa`` in kPa."""
+    matrix = a / (2.0 * b) * jnp.expm1(b * strain.isochoric_I1_minus_3)
+    stretch = jnp.maximum(strain.isochoric_I4f_minus_1, 0.0)
+    fibres = a_f / (2.0 * b_f) * jnp.expm1(b_f * stretch**2)
+    return matrix + fibres + quadratic_logarithmic(strain, kappa)
+
+
+def energy_released(
+    strain: Strain, a: jax.Array, b: jax.Array, a_f: jax.Array, b_f: jax.Array, kappa: jax.Array
+) -> jax.Array:
+    """Strain energy density in kPa as in the paper's released code."""
+    matrix = a / b * jnp.expm1(b * strain.isochoric_I1_minus_3)
+    fibres = a_f / b_f * jnp.expm1(b_f * strain.isochoric_I4f_minus_1**2)
+    return matrix + fibres + quadratic_logarithmic(strain, kappa)
+
+
+_PARAMETERS = ("a", "b", "a_f", "b_f", "kappa")
+HOLZAPFEL_OGDEN = Law("holzapfel_ogden", _PARAMETERS, energy, fibres=True)
+HOLZAPFEL_OGDEN_RELEASED = Law(
+    "holzapfel_ogden_released", _PARAMETERS, energy_released, fibres=True
+)
+
+
+def textbook_from_released(a: float, a_f: float) -> tuple[float, float]:
+    """Textbook ``(a, a_f)`` of the same material under tension, from the released variant's."""
+    return 2.0 * a, 2.0 * a_f
+
+
+def released_from_textbook(a: float, a_f: float) -> tuple[float, float]:
+    """Inverse of :func:`textbook_from_released`."""
+    return 0.5 * a, 0.5 * a_f
