@@ -32,6 +32,9 @@ Verdict = Literal["accepted", "reweight", "not certified"]
 # Below this spread (in log) all weights are equal to a tenth of a percent and the tail has no
 # shape to fit.
 _EQUAL_WEIGHTS = 1e-3
+# When even the largest weight is less than this times their mean, no tail of theirs can do harm,
+# whatever shape a fit to its last few finds; the box is compact, so the ratios are bounded.
+_NO_TAIL = 2.0
 # Beyond this there is no one posterior to certify; for use, look for 1.01.
 LARGEST_R_HAT = 1.05
 
@@ -44,7 +47,8 @@ class Certificate:
         ``not certified`` (the FEM posterior is too far away to be reached by reweighting, or the
         chains do not agree on the cheap one).
     reason : of the verdict, for people.
-    k_hat, k_threshold : Pareto shape of the weights' tail, and the most it may be.
+    k_hat, k_threshold : Pareto shape of the weights' tail, and the most it may be unless no weight
+        reaches twice their mean.
     ess : effective number of reweighted draws.
     shift : per parameter, mean under FEM less mean under the cheap map, in posterior sd.
     mean_fem : per parameter, the reweighted mean.
@@ -118,7 +122,7 @@ def judge(
         reason = f"the chains disagree, R-hat {r_hat:.3f}"
     elif not failed <= largest_failure_rate * len(log_ratios):
         reason = f"{failed} FEM runs failed"
-    elif not k_hat < threshold:
+    elif not (k_hat < threshold or weights.max() * len(weights) < _NO_TAIL):
         reason = "the weights' tail is too heavy to reweight"
     elif not np.isfinite(largest):
         reason = "a parameter has no spread"

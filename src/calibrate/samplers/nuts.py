@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from arviz_stats.base import array_stats
 from jax.flatten_util import ravel_pytree
 from numpyro.infer.hmc import hmc
 from numpyro.infer.util import initialize_model
@@ -31,15 +32,25 @@ _CANDIDATES = 16  # starting points tried, for forward maps that are not valid e
 
 @dataclass(frozen=True)
 class NUTSOptions:
-    """Length of a run; the pilot is equally long."""
+    """Length of a run.
+
+    warmup : iterations that adapt, not kept.
+    draws : kept iterations of a round; the pilot has one round.
+    chains : all in one program.
+    rounds : at most so many, the last one begun when R-hat or ESS ask for it.
+    r_hat, ess : largest R-hat and smallest bulk and tail ESS of any parameter to stop at.
+    """
 
     warmup: int = 500
     draws: int = 1000
     chains: int = 4
+    rounds: int = 8
+    r_hat: float = 1.008
+    ess: float = 400.0
     target_accept: float = 0.85
 
     def __post_init__(self) -> None:
-        for name in ("warmup", "draws", "chains"):
+        for name in ("warmup", "draws", "chains", "rounds"):
             if getattr(self, name) < 1:
                 raise InputError(f"NUTS: {name} is {getattr(self, name)}; it must be 1 or more")
         if not 0.0 < self.target_accept < 1.0:
@@ -92,11 +103,11 @@ def _compiled(model: Model, options: NUTSOptions) -> _Compiled:
 
         return jax.lax.scan(step, state, length=count)
 
-    chains = {"in_axes": (0, None, None)}
+    axes = (0, None, None)  # chains differ in key and state, not in data or map
     return _Compiled(
-        start=jax.jit(jax.vmap(start, **chains)),
+        start=jax.jit(jax.vmap(start, axes)),
         advance=jax.jit(
-            lambda s, d, m, count: jax.vmap(partial(advance, count=count), **chains)(s, d, m),
+            lambda s, d, m, count: jax.vmap(partial(advance, count=count), axes)(s, d, m),
             static_argnames="count",
         ),
         constrain=jax.jit(
@@ -106,33 +117,59 @@ def _compiled(model: Model, options: NUTSOptions) -> _Compiled:
     )
 
 
-def _run(
-    compiled: _Compiled,
-    data: jax.Array,
-    map_: shear.Shear,
-    options: NUTSOptions,
-    key: jax.Array,
-    bar: tqdm,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Draws of ``z`` (chains, draws, p) after warm-up, and statistics (chains, draws)."""
-    states = compiled.start(jax.random.split(key, options.chains), data, map_)
-    if not np.isfinite(states.potential_energy).all():
-        raise SolverError("the posterior density is zero or undefined wherever a chain could start")
-    kept = []
-    for total, keep in ((options.warmup, False), (options.draws, True)):
+class _Chains:
+    """Chains under way: their states, the data and the map they run on."""
+
+    def __init__(
+        self,
+        compiled: _Compiled,
+        data: jax.Array,
+        map_: shear.Shear,
+        key: jax.Array,
+        options: NUTSOptions,
+        bar: tqdm,
+    ) -> None:
+        self.compiled, self.arguments, self.bar = compiled, (data, map_), bar
+        self.states = compiled.start(jax.random.split(key, options.chains), data, map_)
+        if not np.isfinite(self.states.potential_energy).all():
+            raise SolverError("the posterior density is zero wherever a chain could start")
+        self.advance(options.warmup)
+
+    def advance(self, total: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """``z`` (chains, total, p) and statistics (chains, total) of the next iterations."""
+        kept = []
         for done in range(0, total, _CHUNK):
             count = min(_CHUNK, total - done)
-            states, out = compiled.advance(states, data, map_, count=count)
-            if keep:
-                kept.append(jax.tree.map(np.asarray, out))
-            bar.update(count)
-    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *kept)
+            self.states, out = self.compiled.advance(self.states, *self.arguments, count=count)
+            kept.append(jax.tree.map(np.asarray, out))
+            self.bar.update(count)
+        return _join(kept)
+
+
+def _join(parts: list[Any]) -> Any:
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *parts)
+
+
+def _agree(draws: dict[str, np.ndarray], options: NUTSOptions) -> bool:
+    """Whether the chains agree on every parameter and hold enough information on each."""
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    for values in draws.values():
+        if not array_stats.rhat(values, **axes) <= options.r_hat:
+            return False
+        bulk = array_stats.ess(values, method="bulk", **axes)
+        tail = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
+        if not min(bulk, tail) >= options.ess:
+            return False
+    return True
 
 
 def nuts(
     model: Model, data: jax.Array, options: NUTSOptions, seed: int, *, progress: bool = False
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Draws and statistics by name, each (chains, draws).
+
+    Chains go on, round after round, until they agree; where the prior's box cuts a ridge they need
+    a few. Read R-hat all the same: after the last round they may still not.
 
     Raises
     ------
@@ -146,9 +183,15 @@ def nuts(
     total = runs * (options.warmup + options.draws)
     with tqdm(total=total, desc="NUTS", disable=not progress) as bar:
         if runs == 2:
-            z, _ = _run(compiled, data, map_, options, pilot, bar)
+            z, _ = _Chains(compiled, data, map_, pilot, options, bar).advance(options.draws)
             map_ = shear.fit(z.reshape(-1, compiled.dimension))
-        z, statistics = _run(compiled, data, map_, options, final, bar)
-    named = compiled.constrain(data, jnp.asarray(z.reshape(-1, compiled.dimension)))
-    shape = (options.chains, options.draws)
-    return {name: np.asarray(named[name]).reshape(shape) for name in model.names}, statistics
+        chains, kept = _Chains(compiled, data, map_, final, options, bar), []
+        for _ in range(options.rounds):
+            kept.append(chains.advance(options.draws))
+            z, statistics = _join(kept)
+            named = compiled.constrain(data, jnp.asarray(z.reshape(-1, compiled.dimension)))
+            draws = {name: np.asarray(named[name]).reshape(z.shape[:2]) for name in model.names}
+            if options.chains > 1 and _agree(draws, options):
+                break
+            bar.total += options.draws
+    return draws, statistics
