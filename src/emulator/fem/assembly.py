@@ -5,7 +5,8 @@ r"""Residual and tangent of a scene's potential energy over its free degrees of 
     K = \frac{\partial^2 \Pi}{\partial u^2}
       = \sum_{e,q} w_{eq}\, B^T \frac{\partial^2 W}{\partial H^2} B
 
-with :math:`B` the shape-function gradients. Dead loads have no tangent.
+with :math:`B` the shape-function gradients. Dead loads have no tangent; those that follow the
+deformation add the Hessians of their own potentials, facet by facet.
 """
 
 from __future__ import annotations
@@ -18,13 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.fem.sparse import Factorisation, Pattern, element_pattern
+from emulator.fem.sparse import Factorisation, Pattern, block_pattern
 from emulator.mechanics.energy import (
+    at_points,
     displacement_gradient,
+    local_terms,
     nodal_dead_force,
     point_energy,
     strain_energy,
 )
+from emulator.mechanics.pressure import LocalTerm
 from emulator.scenes.scene import Scene
 
 
@@ -44,13 +48,18 @@ class System:
         return free
 
     @cached_property
+    def terms(self) -> list[LocalTerm]:
+        """Potentials of the loads that follow the deformation."""
+        return local_terms(self.scene)
+
+    @cached_property
     def pattern(self) -> Pattern:
-        """Sparsity of the tangent."""
-        nodes = self.scene.discretisation.connectivity
-        dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
+        """Sparsity of the tangent: bulk elements, then the loads' local terms."""
         free_index = np.full(self.scene.held.size, -1)
         free_index[self.free] = np.arange(len(self.free))
-        return element_pattern(dofs, free_index, symmetric=self.factorisation == "cholmod")
+        groups = [self.scene.discretisation.connectivity, *(term.nodes for term in self.terms)]
+        dofs = [(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1) for nodes in groups]
+        return block_pattern(dofs, free_index, symmetric=self.factorisation == "cholmod")
 
     @cached_property
     def dead_force(self) -> np.ndarray:
@@ -71,21 +80,39 @@ class System:
         """Gradient of the strain energy, (n, 3) in mN, reactions included."""
         return jax.grad(strain_energy(self.scene))(u, theta)
 
-    def residual(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
-        """Free part (f,) of the force out of balance in mN, with ``load`` times the dead loads."""
-        return self.restrict(self.internal_force(u, theta) - load * self.dead_force)
+    def external_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Force of the loads at the full level, (n, 3) in mN."""
+        if not self.terms:
+            return jnp.asarray(self.dead_force)
+        values = self.scene.resolve(theta)
+        work = jax.grad(lambda v: sum(term.total(v, values) for term in self.terms))
+        return self.dead_force - work(u)
 
-    def tangent(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+    def potential(
+        self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, jax.Array]:
+        """Potential energy at ``load`` times the loads, and the size of its parts, in mN mm."""
+        internal = strain_energy(self.scene)(u, theta)
+        work = jnp.vdot(self.dead_force, u)
+        if self.terms:
+            values = self.scene.resolve(theta)
+            work = work - sum(term.total(u, values) for term in self.terms)
+        return internal - load * work, jnp.abs(internal) + jnp.abs(load * work)
+
+    def residual(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
+        """Free part (f,) of the force out of balance in mN, at ``load`` times the loads."""
+        return self.restrict(self.internal_force(u, theta) - load * self.external_force(u, theta))
+
+    def tangent(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
         """Nonzeros (nnz,) of the tangent over the free degrees of freedom, mN/mm."""
         grid = self.scene.discretisation
-        moduli = jax.vmap(jax.vmap(jax.hessian(point_energy(self.scene, theta))))
-        A = (
-            moduli(displacement_gradient(self.scene, u))
-            * grid.weights[:, :, None, None, None, None]
-        )
-        blocks = jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
-        k = 3 * grid.connectivity.shape[1]
-        return self.pattern.sum(blocks.reshape(len(blocks), k, k))
+        hessian = jax.hessian(point_energy(self.scene, theta))
+        A = at_points(self.scene, hessian, displacement_gradient(self.scene, u))
+        A = A * grid.weights[:, :, None, None, None, None]
+        bulk = jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
+        values = self.scene.resolve(theta)
+        blocks = [bulk, *(load * term.tangents(u, values) for term in self.terms)]
+        return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
 
     def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
         """Solve ``K x = rhs`` over the free degrees of freedom, shape (f,)."""
@@ -112,7 +139,7 @@ def balance(
     at all, and its relative residual is 0 too. NaN stays NaN.
     """
     internal = system.internal_force(u, theta)
-    external = load * system.dead_force
+    external = load * system.external_force(u, theta)
     residual = system.restrict(internal - external)
     norm = jnp.sqrt(jnp.sum(residual**2))
     scale = jnp.sqrt(jnp.sum(internal**2)) + jnp.sqrt(jnp.sum(external**2))

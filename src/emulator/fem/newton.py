@@ -8,13 +8,15 @@ At load level :math:`s \in (0, 1]` the dead loads are :math:`s f` and the held d
     \Delta \bar u = s \bar u - u|_\text{held}
 
 and steps by the largest :math:`\alpha \in \{1, \tfrac12, \tfrac14, \dots\}` that keeps every
-element's :math:`J` above a fraction of its present least value. Full steps may raise the energy on
-their way (a bending beam first stretches, then contracts), so descent is not asked for; a level
-that does not converge is tried again with half the load increment.
+element's :math:`J` above a fraction of its present least value and, once the supports are met,
+lowers the potential energy (Armijo's rule; where the tangent is indefinite and Newton's direction
+climbs, the opposite one is taken). Exponential laws diverge without it. A level that does not
+converge is tried again with half the load increment.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,7 +27,9 @@ from emulator.fem.assembly import System, balance
 from emulator.fem.solution import Solution, Status
 from emulator.mechanics.energy import volume_ratio
 
-_LEAST_FRACTION = 2.0**-12
+_LEAST_FRACTION = 2.0**-20
+_ARMIJO = 1e-4
+_ROUND_OFF = 1e-13
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class NewtonOptions:
     round_off: float = 1e-8
     absolute: float = 0.0
     max_iterations: int = 200
-    level_iterations: int = 25
+    level_iterations: int = 40
     min_increment: float = 1.0 / 256.0
     shrink: float = 0.2
 
@@ -82,17 +86,30 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
 
     def step(state: _State) -> _State:
         residual, _ = balanced(state.u, state.level)
-        tangent = system.tangent(state.u, theta)
+        tangent = system.tangent(state.u, theta, state.level)
         move_held = jnp.where(held, state.level * held_values - state.u, 0.0)
         # K times the held displacement, without assembling the held columns.
         _, pull = jax.jvp(
-            lambda v: system.restrict(system.internal_force(v, theta)), (state.u,), (move_held,)
+            lambda v: system.residual(v, theta, state.level), (state.u,), (move_held,)
         )
         solvable = jnp.all(jnp.isfinite(tangent))
-        move = system.extend(system.solve(system.pattern.safe_values(tangent), -(residual + pull)))
-        fraction = _largest_fraction(system, state.u, move + move_held, options.shrink)
+        move = system.solve(system.pattern.safe_values(tangent), -(residual + pull))
+        slope = jnp.vdot(residual, move)
+        settled = jnp.all(move_held == 0.0)
+        move = jnp.where(settled & (slope > 0.0), -move, move)
+        move = system.extend(move) + move_held
+        energy, size = system.potential(state.u, theta, state.level)
+        # Near the solution the decrease drowns in the round-off of the energy's parts.
+        ceiling = energy + _ROUND_OFF * size
+        descent = jnp.where(settled, -_ARMIJO * jnp.abs(slope), jnp.inf)
+
+        def lowers(fraction: jax.Array) -> jax.Array:
+            after, _ = system.potential(state.u + fraction * move, theta, state.level)
+            return after <= ceiling + fraction * descent
+
+        fraction = _largest_fraction(system, state.u, move, lowers, options.shrink)
         admissible = solvable & (fraction > 0.0)
-        u = jnp.where(admissible, state.u + fraction * (move + move_held), state.u)
+        u = jnp.where(admissible, state.u + fraction * move, state.u)
         # After a full step the supports are met; setting them avoids the last bit of round-off.
         u = jnp.where(held & admissible & (fraction == 1.0), state.level * held_values, u)
         placed = jnp.all(jnp.where(held, u == state.level * held_values, True))
@@ -137,16 +154,22 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     )
 
 
-def _largest_fraction(system: System, u: jax.Array, move: jax.Array, shrink: float) -> jax.Array:
-    """Most of ``move`` that no element minds, among 1, 1/2, 1/4, ...; 0 where none will do."""
+def _largest_fraction(
+    system: System,
+    u: jax.Array,
+    move: jax.Array,
+    lowers: Callable[[jax.Array], jax.Array],
+    shrink: float,
+) -> jax.Array:
+    """Most of ``move`` that will do, among 1, 1/2, 1/4, ...; 0 where none will."""
     floor = shrink * jnp.min(volume_ratio(system.scene, u))
 
-    def inverts(fraction: jax.Array) -> jax.Array:
+    def unfit(fraction: jax.Array) -> jax.Array:
         J = volume_ratio(system.scene, u + fraction * move)
-        return ~(jnp.min(J) > floor)  # written so that NaN counts as inverted
+        return ~((jnp.min(J) > floor) & lowers(fraction))  # written so that NaN is unfit
 
     def unfinished(fraction: jax.Array) -> jax.Array:
-        return (fraction > _LEAST_FRACTION) & inverts(fraction)
+        return (fraction > _LEAST_FRACTION) & unfit(fraction)
 
     fraction = jax.lax.while_loop(unfinished, lambda fraction: 0.5 * fraction, jnp.array(1.0))
     return jnp.where(fraction > _LEAST_FRACTION, fraction, 0.0)

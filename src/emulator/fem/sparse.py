@@ -46,10 +46,9 @@ class Pattern:
     target: np.ndarray
     size: int
 
-    def sum(self, blocks: jax.Array) -> jax.Array:
-        """Values (nnz,) from element blocks (m, k, k)."""
-        entries = blocks.reshape(-1)[self.source]
-        return jax.ops.segment_sum(entries, self.target, num_segments=len(self.rows))
+    def sum(self, entries: jax.Array) -> jax.Array:
+        """Values (nnz,) from the entries of all blocks, flattened one after the other."""
+        return jax.ops.segment_sum(entries[self.source], self.target, num_segments=len(self.rows))
 
     def solve(self, values: jax.Array, rhs: jax.Array, method: Factorisation) -> jax.Array:
         """``x`` with ``A x = rhs``, shape (size,); differentiable, usable under ``vmap``."""
@@ -62,19 +61,18 @@ class Pattern:
         return jnp.where(jnp.all(jnp.isfinite(values)), values, identity)
 
 
-def element_pattern(dofs: np.ndarray, free_index: np.ndarray, *, symmetric: bool) -> Pattern:
-    """Pattern of element blocks.
+def block_pattern(groups: list[np.ndarray], free_index: np.ndarray, *, symmetric: bool) -> Pattern:
+    """Pattern of dense blocks.
 
     Parameters
     ----------
-    dofs : (m, k) global degree of freedom of each block row.
+    groups : each (k, d): global degrees of freedom of the rows, and columns, of k blocks.
     free_index : (n_dofs,) position among the free ones, -1 where held.
     symmetric : keep only the upper triangle, as CHOLMOD wants.
     """
-    local = free_index[dofs]
     size = int(free_index.max()) + 1
-    rows = np.broadcast_to(local[:, :, None], (*local.shape, local.shape[1])).ravel()
-    columns = np.broadcast_to(local[:, None, :], (*local.shape, local.shape[1])).ravel()
+    pairs = [_block_entries(free_index[dofs]) for dofs in groups]
+    rows, columns = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     keep = (rows >= 0) & (columns >= 0)
     if symmetric:
         keep &= rows <= columns
@@ -87,3 +85,10 @@ def element_pattern(dofs: np.ndarray, free_index: np.ndarray, *, symmetric: bool
         target=target.astype(np.int32),
         size=size,
     )
+
+
+def _block_entries(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of every entry of the blocks of ``dofs`` (k, d), flattened."""
+    shape = (*dofs.shape, dofs.shape[1])
+    rows = np.broadcast_to(dofs[:, :, None], shape).ravel()
+    return rows, np.broadcast_to(dofs[:, None, :], shape).ravel()

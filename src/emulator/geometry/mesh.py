@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import combinations
 from types import MappingProxyType
 
 import numpy as np
@@ -144,6 +145,14 @@ class Mesh:
             known = ", ".join(sorted(self.facet_sets)) or "none"
             raise InputError(f"facet set '{name}' is not in the mesh; its sets: {known}")
         return self.facet_sets[name]
+
+    def elements_behind(self, facets: np.ndarray) -> np.ndarray:
+        """The element (k,) each surface facet (k, 3) belongs to."""
+        owner: dict[tuple[int, ...], int] = {}
+        for corners in combinations(range(4), 3):
+            for k, row in enumerate(np.sort(self.elements[:, corners], axis=1).tolist()):
+                owner[tuple(row)] = k
+        return np.array([owner[tuple(row)] for row in np.sort(facets, axis=1).tolist()])
 
     def to_skfem(self) -> MeshTet:
         """The same mesh for scikit-fem (corner order kept, hence no sorting)."""

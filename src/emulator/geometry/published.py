@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.mesh import Mesh, orient
+from emulator.geometry.mesh import Mesh, boundary_facets, orient
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,27 @@ class PublishedUnits:
         return self.stress * self.length**3
 
 
+PRESSURE_SURFACE = "endocardium"
 _CGS = PublishedUnits(length=10.0, stress=1e-4)
 UNITS = {
     "OnceClampedBeam": _CGS,
     "TwistingBeam": PublishedUnits(length=1.0, stress=1.0),  # dimensionless
+    "Liver": _CGS,
+    "LeftVentricle": PublishedUnits(length=10.0, stress=1.0),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedGeometry:
+    """Geometry of a model.
+
+    mesh : in mm. displacement : (k, 3) mm, prescribed on its node set ``held``.
+    fibres : (m, 3) unit vectors, or ``None``.
+    """
+
+    mesh: Mesh
+    displacement: np.ndarray
+    fibres: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +100,38 @@ def units(model: str) -> PublishedUnits:
     return UNITS[model]
 
 
-def read_mesh(root: str | Path, model: str) -> tuple[Mesh, np.ndarray]:
-    """The mesh in mm, with node set ``held``, and the prescribed displacement of that set, mm."""
-    scale = units(model).length
-    nodes = _array(root, model, "geometryData/reference-coords.npy", (None, 3)) * scale
-    elements = _array(root, model, "geometryData/elements.npy", (None, 4)).astype(np.int64)
+def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
+    """The mesh of ``model`` in mm, with node set ``held`` and, where pressed, its facet set."""
+    scale, folder = units(model).length, "geometryData"
+    nodes = _array(root, model, f"{folder}/reference-coords.npy", (None, 3)) * scale
+    elements = _array(root, model, f"{folder}/elements.npy", (None, 4)).astype(np.int64)
     if elements.min() < 0 or elements.max() >= len(nodes):
         raise InputError(f"published data: elements of {model} name nodes there are none of")
-    interior = _array(root, model, "geometryData/interior-points.npy").reshape(-1)
+    interior = _array(root, model, f"{folder}/interior-points.npy").reshape(-1)
     if len(interior) != len(nodes):
         raise InputError(
             f"published data: {model} marks {len(interior)} nodes but has {len(nodes)}"
         )
     held = np.flatnonzero(~interior.astype(bool))
-    moved = _array_if_there(root, model, "geometryData/disp-add.npy", nodes.shape)
+    moved = _array_if_there(root, model, f"{folder}/disp-add.npy", nodes.shape)
     displacement = np.zeros((len(held), 3)) if moved is None else moved[held] * scale
-    # The release leaves the orientation of its elements open.
-    return Mesh(nodes, orient(nodes, elements), {"held": held}), displacement
+    # The release leaves the orientation of its elements and facets open.
+    elements = orient(nodes, elements)
+    pressed = _array_if_there(root, model, f"{folder}/pressure-surface-facets.npy", (None, 4))
+    facets = {}
+    if pressed is not None:
+        surface = boundary_facets(elements)
+        wanted = {tuple(row) for row in np.sort(pressed[:, 1:], axis=1).tolist()}
+        inside = [tuple(row) in wanted for row in np.sort(surface, axis=1).tolist()]
+        facets[PRESSURE_SURFACE] = surface[inside]
+    fibres = _array_if_there(
+        root, model, f"{folder}/fibre-field-elementwise.npy", (len(elements), 3, 1)
+    )
+    if fibres is not None:
+        fibres = fibres[:, :, 0].astype(float)
+        fibres = fibres / np.linalg.norm(fibres, axis=1, keepdims=True)  # stored in float32
+    mesh = Mesh(nodes, elements, {"held": held}, facets)
+    return PublishedGeometry(mesh, displacement, fibres)
 
 
 def read_tests(root: str | Path, model: str) -> PublishedTests:

@@ -18,6 +18,8 @@ import numpy as np
 
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain, determinant
+from emulator.mechanics.loads import Gravity
+from emulator.mechanics.pressure import LocalTerm
 
 if TYPE_CHECKING:  # a scene is made of mechanics, so mechanics only names its type
     from emulator.scenes.scene import Scene
@@ -38,32 +40,47 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
-    """``W(H)`` in kPa for one displacement gradient (3, 3) at parameters ``theta`` (p,)."""
+    """``W(H, fibre)`` in kPa for one displacement gradient (3, 3) at parameters ``theta`` (p,)."""
     values = scene.resolve(theta)
     arguments = [values[name] for name in scene.law.parameters]
-    return lambda H: scene.law.energy(Strain(H, barriers), *arguments)
+    return lambda H, fibre=None: scene.law.energy(Strain(H, barriers, fibre), *arguments)
+
+
+def at_points(scene: Scene, function: Callable, H: jax.Array) -> jax.Array:
+    """``function(H)`` at every point of ``H`` (m, q, 3, 3), with the fibre if the scene has one."""
+    if scene.fibres is None:
+        return jax.vmap(jax.vmap(function))(H)
+    return jax.vmap(jax.vmap(function, (0, None)))(H, jnp.asarray(scene.fibres))
 
 
 def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
     """``(u, theta) -> int W dX`` in mN mm."""
 
     def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
-        density = jax.vmap(jax.vmap(point_energy(scene, theta, barriers)))
-        return jnp.sum(scene.discretisation.weights * density(displacement_gradient(scene, u)))
+        density = at_points(
+            scene, point_energy(scene, theta, barriers), displacement_gradient(scene, u)
+        )
+        return jnp.sum(scene.discretisation.weights * density)
 
     return energy
 
 
+def local_terms(scene: Scene) -> list[LocalTerm]:
+    """Potentials of the loads that follow the deformation."""
+    return [load.term(scene) for load in scene.loads if not isinstance(load, Gravity)]
+
+
 def nodal_dead_force(scene: Scene) -> np.ndarray | None:
     """Consistent nodal forces of the dead loads, (n, 3) in mN; ``None`` when there are none."""
-    if not scene.loads:
+    dead = [load for load in scene.loads if isinstance(load, Gravity)]
+    if not dead:
         return None
     grid = scene.discretisation
     volume = np.einsum("mq,qa->ma", grid.weights, grid.values)
     nodal_volume = np.bincount(
         grid.connectivity.ravel(), volume.ravel(), minlength=len(scene.mesh.nodes)
     )
-    return nodal_volume[:, None] * sum(load.body_force for load in scene.loads)
+    return nodal_volume[:, None] * sum(load.body_force for load in dead)
 
 
 def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
@@ -76,7 +93,15 @@ def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
         NaN wherever an element is inverted.
     """
     internal = strain_energy(scene, barriers)
-    force = nodal_dead_force(scene)
-    if force is None:
-        return internal
-    return lambda u, theta: internal(u, theta) - jnp.vdot(force, u)
+    force, terms = nodal_dead_force(scene), local_terms(scene)
+
+    def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
+        total = internal(u, theta)
+        if force is not None:
+            total = total - jnp.vdot(force, u)
+        if terms:
+            values = scene.resolve(theta)
+            total = total + sum(term.total(u, values) for term in terms)
+        return total
+
+    return energy

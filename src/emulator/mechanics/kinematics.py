@@ -34,10 +34,19 @@ class Strain:
     ----------
     H : (3, 3) displacement gradient, dimensionless.
     barriers : limits on the invariants, for training only. ``None`` leaves them exact.
+    fibre_direction : (3,) unit vector in the reference body, for laws that ask for it.
     """
 
     H: jax.Array
     barriers: Barriers | None = None
+    fibre_direction: jax.Array | None = None
+
+    @property
+    def fibre(self) -> jax.Array:
+        """The fibre direction, (3,); a scene gives one to every law that asks for it."""
+        if self.fibre_direction is None:
+            raise TypeError("this point has no fibre")
+        return self.fibre_direction
 
     @property
     def J_minus_1(self) -> jax.Array:
@@ -55,5 +64,33 @@ class Strain:
     @property
     def I1_minus_3(self) -> jax.Array:
         """First invariant of ``C = F^T F`` less its value at rest, shape ()."""
+        return self._limited_I1(2.0 * jnp.trace(self.H) + jnp.sum(self.H * self.H))
+
+    @property
+    def isochoric_I1_minus_3(self) -> jax.Array:
+        """``J^(-2/3) I1 - 3``, blind to volume change, shape ()."""
         change = 2.0 * jnp.trace(self.H) + jnp.sum(self.H * self.H)
+        power = -2.0 / 3.0 * self.ln_J
+        return self._limited_I1(change * jnp.exp(power) + 3.0 * jnp.expm1(power))
+
+    @property
+    def isochoric_I4f_minus_1(self) -> jax.Array:
+        """``J^(-2/3) f . C f - 1``: squared fibre stretch less 1, volume change taken out, ()."""
+        along = self.H @ self.fibre
+        change = 2.0 * jnp.vdot(self.fibre, along) + jnp.vdot(along, along)
+        power = -2.0 / 3.0 * self.ln_J
+        change = change * jnp.exp(power) + jnp.expm1(power)
+        return change if self.barriers is None else self.barriers.limit_I4f(1.0 + change) - 1.0
+
+    @property
+    def green_lagrange(self) -> jax.Array:
+        """``E = (C - I)/2``, shape (3, 3)."""
+        return 0.5 * (self.H + self.H.T + self.H.T @ self.H)
+
+    def _limited_I1(self, change: jax.Array) -> jax.Array:
         return change if self.barriers is None else self.barriers.limit_I1(3.0 + change) - 3.0
+
+
+def cofactor(A: jax.Array) -> jax.Array:
+    """Cofactor matrix ``det(A) A^-T`` of one 3x3 matrix by cross products of its rows."""
+    return jnp.stack([jnp.cross(A[1], A[2]), jnp.cross(A[2], A[0]), jnp.cross(A[0], A[1])])

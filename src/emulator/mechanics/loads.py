@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.mechanics.pressure import CavityPressure, PublishedPressure
 
 # (1 g/cm3)(1 m/s2) = 1e-6 kg/mm3 m/s2 = 1e-6 N/mm3 = 1e-3 mN/mm3, and 1 mN/mm2 = 1 kPa.
 _KPA_PER_MM = 1.0e-3
@@ -35,6 +36,11 @@ class Gravity:
         if len(self.direction) != 3 or not 0.0 < np.linalg.norm(self.direction) < np.inf:
             raise InputError(f"gravity: direction is {self.direction}; give 3 numbers, not all 0")
 
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names this load takes from theta or the constants: none."""
+        return ()
+
     def describe(self) -> list[object]:
         """What tells this load from another, however it was written."""
         return ["gravity", *(float(x) + 0.0 for x in np.round(self.body_force, 12))]
@@ -47,4 +53,4 @@ class Gravity:
         return weight * direction / np.linalg.norm(direction)
 
 
-Load = Gravity
+Load = Gravity | CavityPressure | PublishedPressure

@@ -32,7 +32,7 @@ class LocalTerm:
     """A sum of local energies.
 
     nodes : (k, a) nodes each local energy depends on.
-    data : arrays with leading axis k.
+    data : NumPy arrays with leading axis k; made under a trace, JAX ones would be its tracers.
     energy : ``energy(u, data_row, values) -> ()`` in mN mm for one of them, ``u`` (a, 3).
     """
 
@@ -82,7 +82,7 @@ class CavityPressure:
         def energy(u: jax.Array, corners: jax.Array, values: Mapping[str, jax.Array]) -> jax.Array:
             return -_pressure(self, values) * (_volume(corners) - _volume(corners + u))
 
-        return LocalTerm(facets, jnp.asarray(X), energy)
+        return LocalTerm(facets, X, energy)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,10 @@ class PublishedPressure:
     facet_set: str
     pressure: float | None = None
 
-    parameters = CavityPressure.parameters
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names this load takes from theta or the constants."""
+        return () if self.pressure is not None else ("pressure",)
 
     def describe(self) -> list[object]:
         """What tells this load from another."""
@@ -113,7 +116,7 @@ class PublishedPressure:
         nodes = scene.mesh.elements[behind]
         on_facet = (nodes[:, :, None] == facets[:, None, :]).any(axis=2)
         gradients = scene.discretisation.gradients[behind, 0]
-        data = (jnp.asarray(area), jnp.asarray(on_facet / 3.0), jnp.asarray(gradients))
+        data = (area, on_facet / 3.0, gradients)
 
         def energy(u: jax.Array, data: Any, values: Mapping[str, jax.Array]) -> jax.Array:
             area, mean, gradients = data

@@ -53,7 +53,8 @@ class Scene:
     parameters : entries of theta, in order.
     loads : external loads; none is a body deformed by its supports alone.
     supports : where the displacement is known.
-    constants : law parameters that do not vary.
+    constants : parameters of the law and the loads that do not vary.
+    fibres : (m, 3) unit fibre direction of each element, for laws that ask for it.
     recipe : how a built-in scene was made, so that a file can make it again.
     """
 
@@ -64,29 +65,53 @@ class Scene:
     loads: tuple[Load, ...] = ()
     supports: tuple[Support, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
+    fibres: np.ndarray | None = None
     recipe: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "recipe", MappingProxyType(dict(self.recipe)))
-        given = list(self.parameter_names) + list(self.constants)
-        for name in given:
-            if name not in self.law.parameters:
-                raise InputError(
-                    f"scene '{self.name}': parameter '{name}' is not one of law "
-                    f"'{self.law.name}': {', '.join(self.law.parameters)}"
-                )
-            if given.count(name) > 1:
-                raise InputError(f"scene '{self.name}': parameter '{name}' is given twice")
-        for name in self.law.parameters:
-            if name not in given:
-                raise InputError(f"scene '{self.name}': law '{self.law.name}' needs '{name}'")
+        self._check_names()
+        self._check_fibres()
         if not self.parameters:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
         for name, value in self.constants.items():
             if not np.isfinite(value):
                 raise InputError(f"scene '{self.name}': constant '{name}' is {value}")
         self._check_supports()
+
+    def _check_names(self) -> None:
+        given = list(self.parameter_names) + list(self.constants)
+        known = self.known_names
+        for name in given:
+            if name not in known:
+                raise InputError(
+                    f"scene '{self.name}': parameter '{name}' is not one of law "
+                    f"'{self.law.name}' and its loads: {', '.join(known)}"
+                )
+            if given.count(name) > 1:
+                raise InputError(f"scene '{self.name}': parameter '{name}' is given twice")
+        for name in known:
+            if name not in given:
+                owner = f"law '{self.law.name}'" if name in self.law.parameters else "a load"
+                raise InputError(f"scene '{self.name}': {owner} needs '{name}'")
+
+    def _check_fibres(self) -> None:
+        if self.fibres is None:
+            if self.law.fibres:
+                raise InputError(f"scene '{self.name}': law '{self.law.name}' needs fibres")
+            return
+        if not self.law.fibres:
+            raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no fibres")
+        fibres = frozen_array(self.fibres)
+        object.__setattr__(self, "fibres", fibres)
+        if fibres.shape != (len(self.mesh.elements), 3):
+            raise InputError(
+                f"scene '{self.name}': fibres have shape {fibres.shape}; "
+                f"expected ({len(self.mesh.elements)}, 3)"
+            )
+        if not np.allclose(np.linalg.norm(fibres, axis=1), 1.0, atol=1e-6):
+            raise InputError(f"scene '{self.name}': fibres are not unit vectors")
 
     def _check_supports(self) -> None:
         if not self.supports:
@@ -99,6 +124,14 @@ class Scene:
                 f"scene '{self.name}': the {len(points)} held nodes lie on a "
                 f"{'point' if spans == 0 else 'line'}, about which the body could turn freely"
             )
+
+    @property
+    def known_names(self) -> tuple[str, ...]:
+        """Every parameter the law and the loads take."""
+        names = list(self.law.parameters)
+        for load in self.loads:
+            names += [name for name in load.parameters if name not in names]
+        return tuple(names)
 
     # ---- parameters -------------------------------------------------------------------------
     @property
@@ -161,7 +194,7 @@ class Scene:
         return jnp.stack(columns, axis=-1)
 
     def resolve(self, theta: jax.Array) -> dict[str, jax.Array]:
-        """Every law parameter by name, from theta (p,) and the constants."""
+        """Every parameter of law and loads by name, from theta (p,) and the constants."""
         values: dict[str, Any] = dict(self.constants)
         values.update({name: theta[k] for k, name in enumerate(self.parameter_names)})
         return values
@@ -214,6 +247,10 @@ class Scene:
         digest.update(np.sort(self.mesh.elements, axis=1).tobytes())
         digest.update(self.held.tobytes())
         digest.update((np.round(self.held_displacement, 9) + 0.0).tobytes())
+        if self.fibres is not None:
+            digest.update((np.round(self.fibres, 6) + 0.0).tobytes())
+        for name in sorted({getattr(load, "facet_set", "") for load in self.loads} - {""}):
+            digest.update(np.sort(np.sort(self.mesh.facet_set(name), axis=1), axis=0).tobytes())
         description = {
             "law": self.law.name,
             "constants": {name: float(self.constants[name]) for name in sorted(self.constants)},

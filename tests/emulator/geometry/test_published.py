@@ -3,7 +3,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.geometry.published import read_mesh, read_tests
+from emulator.geometry.published import read_geometry, read_tests
 from emulator.scenes.published import published_scene, published_tests
 
 
@@ -21,7 +21,7 @@ def test_the_built_in_cube_is_twisted_like_the_released_one(published):
 
 
 def test_units(published):
-    mesh, _ = read_mesh(published, "OnceClampedBeam")
+    mesh = read_geometry(published, "OnceClampedBeam").mesh
     np.testing.assert_allclose(np.ptp(mesh.nodes, axis=0), [100.0, 10.0, 10.0])
     thetas, tests = published_tests("OnceClampedBeam", published)
     assert thetas.min() >= 50.0
@@ -33,21 +33,21 @@ def test_units(published):
 
 def test_missing_and_damaged_files_are_named(tmp_path):
     with pytest.raises(InputError, match=r"reference-coords.npy is missing"):
-        read_mesh(tmp_path, "OnceClampedBeam")
+        read_geometry(tmp_path, "OnceClampedBeam")
     with pytest.raises(InputError, match="published model 'Heart' is unknown"):
-        read_mesh(tmp_path, "Heart")
+        read_geometry(tmp_path, "Heart")
     geometry = tmp_path / "OnceClampedBeam" / "geometryData"
     geometry.mkdir(parents=True)
     np.save(geometry / "reference-coords.npy", np.eye(4, 3))
     np.save(geometry / "elements.npy", np.array([[0, 1, 2, 9]]))
     with pytest.raises(InputError, match="name nodes there are none of"):
-        read_mesh(tmp_path, "OnceClampedBeam")
+        read_geometry(tmp_path, "OnceClampedBeam")
     np.save(geometry / "elements.npy", np.array([[0, 1, 2]]))
     with pytest.raises(InputError, match=r"has shape \(1, 3\); expected \('any', 4\)"):
-        read_mesh(tmp_path, "OnceClampedBeam")
+        read_geometry(tmp_path, "OnceClampedBeam")
     np.save(geometry / "reference-coords.npy", np.full((4, 3), np.nan))
     with pytest.raises(InputError, match="has values that are not finite"):
-        read_mesh(tmp_path, "OnceClampedBeam")
+        read_geometry(tmp_path, "OnceClampedBeam")
     folder = tmp_path / "OnceClampedBeam" / "simulationData" / "test"
     folder.mkdir(parents=True)
     (folder / "theta.npy").write_bytes(b"\x93NUMPY\x01\x00")

@@ -7,15 +7,93 @@ from scipy.optimize import brentq
 from emulator.errors import InputError
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS, find_law
+from emulator.mechanics.laws.holzapfel_ogden import (
+    released_from_textbook,
+    textbook_from_released,
+)
 from emulator.mechanics.laws.neo_hookean import lame_from_engineering
+from emulator.mechanics.laws.volumetric import logarithmic, quadratic, quadratic_logarithmic
 from scene_support import rotation, slope
 
 MU, LAM = 3.0, 7.0
-ARGUMENTS = {"neo_hookean": (MU, LAM), "neo_hookean_E_nu": (8.0, 0.3)}
+ARGUMENTS = {
+    "neo_hookean": (MU, LAM),
+    "neo_hookean_E_nu": (8.0, 0.3),
+    "holzapfel_ogden": (0.3, 2.0, 3.0, 2.5, 25.0),
+    "holzapfel_ogden_released": (0.15, 2.0, 1.5, 2.5, 25.0),
+    "guccione": (2.0, 8.0, 2.0, 4.0, 50.0),
+}
+FIBRE = np.array([2.0, -1.0, 2.0]) / 3.0
 
 
 def energy(name, H):
-    return find_law(name).energy(Strain(jnp.asarray(H)), *map(jnp.asarray, ARGUMENTS[name]))
+    strain = Strain(jnp.asarray(H), None, jnp.asarray(FIBRE))
+    return find_law(name).energy(strain, *map(jnp.asarray, ARGUMENTS[name]))
+
+
+def isochoric(F):
+    C = np.linalg.det(F) ** (-2 / 3) * F.T @ F
+    return np.trace(C), FIBRE @ C @ FIBRE
+
+
+def deformation(stretched):
+    """A deformation whose fibres are longer, or shorter, than at rest."""
+    F = np.eye(3) + 0.1 * np.random.default_rng(0).normal(size=(3, 3))
+    return F + (0.25 if stretched else -0.25) * np.outer(FIBRE, FIBRE)
+
+
+@pytest.mark.parametrize("stretched", [True, False])
+def test_holzapfel_ogden_equals_its_formula(stretched):
+    F = deformation(stretched)
+    (I1, I4), J = isochoric(F), np.linalg.det(F)
+    assert (I4 > 1) == stretched
+    volume = 25.0 * (J**2 - 1 - 2 * np.log(J))
+    switch = max(I4 - 1, 0.0)
+    a, b, af, bf, _ = ARGUMENTS["holzapfel_ogden"]
+    expected = a / (2 * b) * (np.exp(b * (I1 - 3)) - 1) + af / (2 * bf) * (
+        np.exp(bf * switch**2) - 1
+    )
+    assert energy("holzapfel_ogden", F - np.eye(3)) == pytest.approx(expected + volume, rel=1e-12)
+    a, b, af, bf, _ = ARGUMENTS["holzapfel_ogden_released"]
+    expected = a / b * (np.exp(b * (I1 - 3)) - 1) + af / bf * (np.exp(bf * (I4 - 1) ** 2) - 1)
+    released = energy("holzapfel_ogden_released", F - np.eye(3))
+    assert released == pytest.approx(expected + volume, rel=1e-12)
+
+
+def test_the_two_holzapfel_ogden_forms_agree_in_tension():
+    assert textbook_from_released(0.15, 1.5) == (0.3, 3.0)
+    assert released_from_textbook(0.3, 3.0) == (0.15, 1.5)
+    pulled, pressed = (deformation(s) - np.eye(3) for s in (True, False))
+    textbook, released = "holzapfel_ogden", "holzapfel_ogden_released"
+    assert energy(textbook, pulled) == pytest.approx(float(energy(released, pulled)), rel=1e-12)
+    assert energy(textbook, pressed) < energy(released, pressed)  # no switch in the released one
+
+
+def test_guccione_equals_its_formula_in_fibre_axes():
+    F = deformation(True)
+    axes = np.linalg.qr(np.column_stack([FIBRE, np.eye(3)[:, :2]]))[0]
+    axes[:, 0] *= np.sign(axes[:, 0] @ FIBRE)
+    E = axes.T @ (0.5 * (F.T @ F - np.eye(3))) @ axes
+    C, bf, bt, bfs, kappa = ARGUMENTS["guccione"]
+    Q = (
+        bf * E[0, 0] ** 2
+        + bt * (E[1, 1] ** 2 + E[2, 2] ** 2 + E[1, 2] ** 2 + E[2, 1] ** 2)
+        + bfs * (E[0, 1] ** 2 + E[1, 0] ** 2 + E[0, 2] ** 2 + E[2, 0] ** 2)
+    )
+    expected = C / 2 * (np.exp(Q) - 1) + kappa / 2 * (np.linalg.det(F) - 1) ** 2
+    assert energy("guccione", F - np.eye(3)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_volumetric_energies_and_their_stiffness():
+    kappa, J = 3.0, 1.2
+    strain = Strain((J ** (1 / 3) - 1) * jnp.eye(3))
+    expected = {
+        quadratic: kappa / 2 * (J - 1) ** 2,
+        quadratic_logarithmic: kappa * (J**2 - 1 - 2 * np.log(J)),
+        logarithmic: kappa / 2 * np.log(J) ** 2,
+    }
+    for law, value in expected.items():
+        assert law(strain, kappa) == pytest.approx(value, rel=1e-12)
 
 
 def test_neo_hookean_equals_its_formula_in_F():
@@ -42,7 +120,7 @@ def test_rest_is_free_of_energy_and_stress(name):
 @pytest.mark.parametrize("name", sorted(LAWS))
 def test_frame_indifference(name):
     F = np.eye(3) + 0.2 * np.random.default_rng(3).normal(size=(3, 3))
-    turned = rotation() @ F
+    turned = rotation() @ F  # the fibre is a direction of the reference body and stays
     assert energy(name, turned - np.eye(3)) == pytest.approx(
         float(energy(name, F - np.eye(3))), rel=1e-12
     )
@@ -54,7 +132,7 @@ def test_stress_and_tangent_are_the_derivatives_taylor(name):
     H, D = 0.1 * rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
     W = lambda h: energy(name, h)
     stress, tangent = jax.grad(W)(jnp.asarray(H)), jax.hessian(W)(jnp.asarray(H))
-    steps = 0.1 / 2.0 ** np.arange(5)
+    steps = 0.02 / 2.0 ** np.arange(5)
     first = [abs(W(H + h * D) - W(H) - h * np.sum(stress * D)) for h in steps]
     second = [
         np.linalg.norm(
@@ -83,5 +161,5 @@ def test_an_inverted_point_has_no_energy():
 
 
 def test_unknown_law_names_the_known_ones():
-    with pytest.raises(InputError, match="law 'hooke' is unknown; known laws: neo_hookean"):
+    with pytest.raises(InputError, match="law 'hooke' is unknown; known laws: guccione, holz"):
         find_law("hooke")

@@ -1,10 +1,27 @@
-"""Hyperelastic laws, one a file. To add one: write its energy, add it to ``LAWS``."""
+"""Hyperelastic laws, one a file.
+
+To add one, write a file with its energy, a function of a :class:`~emulator.mechanics.kinematics.Strain`
+and the law's parameters in kPa, wrap it in a :class:`Law`, and add that to ``LAWS``. Stress and
+tangent follow; the tests of ``tests/emulator/mechanics/test_laws.py`` take it up from the registry
+once ``ARGUMENTS`` there has values for it.
+"""
 
 from emulator.errors import InputError
+from emulator.mechanics.laws.guccione import GUCCIONE
+from emulator.mechanics.laws.holzapfel_ogden import HOLZAPFEL_OGDEN, HOLZAPFEL_OGDEN_RELEASED
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.laws.neo_hookean import NEO_HOOKEAN, NEO_HOOKEAN_E_NU
 
-LAWS: dict[str, Law] = {law.name: law for law in (NEO_HOOKEAN, NEO_HOOKEAN_E_NU)}
+LAWS: dict[str, Law] = {
+    law.name: law
+    for law in (
+        NEO_HOOKEAN,
+        NEO_HOOKEAN_E_NU,
+        HOLZAPFEL_OGDEN,
+        HOLZAPFEL_OGDEN_RELEASED,
+        GUCCIONE,
+    )
+}
 
 
 def find_law(name: str) -> Law:

@@ -17,8 +17,10 @@ class Law:
     name : key in the registry.
     parameters : names, in the order ``energy`` takes them.
     energy : ``energy(strain, *parameters) -> W``, the strain energy density (kPa) of one point.
+    fibres : whether the energy asks for ``strain.fibre``.
     """
 
     name: str
     parameters: tuple[str, ...]
     energy: Callable[..., jax.Array]
+    fibres: bool = False
