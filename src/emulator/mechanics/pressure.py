@@ -10,6 +10,7 @@ for facets whose normals point out of the tissue, into the cavity. The lid is fi
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -52,12 +53,12 @@ class LocalTerm:
 
 
 @dataclass(frozen=True)
-class CavityPressure:
-    """Pressure in a cavity, exact (``-p V``).
+class SurfacePressure(ABC):
+    """A pressure on a facet set.
 
     Parameters
     ----------
-    facet_set : the cavity's wall; its rim must be held.
+    facet_set : where it acts.
     pressure : kPa, or ``None`` to make ``pressure`` a parameter of the scene.
     """
 
@@ -71,7 +72,20 @@ class CavityPressure:
 
     def describe(self) -> list[object]:
         """What tells this load from another."""
-        return ["cavity_pressure", self.facet_set, self.pressure]
+        return [type(self).__name__, self.facet_set, self.pressure]
+
+    def value(self, values: Mapping[str, jax.Array]) -> jax.Array | float:
+        """The pressure in kPa among the scene's resolved parameters."""
+        return values["pressure"] if self.pressure is None else self.pressure
+
+    @abstractmethod
+    def term(self, scene: Scene) -> LocalTerm:
+        """The potential of this load on ``scene``."""
+
+
+@dataclass(frozen=True)
+class CavityPressure(SurfacePressure):
+    """Pressure in a cavity, exact (``-p V``); the rim of its wall must be held."""
 
     def term(self, scene: Scene) -> LocalTerm:
         """The potential ``-p [V(u) - V(0)]``."""
@@ -80,13 +94,13 @@ class CavityPressure:
         X = scene.mesh.nodes[facets]
 
         def energy(u: jax.Array, corners: jax.Array, values: Mapping[str, jax.Array]) -> jax.Array:
-            return -_pressure(self, values) * (_volume(corners) - _volume(corners + u))
+            return -self.value(values) * (_volume(corners) - _volume(corners + u))
 
         return LocalTerm(facets, X, energy)
 
 
 @dataclass(frozen=True)
-class PublishedPressure:
+class PublishedPressure(SurfacePressure):
     r"""The pressure work of the released code, for reproducing it; not a follower pressure.
 
     .. math:: \Pi_p = p \int u \cdot \text{cof}(F) N \, dA
@@ -94,18 +108,6 @@ class PublishedPressure:
     differentiated through :math:`\text{cof}(F)` too. On the released ventricle it acts like a
     pressure 1.39 times larger.
     """
-
-    facet_set: str
-    pressure: float | None = None
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names this load takes from theta or the constants."""
-        return () if self.pressure is not None else ("pressure",)
-
-    def describe(self) -> list[object]:
-        """What tells this load from another."""
-        return ["published_pressure", self.facet_set, self.pressure]
 
     def term(self, scene: Scene) -> LocalTerm:
         """The released work, one value of ``F`` a facet: that of the element behind it."""
@@ -121,15 +123,9 @@ class PublishedPressure:
         def energy(u: jax.Array, data: Any, values: Mapping[str, jax.Array]) -> jax.Array:
             area, mean, gradients = data
             F = jnp.eye(3, dtype=u.dtype) + u.T @ gradients
-            return _pressure(self, values) * jnp.vdot(mean @ u, cofactor(F) @ area)
+            return self.value(values) * jnp.vdot(mean @ u, cofactor(F) @ area)
 
         return LocalTerm(nodes, data, energy)
-
-
-def _pressure(
-    load: CavityPressure | PublishedPressure, values: Mapping[str, jax.Array]
-) -> jax.Array | float:
-    return values["pressure"] if load.pressure is None else load.pressure
 
 
 def _volume(corners: jax.Array) -> jax.Array:

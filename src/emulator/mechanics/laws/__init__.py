@@ -1,9 +1,9 @@
 """Hyperelastic laws, one a file.
 
-To add one, write a file with its energy, a function of a :class:`~emulator.mechanics.kinematics.Strain`
-and the law's parameters in kPa, wrap it in a :class:`Law`, and add that to ``LAWS``. Stress and
-tangent follow; the tests of ``tests/emulator/mechanics/test_laws.py`` take it up from the registry
-once ``ARGUMENTS`` there has values for it.
+To add one, write a file with its energy, a function of a ``Strain`` (see
+:mod:`emulator.mechanics.kinematics`) and the law's parameters; wrap it in a :class:`Law` and add
+that to ``LAWS``. Stress and tangent follow. The tests in ``tests/emulator/mechanics/test_laws.py``
+take it up from the registry once their ``ARGUMENTS`` have values for it.
 """
 
 from emulator.errors import InputError
