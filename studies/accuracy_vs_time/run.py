@@ -24,7 +24,7 @@ from emulator.evaluation import quantiles
 from emulator.forward import ForwardMap, fem_forward
 from emulator.reduced import fit_reduced
 from emulator.scenes import Scene
-from emulator.store import write_json
+from emulator.store import replacing, write_json
 from emulator.training import run_campaign, sobol, uniform
 
 HERE = Path(__file__).parent
@@ -140,8 +140,8 @@ def pareto(points: np.ndarray) -> np.ndarray:
 def draw(cases: list[dict[str, Any]], path: Path) -> None:
     """Error against time of a value and of a gradient, the fronts joined."""
     plt = pyplot()
-    figure, panels = plt.subplots(1, 2, figsize=(13.5, 5.6), sharey=True, layout="constrained")
-    families = {"FEM": "tab:green", "emu": "tab:blue", "POD": "tab:orange"}
+    figure, panels = plt.subplots(1, 2, figsize=(14, 5.2), sharey=True, layout="constrained")
+    colours = {"FEM": "tab:green", "emu": "tab:blue", "POD": "tab:orange"}
     for axes, key, title in zip(
         panels, ("value_s", "gradient_s"), ("one value", "one value with its gradient"), strict=True
     ):
@@ -149,17 +149,21 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
         best = points[pareto(points)]
         best = best[np.argsort(best[:, 0])]
         axes.step(best[:, 0], best[:, 1], where="post", color="0.6", lw=1, label="Pareto front")
-        for case, (x, y) in zip(cases, points, strict=True):
-            axes.plot(x, y, "o", color=families[case["name"][:3]], ms=8)
-            note = f"{case['name']}\noffline {case['offline_s']:.0f} s"
-            axes.annotate(note, (x, y), xytext=(7, 4), textcoords="offset points", fontsize=7.5)
+        for number, (case, (x, y)) in enumerate(zip(cases, points, strict=True), start=1):
+            colour = colours[case["name"][:3]]
+            name = f"{number}  {case['name']}, offline {case['offline_s']:.0f} s"
+            axes.plot(x, y, "o", color=colour, ms=6, label=name)
+            # Neighbours' numbers go to different sides.
+            side = [(7, 5), (7, -12), (-12, -12), (-12, 5)][number % 4]
+            axes.annotate(str(number), (x, y), xytext=side, textcoords="offset points")
         axes.set(xscale="log", yscale="log", xlabel=f"time of {title} (ms)")
-        axes.set_xlim(points[:, 0].min() / 2, points[:, 0].max() * 8)
         axes.grid(alpha=0.25)
-        axes.legend(loc="lower left", frameon=False)
     panels[0].set_ylabel("median displacement error (mm)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", frameon=False, fontsize=9)
     figure.suptitle("once-clamped beam, 390 nodes, 2 parameters: what accuracy costs in time")
-    figure.savefig(path, dpi=130)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=130)
     plt.close(figure)
 
 
