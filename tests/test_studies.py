@@ -40,6 +40,18 @@ def test_accuracy_vs_time(tmp_path):
     assert (tmp_path / "pareto.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
+def test_accuracy_vs_time_in_full(tmp_path):
+    run("accuracy_vs_time", "--out", tmp_path)  # asserts its own claims, times included
+
+
+@pytest.mark.slow
+def test_beam_coverage_in_full(tmp_path, published):
+    results = run("beam_coverage", published, "--out", tmp_path)
+    assert results["summary"]["accepted"] >= 48
+    assert all(40 <= hits <= 50 for hits in results["summary"]["covered"].values())
+
+
 def test_beam_coverage(tmp_path, published):
     results = run("beam_coverage", published, "--cases", 1, "--out", tmp_path)
     assert results["cases"][0]["status"] == "accepted"

@@ -52,7 +52,7 @@ def test_a_linear_gaussian_posterior_is_the_known_one(problem, beam):
 
 def test_the_same_seed_gives_the_same_draws(problem):
     _, _, model, data = problem
-    options = cal.NUTSOptions(100, 50)
+    options = cal.NUTSOptions(100, 50, rounds=1)
     a, b, c = (cal.sample(model, data, options=options, seed=s).draws()["mu"] for s in (3, 3, 4))
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, c)
@@ -102,7 +102,7 @@ def test_fem_inside_the_sampler(beam, simulator, kind):
     model = cal.model(forward, cal.nodal_displacements(beam, nodes), cal.GaussianNoise(sd=0.05))
     data = np.asarray(simulator(theta)[nodes])
     data = data + 0.05 * np.random.default_rng(0).normal(size=data.shape)
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(40, 40, chains=2))
+    posterior = cal.sample(model, data, options=cal.NUTSOptions(40, 40, chains=2, rounds=1))
     draws = posterior.draws()["mu"]
     assert np.isfinite(draws).all()
     assert abs(draws.mean() - 73.0) < 5 * draws.std() + 0.5
