@@ -167,7 +167,7 @@ def test_a_posterior_of_another_emulator_is_not_certified(capsys, monkeypatch, t
 
     emulator = load("once_clamped_beam")
     save_emulator(emulator, "mine")
-    words = ["--truth", "mu=73", "lam=61", "--emulator", "mine", "--warmup", 20, "--draws", 20]
+    words = ["--truth", "mu=73", "lam=61", "--emulator", "mine", "--warmup", 10, "--draws", 10]
     code, _ = answer(capsys, "infer", "once_clamped_beam", *words, "--no-certify", "--out", "r")
     assert code == 0
     from dataclasses import replace
@@ -190,10 +190,10 @@ def test_train_evaluate_infer_certify(capsys, block, tmp_path):
     """The whole path on a scene of the user's own."""
     out = tmp_path / "e"
     code, record = answer(
-        capsys, "train", block, "--steps", 150, "--simulations", 16, "--batch", 8, "--out", out
+        capsys, "train", block, "--steps", 100, "--simulations", 16, "--batch", 8, "--out", out
     )
     assert code == 0
-    assert "--objective both --steps 150 --simulations 16 --batch 8 --seed 0" in record["command"]
+    assert "--objective both --steps 100 --simulations 16 --batch 8 --seed 0" in record["command"]
     assert {path.name for path in out.iterdir()} == {"emulator.json", "weights.safetensors"}
     code, errors = answer(capsys, "evaluate", out, "--against", "fem", "--cases", 5)
     assert code == 0

@@ -12,8 +12,9 @@ def test_rows_pass_inside_their_tolerance_and_never_on_nan():
     assert Row("a", 1.0, 1.0, 0.1, "s").to_json()["passed"]
 
 
-def test_fem_reproduces_the_released_solutions(published):
-    rows = {row.name.split(",")[0]: row for row in verify_published(published)}
+@pytest.mark.parametrize("most", [12, pytest.param(None, marks=pytest.mark.slow)])
+def test_fem_reproduces_the_released_solutions(published, most):
+    rows = {row.name.split(",")[0]: row for row in verify_published(published, most=most)}
     assert len(rows) == 8
     for model in ("OnceClampedBeam", "TwistingBeam"):
         assert rows[f"{model}: relative displacement error"].measured <= 1e-8
@@ -33,7 +34,7 @@ def test_a_wrong_reference_is_noticed(published, tmp_path, monkeypatch):
     field = np.load(path)
     path.chmod(0o644)
     np.save(path, field * (1 + 1e-6))
-    failed = [row.name for row in verify_published(tmp_path) if not row.passed]
+    failed = [row.name for row in verify_published(tmp_path, most=5) if not row.passed]
     assert any("TwistingBeam: relative displacement error" in name for name in failed)
     assert not any("OnceClampedBeam" in name for name in failed)
 
