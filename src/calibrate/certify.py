@@ -72,7 +72,7 @@ class Certificate:
 
 def pareto_threshold(draws: int) -> float:
     """Largest shape at which ``draws`` weighted draws are enough (Vehtari et al. 2024, Eq. 13)."""
-    return min(1.0 - 1.0 / np.log10(draws), 0.7)
+    return float(min(1.0 - 1.0 / np.log10(draws), 0.7))
 
 
 def judge(
