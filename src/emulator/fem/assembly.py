@@ -5,8 +5,10 @@ r"""Residual and tangent of a scene's potential energy over its free degrees of 
     K = \frac{\partial^2 \Pi}{\partial u^2}
       = \sum_{e,q} w_{eq}\, B^T \frac{\partial^2 W}{\partial H^2} B
 
-with :math:`B` the shape-function gradients. Dead loads have no tangent; those that follow the
-deformation add the Hessians of their own potentials, facet by facet.
+with :math:`B` the shape-function gradients. Dead loads have no tangent; elastic supports and loads
+that follow the deformation add the Hessians of their own potentials, or the derivatives of their
+forces, facet by facet. With mean dilatation the points of an element are coupled; its block is in
+:mod:`emulator.fem.mixed`.
 """
 
 from __future__ import annotations
@@ -19,16 +21,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.fem.mixed import Condensed, consistent, linearise
 from emulator.fem.sparse import Factorisation, Pattern, block_pattern
 from emulator.mechanics.energy import (
     at_points,
     displacement_gradient,
+    local_forces,
     local_terms,
     nodal_dead_force,
     point_energy,
+    spring_terms,
     strain_energy,
 )
-from emulator.mechanics.pressure import LocalTerm
+from emulator.mechanics.local import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
 
@@ -48,16 +53,27 @@ class System:
         return free
 
     @cached_property
+    def springs(self) -> list[LocalTerm]:
+        """Potentials of the elastic supports."""
+        return spring_terms(self.scene)
+
+    @cached_property
     def terms(self) -> list[LocalTerm]:
         """Potentials of the loads that follow the deformation."""
         return local_terms(self.scene)
 
     @cached_property
+    def forces(self) -> list[LocalForce]:
+        """Loads that follow the deformation and have no potential."""
+        return local_forces(self.scene)
+
+    @cached_property
     def pattern(self) -> Pattern:
-        """Sparsity of the tangent: bulk elements, then the loads' local terms."""
+        """Sparsity of the tangent: bulk elements, then springs, then the loads."""
         free_index = np.full(self.scene.held.size, -1)
         free_index[self.free] = np.arange(len(self.free))
-        groups = [self.scene.discretisation.connectivity, *(term.nodes for term in self.terms)]
+        local = (*self.springs, *self.terms, *self.forces)
+        groups = [self.scene.discretisation.connectivity, *(part.nodes for part in local)]
         dofs = [(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1) for nodes in groups]
         return block_pattern(dofs, free_index, symmetric=self.factorisation == "cholmod")
 
@@ -76,43 +92,108 @@ class System:
         flat = jnp.zeros(self.scene.held.size, dtype=free_values.dtype)
         return flat.at[self.free].set(free_values, unique_indices=True).reshape(-1, 3)
 
+    def internal_energy(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Energy stored in the body and its elastic supports, mN mm."""
+        energy = strain_energy(self.scene)(u, theta)
+        if self.springs:
+            values = self.scene.resolve(theta)
+            energy = energy + sum(spring.total(u, values) for spring in self.springs)
+        return energy
+
     def internal_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Gradient of the strain energy, (n, 3) in mN, reactions included."""
-        return jax.grad(strain_energy(self.scene))(u, theta)
+        """Gradient of the stored energy, (n, 3) in mN, reactions included."""
+        return jax.grad(self.internal_energy)(u, theta)
 
     def external_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Force of the loads at the full level, (n, 3) in mN."""
-        if not self.terms:
-            return jnp.asarray(self.dead_force)
+        force = jnp.asarray(self.dead_force)
         values = self.scene.resolve(theta)
-        work = jax.grad(lambda v: sum(term.total(v, values) for term in self.terms))
-        return self.dead_force - work(u)
+        if self.terms:
+            force = force - jax.grad(lambda v: sum(t.total(v, values) for t in self.terms))(u)
+        return force + self.follower_force(u, theta)
+
+    def follower_force(self, u: jax.Array, theta: jax.Array) -> jax.Array | float:
+        """Force (n, 3) in mN of the loads without a potential; 0 when there are none."""
+        values = self.scene.resolve(theta)
+        return sum((force.total(u, values) for force in self.forces), 0.0)
 
     def potential(
-        self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
+        self,
+        u: jax.Array,
+        theta: jax.Array,
+        load: jax.Array | float = 1.0,
+        follower_force: jax.Array | float = 0.0,
     ) -> tuple[jax.Array, jax.Array]:
-        """Potential energy at ``load`` times the loads, and the size of its parts, in mN mm."""
-        internal = strain_energy(self.scene)(u, theta)
+        """Potential energy at ``load`` times the loads, and the size of its parts, in mN mm.
+
+        A load without a potential counts as the dead force ``follower_force`` (n, 3).
+        """
+        stored = self.internal_energy(u, theta)
         work = jnp.vdot(self.dead_force, u)
+        if self.forces:
+            work = work + jnp.vdot(jnp.asarray(follower_force), u)
         if self.terms:
             values = self.scene.resolve(theta)
             work = work - sum(term.total(u, values) for term in self.terms)
-        return internal - load * work, jnp.abs(internal) + jnp.abs(load * work)
+        return stored - load * work, jnp.abs(stored) + jnp.abs(load * work)
 
     def residual(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
         """Free part (f,) of the force out of balance in mN, at ``load`` times the loads."""
         return self.restrict(self.internal_force(u, theta) - load * self.external_force(u, theta))
 
+    @property
+    def mixed(self) -> bool:
+        """Whether elements have volumes and pressures of their own."""
+        return self.scene.dilatation == "mean"
+
+    def mixed_residual(
+        self,
+        u: jax.Array,
+        theta: jax.Array,
+        load: jax.Array | float,
+        condensed: Condensed,
+        move: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        """Residual (f,) with the volumes eliminated, and its change along ``move`` (n, 3)."""
+        nodes = self.scene.discretisation.connectivity
+        values = self.scene.resolve(theta)
+
+        def spread(local: jax.Array) -> jax.Array:
+            return jnp.zeros_like(u).at[nodes].add(local.reshape(*nodes.shape, 3))
+
+        def others(v: jax.Array) -> jax.Array:
+            springs = jax.grad(lambda w: sum((s.total(w, values) for s in self.springs), 0.0))(v)
+            return springs - load * self.external_force(v, theta)
+
+        force, change = jax.jvp(others, (u,), (move,))
+        local = move[nodes].reshape(len(nodes), -1)
+        change = change + spread(jnp.einsum("mij,mj->mi", condensed.tangent, local))
+        return self.restrict(spread(condensed.force) + force), self.restrict(change)
+
     def tangent(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
         """Nonzeros (nnz,) of the tangent over the free degrees of freedom, mN/mm."""
-        grid = self.scene.discretisation
-        hessian = jax.hessian(point_energy(self.scene, theta))
-        A = at_points(self.scene, hessian, displacement_gradient(self.scene, u))
-        A = A * grid.weights[:, :, None, None, None, None]
-        bulk = jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
+        return self.assemble(self.bulk(u, theta), u, theta, load)
+
+    def assemble(
+        self, bulk: jax.Array, u: jax.Array, theta: jax.Array, load: jax.Array | float
+    ) -> jax.Array:
+        """Nonzeros (nnz,) of the tangent whose elements' blocks are ``bulk``, loads included."""
         values = self.scene.resolve(theta)
-        blocks = [bulk, *(load * term.tangents(u, values) for term in self.terms)]
+        blocks = [bulk]
+        blocks += [spring.tangents(u, values) for spring in self.springs]
+        blocks += [load * part.tangents(u, values) for part in (*self.terms, *self.forces)]
         return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
+
+    def bulk(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Second derivatives (m, ...) of the strain energy, element by element."""
+        grid, scene = self.scene.discretisation, self.scene
+        if scene.dilatation == "mean":
+            return linearise(scene, u, consistent(scene, u, theta), theta).tangent
+        A = at_points(
+            scene, jax.hessian(point_energy(scene, theta)), displacement_gradient(scene, u)
+        )
+        A = A * grid.weights[:, :, None, None, None, None]
+        return jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
 
     def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
         """Solve ``K x = rhs`` over the free degrees of freedom, shape (f,)."""

@@ -10,8 +10,13 @@ At load level :math:`s \in (0, 1]` the dead loads are :math:`s f` and the held d
 and steps by the largest :math:`\alpha \in \{1, \tfrac12, \tfrac14, \dots\}` that keeps every
 element's :math:`J` above a fraction of its present least value and, once the supports are met,
 lowers the potential energy (Armijo's rule; where the tangent is indefinite and Newton's direction
-climbs, the opposite one is taken). Exponential laws diverge without it. A level that does not
-converge is tried again with half the load increment.
+climbs, the opposite one is taken). Exponential laws diverge without it. Loads without a potential
+are held at their present force for this rule, and a step that lowers the residual instead will do.
+A level that does not converge is tried again with half the load increment.
+
+With mean dilatation the elements' volumes and pressures are iterates of their own (see
+:mod:`emulator.fem.mixed`); the point sought is then a saddle, and steps are only kept from
+crushing elements.
 """
 
 from __future__ import annotations
@@ -24,6 +29,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
+from emulator.fem.mixed import Condensed, Volumes, advance, consistent, linearise
 from emulator.fem.solution import Solution, Status
 from emulator.mechanics.energy import volume_ratio
 
@@ -54,8 +60,20 @@ class NewtonOptions:
     shrink: float = 0.2
 
 
+class _Step(NamedTuple):
+    """Newton's full step, and what judges how much of it to take."""
+
+    move: jax.Array  # (n, 3)
+    residual: jax.Array  # (f,)
+    slope: jax.Array  # residual . move, before it was turned round
+    settled: jax.Array  # whether the supports are where they belong
+    solvable: jax.Array
+    condensed: Condensed | None
+
+
 class _State(NamedTuple):
     u: jax.Array  # (n, 3) current iterate
+    volumes: Volumes | None  # that go with it, for mean dilatation
     level: jax.Array  # load level being solved
     u_reached: jax.Array  # (n, 3) solution at the last level that converged
     reached: jax.Array  # that level
@@ -84,38 +102,31 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     def balanced(u: jax.Array, level: jax.Array) -> tuple[jax.Array, jax.Array]:
         return balance(system, u, theta, level, options.absolute)
 
+    def volumes_of(u: jax.Array) -> Volumes | None:
+        return consistent(system.scene, u, theta) if system.mixed else None
+
     def step(state: _State) -> _State:
-        residual, _ = balanced(state.u, state.level)
-        tangent = system.tangent(state.u, theta, state.level)
         move_held = jnp.where(held, state.level * held_values - state.u, 0.0)
-        # K times the held displacement, without assembling the held columns.
-        _, pull = jax.jvp(
-            lambda v: system.residual(v, theta, state.level), (state.u,), (move_held,)
-        )
-        solvable = jnp.all(jnp.isfinite(tangent))
-        move = system.solve(system.pattern.safe_values(tangent), -(residual + pull))
-        slope = jnp.vdot(residual, move)
-        settled = jnp.all(move_held == 0.0)
-        move = jnp.where(settled & (slope > 0.0), -move, move)
-        move = system.extend(move) + move_held
-        energy, size = system.potential(state.u, theta, state.level)
-        # Near the solution the decrease drowns in the round-off of the energy's parts.
-        ceiling = energy + _ROUND_OFF * size
-        descent = jnp.where(settled, -_ARMIJO * jnp.abs(slope), jnp.inf)
-
-        def lowers(fraction: jax.Array) -> jax.Array:
-            after, _ = system.potential(state.u + fraction * move, theta, state.level)
-            return after <= ceiling + fraction * descent
-
-        fraction = _largest_fraction(system, state.u, move, lowers, options.shrink)
-        admissible = solvable & (fraction > 0.0)
-        u = jnp.where(admissible, state.u + fraction * move, state.u)
+        step = _full_step(system, state, theta, move_held)
+        accept = _acceptance(system, state, theta, step)
+        fraction = _largest_fraction(system, state.u, step.move, accept, options.shrink)
+        admissible = step.solvable & (fraction > 0.0)
+        u = jnp.where(admissible, state.u + fraction * step.move, state.u)
         # After a full step the supports are met; setting them avoids the last bit of round-off.
         u = jnp.where(held & admissible & (fraction == 1.0), state.level * held_values, u)
         placed = jnp.all(jnp.where(held, u == state.level * held_values, True))
         _, error = balanced(u, state.level)
         error = jnp.where(placed & admissible & jnp.isfinite(error), error, jnp.inf)
-        return _next_level(options, state, u, admissible, error)
+        after = _next_level(options, state, u, admissible, error)
+        if state.volumes is None or step.condensed is None:
+            return after
+        moved = advance(system.scene, state.volumes, step.condensed, step.move, fraction)
+        back = volumes_of(after.u)
+        # A level given up starts again from the last solution, whose volumes are its own.
+        kept = after.level == state.level
+        return after._replace(
+            volumes=jax.tree.map(lambda a, b: jnp.where(kept, a, b), moved, back)
+        )
 
     def running(state: _State) -> jax.Array:
         return state.status == Status.RUNNING
@@ -133,6 +144,7 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     u = jnp.where(fine & ~inverted, start, 0.0)
     state = _State(
         u=u,
+        volumes=volumes_of(u),
         level=jnp.array(1.0),
         u_reached=jnp.zeros_like(u),
         reached=jnp.array(0.0),
@@ -152,6 +164,67 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
         residual=state.error,
         load_reached=jnp.where(converged, 1.0, state.reached),
     )
+
+
+def _full_step(
+    system: System, state: _State, theta: jax.Array, move_held: jax.Array
+) -> _Step:
+    """Newton's step from ``state``, turned round where it would climb the potential."""
+    u, level = state.u, state.level
+    if state.volumes is None:
+        condensed = None
+        residual = system.residual(u, theta, level)
+        values = system.tangent(u, theta, level)
+        # K times the held displacement, without assembling the held columns.
+        _, pull = jax.jvp(lambda v: system.residual(v, theta, level), (u,), (move_held,))
+    else:
+        condensed = linearise(system.scene, u, state.volumes, theta)
+        residual, pull = system.mixed_residual(u, theta, level, condensed, move_held)
+        values = system.assemble(condensed.tangent, u, theta, level)
+    move = system.solve(system.pattern.safe_values(values), -(residual + pull))
+    slope = jnp.vdot(residual, move)
+    settled = jnp.all(move_held == 0.0)
+    if condensed is None:
+        move = jnp.where(settled & (slope > 0.0), -move, move)
+    return _Step(
+        move=system.extend(move) + move_held,
+        residual=residual,
+        slope=slope,
+        settled=settled,
+        solvable=jnp.all(jnp.isfinite(values)),
+        condensed=condensed,
+    )
+
+
+def _acceptance(
+    system: System, state: _State, theta: jax.Array, step: _Step
+) -> Callable[[jax.Array], jax.Array]:
+    """Whether a fraction of the step makes progress, besides crushing no element."""
+    if step.condensed is not None:
+        volumes, condensed = state.volumes, step.condensed
+        assert volumes is not None
+
+        def positive(fraction: jax.Array) -> jax.Array:
+            after = advance(system.scene, volumes, condensed, step.move, fraction)
+            return jnp.min(after.change) > -1.0
+
+        return positive
+    follower = system.follower_force(state.u, theta)
+    energy, size = system.potential(state.u, theta, state.level, follower)
+    # Near the solution the decrease drowns in the round-off of the energy's parts.
+    ceiling = energy + _ROUND_OFF * size
+    descent = jnp.where(step.settled, -_ARMIJO * jnp.abs(step.slope), jnp.inf)
+
+    def lowers(fraction: jax.Array) -> jax.Array:
+        trial = state.u + fraction * step.move
+        after, _ = system.potential(trial, theta, state.level, follower)
+        lower = after <= ceiling + fraction * descent
+        if system.forces:
+            left = system.residual(trial, theta, state.level)
+            lower |= jnp.sum(left**2) < (1.0 - _ARMIJO * fraction) * jnp.sum(step.residual**2)
+        return lower
+
+    return lowers
 
 
 def _largest_fraction(
@@ -204,7 +277,7 @@ def _next_level(
     )
     moved = solved | failed
     level = jnp.where(moved & ~complete, jnp.minimum(1.0, reached + increment), state.level)
-    return _State(
+    return state._replace(
         u=jnp.where(failed, u_reached, u),
         level=level,
         u_reached=u_reached,

@@ -1,12 +1,15 @@
-"""Shape functions and quadrature of a mesh, tabulated once from scikit-fem."""
+"""Shape functions and quadrature of a mesh, tabulated once from scikit-fem's reference elements."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from skfem import Basis, ElementTetP1
+from skfem import ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2
+from skfem.quadrature import get_quadrature
 
+from emulator.errors import InputError
 from emulator.geometry.mesh import Mesh, frozen_array
 
 
@@ -26,14 +29,58 @@ class Discretisation:
     weights: np.ndarray
 
 
-def linear_tetrahedra(mesh: Mesh) -> Discretisation:
-    """P1 elements with one quadrature point, exact for their constant gradient."""
-    basis = Basis(mesh.to_skfem(), ElementTetP1(), intorder=1)
-    gradients = np.stack([shape[0].grad for shape in basis.basis])  # (a, 3, m, q)
-    values = np.stack([np.asarray(shape[0])[0] for shape in basis.basis])  # (a, q)
+@dataclass(frozen=True, eq=False)
+class FacetRule:
+    """Quadrature on a reference triangle; ``q`` points, ``a`` nodes of the facet.
+
+    values : (q, a) shape functions.
+    slopes : (q, a, 2) their derivatives along the two reference directions.
+    weights : (q,) summing to 1/2, the reference triangle's area.
+    """
+
+    values: np.ndarray
+    slopes: np.ndarray
+    weights: np.ndarray
+
+
+def discretise(mesh: Mesh) -> Discretisation:
+    """Linear elements with one point, quadratic ones with four: each exact for its stiffness.
+
+    The geometry is interpolated by the same shape functions, so a quadratic mesh may be curved.
+
+    Raises
+    ------
+    InputError
+        A curved element that folds over itself at a quadrature point.
+    """
+    element, degree = (ElementTetP1(), 1) if mesh.order == 1 else (ElementTetP2(), 2)
+    points, weights = get_quadrature(element.refdom, degree)
+    values, slopes = _tabulate(element, points)
+    jacobian = np.einsum("mai,qaj->mqij", mesh.nodes[mesh.elements], slopes)
+    determinant = np.linalg.det(jacobian)
+    if not (determinant > 0.0).all():
+        folded = int(np.flatnonzero(~(determinant > 0.0).all(axis=1))[0])
+        raise InputError(f"mesh: element {folded} is curved so much that it folds over itself")
     return Discretisation(
-        connectivity=frozen_array(basis.element_dofs.T, np.int64),
-        gradients=frozen_array(gradients.transpose(2, 3, 0, 1)),
-        values=frozen_array(values.T),
-        weights=frozen_array(basis.dx),
+        connectivity=mesh.elements,
+        gradients=frozen_array(np.einsum("qaj,mqji->mqai", slopes, np.linalg.inv(jacobian))),
+        values=frozen_array(values),
+        weights=frozen_array(determinant * weights),
     )
+
+
+def facet_rule(order: int, degree: int) -> FacetRule:
+    """Quadrature exact for polynomials of ``degree`` on facets with 3 or 6 nodes."""
+    element = ElementTriP1() if order == 1 else ElementTriP2()
+    points, weights = get_quadrature(element.refdom, degree)
+    values, slopes = _tabulate(element, points)
+    return FacetRule(frozen_array(values), frozen_array(slopes), frozen_array(weights))
+
+
+def _tabulate(element: Any, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values (q, a) and slopes (q, a, d) of a nodal reference element at ``points`` (d, q)."""
+    count = len(element.doflocs)
+    shapes = [element.lbasis(points, k) for k in range(count)]
+    values = np.stack([np.broadcast_to(value, points.shape[1]) for value, _ in shapes], axis=1)
+    slopes = np.stack([np.broadcast_to(slope, points.shape) for _, slope in shapes])
+    return values, slopes.transpose(2, 0, 1)

@@ -6,7 +6,8 @@ import numpy as np
 from skfem import MeshTet
 
 from emulator.errors import InputError
-from emulator.geometry.mesh import Mesh, boundary_facets, orient
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import boundary_facets, orient
 
 _FACES = (
     ("left", 0, 0),

@@ -1,9 +1,10 @@
-"""Tetrahedral mesh with named node sets, checked once when it is made."""
+"""Tetrahedral mesh with named node and facet sets, checked once when it is made."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import combinations
 from types import MappingProxyType
 
@@ -11,6 +12,7 @@ import numpy as np
 from skfem import MeshTet
 
 from emulator.errors import InputError
+from emulator.geometry.tetrahedra import boundary_facets, signed_volumes
 
 # A tetrahedron is taken for flat when its volume is below this fraction of its longest edge cubed;
 # a well-shaped one has about 0.1. Round-off in the corner coordinates is many orders smaller.
@@ -24,42 +26,18 @@ def frozen_array(values: object, dtype: type = float) -> np.ndarray:
     return array
 
 
-def signed_volumes(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """Signed volume of each tetrahedron in mm3, shape (m,); negative when inverted."""
-    corner = nodes[elements]
-    a, b, c = (corner[:, k] - corner[:, 0] for k in (1, 2, 3))
-    return np.einsum("mi,mi->m", a, np.cross(b, c)) / 6.0
-
-
-def orient(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """``elements`` with two corners swapped wherever the volume is negative, shape (m, 4)."""
-    elements = np.array(elements, dtype=np.int64)
-    inverted = signed_volumes(nodes, elements) < 0.0
-    elements[inverted, 2], elements[inverted, 3] = elements[inverted, 3], elements[inverted, 2]
-    return elements
-
-
-def boundary_facets(elements: np.ndarray) -> np.ndarray:
-    """Surface triangles (k, 3) of positively oriented tetrahedra, their normals pointing out."""
-    faces = np.concatenate(
-        [elements[:, face] for face in ([1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1])]
-    )
-    _, first, counts = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    return faces[first[counts == 1]]
-
-
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Linear tetrahedra.
+    """Tetrahedra, linear or quadratic; displacements live on all its nodes.
 
     Parameters
     ----------
     nodes : (n, 3) reference coordinates, mm.
-    elements : (m, 4) corner indices, positively oriented.
+    elements : (m, 4) corner indices, positively oriented; (m, 10) adds a node on each edge, in
+        VTK's order (01, 12, 02, 03, 13, 23).
     node_sets : name -> (k,) node indices.
-    facet_sets : name -> (k, 3) corner indices of surface triangles.
+    facet_sets : name -> (k, 3) corner indices of surface triangles; (k, 6) on a quadratic mesh,
+        with the nodes on edges 01, 12 and 20.
 
     Raises
     ------
@@ -86,8 +64,10 @@ class Mesh:
     def _check_shapes(self) -> None:
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 3:
             raise InputError(f"mesh: nodes have shape {self.nodes.shape}; expected (n, 3)")
-        if self.elements.ndim != 2 or self.elements.shape[1] != 4 or not len(self.elements):
-            raise InputError(f"mesh: elements have shape {self.elements.shape}; expected (m, 4)")
+        if self.elements.ndim != 2 or self.elements.shape[1] not in (4, 10) or not self.elements.size:
+            raise InputError(
+                f"mesh: elements have shape {self.elements.shape}; expected (m, 4) or (m, 10)"
+            )
         if not np.isfinite(self.nodes).all():
             bad = int(np.flatnonzero(~np.isfinite(self.nodes).all(axis=1))[0])
             raise InputError(f"mesh: node {bad} has a coordinate that is not finite")
@@ -105,7 +85,7 @@ class Mesh:
 
     def _check_volumes(self) -> None:
         volumes = signed_volumes(self.nodes, self.elements)
-        corner = self.nodes[self.elements]
+        corner = self.nodes[self.corners]
         longest = np.max(np.linalg.norm(corner[:, :, None] - corner[:, None, :], axis=-1), (1, 2))
         flat = np.abs(volumes) <= _FLAT * longest**3
         for wrong, word in ((flat, "no volume"), (volumes < 0.0, "a negative volume (inverted)")):
@@ -119,13 +99,31 @@ class Mesh:
     def _check_facets(self) -> None:
         if not self.facet_sets:
             return
-        surface = {tuple(row) for row in np.sort(boundary_facets(self.elements), axis=1).tolist()}
+        surface = {tuple(row) for row in np.sort(self.surface, axis=1).tolist()}
+        width = 3 if self.order == 1 else 6
         for name, facets in self.facet_sets.items():
-            if facets.ndim != 2 or facets.shape[1:] != (3,) or not len(facets):
-                raise InputError(f"mesh: facet set '{name}' has shape {facets.shape}; not (k, 3)")
+            if facets.ndim != 2 or facets.shape[1:] != (width,) or not len(facets):
+                raise InputError(
+                    f"mesh: facet set '{name}' has shape {facets.shape}; not (k, {width})"
+                )
             for row in np.sort(facets, axis=1).tolist():
                 if tuple(row) not in surface:
                     raise InputError(f"mesh: facet {row} of set '{name}' is not on the surface")
+
+    @property
+    def order(self) -> int:
+        """1 for linear tetrahedra, 2 for quadratic ones."""
+        return 1 if self.elements.shape[1] == 4 else 2
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corner nodes of each element, (m, 4)."""
+        return self.elements[:, :4]
+
+    @cached_property
+    def surface(self) -> np.ndarray:
+        """Every triangle of the surface, (k, 3) or (k, 6), normals pointing out."""
+        return boundary_facets(self.elements)
 
     @property
     def size(self) -> float:
@@ -140,20 +138,22 @@ class Mesh:
         return self.node_sets[name]
 
     def facet_set(self, name: str) -> np.ndarray:
-        """Corners (k, 3) of the facets in set ``name``; :class:`InputError` lists the sets."""
+        """Nodes (k, 3 or 6) of the facets in set ``name``; :class:`InputError` lists the sets."""
         if name not in self.facet_sets:
             known = ", ".join(sorted(self.facet_sets)) or "none"
             raise InputError(f"facet set '{name}' is not in the mesh; its sets: {known}")
         return self.facet_sets[name]
 
     def elements_behind(self, facets: np.ndarray) -> np.ndarray:
-        """The element (k,) each surface facet (k, 3) belongs to."""
+        """The element (k,) each surface facet (k, 3 or 6) belongs to."""
         owner: dict[tuple[int, ...], int] = {}
         for corners in combinations(range(4), 3):
             for k, row in enumerate(np.sort(self.elements[:, corners], axis=1).tolist()):
                 owner[tuple(row)] = k
-        return np.array([owner[tuple(row)] for row in np.sort(facets, axis=1).tolist()])
+        return np.array([owner[tuple(row)] for row in np.sort(facets[:, :3], axis=1).tolist()])
 
     def to_skfem(self) -> MeshTet:
-        """The same mesh for scikit-fem (corner order kept, hence no sorting)."""
+        """A linear mesh for scikit-fem (corner order kept, hence no sorting)."""
+        if self.order != 1:
+            raise InputError("mesh: this needs linear tetrahedra; these are quadratic")
         return MeshTet(self.nodes.T.copy(), self.elements.T.copy(), sort_t=False)

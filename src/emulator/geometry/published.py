@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.mesh import Mesh, boundary_facets, orient
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import boundary_facets, orient
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,20 @@
 r"""Total potential energy of a scene, built of only the terms the scene has.
 
 .. math::
-    \Pi(u, \theta) = \int_\Omega W(\nabla u; \theta)\, dX - \sum_\text{loads} \text{work}
+    \Pi(u, \theta) = \int_\Omega W(\nabla u; \theta)\, dX + \text{springs}
+        - \sum_\text{loads} \text{work}
 
 in mN mm (= micro J; kPa mm3), Dalton et al. (2023), Eq. 20. The displacement ``u`` is the full
 nodal field, (n, 3) in mm, supports included.
+
+With mean dilatation the volume change of an element is that of its mean,
+
+.. math::
+    \hat F = \left(\bar J / J\right)^{1/3} F, \qquad
+    \bar J = \frac{\int_e J\, dX}{\int_e dX},
+
+and W is evaluated at :math:`\hat F`: one volume constraint an element, which quadratic tetrahedra
+can meet without locking (Simo, Taylor & Pister 1985).
 """
 
 from __future__ import annotations
@@ -16,10 +26,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.errors import InputError
 from emulator.mechanics.barriers import Barriers
+from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.kinematics import Strain, determinant
-from emulator.mechanics.loads import Gravity
-from emulator.mechanics.pressure import LocalTerm
+from emulator.mechanics.loads import DeadLoad
+from emulator.mechanics.local import LocalForce, LocalTerm
+from emulator.mechanics.pressure import PotentialPressure
 
 if TYPE_CHECKING:  # a scene is made of mechanics, so mechanics only names its type
     from emulator.scenes.scene import Scene
@@ -53,34 +66,82 @@ def at_points(scene: Scene, function: Callable, H: jax.Array) -> jax.Array:
     return jax.vmap(jax.vmap(function, (0, None)))(H, jnp.asarray(scene.fibres))
 
 
-def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
-    """``(u, theta) -> int W dX`` in mN mm."""
+def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -> jax.Array:
+    """Mean of ``J - 1`` over an element: ``u`` (a, 3), ``gradients`` (q, a, 3), ``weights`` (q,)."""
+    H = jnp.einsum("ai,qaj->qij", u, gradients)
+    return jnp.vdot(weights, jax.vmap(lambda h: Strain(h).J_minus_1)(H)) / jnp.sum(weights)
 
-    def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
-        density = at_points(
-            scene, point_energy(scene, theta, barriers), displacement_gradient(scene, u)
-        )
-        return jnp.sum(scene.discretisation.weights * density)
+
+def with_volume_change(
+    H: jax.Array, change: jax.Array, barriers: Barriers | None = None
+) -> jax.Array:
+    """Displacement gradients ``H`` (q, 3, 3) stretched evenly to ``J - 1 = change``."""
+    ln_J = jax.vmap(lambda h: Strain(h, barriers).ln_J)(H)
+    stretch = jnp.expm1((jnp.log1p(change) - ln_J) / 3.0)[:, None, None]
+    return H + stretch * (H + jnp.eye(3, dtype=H.dtype))
+
+
+def _with_mean_dilatation(
+    H: jax.Array, weights: jax.Array, barriers: Barriers | None
+) -> jax.Array:
+    """Displacement gradients (q, 3, 3) of one element, each point's J replaced by their mean."""
+    J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
+    return with_volume_change(H, jnp.vdot(weights, J_minus_1) / jnp.sum(weights), barriers)
+
+
+def at_volume(scene: Scene, theta: jax.Array) -> Callable:
+    """``(change, u, gradients, weights, fibre) -> ()``: strain energy of an element, mN mm.
+
+    Its volume ratio less 1 is ``change`` throughout, whatever ``u`` (a, 3) in mm says; ``gradients``
+    (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``fibre`` (3,) or ``None``.
+    """
+    at_point = point_energy(scene, theta)
+
+    def energy(
+        change: jax.Array,
+        u: jax.Array,
+        gradients: jax.Array,
+        weights: jax.Array,
+        fibre: jax.Array | None,
+    ) -> jax.Array:
+        H = with_volume_change(jnp.einsum("ai,qaj->qij", u, gradients), change)
+        return jnp.vdot(weights, jax.vmap(lambda h: at_point(h, fibre))(H))
 
     return energy
 
 
+def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
+    """``(u, theta) -> int W dX`` in mN mm."""
+
+    def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
+        weights = scene.discretisation.weights
+        H = displacement_gradient(scene, u)
+        if scene.dilatation == "mean":
+            H = jax.vmap(lambda h, w: _with_mean_dilatation(h, w, barriers))(H, weights)
+        return jnp.sum(weights * at_points(scene, point_energy(scene, theta, barriers), H))
+
+    return energy
+
+
+def spring_terms(scene: Scene) -> list[LocalTerm]:
+    """Potentials of the elastic supports."""
+    return [support.term(scene) for support in scene.elastic_supports]
+
+
 def local_terms(scene: Scene) -> list[LocalTerm]:
     """Potentials of the loads that follow the deformation."""
-    return [load.term(scene) for load in scene.loads if not isinstance(load, Gravity)]
+    return [load.term(scene) for load in scene.loads if isinstance(load, PotentialPressure)]
+
+
+def local_forces(scene: Scene) -> list[LocalForce]:
+    """Loads that follow the deformation and have no potential."""
+    return [load.forces(scene) for load in scene.loads if isinstance(load, FollowerPressure)]
 
 
 def nodal_dead_force(scene: Scene) -> np.ndarray | None:
-    """Consistent nodal forces of the dead loads, (n, 3) in mN; ``None`` when there are none."""
-    dead = [load for load in scene.loads if isinstance(load, Gravity)]
-    if not dead:
-        return None
-    grid = scene.discretisation
-    volume = np.einsum("mq,qa->ma", grid.weights, grid.values)
-    nodal_volume = np.bincount(
-        grid.connectivity.ravel(), volume.ravel(), minlength=len(scene.mesh.nodes)
-    )
-    return nodal_volume[:, None] * sum(load.body_force for load in dead)
+    """Nodal forces of the dead loads, (n, 3) in mN; ``None`` when there are none."""
+    dead = [load.nodal_force(scene) for load in scene.loads if isinstance(load, DeadLoad)]
+    return np.sum(dead, axis=0) if dead else None
 
 
 def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
@@ -91,17 +152,29 @@ def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
     scene : what is simulated.
     barriers : limits on the invariants for training; ``None`` gives the exact energy, which is
         NaN wherever an element is inverted.
+
+    Raises
+    ------
+    InputError
+        A load of the scene has no potential.
     """
-    internal = strain_energy(scene, barriers)
+    for load in scene.loads:
+        if isinstance(load, FollowerPressure):
+            raise InputError(
+                f"scene '{scene.name}': the follower pressure on '{load.facet_set}' has no "
+                "potential, so the scene has no energy; hold the rim and use CavityPressure, or "
+                "work with FEM displacements"
+            )
+    internal, springs = strain_energy(scene, barriers), spring_terms(scene)
     force, terms = nodal_dead_force(scene), local_terms(scene)
 
     def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
         total = internal(u, theta)
         if force is not None:
             total = total - jnp.vdot(force, u)
-        if terms:
+        if springs or terms:
             values = scene.resolve(theta)
-            total = total + sum(term.total(u, values) for term in terms)
+            total = total + sum(term.total(u, values) for term in springs + terms)
         return total
 
     return energy

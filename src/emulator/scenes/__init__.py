@@ -3,7 +3,8 @@
 from emulator.scenes.beams import once_clamped_beam, twice_clamped_beam
 from emulator.scenes.parameters import Parameter
 from emulator.scenes.registry import BUILT_IN, find_scene, scene_from_recipe
-from emulator.scenes.scene import Scene, Support
+from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Support
 from emulator.scenes.twisting_cube import twisting_cube
 
 __all__ = [

@@ -6,7 +6,8 @@ from emulator.geometry.generators import box
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.loads import Gravity
 from emulator.scenes.parameters import Parameter
-from emulator.scenes.scene import Scene, Support
+from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Support
 
 
 def _beam(name: str, cells: tuple[int, int, int], clamped: tuple[str, ...]) -> Scene:

@@ -41,7 +41,8 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.loads import Gravity, Load
 from emulator.scenes.parameters import Parameter
-from emulator.scenes.scene import Scene, Support
+from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Support
 
 _KEYS = {"law", "mesh", "node_sets", "supports", "loads", "parameters", "constants"}
 _AXES = {"x": 0, "y": 1, "z": 2}

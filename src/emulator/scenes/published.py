@@ -22,7 +22,8 @@ from emulator.mechanics.laws import find_law
 from emulator.mechanics.loads import Gravity, Load
 from emulator.mechanics.pressure import PublishedPressure
 from emulator.scenes.parameters import Parameter
-from emulator.scenes.scene import Scene, Support
+from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Support
 
 _GRAVITY = Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80)
 

@@ -8,35 +8,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.discretisation import Discretisation, linear_tetrahedra
+from emulator.geometry.discretisation import Discretisation, discretise
 from emulator.geometry.mesh import Mesh, frozen_array
+from emulator.mechanics.elastic_support import ElasticSupport
 from emulator.mechanics.laws import Law
 from emulator.mechanics.loads import Load
 from emulator.scenes.parameters import Parameter
-
-
-@dataclass(frozen=True, eq=False)
-class Support:
-    """Displacement of a node set held at a value.
-
-    Parameters
-    ----------
-    node_set : name of the set.
-    displacement : (3,) or (k, 3) in mm, one row a node of the set; zero clamps it.
-    """
-
-    node_set: str
-    displacement: np.ndarray = field(default_factory=lambda: np.zeros(3))
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "displacement", frozen_array(self.displacement))
+from emulator.scenes.supports import Support, free_motions, prescribe
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +37,12 @@ class Scene:
     law : hyperelastic law.
     parameters : entries of theta, in order.
     loads : external loads; none is a body deformed by its supports alone.
-    supports : where the displacement is known.
+    supports : where the displacement is known, and where springs resist it.
     constants : parameters of the law and the loads that do not vary.
     fibres : (m, 3) unit fibre direction of each element, for laws that ask for it.
     recipe : how a built-in scene was made, so that a file can make it again.
+    dilatation : ``pointwise``, or ``mean`` to take the volume change of each element as one, which
+        keeps quadratic elements from locking when the material is nearly incompressible.
     """
 
     name: str
@@ -63,16 +50,18 @@ class Scene:
     law: Law
     parameters: tuple[Parameter, ...]
     loads: tuple[Load, ...] = ()
-    supports: tuple[Support, ...] = ()
+    supports: tuple[Support | ElasticSupport, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
     fibres: np.ndarray | None = None
     recipe: Mapping[str, Any] = field(default_factory=dict)
+    dilatation: Literal["pointwise", "mean"] = "pointwise"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "recipe", MappingProxyType(dict(self.recipe)))
         self._check_names()
         self._check_fibres()
+        self._check_dilatation()
         if not self.parameters:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
         for name, value in self.constants.items():
@@ -113,16 +102,29 @@ class Scene:
         if not np.allclose(np.linalg.norm(fibres, axis=1), 1.0, atol=1e-6):
             raise InputError(f"scene '{self.name}': fibres are not unit vectors")
 
+    def _check_dilatation(self) -> None:
+        if self.dilatation not in ("pointwise", "mean"):
+            raise InputError(
+                f"scene '{self.name}': dilatation '{self.dilatation}'; use pointwise or mean"
+            )
+        if self.dilatation == "mean" and self.mesh.order == 1:
+            raise InputError(
+                f"scene '{self.name}': mean dilatation on linear tetrahedra changes nothing, "
+                "they have one point each; make the mesh quadratic"
+            )
+
     def _check_supports(self) -> None:
         if not self.supports:
             raise InputError(f"scene '{self.name}': no support, the body could move freely")
-        points = self.mesh.nodes[self.held.all(axis=1)]
-        # A held point leaves three rotations, a held line one.
-        spans = np.linalg.matrix_rank(points - points[:1], tol=1e-9 * self.mesh.size)
-        if spans < 2:
+        nodes, axes = np.nonzero(self.held)
+        springs = [support.resisted(self) for support in self.elastic_supports]
+        points = np.concatenate([self.mesh.nodes[nodes], *(place for place, _ in springs)])
+        directions = np.concatenate([np.eye(3)[axes], *(along for _, along in springs)])
+        free = free_motions(points, directions)
+        if free:
             raise InputError(
-                f"scene '{self.name}': the {len(points)} held nodes lie on a "
-                f"{'point' if spans == 0 else 'line'}, about which the body could turn freely"
+                f"scene '{self.name}': its supports leave {free} of the 6 rigid motions free, "
+                "the body could move or turn; hold more nodes or components"
             )
 
     @property
@@ -203,29 +205,17 @@ class Scene:
     @cached_property
     def discretisation(self) -> Discretisation:
         """Shape functions and quadrature of the mesh."""
-        return linear_tetrahedra(self.mesh)
+        return discretise(self.mesh)
+
+    @property
+    def elastic_supports(self) -> tuple[ElasticSupport, ...]:
+        """Those of the supports that are springs."""
+        return tuple(s for s in self.supports if isinstance(s, ElasticSupport))
 
     @cached_property
     def prescribed(self) -> tuple[np.ndarray, np.ndarray]:
         """``(held, values)``: where the displacement is known, (n, 3) bool, and it, (n, 3) mm."""
-        held = np.zeros(self.mesh.nodes.shape, dtype=bool)
-        values = np.zeros(self.mesh.nodes.shape)
-        for support in self.supports:
-            nodes = self.mesh.node_set(support.node_set)
-            if not np.isfinite(support.displacement).all():
-                raise InputError(f"support on '{support.node_set}': displacement is not finite")
-            if support.displacement.shape not in ((3,), (len(nodes), 3)):
-                raise InputError(
-                    f"support on '{support.node_set}': displacement has shape "
-                    f"{support.displacement.shape}; expected (3,) or ({len(nodes)}, 3)"
-                )
-            wanted = np.broadcast_to(support.displacement, (len(nodes), 3))
-            if (held[nodes] & (values[nodes] != wanted)).any():
-                raise InputError(
-                    f"support on '{support.node_set}' contradicts another one on a shared node"
-                )
-            held[nodes], values[nodes] = True, wanted
-        return frozen_array(held, bool), frozen_array(values)
+        return prescribe(self.mesh, [s for s in self.supports if isinstance(s, Support)])
 
     @property
     def held(self) -> np.ndarray:
@@ -249,13 +239,18 @@ class Scene:
         digest.update((np.round(self.held_displacement, 9) + 0.0).tobytes())
         if self.fibres is not None:
             digest.update((np.round(self.fibres, 6) + 0.0).tobytes())
-        for name in sorted({getattr(load, "facet_set", "") for load in self.loads} - {""}):
+        surfaces = {getattr(part, "facet_set", "") for part in (*self.loads, *self.supports)}
+        for name in sorted(surfaces - {""}):
             digest.update(np.sort(np.sort(self.mesh.facet_set(name), axis=1), axis=0).tobytes())
-        description = {
+        description: dict[str, Any] = {
             "law": self.law.name,
             "constants": {name: float(self.constants[name]) for name in sorted(self.constants)},
             "parameters": [[p.name, float(p.low), float(p.high), p.scale] for p in self.parameters],
             "loads": [load.describe() for load in self.loads],
         }
+        if self.elastic_supports:
+            description["springs"] = [support.describe() for support in self.elastic_supports]
+        if self.dilatation != "pointwise":
+            description["dilatation"] = self.dilatation
         digest.update(json.dumps(description, sort_keys=True).encode())
         return digest.hexdigest()[:16]

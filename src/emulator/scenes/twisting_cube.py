@@ -7,7 +7,8 @@ import numpy as np
 from emulator.geometry.generators import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.parameters import Parameter
-from emulator.scenes.scene import Scene, Support
+from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Support
 
 
 def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
-from emulator.geometry.discretisation import linear_tetrahedra
+from emulator.geometry.discretisation import discretise
 from emulator.geometry.generators import box
-from emulator.geometry.mesh import Mesh, orient, signed_volumes
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import orient, signed_volumes
 
 NODES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)
 GOOD = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
@@ -86,7 +87,7 @@ def test_missing_node_set_lists_the_others():
 
 def test_shape_functions_sum_to_one_and_reproduce_linear_fields():
     mesh = box((2.0, 3.0, 4.0), (2, 2, 2))
-    grid = linear_tetrahedra(mesh)
+    grid = discretise(mesh)
     np.testing.assert_allclose(grid.values.sum(axis=1), 1.0)
     np.testing.assert_allclose(grid.gradients.sum(axis=2), 0.0, atol=1e-13)
     assert grid.weights.sum() == pytest.approx(24.0)

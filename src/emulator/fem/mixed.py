@@ -1,0 +1,125 @@
+r"""Newton steps for mean dilatation, with each element's volume and pressure as iterates.
+
+On the displacements alone, a stiff volume term lets Newton move only as far as the constraint is
+straight: hundreds of tiny steps at nu = 0.4999. So the element's volume ratio :math:`\theta` and
+pressure :math:`p` become unknowns (Simo, Taylor & Pister 1985), stationary points of
+
+.. math::
+    L = \sum_e E_e(u, \theta_e) + p_e V_e \left[\bar J_e(u) - \theta_e\right], \qquad
+    E_e(u, \theta) = \sum_q w_q\, W\!\left((\theta / J_q)^{1/3} F_q\right).
+
+With :math:`g = E_{u\theta}`, :math:`b = V \bar J_u`, :math:`r_\theta = E_\theta - pV` and
+:math:`r_p = V(\bar J - \theta)`, the two are eliminated element by element,
+
+.. math::
+    V \Delta\theta &= r_p + b^T \Delta u, \qquad
+    V \Delta p = r_\theta + g^T \Delta u + E_{\theta\theta}\, \Delta\theta \\
+    K_e &= E_{uu} + p V \bar J_{uu} + (g b^T + b g^T)/V + E_{\theta\theta}\, b b^T/V^2 \\
+    f_e &= E_u + p b + g\, r_p/V + b\,(r_\theta + E_{\theta\theta}\, r_p/V)/V .
+
+Where :math:`\theta = \bar J(u)` and :math:`p = E_\theta/V` these are the force and the tangent of
+the energy in u alone, so both formulations have the same solutions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from emulator.mechanics.energy import at_volume, mean_volume_change
+from emulator.scenes.scene import Scene
+
+
+class Volumes(NamedTuple):
+    """Iterates of the elements: volume ratio less 1 and pressure in kPa, both (m,)."""
+
+    change: jax.Array
+    pressure: jax.Array
+
+
+class Condensed(NamedTuple):
+    """Linearisation with the volumes eliminated.
+
+    force : (m, a, 3) mN. tangent : (m, 3a, 3a) mN/mm.
+    b, g : (m, a, 3) couplings; r_change, r_pressure, stiffness : (m,).
+    """
+
+    force: jax.Array
+    tangent: jax.Array
+    b: jax.Array
+    g: jax.Array
+    r_change: jax.Array
+    r_pressure: jax.Array
+    stiffness: jax.Array
+
+
+def _arguments(scene: Scene, u: jax.Array) -> tuple[tuple, tuple]:
+    """Arrays of every element, and the axes to map over."""
+    grid = scene.discretisation
+    local = (u[grid.connectivity], jnp.asarray(grid.gradients), jnp.asarray(grid.weights))
+    if scene.fibres is None:
+        return (*local, None), (0, 0, 0, None)
+    return (*local, jnp.asarray(scene.fibres)), (0, 0, 0, 0)
+
+
+def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:
+    """Volumes and pressures that belong to the displacement ``u`` (n, 3)."""
+
+    def one(*element: jax.Array) -> Volumes:
+        change = mean_volume_change(*element[:3])
+        slope = jax.grad(at_volume(scene, theta), argnums=0)(change, *element)
+        return Volumes(change, slope / jnp.sum(element[2]))
+
+    arguments, axes = _arguments(scene, u)
+    return jax.vmap(one, axes)(*arguments)
+
+
+def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) -> Condensed:
+    """Force and tangent of every element at ``u`` (n, 3) and ``volumes``."""
+    energy = at_volume(scene, theta)
+
+    def one(change, pressure, local, gradients, weights, fibre):  # noqa: ANN001, ANN202
+        V = jnp.sum(weights)
+
+        def E(v: jax.Array, t: jax.Array) -> jax.Array:
+            return energy(t, v, gradients, weights, fibre)
+
+        def volume(v: jax.Array) -> jax.Array:
+            return V * mean_volume_change(v, gradients, weights)
+
+        # One pass of second derivatives gives E_u, E_t and their derivatives.
+        (E_u, E_t), ((E_uu, g), (_, E_tt)) = (
+            jax.grad(E, (0, 1))(local, change),
+            jax.jacfwd(jax.grad(E, (0, 1)), (0, 1))(local, change),
+        )
+        b, b_u = jax.grad(volume)(local), jax.hessian(volume)(local)
+        r_change, r_pressure = E_t - pressure * V, volume(local) - V * change
+        outer = jnp.einsum("ai,bj->aibj", g, b)
+        tangent = (
+            E_uu
+            + pressure * b_u
+            + (outer + outer.transpose(2, 3, 0, 1)) / V
+            + E_tt / V**2 * jnp.einsum("ai,bj->aibj", b, b)
+        )
+        force = E_u + pressure * b
+        force = force + g * r_pressure / V + b * (r_change + E_tt * r_pressure / V) / V
+        size = local.size
+        return Condensed(force, tangent.reshape(size, size), b, g, r_change, r_pressure, E_tt)
+
+    arguments, axes = _arguments(scene, u)
+    return jax.vmap(one, (0, 0, *axes))(*volumes, *arguments)
+
+
+def advance(
+    scene: Scene, volumes: Volumes, at: Condensed, move: jax.Array, fraction: jax.Array
+) -> Volumes:
+    """``volumes`` after ``fraction`` of the step whose displacement is ``move`` (n, 3)."""
+    local = move[scene.discretisation.connectivity]
+    V = jnp.sum(jnp.asarray(scene.discretisation.weights), axis=1)
+    change = (at.r_pressure + jnp.einsum("mai,mai->m", at.b, local)) / V
+    pressure = at.r_change + jnp.einsum("mai,mai->m", at.g, local) + at.stiffness * change
+    return Volumes(
+        volumes.change + fraction * change, volumes.pressure + fraction * pressure / V
+    )

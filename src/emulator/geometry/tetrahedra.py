@@ -1,0 +1,56 @@
+"""Numbering inside a tetrahedron, and what follows from it: volume, orientation, surface.
+
+Linear elements have four corners. Quadratic ones add a node on each edge, in VTK's order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Edge k carries local node 4 + k of a quadratic element.
+EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
+# Faces of a positively oriented tetrahedron, normals pointing out.
+FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
+
+
+def _with_midpoints(face: tuple[int, ...]) -> tuple[int, ...]:
+    """Local nodes of a quadratic face: its corners, then the midpoints of 01, 12 and 20."""
+    pairs = [(face[k], face[(k + 1) % 3]) for k in range(3)]
+    return face + tuple(4 + EDGES.index((min(pair), max(pair))) for pair in pairs)
+
+
+QUADRATIC_FACES = tuple(_with_midpoints(face) for face in FACES)
+
+
+def signed_volumes(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """Signed volume of each tetrahedron's corners in mm3, shape (m,); negative when inverted."""
+    corner = nodes[elements[:, :4]]
+    a, b, c = (corner[:, k] - corner[:, 0] for k in (1, 2, 3))
+    return np.einsum("mi,mi->m", a, np.cross(b, c)) / 6.0
+
+
+def orient(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """``elements`` (m, 4 or 10), corners 2 and 3 swapped wherever the volume is negative."""
+    elements = np.array(elements, dtype=np.int64)
+    swapped = [0, 1, 3, 2]
+    if elements.shape[1] == 10:
+        swapped += [
+            4 + EDGES.index(tuple(sorted((swapped[a], swapped[b]))))  # type: ignore[arg-type]
+            for a, b in EDGES
+        ]
+    inverted = signed_volumes(nodes, elements) < 0.0
+    elements[inverted] = elements[inverted][:, swapped]
+    return elements
+
+
+def boundary_facets(elements: np.ndarray) -> np.ndarray:
+    """Surface triangles (k, 3 or 6) of positively oriented tetrahedra, their normals pointing out.
+
+    Quadratic ones list their corners, then the midpoints of edges 01, 12 and 20.
+    """
+    local = FACES if elements.shape[1] == 4 else QUADRATIC_FACES
+    faces = np.concatenate([elements[:, face] for face in local])
+    _, first, counts = np.unique(
+        np.sort(faces[:, :3], axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return faces[first[counts == 1]]
