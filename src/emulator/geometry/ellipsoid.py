@@ -127,17 +127,18 @@ def truncated_ellipsoid(
 def wall_midpoints(
     wall: EllipsoidalWall, r: np.ndarray, phi: np.ndarray, t: np.ndarray
 ) -> Midpoints:
-    """Middles of edges in the parametrisation, for nodes at ``r``, ``phi``, ``t``, each (n,).
+    """Middles of edges, for nodes at ``r``, ``phi``, ``t``, each (n,).
 
-    The apex has no angle of its own; an edge that ends there takes its other end's.
+    Halfway in the disc with polar coordinates r and phi, where the apex is a point like any other;
+    on the disc's rim, which is the base, along the rim.
     """
+    disc_points = np.column_stack([r * np.cos(phi), r * np.sin(phi)])
 
     def midpoints(edges: np.ndarray) -> np.ndarray:
-        ends = phi[edges]
-        apex = r[edges] == 0.0
-        ends = np.where(apex, ends[:, ::-1], ends)
-        turn = np.angle(np.exp(1j * (ends[:, 1] - ends[:, 0])))  # the short way round
-        return wall.position(r[edges].mean(axis=1), ends[:, 0] + 0.5 * turn, t[edges].mean(axis=1))
+        x, y = disc_points[edges].mean(axis=1).T
+        on_rim = (r[edges] == 1.0).all(axis=1)
+        radius = np.where(on_rim, 1.0, np.hypot(x, y))
+        return wall.position(radius, np.arctan2(y, x), t[edges].mean(axis=1))
 
     return midpoints
 

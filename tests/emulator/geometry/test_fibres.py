@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
+from emulator.geometry.biventricle import biventricle
 from emulator.geometry.ellipsoid import HUMAN, human_ventricle, land_ventricle
-from emulator.geometry.fibres import Depth, depth, rule_based_directions, rule_based_fibres, turned
+from emulator.geometry.fibres import (
+    Depth,
+    biventricular_directions,
+    depth,
+    rule_based_directions,
+    rule_based_fibres,
+    turned,
+)
 from emulator.geometry.generators import box
 from emulator.geometry.sphere import sphere_octant
 from geometry_support import order_of
@@ -90,6 +98,22 @@ def test_directions_are_orthonormal_and_a_wall_across_the_axis_has_some():
         np.testing.assert_allclose(np.linalg.norm(fibres, axis=1), 1.0)
         np.testing.assert_allclose(np.linalg.norm(sheets, axis=1), 1.0)
         np.testing.assert_allclose(np.einsum("mi,mi->m", fibres, sheets), 0.0, atol=1e-12)
+
+
+def test_each_ventricle_has_its_own_depth():
+    mesh = biventricle(rings=12, around=24, layers=(3, 2))
+    fibres, sheets = biventricular_directions(mesh, angles=(60.0, -60.0))
+    np.testing.assert_allclose(np.linalg.norm(fibres, axis=1), 1.0)
+    np.testing.assert_allclose(np.einsum("mi,mi->m", fibres, sheets), 0.0, atol=1e-12)
+    for name, climbs in (("lv_endocardium", 1), ("rv_endocardium", -1), ("epicardium", -1)):
+        behind = mesh.elements_behind(mesh.facet_set(name))
+        x, _, z = centroids(mesh)[behind].T
+        half_way = (np.abs(z) < 20.0) & (x < 34.0)  # nothing of the free wall but its edges
+        slope = np.median(fibres[behind, 2][half_way])
+        assert climbs * slope > 0.3, name
+    inside = mesh.elements_behind(mesh.facet_set("rv_endocardium"))
+    x, _, z = centroids(mesh)[inside].T
+    assert np.median(fibres[inside, 2][(x > 45.0) & (np.abs(z) < 20.0)]) > 0.3
 
 
 def test_a_quadratic_mesh_has_the_fibres_of_its_linear_one():
