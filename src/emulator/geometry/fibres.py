@@ -148,4 +148,6 @@ def _nodes(mesh: Mesh, names: tuple[str, ...]) -> np.ndarray:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    """Vectors (k, 3) at length one; a zero vector, as where depth is constant, becomes e_x."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 0.0, vectors / np.where(length > 0.0, length, 1.0), np.eye(3)[0])

@@ -116,6 +116,13 @@ def test_each_ventricle_has_its_own_depth():
     assert np.median(fibres[inside, 2][(x > 45.0) & (np.abs(z) < 20.0)]) > 0.3
 
 
+def test_a_wall_of_one_layer_has_directions():
+    # All nodes of the free wall are on surfaces, where the left ventricle's fields are constant.
+    fibres, sheets = biventricular_directions(biventricle(rings=8, around=16, layers=(1, 1)))
+    np.testing.assert_allclose(np.linalg.norm(fibres, axis=1), 1.0)
+    np.testing.assert_allclose(np.linalg.norm(sheets, axis=1), 1.0)
+
+
 def test_a_quadratic_mesh_has_the_fibres_of_its_linear_one():
     np.testing.assert_allclose(
         rule_based_fibres(land_ventricle(order=2)), rule_based_fibres(land_ventricle()), atol=1e-10

@@ -31,11 +31,12 @@ def test_its_edge_stands_on_the_epicardium(s):
 
 
 def test_it_is_as_thick_as_it_says_where_it_stands():
+    # Measured along the epicardium, which is curved: the chord is a little shorter.
     for xi, eta in ((0.0, 0.0), (1.0, 1.0)):
         inside, outside = (
             SEPTUM.sheet(np.array([xi]), np.array([eta]), np.array([s]))[0] for s in (0.0, 1.0)
         )
-        assert np.linalg.norm(outside - inside) == pytest.approx(4.0, rel=0.02)
+        assert np.linalg.norm(outside - inside) == pytest.approx(4.0, rel=0.03)
 
 
 def test_bad_dimensions_are_named():
