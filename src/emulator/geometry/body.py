@@ -1,0 +1,44 @@
+"""What the generators of curved bodies share: named surfaces, straight or quadratic edges."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.mesh import Mesh, boundary_facets, orient
+
+Midpoints = Callable[[np.ndarray], np.ndarray]
+"""Edges (e, 2) of node numbers -> positions (e, 3) in mm of their middles on the true body."""
+
+
+def body(
+    nodes: np.ndarray,
+    elements: np.ndarray,
+    surfaces: Mapping[str, np.ndarray],
+    node_sets: Mapping[str, np.ndarray],
+    midpoints: Midpoints | None,
+    order: int,
+) -> Mesh:
+    """The mesh of a body, its elements oriented.
+
+    Parameters
+    ----------
+    nodes, elements : (n, 3) mm and (m, 4), any orientation.
+    surfaces : name -> nodes; a surface triangle belongs to the set that has its three corners.
+    node_sets : name -> nodes.
+    midpoints : where the edges' middles lie; ``None`` for straight edges.
+    order : 1 for linear, 2 for quadratic tetrahedra.
+    """
+    if order not in (1, 2):
+        raise InputError(f"mesh: order {order}; expected 1 or 2")
+    elements = orient(nodes, elements)
+    surface = boundary_facets(elements)
+    facets = {name: surface[np.isin(surface, on).all(axis=1)] for name, on in surfaces.items()}
+    mesh = Mesh(nodes, elements, node_sets, facets)
+    if order == 1:
+        return mesh
+    from emulator.geometry.quadratic import to_quadratic
+
+    return to_quadratic(mesh, midpoints)
