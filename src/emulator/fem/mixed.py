@@ -120,6 +120,4 @@ def advance(
     V = jnp.sum(jnp.asarray(scene.discretisation.weights), axis=1)
     change = (at.r_pressure + jnp.einsum("mai,mai->m", at.b, local)) / V
     pressure = at.r_change + jnp.einsum("mai,mai->m", at.g, local) + at.stiffness * change
-    return Volumes(
-        volumes.change + fraction * change, volumes.pressure + fraction * pressure / V
-    )
+    return Volumes(volumes.change + fraction * change, volumes.pressure + fraction * pressure / V)

@@ -124,9 +124,7 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
         back = volumes_of(after.u)
         # A level given up starts again from the last solution, whose volumes are its own.
         kept = after.level == state.level
-        return after._replace(
-            volumes=jax.tree.map(lambda a, b: jnp.where(kept, a, b), moved, back)
-        )
+        return after._replace(volumes=jax.tree.map(lambda a, b: jnp.where(kept, a, b), moved, back))
 
     def running(state: _State) -> jax.Array:
         return state.status == Status.RUNNING
@@ -166,9 +164,7 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     )
 
 
-def _full_step(
-    system: System, state: _State, theta: jax.Array, move_held: jax.Array
-) -> _Step:
+def _full_step(system: System, state: _State, theta: jax.Array, move_held: jax.Array) -> _Step:
     """Newton's step from ``state``, turned round where it would climb the potential."""
     u, level = state.u, state.level
     if state.volumes is None:

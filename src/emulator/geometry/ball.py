@@ -6,7 +6,7 @@ from itertools import combinations, permutations, product
 
 import numpy as np
 
-from emulator.geometry.body import Midpoints
+from emulator.geometry.quadratic import Midpoints
 
 
 def triangle_lattice(divisions: int) -> tuple[np.ndarray, np.ndarray]:

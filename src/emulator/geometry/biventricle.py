@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.body import Midpoints, body
+from emulator.geometry.body import body
 from emulator.geometry.disc import disc
 from emulator.geometry.ellipsoid import HUMAN, EllipsoidalWall, wall_midpoints
 from emulator.geometry.footprint import Footprint, open_sheet, spread
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.prisms import extrude, stacked
+from emulator.geometry.quadratic import Midpoints
 from emulator.geometry.right_ventricle import RightVentricle, Septum
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.mesh import Mesh, boundary_facets, orient
-
-Midpoints = Callable[[np.ndarray], np.ndarray]
-"""Edges (e, 2) of node numbers -> positions (e, 3) in mm of their middles on the true body."""
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.quadratic import Midpoints, to_quadratic
+from emulator.geometry.tetrahedra import boundary_facets, orient
 
 
 def body(
@@ -37,8 +36,4 @@ def body(
     surface = boundary_facets(elements)
     facets = {name: surface[np.isin(surface, on).all(axis=1)] for name, on in surfaces.items()}
     mesh = Mesh(nodes, elements, node_sets, facets)
-    if order == 1:
-        return mesh
-    from emulator.geometry.quadratic import to_quadratic
-
-    return to_quadratic(mesh, midpoints)
+    return mesh if order == 1 else to_quadratic(mesh, midpoints)

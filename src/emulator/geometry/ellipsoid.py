@@ -14,10 +14,11 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.body import Midpoints, body
+from emulator.geometry.body import body
 from emulator.geometry.disc import disc
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.prisms import extrude, stacked
+from emulator.geometry.quadratic import Midpoints
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ the circumferential :math:`c = k \times n / |k \times n|`, and
           \alpha = \alpha_{endo} + \tau\, (\alpha_{epi} - \alpha_{endo}).
 
 A positive angle climbs from the circumference towards the base when ``axis`` points there, going
-round anticlockwise as seen from the base.
+round anticlockwise as seen from the base: the right-handed helix of a heart's endocardium.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def rule_based_directions(
     mesh: Mesh,
     endocardium: str = "endocardium",
     epicardium: str = "epicardium",
-    angles: Angles = (-90.0, 90.0),
+    angles: Angles = (90.0, -90.0),
     axis: Axis = (0.0, 0.0, 1.0),
 ) -> Directions:
     """Fibres, and sheets along the transmural direction.
@@ -63,7 +63,7 @@ def rule_based_fibres(
     mesh: Mesh,
     endocardium: str = "endocardium",
     epicardium: str = "epicardium",
-    angles: Angles = (-90.0, 90.0),
+    angles: Angles = (90.0, -90.0),
     axis: Axis = (0.0, 0.0, 1.0),
 ) -> np.ndarray:
     """The fibres (m, 3) of :func:`rule_based_directions`."""
@@ -71,7 +71,7 @@ def rule_based_fibres(
 
 
 def biventricular_directions(
-    mesh: Mesh, angles: Angles = (-90.0, 90.0), axis: Axis = (0.0, 0.0, 1.0)
+    mesh: Mesh, angles: Angles = (90.0, -90.0), axis: Axis = (0.0, 0.0, 1.0)
 ) -> Directions:
     """The rule for two ventricles; the left one's governs the septum.
 

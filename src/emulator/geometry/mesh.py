@@ -64,7 +64,11 @@ class Mesh:
     def _check_shapes(self) -> None:
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 3:
             raise InputError(f"mesh: nodes have shape {self.nodes.shape}; expected (n, 3)")
-        if self.elements.ndim != 2 or self.elements.shape[1] not in (4, 10) or not self.elements.size:
+        if (
+            self.elements.ndim != 2
+            or self.elements.shape[1] not in (4, 10)
+            or not self.elements.size
+        ):
             raise InputError(
                 f"mesh: elements have shape {self.elements.shape}; expected (m, 4) or (m, 10)"
             )

@@ -81,9 +81,7 @@ def with_volume_change(
     return H + stretch * (H + jnp.eye(3, dtype=H.dtype))
 
 
-def _with_mean_dilatation(
-    H: jax.Array, weights: jax.Array, barriers: Barriers | None
-) -> jax.Array:
+def _with_mean_dilatation(H: jax.Array, weights: jax.Array, barriers: Barriers | None) -> jax.Array:
     """Displacement gradients (q, 3, 3) of one element, each point's J replaced by their mean."""
     J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
     return with_volume_change(H, jnp.vdot(weights, J_minus_1) / jnp.sum(weights), barriers)

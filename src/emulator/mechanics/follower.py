@@ -38,6 +38,8 @@ class FollowerPressure(SurfacePressure):
 
         def force(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
             normals = area_vectors(corners + u, rule)
-            return -self.value(values) * jnp.einsum("q,qa,qi->ai", rule.weights, rule.values, normals)
+            return -self.value(values) * jnp.einsum(
+                "q,qa,qi->ai", rule.weights, rule.values, normals
+            )
 
         return LocalForce(facets, scene.mesh.nodes[facets], force)
