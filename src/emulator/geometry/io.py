@@ -86,19 +86,16 @@ def write_mesh(
     Raises
     ------
     InputError
-        Another suffix, or what a .msh cannot hold: directions, or different nodes in a node set
-        and a facet set of one name.
+        Another suffix, or what the format cannot hold: for .msh, directions, or different nodes in
+        a node set and a facet set of one name; for .xdmf, facet sets of a quadratic mesh.
     """
-    suffix = Path(path).suffix
-    if suffix not in (".msh", ".vtu", ".xdmf"):
-        raise InputError(f"mesh file {path}: cannot write '{suffix}'; use .msh, .vtu or .xdmf")
     directions = {
         name: np.asarray(values)
         for name, values in (("fibres", fibres), ("sheets", sheets))
         if values is not None
     }
-    if suffix == ".msh":
-        _check_msh(path, mesh, directions)
+    _check_format(path, mesh, directions)
+    suffix = Path(path).suffix
     with replacing(path) as temporary:
         if suffix == ".msh":
             content = _with_tags(mesh)
@@ -229,7 +226,15 @@ def _unit(values: np.ndarray, name: str, where: str) -> np.ndarray:
 
 
 # ---- writing -------------------------------------------------------------------------------------
-def _check_msh(path: str | Path, mesh: Mesh, directions: Mapping[str, np.ndarray]) -> None:
+def _check_format(path: str | Path, mesh: Mesh, directions: Mapping[str, np.ndarray]) -> None:
+    """Refuse what a format cannot hold, or meshio cannot read back from it."""
+    suffix = Path(path).suffix
+    if suffix not in (".msh", ".vtu", ".xdmf"):
+        raise InputError(f"mesh file {path}: cannot write '{suffix}'; use .msh, .vtu or .xdmf")
+    if suffix == ".xdmf" and mesh.elements.shape[1] == 10 and mesh.facet_sets:
+        raise InputError(f"mesh file {path}: .xdmf cannot hold quadratic facet sets; use .vtu")
+    if suffix != ".msh":
+        return
     if directions:
         raise InputError(f"mesh file {path}: .msh cannot hold {', '.join(directions)}; use .vtu")
     for name in own_node_sets(mesh):
