@@ -8,6 +8,7 @@ from calibrate.verify.homogeneous import (
     PRINCIPAL_STRESS,
     equibiaxial,
     uniaxial,
+    verify_homogeneous,
 )
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS
@@ -58,3 +59,16 @@ def test_small_strain_is_linear_elasticity():
     assert (one.stretches[1] - 1.0) / strain == pytest.approx(-nu, rel=1e-5)
     two = equibiaxial("neo_hookean_E_nu", 1.0 + strain, values)
     assert two.stresses[0] / strain == pytest.approx(E / (1.0 - nu), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name == "guccione" else pytest.mark.slow)
+        for name in sorted(LAWS)
+    ],
+)
+def test_fem_cubes_agree(name):
+    rows = verify_homogeneous([name])
+    assert len(rows) == 8
+    assert [row for row in rows if not row.passed] == []
