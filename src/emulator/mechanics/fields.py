@@ -12,7 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.mechanics.energy import at_points, displacement_gradient, point_energy
+from emulator.mechanics.energy import (
+    at_points,
+    displacement_gradient,
+    point_energy,
+    with_mean_dilatation,
+)
 from emulator.mechanics.kinematics import determinant
 
 if TYPE_CHECKING:
@@ -37,7 +42,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     H = displacement_gradient(scene, jnp.asarray(u))
     F = H + jnp.eye(3, dtype=H.dtype)
     J = jax.vmap(jax.vmap(determinant))(F)
-    P = at_points(scene, jax.grad(point_energy(scene, theta)), H)
+    P = _first_piola(scene, H, theta)
     # sigma is symmetric up to round-off, which eigenvalue routines trip over.
     sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]
     E = _symmetric(H + 0.5 * jnp.swapaxes(H, -1, -2) @ H)
@@ -56,6 +61,19 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
         fields["deformed_fibres"] = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         fields["fibre_stretch"] = mean(jnp.linalg.norm(along, axis=-1))
     return fields
+
+
+def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
+    """Stress (m, q, 3, 3) in kPa that does the strain energy's work on ``H``."""
+    if scene.dilatation == "pointwise":
+        return at_points(scene, jax.grad(point_energy(scene, theta)), H)
+    weights = jnp.asarray(scene.discretisation.weights)
+
+    def energy(H: jax.Array) -> jax.Array:
+        evened = jax.vmap(with_mean_dilatation)(H, weights)
+        return jnp.sum(weights * at_points(scene, point_energy(scene, theta), evened))
+
+    return jax.grad(energy)(H) / weights[..., None, None]
 
 
 def _symmetric(A: jax.Array) -> jax.Array:

@@ -1,11 +1,12 @@
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from emulator.mechanics.fields import element_fields
+from emulator.mechanics.fields import _first_piola, element_fields
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from scene_support import block, rotation
@@ -98,3 +99,25 @@ def test_means_are_weighted_by_volume():
     vars(scene)["discretisation"] = doubled  # where cached_property keeps it
     for name, values in element_fields(scene, u, scene.centre).items():
         np.testing.assert_allclose(values, once[name], rtol=1e-13)
+
+
+def test_mean_dilatation_on_quadratic_elements():
+    """Stress is symmetric, and its volume mean is the mean of what the nodal forces do."""
+    from emulator.geometry.quadratic import to_quadratic
+    from emulator.mechanics.energy import displacement_gradient, strain_energy
+
+    plain = block()
+    mesh = to_quadratic(plain.mesh)
+    scene = dataclasses.replace(plain, mesh=mesh, dilatation="mean")
+    rng = np.random.default_rng(4)
+    u, theta = jnp.asarray(0.03 * rng.normal(size=mesh.nodes.shape)), scene.centre
+    force = jax.grad(strain_energy(scene))(u, theta)
+    # int P dX = sum of f x X, and int tau dX = sum of f x (X + u), tau = J sigma.
+    P = _first_piola(scene, displacement_gradient(scene, u), theta)
+    F = displacement_gradient(scene, u) + np.eye(3)
+    tau = jnp.einsum("mq,mqij,mqkj->ik", scene.discretisation.weights, P, F)
+    expected = force.T @ (mesh.nodes + u)
+    np.testing.assert_allclose(tau, expected, atol=1e-11)
+    np.testing.assert_allclose(tau, tau.T, atol=1e-11)
+    sigma = element_fields(scene, u, theta)["cauchy_stress"]
+    np.testing.assert_array_equal(sigma, np.swapaxes(sigma, 1, 2))
