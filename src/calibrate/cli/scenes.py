@@ -27,7 +27,9 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
     )
-    parser.add_argument("--out", metavar="FILE.vtu", help="write the deformed body")
+    parser.add_argument(
+        "--out", metavar="FILE.vtu", help="write displacement, stress, strain and fibres"
+    )
     add_json(parser)
     parser.set_defaults(run=simulate)
 
@@ -81,8 +83,9 @@ def simulate(arguments: argparse.Namespace) -> int:
 
     from emulator.errors import InputError
     from emulator.fem import Simulator, Status
-    from emulator.geometry.io import write_displacement
+    from emulator.geometry.io import write_solution
     from emulator.mechanics.energy import potential_energy, volume_ratio
+    from emulator.mechanics.fields import element_fields
     from emulator.scenes import find_scene
 
     scene = find_scene(arguments.scene, arguments.root)
@@ -108,7 +111,8 @@ def simulate(arguments: argparse.Namespace) -> int:
     }
     if arguments.out and status is Status.CONVERGED:
         u = np.asarray(solution.displacement)
-        write_displacement(arguments.out, scene.mesh, u, {"J": J.mean(axis=1)})
+        fields = element_fields(scene, solution.displacement, theta)
+        write_solution(arguments.out, scene.mesh, u, fields)
         result["out"] = arguments.out
     lines = [f"{scene.name}: {status.text}, {result['iterations']} Newton iterations"]
     lines.append(

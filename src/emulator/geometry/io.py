@@ -1,59 +1,290 @@
-"""Meshes in from files, deformed bodies out to VTU, through meshio."""
+"""Meshes in and out of files with their named sets, deformed bodies out to VTU, through meshio."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 
 import meshio
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.mesh import Mesh
+from emulator.geometry.groups import MARK, own_node_sets, read_sets
+from emulator.geometry.mesh import Mesh, orient
 from emulator.store import replacing
+
+# Cells by their number of nodes: (tetrahedron, triangle).
+_KINDS = {4: ("tetra", "triangle"), 10: ("tetra10", "triangle6")}
+_LOWER = {"triangle", "triangle6", "line", "line3", "vertex"}
+# Files hold seven digits at times; what is further from unit length was not meant to be.
+_UNIT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A mesh with the directions its file has: fibres and sheets (m, 3), or ``None``."""
+
+    mesh: Mesh
+    fibres: np.ndarray | None = None
+    sheets: np.ndarray | None = None
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Linear tetrahedra from any file meshio reads, lengths taken as mm.
+    """Tetrahedra and named sets from any file meshio reads, lengths taken as mm.
+
+    Groups of triangles become facet sets and node sets, groups of lines and points node sets.
+    Nodes of no tetrahedron are dropped and inverted tetrahedra are turned.
 
     Raises
     ------
     InputError
-        Missing or unreadable file, no tetrahedra, or a mesh :class:`Mesh` refuses.
+        Missing or unreadable file, cells other than tetrahedra, a group without a name, a group
+        off the surface, or a mesh :class:`Mesh` refuses.
     """
-    path = Path(path)
+    return _convert(path, directions=False).mesh
+
+
+def read_body(path: str | Path) -> Body:
+    """The mesh as :func:`read_mesh` has it, with its ``fibres`` and ``sheets``.
+
+    Both are cell data, or point data averaged over each element's corners, where their signs do
+    not matter.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_mesh`, or a direction that is not a unit vector.
+    """
+    return _convert(path, directions=True)
+
+
+def read_fibres(path: str | Path) -> np.ndarray:
+    """Unit fibre direction (m, 3) of each element; :class:`InputError` when the file has none."""
+    fibres = read_body(path).fibres
+    if fibres is None:
+        raise InputError(f"mesh file {path}: it has no fibres; add cell data 'fibres' (m, 3)")
+    return fibres
+
+
+def write_mesh(
+    path: str | Path,
+    mesh: Mesh,
+    fibres: np.ndarray | None = None,
+    sheets: np.ndarray | None = None,
+) -> None:
+    """Write mesh, named sets and directions (m, 3), to be read back by :func:`read_body`.
+
+    Parameters
+    ----------
+    path : ends in .vtu, .xdmf or .msh (gmsh 2.2, sets as physical groups).
+    mesh : in mm.
+    fibres, sheets : unit directions of each element; not in .msh, where meshio cannot read them.
+
+    Raises
+    ------
+    InputError
+        Another suffix, or what the format cannot hold: for .msh, directions, or different nodes in
+        a node set and a facet set of one name; for .xdmf, facet sets of a quadratic mesh.
+    """
+    directions = {
+        name: np.asarray(values)
+        for name, values in (("fibres", fibres), ("sheets", sheets))
+        if values is not None
+    }
+    _check_format(path, mesh, directions)
+    suffix = Path(path).suffix
+    with replacing(path) as temporary:
+        if suffix == ".msh":
+            content = _with_tags(mesh)
+            meshio.write(temporary, content, file_format="gmsh22", binary=True)
+        else:
+            # XDMF would otherwise put its numbers in a second file, named after the temporary.
+            options = {"data_format": "XML"} if suffix == ".xdmf" else {}
+            content = _with_marks(mesh, directions)
+            meshio.write(temporary, content, file_format=suffix[1:], **options)
+
+
+def write_solution(
+    path: str | Path, mesh: Mesh, displacement: np.ndarray, fields: Mapping[str, np.ndarray] = {}
+) -> None:
+    """Write a deformed body as VTU, whole or not at all.
+
+    Parameters
+    ----------
+    mesh : the reference body, mm.
+    displacement : (n, 3) mm.
+    fields : cell data (m,), (m, 3) or (m, 3, 3), the last written as nine components, row by row;
+        :func:`emulator.mechanics.fields.element_fields` has those of a solution.
+    """
+    cells = {}
+    for name, values in fields.items():
+        array = np.asarray(values)
+        cells[name] = [array.reshape(len(array), -1) if array.ndim == 3 else array]
+    output = meshio.Mesh(
+        mesh.nodes,
+        [(_KINDS[mesh.elements.shape[1]][0], mesh.elements)],
+        point_data={"displacement": np.asarray(displacement)},
+        cell_data=cells,
+    )
+    with replacing(path) as temporary:
+        meshio.write(temporary, output, file_format="vtu")
+
+
+# ---- reading -------------------------------------------------------------------------------------
+def _load(path: Path) -> meshio.Mesh:
     if not path.is_file():
         raise InputError(f"mesh file {path} does not exist")
     said = io.StringIO()
     try:
         # meshio's readers raise whatever they meet, or print and exit.
         with redirect_stdout(said), redirect_stderr(said):
-            found = meshio.read(path)
+            return meshio.read(path)
     except (Exception, SystemExit) as error:
         reason = said.getvalue() if isinstance(error, SystemExit) else str(error)
         reason = " ".join(reason.split())[:160] or type(error).__name__
         raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
-    kinds = sorted({block.type for block in found.cells})
-    tetrahedra = [block.data for block in found.cells if block.type == "tetra"]
-    if not tetrahedra:
-        raise InputError(f"mesh file {path} has no linear tetrahedra, only {', '.join(kinds)}")
-    other = [kind for kind in kinds if kind not in ("tetra", "triangle", "line", "vertex")]
+
+
+def _convert(path: str | Path, *, directions: bool) -> Body:
+    found = _load(Path(path))
+    try:
+        mesh, used = _mesh(found)
+        if not directions:
+            return Body(mesh)
+        fibres, sheets = (_directions(found, mesh, used, name) for name in ("fibres", "sheets"))
+        return Body(mesh, fibres, sheets)
+    except InputError as error:
+        raise InputError(f"mesh file {path}: {str(error).removeprefix('mesh: ')}") from error
+
+
+def _mesh(found: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
+    """The mesh, and the file's number (n,) of each of its nodes."""
+    kind = _tetrahedra(found)
+    elements = np.concatenate([block.data for block in found.cells if block.type == kind])
+    used, points = np.unique(elements), np.asarray(found.points, dtype=float)
+    if used[0] < 0 or used[-1] >= len(points):
+        return Mesh(points, elements), used  # which says so
+    number = np.full(len(points), -1)
+    number[used] = np.arange(len(used))
+    nodes = points[used]
+    elements = orient(nodes, number[elements])
+    return Mesh(nodes, elements, *read_sets(found, number, elements)), used
+
+
+def _tetrahedra(found: meshio.Mesh) -> str:
+    """The one type of tetrahedra in the file; :class:`InputError` names any other cells."""
+    kinds = sorted({block.type for block in found.cells if len(block.data)})
+    solid = [kind for kind in kinds if kind in ("tetra", "tetra10")]
+    other = [kind for kind in kinds if kind not in _LOWER | {"tetra", "tetra10"}]
     if other:
-        raise InputError(f"mesh file {path} also has {', '.join(other)}; only tetra is supported")
-    return Mesh(found.points, np.concatenate(tetrahedra))
+        raise InputError(
+            f"it has {', '.join(other)} cells; expected tetrahedra only (tetra or tetra10): "
+            "mesh or split the volume into them"
+        )
+    if not solid:
+        raise InputError(
+            f"it has no tetrahedra, only {', '.join(kinds) or 'no cells'}; mesh the volume, and "
+            "give it a physical group if the surface has one, or gmsh leaves it out"
+        )
+    if len(solid) > 1:
+        raise InputError("it has both tetra and tetra10 cells; expected one of the two")
+    return solid[0]
 
 
-def write_displacement(
-    path: str | Path, mesh: Mesh, displacement: np.ndarray, cells: Mapping[str, np.ndarray] = {}
-) -> None:
-    """Write mesh, displacement (n, 3) mm and cell data (m, ...) as VTU, whole or not at all."""
-    output = meshio.Mesh(
+def _directions(found: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str) -> np.ndarray | None:
+    """Unit vectors (m, 3) from cell or point data ``name``."""
+    kind = _KINDS[mesh.elements.shape[1]][0]
+    if name in found.cell_data:
+        blocks = zip(found.cells, found.cell_data[name], strict=True)
+        values = np.concatenate([data for block, data in blocks if block.type == kind])
+        return _unit(values, name, "element")
+    if name in found.point_data:
+        at_nodes = _unit(np.asarray(found.point_data[name])[used], name, "node")
+        corners = at_nodes[mesh.elements[:, :4]]
+        # A direction and its opposite are the same: turn all to the first corner's side.
+        sides = np.where(np.einsum("mai,mi->ma", corners, corners[:, 0]) < 0.0, -1.0, 1.0)
+        mean = np.einsum("mai,ma->mi", corners, sides)
+        return mean / np.linalg.norm(mean, axis=1, keepdims=True)
+    return None
+
+
+def _unit(values: np.ndarray, name: str, where: str) -> np.ndarray:
+    values = np.asarray(values, dtype=float)
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise InputError(f"'{name}' have shape {values.shape}; expected 3 components")
+    length = np.linalg.norm(values, axis=1, keepdims=True)
+    wrong = np.flatnonzero(~(np.abs(length[:, 0] - 1.0) <= _UNIT))
+    if wrong.size:
+        raise InputError(
+            f"'{name}' at {where} {wrong[0]} has length {length[wrong[0], 0]:.4g}, "
+            f"{wrong.size} such of {len(values)}; expected unit vectors"
+        )
+    return values / length
+
+
+# ---- writing -------------------------------------------------------------------------------------
+def _check_format(path: str | Path, mesh: Mesh, directions: Mapping[str, np.ndarray]) -> None:
+    """Refuse what a format cannot hold, or meshio cannot read back from it."""
+    suffix = Path(path).suffix
+    if suffix not in (".msh", ".vtu", ".xdmf"):
+        raise InputError(f"mesh file {path}: cannot write '{suffix}'; use .msh, .vtu or .xdmf")
+    if suffix == ".xdmf" and mesh.elements.shape[1] == 10 and mesh.facet_sets:
+        raise InputError(f"mesh file {path}: .xdmf cannot hold quadratic facet sets; use .vtu")
+    if suffix != ".msh":
+        return
+    if directions:
+        raise InputError(f"mesh file {path}: .msh cannot hold {', '.join(directions)}; use .vtu")
+    for name in own_node_sets(mesh):
+        if name in mesh.facet_sets:
+            raise InputError(
+                f"mesh file {path}: facet set '{name}' and node set '{name}' have different nodes; "
+                "give them different names or use .vtu"
+            )
+
+
+def _with_tags(mesh: Mesh) -> meshio.Mesh:
+    """Sets as gmsh's physical groups; a facet or node in two sets is written twice."""
+    solid, triangle = _KINDS[mesh.elements.shape[1]]
+    groups = [(2, triangle, name, rows) for name, rows in mesh.facet_sets.items()]
+    groups += [(0, "vertex", name, n[:, None]) for name, n in own_node_sets(mesh).items()]
+    blocks = [(solid, mesh.elements), *((kind, rows) for _, kind, _, rows in groups)]
+    tags = [np.full(len(rows), tag) for tag, (_, rows) in enumerate(blocks)]
+    return meshio.Mesh(
         mesh.nodes,
-        [("tetra", mesh.elements)],
-        point_data={"displacement": np.asarray(displacement)},
-        cell_data={name: [np.asarray(values)] for name, values in cells.items()},
+        blocks,
+        cell_data={"gmsh:physical": tags, "gmsh:geometrical": [tag + 1 for tag in tags]},
+        field_data={
+            name: np.array([tag, dimension])
+            for tag, (dimension, _, name, _) in enumerate(groups, start=1)
+        },
     )
-    with replacing(path) as temporary:
-        meshio.write(temporary, output, file_format="vtu")
+
+
+def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh:
+    """Sets as data of 0 and 1 on triangles and points."""
+    solid, triangle = _KINDS[mesh.elements.shape[1]]
+    blocks = [(solid, mesh.elements)]
+    marks: dict[str, np.ndarray] = {}
+    if mesh.facet_sets:
+        sets = list(mesh.facet_sets.values())
+        rows, place = np.unique(np.concatenate(sets), axis=0, return_inverse=True)
+        blocks.append((triangle, rows))
+        ends = np.cumsum([len(facets) for facets in sets])[:-1]
+        for name, members in zip(mesh.facet_sets, np.split(place, ends), strict=True):
+            marks[MARK + name] = np.isin(np.arange(len(rows)), members).astype(np.int32)
+    data = {name: _padded(values, blocks) for name, values in directions.items()}
+    none = np.zeros(len(mesh.elements), np.int32)
+    data |= {name: [none, values] for name, values in marks.items()}
+    points = {
+        MARK + name: np.isin(np.arange(len(mesh.nodes)), nodes).astype(np.int32)
+        for name, nodes in own_node_sets(mesh).items()
+    }
+    return meshio.Mesh(mesh.nodes, blocks, cell_data=data, point_data=points)
+
+
+def _padded(values: np.ndarray, blocks: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
+    """``values`` (m, 3) of the tetrahedra, and zeros for the other cells."""
+    return [values, *(np.zeros((len(rows), 3)) for _, rows in blocks[1:])]

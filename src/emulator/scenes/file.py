@@ -3,9 +3,9 @@
 .. code-block:: toml
 
     law = "neo_hookean"
-    mesh = "block.vtu"                       # any format meshio reads, in mm
-
-    [node_sets.left]                         # nodes on a plane
+    mesh = "block.vtu"                       # any format meshio reads, in mm, with its named
+                                             # groups and, where the law asks, its fibres
+    [node_sets.left]                         # or nodes on a plane
     axis = "x"
     at = 0.0
 
@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.io import read_mesh
+from emulator.geometry.io import Body, read_body, read_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.loads import Gravity, Load
@@ -80,12 +80,15 @@ def read_scene(path: str | Path) -> Scene:
 
 
 def _scene(path: Path, text: dict[str, Any]) -> Scene:
-    mesh = read_mesh(path.parent / text["mesh"])
+    law, mesh_path = find_law(text["law"]), path.parent / text["mesh"]
+    body = read_body(mesh_path) if law.fibres else Body(read_mesh(mesh_path))
+    mesh = body.mesh
     sets = {name: _on_plane(mesh, name, plane) for name, plane in text.get("node_sets", {}).items()}
     return Scene(
         name=path.stem,
-        mesh=replace(mesh, node_sets=sets),
-        law=find_law(text["law"]),
+        mesh=replace(mesh, node_sets={**mesh.node_sets, **sets}),
+        law=law,
+        fibres=body.fibres,
         parameters=tuple(_parameter(name, entry) for name, entry in text["parameters"].items()),
         loads=tuple(_load(load) for load in text.get("loads", [])),
         supports=tuple(

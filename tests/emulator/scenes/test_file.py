@@ -4,6 +4,7 @@ import pytest
 
 from emulator.errors import InputError
 from emulator.geometry.generators import box
+from emulator.geometry.io import write_mesh
 from emulator.scenes import find_scene, scene_from_recipe
 
 SCENE = """
@@ -70,15 +71,27 @@ def test_one_line_for_every_mistake(folder, old, new, message):
     assert "\n" not in str(caught.value).replace("(at line", "")
 
 
-def test_inverted_and_flat_elements_are_refused(folder):
+def test_flat_elements_are_refused(folder):
     mesh = box((2.0, 1.0, 1.0), (2, 1, 1))
-    for elements, nodes, message in (
-        (mesh.elements[:, [0, 2, 1, 3]], mesh.nodes, "inverted"),
-        (mesh.elements, mesh.nodes * [1, 1, 0], "no volume"),
-    ):
-        meshio.write(folder / "block.vtu", meshio.Mesh(nodes, [("tetra", elements)]))
-        with pytest.raises(InputError, match=message):
-            find_scene(str(folder / "scene.toml"))
+    flat = meshio.Mesh(mesh.nodes * [1, 1, 0], [("tetra", mesh.elements)])
+    meshio.write(folder / "block.vtu", flat)
+    with pytest.raises(InputError, match="no volume"):
+        find_scene(str(folder / "scene.toml"))
+
+
+def test_named_groups_and_fibres_come_from_the_mesh_file(folder):
+    mesh = box((2.0, 1.0, 1.0), (2, 1, 1))
+    fibres = np.tile([0.0, 1.0, 0.0], (len(mesh.elements), 1))
+    write_mesh(folder / "block.vtu", mesh, fibres)
+    text = SCENE.replace('[node_sets.left]\naxis = "x"\nat = 0.0\n', "")
+    (folder / "scene.toml").write_text(text)
+    scene = find_scene(str(folder / "scene.toml"))
+    np.testing.assert_array_equal(scene.mesh.node_set("left"), mesh.node_set("left"))
+    assert scene.fibres is None
+    constants = "C = 2.0\nb_f = 8.0\nb_t = 2.0\nb_fs = 4.0"
+    text = text.replace("neo_hookean", "guccione").replace("lam = 30.0", constants)
+    (folder / "scene.toml").write_text(text.replace("parameters.mu", "parameters.kappa"))
+    np.testing.assert_array_equal(find_scene(str(folder / "scene.toml")).fibres, fibres)
 
 
 def test_unknown_names(tmp_path):

@@ -1,0 +1,208 @@
+r"""Uniaxial and equibiaxial stretch of a cube: the solution of every law in closed form.
+
+The cube's edges, and its fibres along x, are the principal axes, so that a law is a function of
+three stretches and the first Piola stress is diagonal, :math:`P_i = \partial W/\partial\lambda_i`.
+What is not pulled is free, :math:`P_i = 0`, which is one equation for the lateral stretch.
+
+The formulas below are written out by hand in NumPy, for comparison with the laws: they share no
+code with them. :func:`verify_homogeneous` solves the same cubes by finite elements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import brentq
+
+from calibrate.verify.row import Row
+from emulator.fem import Simulator
+from emulator.geometry.generators import box
+from emulator.mechanics.energy import strain_energy
+from emulator.mechanics.laws import find_law
+from emulator.scenes import Parameter, Scene, Support
+
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Homogeneous:
+    """Principal stretches and first Piola stresses in kPa along x (the fibres), y and z."""
+
+    stretches: tuple[float, float, float]
+    stresses: tuple[float, float, float]
+
+
+def uniaxial(law: str, stretch: float, values: Values) -> Homogeneous:
+    """Pulled by ``stretch`` along x, free along y and z; ``values`` are the law's parameters."""
+    return _solve(law, values, lambda free: (stretch, free, free))
+
+
+def equibiaxial(law: str, stretch: float, values: Values) -> Homogeneous:
+    """Pulled by ``stretch`` along x and y, free along z; ``values`` are the law's parameters."""
+    return _solve(law, values, lambda free: (stretch, stretch, free))
+
+
+def _solve(
+    law: str, values: Values, stretches: Callable[[float], tuple[float, float, float]]
+) -> Homogeneous:
+    stress = PRINCIPAL_STRESS[law]
+
+    def free_stress(free: float) -> float:
+        return float(stress(np.array(stretches(free)), values)[2])
+
+    low = high = 1.0
+    while free_stress(low) > 0.0:
+        low *= 0.95
+    while free_stress(high) < 0.0:
+        high *= 1.05
+    free = low if low == high else brentq(free_stress, low, high, xtol=1e-15, rtol=1e-15)
+    found = stretches(free)
+    first, second, third = map(float, stress(np.array(found), values))
+    return Homogeneous(found, (first, second, third))
+
+
+def neo_hookean(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r""":math:`P_i = \mu (\lambda_i - 1/\lambda_i) + \lambda \ln J / \lambda_i` in kPa, (3,)."""
+    mu, lam = values["mu"], values["lam"]
+    return mu * (stretches - 1.0 / stretches) + lam * np.log(np.prod(stretches)) / stretches
+
+
+def neo_hookean_engineering(stretches: np.ndarray, values: Values) -> np.ndarray:
+    """:func:`neo_hookean` from Young's modulus ``E`` in kPa and Poisson's ratio ``nu``, (3,)."""
+    E, nu = values["E"], values["nu"]
+    lame = {"mu": E / 2.0 / (1.0 + nu), "lam": E * nu / (1.0 + nu) / (1.0 - 2.0 * nu)}
+    return neo_hookean(stretches, lame)
+
+
+def _isochoric(stretches: np.ndarray) -> tuple[np.ndarray, ...]:
+    r"""``(I1 - 3, I4 - 1)``, both isochoric, and their derivatives in the stretches.
+
+    .. math::
+        \partial \bar I_1 / \partial\lambda_i &= J^{-2/3} (2\lambda_i - 2 I_1 / 3\lambda_i) \\
+        \partial \bar I_4 / \partial\lambda_i &=
+            J^{-2/3} (2\lambda_1 \delta_{i1} - 2 \lambda_1^2 / 3\lambda_i)
+    """
+    scale = np.prod(stretches) ** (-2.0 / 3.0)
+    I1, I4 = np.sum(stretches**2), stretches[0] ** 2
+    along = np.array([2.0 * stretches[0], 0.0, 0.0])
+    d_I1 = scale * (2.0 * stretches - 2.0 / 3.0 * I1 / stretches)
+    d_I4 = scale * (along - 2.0 / 3.0 * I4 / stretches)
+    return scale * I1 - 3.0, scale * I4 - 1.0, d_I1, d_I4
+
+
+def holzapfel_ogden(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r"""Textbook form, fibres switched off in compression, in kPa, (3,).
+
+    .. math::
+        P_i = \tfrac{a}{2} e^{b(\bar I_1 - 3)} \partial_i \bar I_1
+          + a_f x\, e^{b_f x^2} \partial_i \bar I_4 + 2\kappa (J^2 - 1)/\lambda_i,
+        \quad x = \max(\bar I_4 - 1, 0)
+    """
+    a, b, a_f, b_f, kappa = (values[name] for name in ("a", "b", "a_f", "b_f", "kappa"))
+    I1, I4, d_I1, d_I4 = _isochoric(stretches)
+    x = max(float(I4), 0.0)
+    volume = 2.0 * kappa * (np.prod(stretches) ** 2 - 1.0) / stretches
+    return a / 2.0 * np.exp(b * I1) * d_I1 + a_f * x * np.exp(b_f * x**2) * d_I4 + volume
+
+
+def holzapfel_ogden_released(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r"""The released form: twice the textbook's factors and no switch, in kPa, (3,)."""
+    a, b, a_f, b_f, kappa = (values[name] for name in ("a", "b", "a_f", "b_f", "kappa"))
+    I1, I4, d_I1, d_I4 = _isochoric(stretches)
+    volume = 2.0 * kappa * (np.prod(stretches) ** 2 - 1.0) / stretches
+    return a * np.exp(b * I1) * d_I1 + 2.0 * a_f * I4 * np.exp(b_f * I4**2) * d_I4 + volume
+
+
+def guccione(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r"""Fibres along x, in kPa, (3,).
+
+    .. math::
+        P_i = C e^Q b_i E_i \lambda_i + \kappa (J - 1) J / \lambda_i, \quad
+        E_i = (\lambda_i^2 - 1)/2, \quad Q = \sum_i b_i E_i^2, \quad b = (b_f, b_t, b_t)
+    """
+    b = np.array([values["b_f"], values["b_t"], values["b_t"]])
+    E, J = (stretches**2 - 1.0) / 2.0, np.prod(stretches)
+    matrix = values["C"] * np.exp(np.sum(b * E**2)) * b * E * stretches
+    return matrix + values["kappa"] * (J - 1.0) * J / stretches
+
+
+PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
+    "neo_hookean": neo_hookean,
+    "neo_hookean_E_nu": neo_hookean_engineering,
+    "holzapfel_ogden": holzapfel_ogden,
+    "holzapfel_ogden_released": holzapfel_ogden_released,
+    "guccione": guccione,
+}
+
+# Stiff enough to volume change to be like tissue, and with every term at work.
+PARAMETERS: dict[str, dict[str, float]] = {
+    "neo_hookean": {"mu": 10.0, "lam": 30.0},
+    "neo_hookean_E_nu": {"E": 30.0, "nu": 0.4},
+    "holzapfel_ogden": {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "kappa": 50.0},
+    "holzapfel_ogden_released": {"a": 1.0, "b": 3.0, "a_f": 2.5, "b_f": 4.0, "kappa": 50.0},
+    "guccione": {"C": 2.0, "b_f": 8.0, "b_t": 2.0, "b_fs": 4.0, "kappa": 50.0},
+}
+
+STRETCHES = (0.85, 1.2)
+_TOLERANCE = 1e-8  # of the stress; the solver leaves 1e-10
+_SOURCE = "closed form in principal stretches, written out in calibrate.verify.homogeneous"
+
+
+def verify_homogeneous(laws: Sequence[str] = tuple(PARAMETERS)) -> list[Row]:
+    """FEM cubes against :func:`uniaxial` and :func:`equibiaxial`: stress in kPa, free stretch."""
+    rows = []
+    for law in laws:
+        for kind, solve in (("uniaxial", uniaxial), ("equibiaxial", equibiaxial)):
+            for stretch in STRETCHES:
+                expected = solve(law, stretch, PARAMETERS[law])
+                found = _by_fem(law, kind, stretch)
+                for what, k, measured, reference in (
+                    ("stress along x", 0, found.stresses, expected.stresses),
+                    ("free stretch", 2, found.stretches, expected.stretches),
+                ):
+                    name = f"{law}: {kind}, stretch {stretch:g}: {what}"
+                    tolerance = _TOLERANCE * abs(reference[k])
+                    rows.append(Row(name, measured[k], reference[k], tolerance, _SOURCE))
+    return rows
+
+
+def cube_scene(law: str, kind: str, stretch: float) -> Scene:
+    """A cube of 1 mm on three planes of symmetry, pulled along x, and along y if equibiaxial."""
+    pull = stretch - 1.0
+    supports = [
+        Support("left", components="x"),
+        Support("front", components="y"),
+        Support("bottom", components="z"),
+        Support("right", np.array([pull, 0.0, 0.0]), components="x"),
+    ]
+    if kind == "equibiaxial":
+        supports.append(Support("back", np.array([0.0, pull, 0.0]), components="y"))
+    mesh, found = box((1.0, 1.0, 1.0), (2, 2, 2)), find_law(law)
+    varied, *fixed = PARAMETERS[law].items()
+    return Scene(
+        name=f"{kind} cube",
+        mesh=mesh,
+        law=found,
+        parameters=(Parameter(varied[0], "kPa", 0.5 * varied[1], 2.0 * varied[1]),),
+        supports=tuple(supports),
+        constants=dict(fixed),
+        fibres=np.tile([1.0, 0.0, 0.0], (len(mesh.elements), 1)) if found.fibres else None,
+    )
+
+
+def _by_fem(law: str, kind: str, stretch: float) -> Homogeneous:
+    """Stretches from the corner opposite the origin, stresses from the faces' reactions (1 mm2)."""
+    scene = cube_scene(law, kind, stretch)
+    theta = jnp.array([next(iter(PARAMETERS[law].values()))])
+    solution = Simulator(scene).solve(theta).require_converged(f"{law}, {kind}")
+    u = solution.displacement
+    force = jax.grad(strain_energy(scene))(u, theta)
+    corner = int(np.argmax(scene.mesh.nodes.sum(axis=1)))
+    sets = [scene.mesh.node_set(name) for name in ("right", "back", "top")]
+    first, second, third = (float(force[nodes, k].sum()) for k, nodes in enumerate(sets))
+    x, y, z = (1.0 + float(u[corner, k]) for k in range(3))
+    return Homogeneous((x, y, z), (first, second, third))
