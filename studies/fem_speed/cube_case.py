@@ -9,6 +9,7 @@ import json
 import resource
 import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,18 @@ from emulator.fem import Status
 
 
 def peak_gb() -> float:
-    """Most memory this process ever held; Linux counts in kB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    """Most memory this process ever held.
+
+    On Linux ``ru_maxrss`` begins at that of the process which started this one; the kernel's own
+    high-water mark begins anew with the program.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        line = next(x for x in status.read_text().splitlines() if x.startswith("VmHWM"))
+        kilobytes = int(line.split()[1])
+    else:
+        kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return kilobytes * 1024 / 1e9
 
 
 def timed_solve(simulator: em.Simulator, theta: jax.Array) -> tuple[float, em.Solution]:

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, FacetBasis, LinearForm, MeshTet
 from skfem.assembly import asm
@@ -26,6 +27,15 @@ class Result(NamedTuple):
     displacement: np.ndarray
     iterations: int
     converged: bool
+
+
+class Fields(NamedTuple):
+    """Integrands of the forms; elements or facets, and their quadrature points, last."""
+
+    stress: np.ndarray  # (3, 3, m, 1)
+    elasticity: np.ndarray  # (3, 3, 3, 3, m, 1)
+    area: np.ndarray  # (3, k, 1): cof(F) N
+    turning: np.ndarray  # (3, 3, 3, k, 1): its derivative in F
 
 
 @dataclass(frozen=True)
@@ -169,23 +179,24 @@ class Body:
         held = self.basis.nodal_dofs[:, self.held].ravel()
         return np.setdiff1d(np.arange(self.basis.N), held)
 
-    def forces(self, u, material, pressure):
-        """Internal force, and that of the pressure, over all degrees of freedom."""
-        P, _ = material.stress_and_elasticity(self.basis.interpolate(u).grad)
+    def fields(self, u: np.ndarray, material: Material) -> Fields:
+        """What the forms integrate, at every quadrature point."""
+        stress, elasticity = material.stress_and_elasticity(self.basis.interpolate(u).grad)
         F = IDENTITY + self.facet_basis.interpolate(u).grad
-        area = np.einsum("ij...,j...->i...", _cofactor(F), self.facet_basis.normals)
-        return (
-            asm(internal, self.basis, stress=P),
-            -pressure * asm(pressed, self.facet_basis, area=area),
-        )
+        normals = self.facet_basis.normals
+        area = np.einsum("ij...,j...->i...", _cofactor(F), normals)
+        return Fields(stress, elasticity, area, _turning(F, normals))
 
-    def tangent(self, u, material, pressure):
-        _, A = material.stress_and_elasticity(self.basis.interpolate(u).grad)
-        F = IDENTITY + self.facet_basis.interpolate(u).grad
-        turning = _turning(F, self.facet_basis.normals)
-        return asm(stiffness, self.basis, elasticity=A) + pressure * asm(
-            pressed_tangent, self.facet_basis, turning=turning
-        )
+    def forces(self, fields: Fields, pressure: float) -> tuple[np.ndarray, np.ndarray]:
+        """Internal force, and that of the pressure, over all degrees of freedom."""
+        inner = asm(internal, self.basis, stress=fields.stress)
+        return inner, -pressure * asm(pressed, self.facet_basis, area=fields.area)
+
+    def tangent(self, fields: Fields, pressure: float) -> csc_matrix:
+        """Derivative of the residual over the free degrees of freedom."""
+        K = asm(stiffness, self.basis, elasticity=fields.elasticity)
+        K = K + pressure * asm(pressed_tangent, self.facet_basis, turning=fields.turning)
+        return K[self.free][:, self.free].tocsc()
 
     def solve(self, theta: np.ndarray, steps: int = 3) -> Result:
         """Newton from rest in equal load steps; twice as many when one of them fails."""
@@ -217,17 +228,17 @@ class Body:
     ) -> tuple[np.ndarray, int, bool]:
         for iteration in range(26):
             with np.errstate(all="ignore"):  # a step too far shows as NaN
-                inner, outer = self.forces(u, material, pressure)
+                fields = self.fields(u, material)
+                inner, outer = self.forces(fields, pressure)
                 residual = (inner - outer)[self.free]
                 size = np.linalg.norm(inner) + np.linalg.norm(outer)
             if not np.isfinite(size):
                 return u, iteration, False
             if np.linalg.norm(residual) <= tolerance * size:
                 return u, iteration, True
-            K = self.tangent(u, material, pressure)[self.free][:, self.free].tocsc()
             # Minimum degree on A + A' is SuperLU's best ordering for a symmetric pattern.
             factor = splu(
-                K,
+                self.tangent(fields, pressure),
                 permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.01,
                 options={"SymmetricMode": True},
