@@ -376,6 +376,27 @@ def draw(cases: list[dict], path: Path) -> None:
     plt.close(figure)
 
 
+def table(cases: list[dict]) -> str:
+    """The README's tables."""
+    lines = ["| | median | compilation, once | iterations |", "|---|---|---|---|"]
+    for case in (case for case in cases if "median_s" in case):
+        compiling = f"{case['compile_s']:.1f} s" if "compile_s" in case else "none"
+        count = f"{case['iterations']:.0f}" if "iterations" in case else ""
+        lines.append(f"| {case['name']} | {case['median_s']:.3f} s | {compiling} | {count} |")
+    lines += [
+        "",
+        "| nodes | tetrahedra | from rest | compilation, once | iterations | peak memory |",
+    ]
+    lines.append("|---|---|---|---|---|---|")
+    lines += [
+        f"| {case['nodes']} | {case['elements']} | {case['cold_s']:.2f} s | "
+        f"{case['compile_s']:.1f} s | {case['iterations']} | {case['peak_gb']:.2f} GB |"
+        for case in cases
+        if "cold_s" in case
+    ]
+    return "\n".join(lines)
+
+
 def check(cases: list[dict]) -> None:
     """The claims of the study's README that do not depend on the machine."""
     for case in cases:
@@ -412,6 +433,7 @@ def main() -> None:
         arguments.out / "results.json", {**header, "times_as_long_as_ours": found, "cases": cases}
     )
     draw(cases, arguments.out / "speed.png")
+    print(table(cases))
     check(cases)
     if not arguments.quick:
         check_times(found)
