@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from compiling import Compiling
 from plain_skfem import Body
 
 import emulator as em
@@ -111,6 +112,13 @@ def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
     return time.perf_counter() - begin, result
 
 
+def first_call(function: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
+    """Seconds of the first call, and those of them that JAX compiled."""
+    compiling = Compiling()
+    seconds, _ = timed(function, *arguments)
+    return seconds, compiling.so_far()
+
+
 def row(name: str, seconds: Iterable[float], converged: Iterable[bool], **more: Any) -> dict:
     """A case of the study: the median, and the extremes, of single calls."""
     seconds, converged = np.asarray(list(seconds)), list(converged)
@@ -130,7 +138,7 @@ def row(name: str, seconds: Iterable[float], converged: Iterable[bool], **more: 
 
 def ours_cold(simulator: em.Simulator, thetas: jax.Array) -> tuple[dict, np.ndarray]:
     """From rest; the first theta pays for compilation and the symbolic factorisation."""
-    first, _ = timed(simulator.solve, thetas[0])
+    first, compile_s = first_call(simulator.solve, thetas[0])
     runs = [timed(simulator.solve, theta) for theta in thetas[1:]]
     seconds = [run[0] for run in runs]
     solutions = [run[1] for run in runs]
@@ -139,7 +147,8 @@ def ours_cold(simulator: em.Simulator, thetas: jax.Array) -> tuple[dict, np.ndar
         seconds,
         [bool(s.converged) for s in solutions],
         iterations=float(np.median([int(s.iterations) for s in solutions])),
-        compile_s=first - float(np.median(seconds)),
+        first_call_s=first,
+        compile_s=compile_s,
     )
     return case, np.stack([s.displacement for s in solutions])
 
@@ -153,7 +162,7 @@ def neighbours(thetas: jax.Array) -> jax.Array:
 def ours_warm(simulator: em.Simulator, thetas: jax.Array) -> dict:
     """Started from the solution at a neighbouring theta."""
     starts = [simulator.solve(theta).displacement for theta in neighbours(thetas)]
-    first, _ = timed(simulator.solve, thetas[0], starts[0])
+    first, compile_s = first_call(simulator.solve, thetas[0], starts[0])
     runs = [timed(simulator.solve, *pair) for pair in zip(thetas[1:], starts[1:], strict=True)]
     seconds = [run[0] for run in runs]
     return row(
@@ -161,7 +170,8 @@ def ours_warm(simulator: em.Simulator, thetas: jax.Array) -> dict:
         seconds,
         [bool(run[1].converged) for run in runs],
         iterations=float(np.median([int(run[1].iterations) for run in runs])),
-        compile_s=first - float(np.median(seconds)),
+        first_call_s=first,
+        compile_s=compile_s,
     )
 
 
@@ -175,14 +185,15 @@ def ours_gradient(simulator: em.Simulator, facet_set: str, thetas: jax.Array) ->
 
     both = jax.jit(jax.value_and_grad(value, has_aux=True))
     starts = [simulator.solve(theta).displacement for theta in neighbours(thetas)]
-    first, _ = timed(both, thetas[0], starts[0])
+    first, compile_s = first_call(both, thetas[0], starts[0])
     runs = [timed(both, *pair) for pair in zip(thetas[1:], starts[1:], strict=True)]
     seconds = [run[0] for run in runs]
     return row(
         "ours, warm, volume and gradient",
         seconds,
         [int(run[1][0][1]) == Status.CONVERGED for run in runs],
-        compile_s=first - float(np.median(seconds)),
+        first_call_s=first,
+        compile_s=compile_s,
         gradient_error=_slope_error(simulator, value, thetas[1], runs[0][1][1]),
     )
 
@@ -206,10 +217,12 @@ def relative_difference(u: np.ndarray, reference: np.ndarray) -> float:
 
 
 def plain(problem: Problem, thetas: jax.Array, reference: np.ndarray) -> dict:
-    """scikit-fem and SciPy, in the number of load steps that suits it best."""
+    """scikit-fem and SciPy, in the number of load steps that needs the fewest iterations."""
     body = Body(**arrays(problem))
-    trials = {steps: timed(body.solve, np.asarray(thetas[0]), steps) for steps in (1, 2, 3, 4)}
-    steps = min(trials, key=lambda k: trials[k][0])
+    spare = np.asarray(uniform(problem.scene, 3, jax.random.key(SEED + 2)))
+    steps = min(
+        (1, 2, 3, 4, 6), key=lambda k: sum(body.solve(theta, k).iterations for theta in spare)
+    )
     runs = [timed(body.solve, np.asarray(theta), steps) for theta in thetas[1:]]
     return row(
         "scikit-fem + SciPy, cold",
@@ -409,8 +422,8 @@ def check(cases: list[dict]) -> None:
 
 def check_times(found: dict[str, float]) -> None:
     """Those about time."""
-    assert found["scikit-fem"] > 2.0
-    assert found.get("FEniCS", 20.0) > 5.0
+    assert found["scikit-fem"] > 1.5
+    assert found.get("FEniCS", 20.0) > 4.0
 
 
 def main() -> None:
