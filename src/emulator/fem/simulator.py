@@ -16,6 +16,7 @@ from functools import cached_property, partial
 import jax
 import jax.numpy as jnp
 
+from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.newton import NewtonOptions, newton
 from emulator.fem.solution import Solution, Status
@@ -58,9 +59,13 @@ class Simulator:
         The displacement is differentiable in ``theta``; ``start`` only affects the time taken.
         Never raises on a hard case: read ``status``. (Inside ``jit`` the direct solver does raise
         on a tangent that is singular to the last bit.)
+
+        Raises
+        ------
+        InputError
+            ``theta`` or ``start`` has the wrong shape.
         """
-        start = self.rest if start is None else start
-        theta = jnp.asarray(theta, dtype=float)
+        theta, start = self._checked(theta, self.rest if start is None else start)
         try:
             solution = self._solve(theta, jax.lax.stop_gradient(start))
             if not isinstance(solution.status, jax.core.Tracer):
@@ -70,6 +75,19 @@ class Simulator:
                 raise
             return self._singular()
         return solution
+
+    def _checked(self, theta: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Both in float64. A theta of the wrong length would be read past its end, silently."""
+        theta, start = jnp.asarray(theta, dtype=float), jnp.asarray(start, dtype=float)
+        for name, array, shape in (
+            ("theta", theta, (len(self.scene.parameters),)),
+            ("start", start, self.scene.held.shape),
+        ):
+            if array.shape != shape:
+                raise InputError(
+                    f"scene '{self.scene.name}': {name} has shape {array.shape}; expected {shape}"
+                )
+        return theta, start
 
     def _singular(self) -> Solution:
         """What the direct solver's refusal of an exactly singular tangent amounts to."""
@@ -95,7 +113,12 @@ class Simulator:
         """Solutions for many theta (c, p), one after the other; fields gain a leading axis."""
         if starts is None:
             starts = jnp.zeros((len(thetas), *self.scene.held.shape))
-        return self._campaign(jnp.asarray(thetas, dtype=float), starts)
+        thetas, starts = jnp.asarray(thetas, dtype=float), jnp.asarray(starts, dtype=float)
+        if len(thetas) != len(starts):
+            raise InputError(f"campaign: {len(thetas)} theta, but {len(starts)} starts")
+        if len(thetas):
+            self._checked(thetas[0], starts[0])
+        return self._campaign(thetas, starts)
 
     @cached_property
     def _solve(self):  # noqa: ANN202 - a jitted closure, private

@@ -155,6 +155,25 @@ def test_failures_have_names(beam, simulator):
         short.require_converged()
 
 
+def test_arguments_of_the_wrong_shape_are_refused(beam, simulator):
+    with pytest.raises(InputError, match=r"theta has shape \(1,\); expected \(2,\)"):
+        simulator.solve(jnp.array([60.0]))
+    with pytest.raises(InputError, match=r"theta has shape \(3,\)"):
+        jax.jit(simulator.solve)(jnp.array([60.0, 60.0, 60.0]))
+    with pytest.raises(InputError, match=r"start has shape \(3,\)"):
+        simulator.solve(beam.centre, jnp.zeros(3))
+    with pytest.raises(InputError, match="2 theta, but 1 starts"):
+        simulator.campaign(jnp.ones((2, 2)), jnp.zeros((1, *beam.held.shape)))
+
+
+@pytest.mark.parametrize("kind", [np.float32, int])
+def test_a_start_of_another_type_is_taken(beam, simulator, kind):
+    start = np.asarray(simulator(beam.centre)).astype(kind)
+    np.testing.assert_allclose(
+        simulator.solve(beam.centre, start).displacement, simulator(beam.centre), atol=1e-8
+    )
+
+
 def test_an_impossible_load_ends_in_a_named_failure():
     # Turned through half a circle and squeezed flat: no admissible state exists.
     scene = block(cells=(2, 2, 2))
