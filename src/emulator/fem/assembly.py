@@ -156,19 +156,22 @@ class System:
     ) -> tuple[jax.Array, jax.Array]:
         """Residual (f,) with the volumes eliminated, and its change along ``move`` (n, 3)."""
         nodes = self.scene.discretisation.connectivity
-        values = self.scene.resolve(theta)
-
-        def spread(local: jax.Array) -> jax.Array:
-            return jnp.zeros_like(u).at[nodes].add(local.reshape(*nodes.shape, 3))
-
-        def others(v: jax.Array) -> jax.Array:
-            springs = jax.grad(lambda w: sum((s.total(w, values) for s in self.springs), 0.0))(v)
-            return springs - load * self.external_force(v, theta)
-
-        force, change = jax.jvp(others, (u,), (move,))
+        force, change = jax.jvp(lambda v: self.others(v, theta, load), (u,), (move,))
         local = move[nodes].reshape(len(nodes), -1)
-        change = change + spread(jnp.einsum("mij,mj->mi", condensed.tangent, local))
-        return self.restrict(spread(condensed.force) + force), self.restrict(change)
+        change = change + self.spread(jnp.einsum("mij,mj->mi", condensed.tangent, local))
+        return self.restrict(self.spread(condensed.force) + force), self.restrict(change)
+
+    def spread(self, local: jax.Array) -> jax.Array:
+        """Nodal sums (n, 3) of what the elements have at their nodes, (m, ...)."""
+        nodes = self.scene.discretisation.connectivity
+        at_nodes = local.reshape(*nodes.shape, 3)
+        return jnp.zeros(self.scene.held.shape, local.dtype).at[nodes].add(at_nodes)
+
+    def others(self, u: jax.Array, theta: jax.Array, load: jax.Array | float) -> jax.Array:
+        """Force (n, 3) in mN out of balance that is not the bulk's: springs less loads."""
+        values = self.scene.resolve(theta)
+        springs = jax.grad(lambda w: sum((s.total(w, values) for s in self.springs), 0.0))(u)
+        return springs - load * self.external_force(u, theta)
 
     def tangent(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
         """Nonzeros (nnz,) of the tangent over the free degrees of freedom, mN/mm."""

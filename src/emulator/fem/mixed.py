@@ -112,6 +112,28 @@ def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) ->
     return jax.vmap(one, (0, 0, *axes))(*volumes, *arguments)
 
 
+def carried(
+    scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array, at: Condensed
+) -> jax.Array:
+    """Force (m, a, 3) of every element at ``u`` and ``volumes``, eliminated with ``at``.
+
+    What :func:`linearise` calls force, but with the couplings of an earlier iterate: solving with
+    that iterate's tangent gives the simplified Newton step.
+    """
+    energy = at_volume(scene, theta)
+
+    def one(change, pressure, at, local, gradients, weights, fibre):  # noqa: ANN001, ANN202
+        V = jnp.sum(weights)
+        E_t, E_u = jax.grad(energy, (0, 1))(change, local, gradients, weights, fibre)
+        mean, slope = jax.value_and_grad(mean_volume_change)(local, gradients, weights)
+        r_change, r_pressure = E_t - pressure * V, V * (mean - change)
+        force = E_u + pressure * V * slope + at.g * r_pressure / V
+        return force + at.b * (r_change + at.stiffness * r_pressure / V) / V
+
+    arguments, axes = _arguments(scene, u)
+    return jax.vmap(one, (0, 0, 0, *axes))(*volumes, at, *arguments)
+
+
 def advance(
     scene: Scene, volumes: Volumes, at: Condensed, move: jax.Array, fraction: jax.Array
 ) -> Volumes:

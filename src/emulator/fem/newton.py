@@ -12,11 +12,19 @@ element's :math:`J` above a fraction of its present least value and, once the su
 lowers the potential energy (Armijo's rule; where the tangent is indefinite and Newton's direction
 climbs, the opposite one is taken). Exponential laws diverge without it. Loads without a potential
 are held at their present force for this rule, and a step that lowers the residual instead will do.
-A level that does not converge is tried again with half the load increment.
+A level that does not converge, or only crawls, is tried again with half the load increment.
 
 With mean dilatation the elements' volumes and pressures are iterates of their own (see
-:mod:`emulator.fem.mixed`); the point sought is then a saddle, and steps are only kept from
-crushing elements.
+:mod:`emulator.fem.mixed`). The point sought is then a saddle, and no energy tells a good step from
+a bad one. Deuflhard's natural monotonicity does: from where a step leads, Newton with the tangent
+of where it started must have less far to go,
+
+.. math::
+    \left| K(x)^{-1} r(x + \alpha \Delta x) \right|
+    \le \left(1 - \frac{\alpha}{4}\right) |\Delta x|
+
+(P. Deuflhard, Newton Methods for Nonlinear Problems, 2004, ch. 3.3). The factors are there
+already. Measured in mm, the stiff volumes do not drown all else as they do in a residual.
 """
 
 from __future__ import annotations
@@ -29,11 +37,16 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
-from emulator.fem.mixed import Condensed, Volumes, advance, consistent, linearise
+from emulator.fem.mixed import Condensed, Volumes, advance, carried, consistent, linearise
 from emulator.fem.solution import Solution, Status
 from emulator.mechanics.energy import volume_ratio
 
 _LEAST_FRACTION = 2.0**-20
+_LEAST_MIXED_FRACTION = 2.0**-7  # natural monotonicity fails early: a lower load is cheaper
+# Steps shorter than this are a crawl; after so many a level is given up for a lower one.
+_CRAWL, _CRAWLS = 2.0**-6, 8
+# A step longer than this many sizes of the body comes of a singular tangent.
+_ENDLESS = 1e8
 _ARMIJO = 1e-4
 _ROUND_OFF = 1e-13
 
@@ -69,6 +82,8 @@ class _Step(NamedTuple):
     settled: jax.Array  # whether the supports are where they belong
     solvable: jax.Array
     condensed: Condensed | None
+    values: jax.Array  # (nnz,) of the tangent
+    pull: jax.Array  # (f,) change of the residual with the held displacement
 
 
 class _State(NamedTuple):
@@ -82,6 +97,8 @@ class _State(NamedTuple):
     iterations: jax.Array
     error: jax.Array  # residual relative to the tolerance's scale at `u`, of level `level`
     status: jax.Array
+    obstacle: jax.Array  # the status to end with, should this be the last step
+    crawled: jax.Array  # short steps at this level
 
 
 def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array) -> Solution:
@@ -99,6 +116,8 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     held = jnp.asarray(system.scene.held)
     held_values = jnp.asarray(system.scene.held_displacement)
 
+    least = _LEAST_MIXED_FRACTION if system.mixed else _LEAST_FRACTION
+
     def balanced(u: jax.Array, level: jax.Array) -> tuple[jax.Array, jax.Array]:
         return balance(system, u, theta, level, options.absolute)
 
@@ -108,8 +127,9 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     def step(state: _State) -> _State:
         move_held = jnp.where(held, state.level * held_values - state.u, 0.0)
         step = _full_step(system, state, theta, move_held)
-        accept = _acceptance(system, state, theta, step)
-        fraction = _largest_fraction(system, state.u, step.move, accept, options.shrink)
+        crushes = _guard(system, state, step, options.shrink)
+        accepts = _acceptance(system, options, state, theta, step)
+        fraction, crushed = _largest_fraction(crushes, accepts, least)
         admissible = step.solvable & (fraction > 0.0)
         u = jnp.where(admissible, state.u + fraction * step.move, state.u)
         # After a full step the supports are met; setting them avoids the last bit of round-off.
@@ -117,6 +137,10 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
         placed = jnp.all(jnp.where(held, u == state.level * held_values, True))
         _, error = balanced(u, state.level)
         error = jnp.where(placed & admissible & jnp.isfinite(error), error, jnp.inf)
+        state = state._replace(
+            obstacle=_obstacle(step, crushed, system.scene.mesh.size),
+            crawled=state.crawled + (fraction < _CRAWL),
+        )
         after = _next_level(options, state, u, admissible, error)
         if state.volumes is None or step.condensed is None:
             return after
@@ -151,6 +175,8 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
         iterations=jnp.array(0),
         error=jnp.where(fine & placed, error, jnp.inf),
         status=jnp.asarray(status, dtype=jnp.int64),
+        obstacle=jnp.asarray(Status.LOAD_LIMIT, dtype=jnp.int64),
+        crawled=jnp.array(0),
     )
     state = jax.lax.while_loop(running, step, state)
     converged = state.status == Status.CONVERGED
@@ -177,7 +203,9 @@ def _full_step(system: System, state: _State, theta: jax.Array, move_held: jax.A
         condensed = linearise(system.scene, u, state.volumes, theta)
         residual, pull = system.mixed_residual(u, theta, level, condensed, move_held)
         values = system.assemble(condensed.tangent, u, theta, level)
-    move = system.solve(system.pattern.safe_values(values), -(residual + pull))
+    solvable = system.pattern.solvable(values)
+    values = system.pattern.safe_values(values)
+    move = system.solve(values, -(residual + pull))
     slope = jnp.vdot(residual, move)
     settled = jnp.all(move_held == 0.0)
     if condensed is None:
@@ -187,24 +215,60 @@ def _full_step(system: System, state: _State, theta: jax.Array, move_held: jax.A
         residual=residual,
         slope=slope,
         settled=settled,
-        solvable=jnp.all(jnp.isfinite(values)),
+        solvable=solvable,
         condensed=condensed,
+        values=values,
+        pull=pull,
     )
 
 
+def _obstacle(step: _Step, crushed: jax.Array, size: float) -> jax.Array:
+    """The status that says why a step was not longer."""
+    endless = ~(jnp.max(jnp.abs(step.move)) <= _ENDLESS * size)
+    short = jnp.where(crushed, Status.INVERTED_ELEMENT, Status.LOAD_LIMIT)
+    return jnp.where(~step.solvable | endless, Status.SINGULAR_TANGENT, short)
+
+
+def _size(field: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(field**2))
+
+
 def _acceptance(
+    system: System, options: NewtonOptions, state: _State, theta: jax.Array, step: _Step
+) -> Callable[[jax.Array], jax.Array]:
+    """Whether a fraction of the step makes progress."""
+    if step.condensed is not None:
+        return _natural(system, options, state, theta, step)
+    return _lowering(system, state, theta, step)
+
+
+def _natural(
+    system: System, options: NewtonOptions, state: _State, theta: jax.Array, step: _Step
+) -> Callable[[jax.Array], jax.Array]:
+    """Natural monotonicity, for mean dilatation."""
+    volumes, condensed = state.volumes, step.condensed
+    assert volumes is not None
+    assert condensed is not None
+
+    def approaches(fraction: jax.Array) -> jax.Array:
+        after = advance(system.scene, volumes, condensed, step.move, fraction)
+        u = state.u + fraction * step.move
+        elements = carried(system.scene, u, after, theta, condensed)
+        left = system.spread(elements) + system.others(u, theta, state.level)
+        rest = -(system.restrict(left) + (1.0 - fraction) * step.pull)
+        rest = system.extend(system.solve(step.values, rest))
+        rest = rest + (1.0 - fraction) * jnp.where(system.scene.held, step.move, 0.0)
+        nearer = _size(rest) <= (1.0 - 0.25 * fraction) * _size(step.move)
+        # Where round-off is all that is left, it cannot be told from progress.
+        return nearer | ((state.at_level > 0) & (state.error <= options.round_off))
+
+    return approaches
+
+
+def _lowering(
     system: System, state: _State, theta: jax.Array, step: _Step
 ) -> Callable[[jax.Array], jax.Array]:
-    """Whether a fraction of the step makes progress, besides crushing no element."""
-    if step.condensed is not None:
-        volumes, condensed = state.volumes, step.condensed
-        assert volumes is not None
-
-        def positive(fraction: jax.Array) -> jax.Array:
-            after = advance(system.scene, volumes, condensed, step.move, fraction)
-            return jnp.min(after.change) > -1.0
-
-        return positive
+    """Armijo's rule on the potential energy."""
     follower = system.follower_force(state.u, theta)
     energy, size = system.potential(state.u, theta, state.level, follower)
     # Near the solution the decrease drowns in the round-off of the energy's parts.
@@ -223,25 +287,53 @@ def _acceptance(
     return lowers
 
 
+def _guard(
+    system: System, state: _State, step: _Step, shrink: float
+) -> Callable[[jax.Array], jax.Array]:
+    """Whether a fraction of the step leaves too little of an element's volume."""
+    floor = shrink * jnp.min(volume_ratio(system.scene, state.u))
+
+    def crushes(fraction: jax.Array) -> jax.Array:
+        J = volume_ratio(system.scene, state.u + fraction * step.move)
+        fits = jnp.min(J) > floor  # written so that NaN does not fit
+        if state.volumes is not None and step.condensed is not None:
+            after = advance(system.scene, state.volumes, step.condensed, step.move, fraction)
+            fits &= jnp.min(after.change) > -1.0
+        return ~fits
+
+    return crushes
+
+
+_Search = tuple[jax.Array, jax.Array, jax.Array]
+
+
 def _largest_fraction(
-    system: System,
-    u: jax.Array,
-    move: jax.Array,
-    lowers: Callable[[jax.Array], jax.Array],
-    shrink: float,
-) -> jax.Array:
-    """Most of ``move`` that will do, among 1, 1/2, 1/4, ...; 0 where none will."""
-    floor = shrink * jnp.min(volume_ratio(system.scene, u))
+    crushes: Callable[[jax.Array], jax.Array],
+    accepts: Callable[[jax.Array], jax.Array],
+    least: float,
+) -> tuple[jax.Array, jax.Array]:
+    """Most of a step that will do, among 1, 1/2, 1/4, ... down to ``least``; 0 where none will.
 
-    def unfit(fraction: jax.Array) -> jax.Array:
-        J = volume_ratio(system.scene, u + fraction * move)
-        return ~((jnp.min(J) > floor) & lowers(fraction))  # written so that NaN is unfit
+    And whether elements were what forbade more of it.
+    """
 
-    def unfinished(fraction: jax.Array) -> jax.Array:
-        return (fraction > _LEAST_FRACTION) & unfit(fraction)
+    def judged(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        crush = crushes(fraction)
+        return crush | ~accepts(fraction), crush
 
-    fraction = jax.lax.while_loop(unfinished, lambda fraction: 0.5 * fraction, jnp.array(1.0))
-    return jnp.where(fraction > _LEAST_FRACTION, fraction, 0.0)
+    def unfinished(search: _Search) -> jax.Array:
+        fraction, unfit, _ = search
+        return (fraction > least) & unfit
+
+    def halved(search: _Search) -> _Search:
+        fraction, _, before = search
+        unfit, crush = judged(0.5 * fraction)
+        return 0.5 * fraction, unfit, jnp.where(unfit, crush, before)
+
+    unfit, crush = judged(jnp.array(1.0))
+    search = (jnp.array(1.0), unfit, crush)
+    fraction, unfit, crushed = jax.lax.while_loop(unfinished, halved, search)
+    return jnp.where(unfit, 0.0, fraction), crushed
 
 
 def _next_level(
@@ -256,10 +348,13 @@ def _next_level(
     stalled = (error <= options.round_off) & (error > 0.3 * state.error) & (at_level > 1)
     solved = (error <= options.tolerance) | stalled
     complete = solved & (state.level >= 1.0)
-    failed = ~solved & (~admissible | (at_level >= options.level_iterations))
+    # Short steps one after the other lead nowhere, or slowly: a smaller load gets there sooner.
+    halved = 0.5 * (state.level - state.reached)
+    hopeless = (state.crawled >= _CRAWLS) & (halved >= options.min_increment)
+    failed = ~solved & (~admissible | hopeless | (at_level >= options.level_iterations))
     # Easy levels earn a longer next step, failures a shorter one.
     increment = jnp.where(solved & (at_level <= 8), 2.0 * state.increment, state.increment)
-    increment = jnp.where(failed, 0.5 * (state.level - state.reached), increment)
+    increment = jnp.where(failed, halved, increment)
     reached = jnp.where(solved, state.level, state.reached)
     u_reached = jnp.where(solved, u, state.u_reached)
     status = jnp.where(
@@ -267,7 +362,7 @@ def _next_level(
         Status.CONVERGED,
         jnp.where(
             failed & (increment < options.min_increment),
-            Status.LOAD_LIMIT,
+            state.obstacle,
             jnp.where(iterations >= options.max_iterations, Status.ITERATION_LIMIT, Status.RUNNING),
         ),
     )
@@ -280,6 +375,7 @@ def _next_level(
         reached=reached,
         increment=increment,
         at_level=jnp.where(moved, 0, at_level),
+        crawled=jnp.where(moved, 0, state.crawled),
         iterations=iterations,
         error=error,
         status=jnp.asarray(status, dtype=state.status.dtype),

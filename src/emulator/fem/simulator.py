@@ -57,8 +57,7 @@ class Simulator:
         """Equilibrium at ``theta`` (p,), from ``start`` (n, 3) mm or from rest.
 
         The displacement is differentiable in ``theta``; ``start`` only affects the time taken.
-        Never raises on a hard case: read ``status``. (Inside ``jit`` the direct solver does raise
-        on a tangent that is singular to the last bit.)
+        Never raises on a hard case: read ``status``.
 
         Raises
         ------

@@ -19,6 +19,7 @@ class Status(IntEnum):
     LOAD_LIMIT = 2
     INVALID_INPUT = 3
     SINGULAR_TANGENT = 4
+    INVERTED_ELEMENT = 5
     RUNNING = 9
 
     @property
@@ -33,6 +34,7 @@ _TEXT = {
     Status.LOAD_LIMIT: "load limit reached: no equilibrium found at the full load",
     Status.INVALID_INPUT: "theta or the starting displacement is not finite",
     Status.SINGULAR_TANGENT: "singular tangent: stiffness vanishes or the supports are too few",
+    Status.INVERTED_ELEMENT: "inverted element: every way to the full load turns one inside out",
     Status.RUNNING: "still running",
 }
 

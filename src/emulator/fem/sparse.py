@@ -16,6 +16,9 @@ import numpy as np
 import sparsax
 from threadpoolctl import ThreadpoolController
 
+_RAISE = 2.0**-50
+_LEAST_ROW = 1e-290
+
 Factorisation = Literal["umfpack", "cholmod"]
 
 
@@ -61,10 +64,21 @@ class Pattern:
         solver = sparsax.solve if method == "cholmod" else sparsax.umf_solve
         return solver(self.rows, self.columns, values, rhs)
 
+    def solvable(self, values: jax.Array) -> jax.Array:
+        """Whether ``values`` are finite and leave no row empty, shape ()."""
+        rows = jax.ops.segment_sum(jnp.abs(values), self.rows, num_segments=self.size)
+        rows += jax.ops.segment_sum(jnp.abs(values), self.columns, num_segments=self.size)
+        return jnp.all(jnp.isfinite(values)) & jnp.all(rows >= _LEAST_ROW)
+
     def safe_values(self, values: jax.Array) -> jax.Array:
-        """``values``, or the identity's where any is not finite: the solver raises on NaN."""
-        identity = jnp.asarray(self.rows == self.columns, dtype=values.dtype)
-        return jnp.where(jnp.all(jnp.isfinite(values)), values, identity)
+        """``values`` the solver will not raise on: the identity's for what cannot be solved.
+
+        UMFPACK raises on NaN, and on a pivot that is zero to the last bit. A diagonal larger by
+        round-off makes such a pivot tiny instead, and the step so long that Newton sees it.
+        """
+        diagonal = jnp.asarray(self.rows == self.columns, dtype=values.dtype)
+        raised = values * (1.0 + _RAISE * diagonal)
+        return jnp.where(self.solvable(values), raised, diagonal)
 
 
 def block_pattern(groups: list[np.ndarray], free_index: np.ndarray, *, symmetric: bool) -> Pattern:
