@@ -43,10 +43,11 @@ from emulator.mechanics.energy import volume_ratio
 
 _LEAST_FRACTION = 2.0**-20
 _LEAST_MIXED_FRACTION = 2.0**-7  # natural monotonicity fails early: a lower load is cheaper
-# Steps shorter than this are a crawl; after so many a level is given up for a lower one.
+# Steps shorter than this are a crawl, as are those kept short by elements about to be crushed.
+# After so many a level is given up for a lower one.
 _CRAWL, _CRAWLS = 2.0**-6, 8
-# A step longer than this many sizes of the body comes of a singular tangent.
-_ENDLESS = 1e8
+# A step that is this much longer than the force over the largest stiffness: a singular tangent.
+_ENDLESS = 1e13
 _ARMIJO = 1e-4
 _ROUND_OFF = 1e-13
 
@@ -138,8 +139,8 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
         _, error = balanced(u, state.level)
         error = jnp.where(placed & admissible & jnp.isfinite(error), error, jnp.inf)
         state = state._replace(
-            obstacle=_obstacle(step, crushed, system.scene.mesh.size),
-            crawled=state.crawled + (fraction < _CRAWL),
+            obstacle=_obstacle(step, crushed),
+            crawled=state.crawled + ((fraction < _CRAWL) | (crushed & (fraction < 0.5))),
         )
         after = _next_level(options, state, u, admissible, error)
         if state.volumes is None or step.condensed is None:
@@ -222,9 +223,11 @@ def _full_step(system: System, state: _State, theta: jax.Array, move_held: jax.A
     )
 
 
-def _obstacle(step: _Step, crushed: jax.Array, size: float) -> jax.Array:
+def _obstacle(step: _Step, crushed: jax.Array) -> jax.Array:
     """The status that says why a step was not longer."""
-    endless = ~(jnp.max(jnp.abs(step.move)) <= _ENDLESS * size)
+    force = jnp.max(jnp.abs(step.residual + step.pull))
+    stiffness = jnp.max(jnp.abs(step.values))
+    endless = ~(stiffness * jnp.max(jnp.abs(step.move)) <= _ENDLESS * force)
     short = jnp.where(crushed, Status.INVERTED_ELEMENT, Status.LOAD_LIMIT)
     return jnp.where(~step.solvable | endless, Status.SINGULAR_TANGENT, short)
 
