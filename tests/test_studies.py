@@ -1,11 +1,13 @@
 """Studies run from a clean clone with one command; here on a few cases."""
 
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 STUDIES = Path(__file__).parents[1] / "studies"
@@ -54,6 +56,55 @@ def test_fem_speed(tmp_path):
 @pytest.mark.slow
 def test_fem_speed_in_full(tmp_path, published):
     run("fem_speed", "--published", published, "--out", tmp_path)  # asserts its own claims
+
+
+def test_stability(tmp_path):
+    names = (
+        "theta_zero_inside_jit",
+        "theta_too_short",
+        "pushed_through_itself",
+        "squeezed_to_half",
+    )
+    results = run("stability", "--cases", *names, "--workers", 1, "--out", tmp_path)
+    status = {case["name"]: case["status"] for case in results["cases"]}
+    assert status == {
+        "theta_zero_inside_jit": "SINGULAR_TANGENT",
+        "theta_too_short": "InputError",
+        "pushed_through_itself": "INVERTED_ELEMENT",
+        "squeezed_to_half": "CONVERGED",
+    }
+    assert results["summary"]["silent_wrong"] == 0
+
+
+def test_a_hang_in_stability_is_recorded_and_loses_nothing(tmp_path):
+    out = ("--workers", 1, "--limit", 0.01, "--out", tmp_path)
+    with pytest.raises(AssertionError, match="hangs or exceptions"):
+        run("stability", "--cases", "theta_too", *out)
+    cases = json.loads((tmp_path / "results.json").read_text())["cases"]
+    assert [case["status"] for case in cases] == ["hang", "hang"]
+
+
+def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
+    spec = importlib.util.spec_from_file_location("judge", STUDIES / "stability" / "judge.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    u = np.asarray(simulator(beam.centre))
+    theta = np.asarray(beam.centre)
+    right = module.judge(beam, u, theta)
+    assert right.wrong == ""
+    assert right.independent
+    assert right.residual < 1e-8
+    assert "residual" in module.judge(beam, 1.001 * u, theta).wrong
+    assert "residual" in module.judge(beam, u, 1.001 * theta).wrong
+    assert "support" in module.judge(beam, u + 1e-15, theta).wrong
+    assert "J = " in module.judge(beam, -2.0 * beam.mesh.nodes, theta).wrong
+    assert "finite" in module.judge(beam, np.nan * u, theta).wrong
+    assert module.judge(beam, u, theta, "a claim that fails").wrong == "a claim that fails"
+
+
+@pytest.mark.slow
+def test_stability_in_full(tmp_path):
+    run("stability", "--out", tmp_path)  # asserts its own claims
 
 
 @pytest.mark.slow
