@@ -1,27 +1,31 @@
 r"""Newton's method with adaptive load steps, as one loop inside ``jax.jit``.
 
-At load level :math:`s \in (0, 1]` the dead loads are :math:`s f` and the held displacements
+At load level :math:`s \in (0, 1]` the loads are :math:`s f` and the held displacements
 :math:`s \bar u`. Each iteration solves
 
 .. math::
-    K(u)\, \Delta u = -\left[r_s(u) + K(u)\, \Delta \bar u\right], \qquad
+    K\, \Delta u = -\left[r_s(u) + K\, \Delta \bar u\right], \qquad
     \Delta \bar u = s \bar u - u|_\text{held}
 
-and steps by the largest :math:`\alpha \in \{1, \tfrac12, \tfrac14, \dots\}` that keeps every
-element's :math:`J` above a fraction of its present least value and, once the supports are met,
-lowers the potential energy (Armijo's rule; where the tangent is indefinite and Newton's direction
-climbs, the opposite one is taken). Exponential laws diverge without it. Loads without a potential
+and steps by an :math:`\alpha \in \{1, \tfrac12, \tfrac14, \dots\}` that keeps every element's
+:math:`J` above a fraction of its present least value and, once the supports are met, lowers the
+potential energy (Armijo's rule; where the tangent is indefinite and Newton's direction climbs, the
+opposite one is taken). Exponential laws diverge without it. Loads without a potential
 are held at their present force for this rule, and a step that lowers the residual instead will do.
 A level that does not converge is tried again with half the load increment.
 
+Two things save factorisations, most of the cost. The tangent of the last iteration is kept while a
+step with it cuts the residual at least tenfold. And as long as the loads are hardly balanced, as
+at rest, their own stiffness is left out: a pressure that nothing resists yet softens the tangent
+and points the step nowhere useful.
+
 With mean dilatation the elements' volumes and pressures are iterates of their own (see
 :mod:`emulator.fem.mixed`); the point sought is then a saddle, and steps are only kept from
-crushing elements.
+crushing elements: a load step whose first iteration would is halved at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,13 +33,15 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
+from emulator.fem.line_search import Direction, choose_fraction
 from emulator.fem.mixed import Condensed, Volumes, advance, consistent, linearise
 from emulator.fem.solution import Solution, Status
 from emulator.mechanics.energy import volume_ratio
 
-_LEAST_FRACTION = 2.0**-20
-_ARMIJO = 1e-4
-_ROUND_OFF = 1e-13
+_NEAR = 0.05  # relative residual below which a step is judged by the residual alone
+_UNBALANCED = 0.5  # and above which the stiffness of the loads misleads
+_KEEP_TANGENT = 0.1  # a step this good earns its tangent another one
+_MIXED_ITERATIONS = 15  # a mixed load step that works takes less than ten
 
 
 @dataclass(frozen=True)
@@ -60,18 +66,9 @@ class NewtonOptions:
     shrink: float = 0.2
 
 
-class _Step(NamedTuple):
-    """Newton's full step, and what judges how much of it to take."""
+class NewtonState(NamedTuple):
+    """What the next iteration needs."""
 
-    move: jax.Array  # (n, 3)
-    residual: jax.Array  # (f,)
-    slope: jax.Array  # residual . move, before it was turned round
-    settled: jax.Array  # whether the supports are where they belong
-    solvable: jax.Array
-    condensed: Condensed | None
-
-
-class _State(NamedTuple):
     u: jax.Array  # (n, 3) current iterate
     volumes: Volumes | None  # that go with it, for mean dilatation
     level: jax.Array  # load level being solved
@@ -80,8 +77,28 @@ class _State(NamedTuple):
     increment: jax.Array
     at_level: jax.Array  # iterations spent at this level
     iterations: jax.Array
-    error: jax.Array  # residual relative to the tolerance's scale at `u`, of level `level`
+    factorisations: jax.Array
+    residual: jax.Array  # (f,) at `u` and `level`, unless at_level is 0
+    error: jax.Array  # the same relative to the forces at work; inf until the supports are met
+    tangent: jax.Array  # (nnz,) the last one assembled
+    refresh: jax.Array  # whether the next iteration needs a new one
+    crushed: jax.Array  # whether the last level was given up because elements would invert
     status: jax.Array
+
+    def forget_tangent(self, system: System) -> NewtonState:
+        """The same state for a ``system`` that stores tangents in another way."""
+        empty = jnp.zeros(len(system.pattern.rows))
+        return self._replace(tangent=empty, refresh=jnp.array(True))
+
+
+class _Outcome(NamedTuple):
+    """Where a step leads; fraction 0 means nowhere."""
+
+    u: jax.Array
+    residual: jax.Array
+    error: jax.Array
+    fraction: jax.Array
+    crushed: jax.Array
 
 
 def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array) -> Solution:
@@ -96,191 +113,216 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     -------
     Solution, whose status is CONVERGED or names the failure; its displacement is always finite.
     """
-    held = jnp.asarray(system.scene.held)
-    held_values = jnp.asarray(system.scene.held_displacement)
-
-    def balanced(u: jax.Array, level: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return balance(system, u, theta, level, options.absolute)
-
-    def volumes_of(u: jax.Array) -> Volumes | None:
-        return consistent(system.scene, u, theta) if system.mixed else None
-
-    def step(state: _State) -> _State:
-        move_held = jnp.where(held, state.level * held_values - state.u, 0.0)
-        step = _full_step(system, state, theta, move_held)
-        accept = _acceptance(system, state, theta, step)
-        fraction = _largest_fraction(system, state.u, step.move, accept, options.shrink)
-        admissible = step.solvable & (fraction > 0.0)
-        u = jnp.where(admissible, state.u + fraction * step.move, state.u)
-        # After a full step the supports are met; setting them avoids the last bit of round-off.
-        u = jnp.where(held & admissible & (fraction == 1.0), state.level * held_values, u)
-        placed = jnp.all(jnp.where(held, u == state.level * held_values, True))
-        _, error = balanced(u, state.level)
-        error = jnp.where(placed & admissible & jnp.isfinite(error), error, jnp.inf)
-        after = _next_level(options, state, u, admissible, error)
-        if state.volumes is None or step.condensed is None:
-            return after
-        moved = advance(system.scene, state.volumes, step.condensed, step.move, fraction)
-        back = volumes_of(after.u)
-        # A level given up starts again from the last solution, whose volumes are its own.
-        kept = after.level == state.level
-        return after._replace(volumes=jax.tree.map(lambda a, b: jnp.where(kept, a, b), moved, back))
-
-    def running(state: _State) -> jax.Array:
-        return state.status == Status.RUNNING
-
-    _, error = balanced(start, jnp.array(1.0))
-    placed = jnp.all(jnp.where(held, start == held_values, True))
-    fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(theta))
-    inverted = ~(jnp.min(volume_ratio(system.scene, start)) > 0.0)
-    status = jnp.where(
-        ~fine,
-        Status.INVALID_INPUT,
-        jnp.where(placed & (error <= options.tolerance), Status.CONVERGED, Status.RUNNING),
+    solver = Newton(system, options, theta)
+    return solution_of(
+        jax.lax.while_loop(
+            lambda state: state.status == Status.RUNNING, solver.step, solver.begin(start)
+        )
     )
-    # An inverted start is no start: begin at rest.
-    u = jnp.where(fine & ~inverted, start, 0.0)
-    state = _State(
-        u=u,
-        volumes=volumes_of(u),
-        level=jnp.array(1.0),
-        u_reached=jnp.zeros_like(u),
-        reached=jnp.array(0.0),
-        increment=jnp.array(1.0),
-        at_level=jnp.array(0),
-        iterations=jnp.array(0),
-        error=jnp.where(fine & placed, error, jnp.inf),
-        status=jnp.asarray(status, dtype=jnp.int64),
-    )
-    state = jax.lax.while_loop(running, step, state)
+
+
+def solution_of(state: NewtonState) -> Solution:
+    """What the iteration ended with."""
     converged = state.status == Status.CONVERGED
-    u = jnp.where(converged, state.u, state.u_reached)
     return Solution(
-        displacement=u,
+        displacement=jnp.where(converged, state.u, state.u_reached),
         status=state.status,
         iterations=state.iterations,
+        factorisations=state.factorisations,
         residual=state.error,
         load_reached=jnp.where(converged, 1.0, state.reached),
     )
 
 
-def _full_step(system: System, state: _State, theta: jax.Array, move_held: jax.Array) -> _Step:
-    """Newton's step from ``state``, turned round where it would climb the potential."""
-    u, level = state.u, state.level
-    if state.volumes is None:
-        condensed = None
-        residual = system.residual(u, theta, level)
-        values = system.tangent(u, theta, level)
-        # K times the held displacement, without assembling the held columns.
-        _, pull = jax.jvp(lambda v: system.residual(v, theta, level), (u,), (move_held,))
-    else:
-        condensed = linearise(system.scene, u, state.volumes, theta)
-        residual, pull = system.mixed_residual(u, theta, level, condensed, move_held)
-        values = system.assemble(condensed.tangent, u, theta, level)
-    move = system.solve(system.pattern.safe_values(values), -(residual + pull))
-    slope = jnp.vdot(residual, move)
-    settled = jnp.all(move_held == 0.0)
-    if condensed is None:
-        move = jnp.where(settled & (slope > 0.0), -move, move)
-    return _Step(
-        move=system.extend(move) + move_held,
-        residual=residual,
-        slope=slope,
-        settled=settled,
-        solvable=jnp.all(jnp.isfinite(values)),
-        condensed=condensed,
-    )
+@dataclass(frozen=True, eq=False)
+class Newton:
+    """The iteration for one theta."""
 
+    system: System
+    options: NewtonOptions
+    theta: jax.Array
 
-def _acceptance(
-    system: System, state: _State, theta: jax.Array, step: _Step
-) -> Callable[[jax.Array], jax.Array]:
-    """Whether a fraction of the step makes progress, besides crushing no element."""
-    if step.condensed is not None:
-        volumes, condensed = state.volumes, step.condensed
-        assert volumes is not None
+    def begin(self, start: jax.Array) -> NewtonState:
+        """The state to iterate from: ``start``, or rest where that is no start."""
+        residual, error = self._balance(start, jnp.array(1.0))
+        fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(self.theta))
+        inverted = ~(jnp.min(volume_ratio(self.system.scene, start)) > 0.0)
+        solved = ~inverted & (error <= self.options.tolerance)
+        status = jnp.where(solved, Status.CONVERGED, Status.RUNNING)
+        u = jnp.where(fine & ~inverted, start, 0.0)
+        return NewtonState(
+            u=u,
+            volumes=consistent(self.system.scene, u, self.theta) if self.system.mixed else None,
+            level=jnp.array(1.0),
+            u_reached=jnp.zeros_like(u),
+            reached=jnp.array(0.0),
+            increment=jnp.array(1.0),
+            at_level=jnp.array(0),
+            iterations=jnp.array(0),
+            factorisations=jnp.array(0),
+            residual=residual,
+            error=jnp.where(fine, error, jnp.inf),
+            tangent=jnp.zeros(len(self.system.pattern.rows)),
+            refresh=jnp.array(True),
+            crushed=jnp.array(False),
+            status=jnp.asarray(jnp.where(fine, status, Status.INVALID_INPUT), dtype=jnp.int64),
+        )
 
-        def positive(fraction: jax.Array) -> jax.Array:
-            after = advance(system.scene, volumes, condensed, step.move, fraction)
-            return jnp.min(after.change) > -1.0
+    def step(self, state: NewtonState) -> NewtonState:
+        """One iteration."""
+        residual, error = jax.lax.cond(
+            state.at_level == 0,
+            lambda: self._balance(state.u, state.level),
+            lambda: (state.residual, state.error),
+        )
+        state = state._replace(residual=residual, error=error)
+        tangent, direction, condensed = self._direction(state)
+        quick = self._full_step(state, direction)
+        # A kept tangent is worth a full step or nothing: its direction is not searched along.
+        outcome = jax.lax.cond(
+            (quick.fraction > 0.0) | ~state.refresh,
+            lambda: quick,
+            lambda: self._searched_step(state, direction),
+        )
+        after = self._next_level(state, outcome, tangent)
+        if state.volumes is None or condensed is None:
+            return after
+        return after._replace(volumes=self._volumes(state, outcome, direction, condensed, after))
 
-        return positive
-    follower = system.follower_force(state.u, theta)
-    energy, size = system.potential(state.u, theta, state.level, follower)
-    # Near the solution the decrease drowns in the round-off of the energy's parts.
-    ceiling = energy + _ROUND_OFF * size
-    descent = jnp.where(step.settled, -_ARMIJO * jnp.abs(step.slope), jnp.inf)
+    def _balance(self, u: jax.Array, level: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Residual (f,) and its relative size, infinite unless finite and the supports are met."""
+        residual, error = balance(self.system, u, self.theta, level, self.options.absolute)
+        placed = jnp.all(self._offset(u, level) == 0.0)
+        return residual, jnp.where(placed & jnp.isfinite(error), error, jnp.inf)
 
-    def lowers(fraction: jax.Array) -> jax.Array:
-        trial = state.u + fraction * step.move
-        after, _ = system.potential(trial, theta, state.level, follower)
-        lower = after <= ceiling + fraction * descent
-        if system.forces:
-            left = system.residual(trial, theta, state.level)
-            lower |= jnp.sum(left**2) < (1.0 - _ARMIJO * fraction) * jnp.sum(step.residual**2)
-        return lower
+    def _offset(self, u: jax.Array, level: jax.Array) -> jax.Array:
+        """How far the held displacements are from where the level wants them, (n, 3) mm."""
+        scene = self.system.scene
+        return jnp.where(scene.held, level * scene.held_displacement - u, 0.0)
 
-    return lowers
+    def _direction(self, state: NewtonState) -> tuple[jax.Array, Direction, Condensed | None]:
+        """Newton's step, turned round where it would climb the potential, and its tangent."""
+        system, u, level, theta = self.system, state.u, state.level, self.theta
+        offset = self._offset(u, level)
+        # See the module's docstring: loads that nothing balances yet lend no stiffness.
+        stiffening = jnp.where(state.error > _UNBALANCED, 0.0, level)
+        residual, condensed = state.residual, None
+        if state.volumes is None:
+            tangent = jax.lax.cond(
+                state.refresh,
+                lambda: system.tangent(u, theta, stiffening),
+                lambda: state.tangent,
+            )
+            # K times the held displacement, without assembling the held columns.
+            _, pull = jax.jvp(lambda v: system.residual(v, theta, stiffening), (u,), (offset,))
+        else:
+            condensed = linearise(system.scene, u, state.volumes, theta)
+            residual, pull = system.mixed_residual(u, theta, level, condensed, offset)
+            tangent = system.assemble(condensed.tangent, u, theta, level)
+        solvable = jnp.all(jnp.isfinite(tangent))
+        tangent = system.pattern.safe_values(tangent)
+        move = system.solve(tangent, -(residual + pull))
+        slope = jnp.vdot(residual, move)
+        settled = jnp.all(offset == 0.0)
+        if condensed is None:
+            move = jnp.where(settled & (slope > 0.0), -move, move)
+        move = system.extend(move) + offset
+        direction = Direction(
+            move=jnp.where(solvable, move, jnp.nan), residual=residual, slope=slope, settled=settled
+        )
+        return tangent, direction, condensed
 
+    def _full_step(self, state: NewtonState, direction: Direction) -> _Outcome:
+        """The whole step where the residual alone can tell that it is good."""
+        near = direction.settled & (state.error < _NEAR) & (not self.system.mixed)
+        trial = state.u + direction.move
+        residual, error = self._balance(trial, state.level)
+        J, now = (jnp.min(volume_ratio(self.system.scene, u)) for u in (trial, state.u))
+        good = near & (error <= 0.5 * state.error) & (self.options.shrink * now < J)
+        return _Outcome(
+            u=jnp.where(good, trial, state.u),
+            residual=jnp.where(good, residual, state.residual),
+            error=jnp.where(good, error, state.error),
+            fraction=jnp.where(good, 1.0, 0.0),
+            crushed=jnp.array(False),
+        )
 
-def _largest_fraction(
-    system: System,
-    u: jax.Array,
-    move: jax.Array,
-    lowers: Callable[[jax.Array], jax.Array],
-    shrink: float,
-) -> jax.Array:
-    """Most of ``move`` that will do, among 1, 1/2, 1/4, ...; 0 where none will."""
-    floor = shrink * jnp.min(volume_ratio(system.scene, u))
+    def _searched_step(self, state: NewtonState, direction: Direction) -> _Outcome:
+        """The part of the step that makes most progress."""
+        fraction, crushed = choose_fraction(
+            self.system, state.u, state.level, self.theta, direction, self.options.shrink
+        )
+        u = jnp.where(fraction > 0.0, state.u + fraction * direction.move, state.u)
+        # After a full step the supports are met; setting them avoids the last bit of round-off.
+        scene = self.system.scene
+        u = jnp.where(scene.held & (fraction == 1.0), state.level * scene.held_displacement, u)
+        residual, error = self._balance(u, state.level)
+        return _Outcome(u, residual, error, fraction, crushed)
 
-    def unfit(fraction: jax.Array) -> jax.Array:
-        J = volume_ratio(system.scene, u + fraction * move)
-        return ~((jnp.min(J) > floor) & lowers(fraction))  # written so that NaN is unfit
+    def _volumes(
+        self,
+        state: NewtonState,
+        outcome: _Outcome,
+        direction: Direction,
+        condensed: Condensed,
+        after: NewtonState,
+    ) -> Volumes:
+        """Volumes after the step; those of the last solution where the level has changed."""
+        assert state.volumes is not None
+        move = jnp.where(outcome.fraction > 0.0, direction.move, 0.0)
+        scene = self.system.scene
+        moved = advance(scene, state.volumes, condensed, move, outcome.fraction)
+        own = consistent(scene, after.u, self.theta)
+        kept = after.level == state.level
+        return jax.tree.map(lambda a, b: jnp.where(kept, a, b), moved, own)
 
-    def unfinished(fraction: jax.Array) -> jax.Array:
-        return (fraction > _LEAST_FRACTION) & unfit(fraction)
-
-    fraction = jax.lax.while_loop(unfinished, lambda fraction: 0.5 * fraction, jnp.array(1.0))
-    return jnp.where(fraction > _LEAST_FRACTION, fraction, 0.0)
-
-
-def _next_level(
-    options: NewtonOptions,
-    state: _State,
-    u: jax.Array,
-    admissible: jax.Array,
-    error: jax.Array,
-) -> _State:
-    """Stay, move on to a higher load level, or fall back to a lower one."""
-    iterations, at_level = state.iterations + 1, state.at_level + 1
-    stalled = (error <= options.round_off) & (error > 0.3 * state.error) & (at_level > 1)
-    solved = (error <= options.tolerance) | stalled
-    complete = solved & (state.level >= 1.0)
-    failed = ~solved & (~admissible | (at_level >= options.level_iterations))
-    # Easy levels earn a longer next step, failures a shorter one.
-    increment = jnp.where(solved & (at_level <= 8), 2.0 * state.increment, state.increment)
-    increment = jnp.where(failed, 0.5 * (state.level - state.reached), increment)
-    reached = jnp.where(solved, state.level, state.reached)
-    u_reached = jnp.where(solved, u, state.u_reached)
-    status = jnp.where(
-        complete,
-        Status.CONVERGED,
-        jnp.where(
-            failed & (increment < options.min_increment),
-            Status.LOAD_LIMIT,
-            jnp.where(iterations >= options.max_iterations, Status.ITERATION_LIMIT, Status.RUNNING),
-        ),
-    )
-    moved = solved | failed
-    level = jnp.where(moved & ~complete, jnp.minimum(1.0, reached + increment), state.level)
-    return state._replace(
-        u=jnp.where(failed, u_reached, u),
-        level=level,
-        u_reached=u_reached,
-        reached=reached,
-        increment=increment,
-        at_level=jnp.where(moved, 0, at_level),
-        iterations=iterations,
-        error=error,
-        status=jnp.asarray(status, dtype=state.status.dtype),
-    )
+    def _next_level(self, state: NewtonState, outcome: _Outcome, tangent: jax.Array) -> NewtonState:
+        """Stay, move on to a higher load level, or fall back to a lower one."""
+        options, error = self.options, outcome.error
+        iterations, at_level = state.iterations + 1, state.at_level + 1
+        fresh, stuck = state.refresh, state.refresh & ~(outcome.fraction > 0.0)
+        spent = at_level >= options.level_iterations
+        if self.system.mixed:
+            # Nothing guides a mixed step that had to be cut; it seldom finds its way back.
+            stuck |= outcome.fraction < 1.0
+            spent |= at_level >= _MIXED_ITERATIONS
+        slow = fresh & (error > 0.3 * state.error) & (at_level > 1)
+        solved = (error <= options.tolerance) | (slow & (error <= options.round_off))
+        complete = solved & (state.level >= 1.0)
+        failed = ~solved & (stuck | spent)
+        # Easy levels earn a longer next step, failures a shorter one.
+        increment = jnp.where(solved & (at_level <= 8), 2.0 * state.increment, state.increment)
+        increment = jnp.where(failed, 0.5 * (state.level - state.reached), increment)
+        reached = jnp.where(solved, state.level, state.reached)
+        u_reached = jnp.where(solved, outcome.u, state.u_reached)
+        crushed = jnp.where(failed, outcome.crushed, state.crushed)
+        limit = jnp.where(crushed, Status.INVERTED_ELEMENT, Status.LOAD_LIMIT)
+        status = jnp.where(
+            complete,
+            Status.CONVERGED,
+            jnp.where(
+                failed & (increment < options.min_increment),
+                limit,
+                jnp.where(
+                    iterations >= options.max_iterations, Status.ITERATION_LIMIT, Status.RUNNING
+                ),
+            ),
+        )
+        moved = solved | failed
+        good = (outcome.fraction == 1.0) & (error <= _KEEP_TANGENT * state.error)
+        return state._replace(
+            u=jnp.where(failed, u_reached, outcome.u),
+            level=jnp.where(moved & ~complete, jnp.minimum(1.0, reached + increment), state.level),
+            u_reached=u_reached,
+            reached=reached,
+            increment=increment,
+            at_level=jnp.where(moved, 0, at_level),
+            iterations=iterations,
+            factorisations=state.factorisations + state.refresh,
+            residual=outcome.residual,
+            error=error,
+            tangent=tangent,
+            refresh=~good | moved | self.system.mixed,
+            crushed=crushed,
+            status=jnp.asarray(status, dtype=state.status.dtype),
+        )
