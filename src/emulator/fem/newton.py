@@ -198,7 +198,9 @@ class Newton:
     def _offset(self, u: jax.Array, level: jax.Array) -> jax.Array:
         """How far the held displacements are from where the level wants them, (n, 3) mm."""
         scene = self.system.scene
-        return jnp.where(scene.held, level * scene.held_displacement - u, 0.0)
+        wanted = level * scene.held_displacement
+        # Fused multiply-add would find the last bit of the product missing in the difference.
+        return jnp.where(scene.held & (u != wanted), wanted - u, 0.0)
 
     def _direction(self, state: NewtonState) -> tuple[jax.Array, Direction, Condensed | None]:
         """Newton's step, turned round where it would climb the potential, and its tangent."""
@@ -309,7 +311,8 @@ class Newton:
             ),
         )
         moved = solved | failed
-        good = (outcome.fraction == 1.0) & (error <= _KEEP_TANGENT * state.error)
+        good = (outcome.fraction == 1.0) & jnp.isfinite(error)
+        good &= error <= _KEEP_TANGENT * state.error
         return state._replace(
             u=jnp.where(failed, u_reached, outcome.u),
             level=jnp.where(moved & ~complete, jnp.minimum(1.0, reached + increment), state.level),

@@ -160,7 +160,7 @@ def test_an_impossible_load_ends_in_a_named_failure():
     scene = block(cells=(2, 2, 2))
     scene = replace(scene, supports=(Support("left"), Support("right", np.array([-2.5, 0.0, 0.0]))))
     solution = em.Simulator(scene).solve(scene.centre)
-    assert solution.status in (em.Status.LOAD_LIMIT, em.Status.ITERATION_LIMIT)
+    assert solution.status == em.Status.INVERTED_ELEMENT
     assert 0.0 < solution.load_reached < 1.0
     assert np.isfinite(solution.displacement).all()
 
