@@ -39,11 +39,13 @@ class SurfacePressure:
     Parameters
     ----------
     facet_set : where it acts.
-    pressure : kPa, or ``None`` to make ``pressure`` a parameter of the scene.
+    pressure : kPa, or ``None`` to make it a parameter of the scene.
+    parameter : name of that parameter; give each of several pressures its own.
     """
 
     facet_set: str
     pressure: float | None = None
+    parameter: str = "pressure"
 
     def __post_init__(self) -> None:
         if self.pressure is not None and not np.isfinite(self.pressure):
@@ -52,15 +54,16 @@ class SurfacePressure:
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names this load takes from theta or the constants."""
-        return () if self.pressure is not None else ("pressure",)
+        return () if self.pressure is not None else (self.parameter,)
 
     def describe(self) -> list[object]:
         """What tells this load from another."""
-        return [type(self).__name__, self.facet_set, self.pressure]
+        named = [] if self.parameter == "pressure" else [self.parameter]
+        return [type(self).__name__, self.facet_set, self.pressure, *named]
 
     def value(self, values: Values) -> jax.Array | float:
         """The pressure in kPa among the scene's resolved parameters."""
-        return values["pressure"] if self.pressure is None else self.pressure
+        return values[self.parameter] if self.pressure is None else self.pressure
 
 
 @dataclass(frozen=True)

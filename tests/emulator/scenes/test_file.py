@@ -95,7 +95,7 @@ def test_named_groups_and_fibres_come_from_the_mesh_file(folder):
 
 
 def test_unknown_names(tmp_path):
-    with pytest.raises(InputError, match="scene 'beam' is unknown; built in: once_clamped_beam"):
+    with pytest.raises(InputError, match="scene 'beam' is unknown; built in: biventricle"):
         find_scene("beam")
     with pytest.raises(InputError, match="does not exist"):
         find_scene(str(tmp_path / "none.toml"))
