@@ -40,6 +40,22 @@ def test_accuracy_vs_time(tmp_path):
     assert (tmp_path / "pareto.png").stat().st_size > 10_000
 
 
+def test_fem_speed(tmp_path):
+    # No dolfin here: compiling its forms alone takes longer than all the rest.
+    words = ("--quick", "--fenics-python", tmp_path / "absent", "--out", tmp_path)
+    results = run("fem_speed", *words)
+    cases = {case["name"]: case for case in results["cases"]}
+    assert cases["scikit-fem + SciPy, cold"]["difference"] <= 1e-6
+    assert cases["FEniCS, cold"]["status"].startswith("skipped")
+    assert cases["cube, 4 cells an edge"]["nodes"] == 125
+    assert (tmp_path / "speed.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_fem_speed_in_full(tmp_path, published):
+    run("fem_speed", "--published", published, "--out", tmp_path)  # asserts its own claims
+
+
 @pytest.mark.slow
 def test_accuracy_vs_time_in_full(tmp_path):
     run("accuracy_vs_time", "--out", tmp_path)  # asserts its own claims, times included

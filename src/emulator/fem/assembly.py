@@ -72,7 +72,7 @@ class System:
         """Sparsity of the tangent: bulk elements, then springs, then the loads."""
         free_index = np.full(self.scene.held.size, -1)
         free_index[self.free] = np.arange(len(self.free))
-        local = (*self.springs, *self.terms, *self.forces)
+        local: list[LocalTerm | LocalForce] = [*self.springs, *self.terms, *self.forces]
         groups = [self.scene.discretisation.connectivity, *(part.nodes for part in local)]
         dofs = [(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1) for nodes in groups]
         return block_pattern(dofs, free_index, symmetric=self.factorisation == "cholmod")
@@ -181,7 +181,8 @@ class System:
         values = self.scene.resolve(theta)
         blocks = [bulk]
         blocks += [spring.tangents(u, values) for spring in self.springs]
-        blocks += [load * part.tangents(u, values) for part in (*self.terms, *self.forces)]
+        loads: list[LocalTerm | LocalForce] = [*self.terms, *self.forces]
+        blocks += [load * part.tangents(u, values) for part in loads]
         return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
 
     def bulk(self, u: jax.Array, theta: jax.Array) -> jax.Array:

@@ -19,6 +19,12 @@ from threadpoolctl import ThreadpoolController
 Factorisation = Literal["umfpack", "cholmod"]
 
 
+# sparsax would keep up to 32 UMFPACK and 8 CHOLMOD factors a pattern, and 64 tokens' worth, against
+# values that return. Ours never do, and a factor of a large mesh is a gigabyte.
+sparsax.set_umf_cache_size(2)
+sparsax.set_num_cache_size(2)
+
+
 def quiet_blas() -> None:
     """Hold the BLAS inside the sparse solver to one thread.
 

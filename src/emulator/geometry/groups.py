@@ -13,7 +13,8 @@ import meshio
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.mesh import Mesh, boundary_facets
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import boundary_facets
 
 MARK = "set:"
 _TAG = "gmsh:physical"

@@ -13,7 +13,8 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.groups import MARK, own_node_sets, read_sets
-from emulator.geometry.mesh import Mesh, orient
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import orient
 from emulator.store import replacing
 
 # Cells by their number of nodes: (tetrahedron, triangle).

@@ -34,10 +34,8 @@ def orient(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
     elements = np.array(elements, dtype=np.int64)
     swapped = [0, 1, 3, 2]
     if elements.shape[1] == 10:
-        swapped += [
-            4 + EDGES.index(tuple(sorted((swapped[a], swapped[b]))))  # type: ignore[arg-type]
-            for a, b in EDGES
-        ]
+        ends = [(swapped[a], swapped[b]) for a, b in EDGES]
+        swapped += [4 + EDGES.index((min(pair), max(pair))) for pair in ends]
     inverted = signed_volumes(nodes, elements) < 0.0
     elements[inverted] = elements[inverted][:, swapped]
     return elements

@@ -64,7 +64,7 @@ class ElasticSupport:
         areas = np.linalg.norm(normals, axis=-1)
         data = (rule.weights * areas, normals / areas[..., None])
 
-        def energy(u: jax.Array, data: Any, values: Values) -> jax.Array:
+        def energy(u: jax.Array, data: Any, _: Values) -> jax.Array:
             weights, normal = data
             at_points = rule.values @ u
             if self.direction == "normal":

@@ -67,7 +67,7 @@ def at_points(scene: Scene, function: Callable, H: jax.Array) -> jax.Array:
 
 
 def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -> jax.Array:
-    """Mean of ``J - 1`` over an element: ``u`` (a, 3), ``gradients`` (q, a, 3), ``weights`` (q,)."""
+    """Mean of ``J - 1`` over an element with ``u`` (a, 3), ``gradients`` (q, a, 3), ``weights``."""
     H = jnp.einsum("ai,qaj->qij", u, gradients)
     return jnp.vdot(weights, jax.vmap(lambda h: Strain(h).J_minus_1)(H)) / jnp.sum(weights)
 
@@ -81,7 +81,9 @@ def with_volume_change(
     return H + stretch * (H + jnp.eye(3, dtype=H.dtype))
 
 
-def _with_mean_dilatation(H: jax.Array, weights: jax.Array, barriers: Barriers | None) -> jax.Array:
+def with_mean_dilatation(
+    H: jax.Array, weights: jax.Array, barriers: Barriers | None = None
+) -> jax.Array:
     """Displacement gradients (q, 3, 3) of one element, each point's J replaced by their mean."""
     J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
     return with_volume_change(H, jnp.vdot(weights, J_minus_1) / jnp.sum(weights), barriers)
@@ -90,8 +92,8 @@ def _with_mean_dilatation(H: jax.Array, weights: jax.Array, barriers: Barriers |
 def at_volume(scene: Scene, theta: jax.Array) -> Callable:
     """``(change, u, gradients, weights, fibre) -> ()``: strain energy of an element, mN mm.
 
-    Its volume ratio less 1 is ``change`` throughout, whatever ``u`` (a, 3) in mm says; ``gradients``
-    (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``fibre`` (3,) or ``None``.
+    Its volume ratio less 1 is ``change`` throughout, whatever ``u`` (a, 3) in mm says;
+    ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``fibre`` (3,) or ``None``.
     """
     at_point = point_energy(scene, theta)
 
@@ -115,7 +117,7 @@ def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
         weights = scene.discretisation.weights
         H = displacement_gradient(scene, u)
         if scene.dilatation == "mean":
-            H = jax.vmap(lambda h, w: _with_mean_dilatation(h, w, barriers))(H, weights)
+            H = jax.vmap(lambda h, w: with_mean_dilatation(h, w, barriers))(H, weights)
         return jnp.sum(weights * at_points(scene, point_energy(scene, theta, barriers), H))
 
     return energy

@@ -75,10 +75,10 @@ def prescribe(mesh: Mesh, supports: list[Support]) -> tuple[np.ndarray, np.ndarr
 
 
 def free_motions(points: np.ndarray, directions: np.ndarray) -> int:
-    """How many of the six rigid motions are left when ``points`` (k, 3) cannot move along
-    ``directions`` (k, 3).
+    """How many of the six rigid motions remain.
 
-    A small rigid motion ``a + w x X`` moves the point along the direction by
+    ``points`` (k, 3) cannot move along ``directions`` (k, 3). A small rigid motion ``a + w x X``
+    moves a point along its direction by
     ``a . d + w . (X x d)``; the rank of those rows says how many motions are stopped.
     """
     if not len(points):
