@@ -25,6 +25,7 @@ from emulator.errors import InputError
 from emulator.mechanics.facets import cone_volume, rim
 from emulator.mechanics.kinematics import cofactor
 from emulator.mechanics.local import LocalTerm, Values
+from emulator.mechanics.quantity import Quantity
 
 if TYPE_CHECKING:
     from emulator.scenes.scene import Scene
@@ -52,9 +53,11 @@ class SurfacePressure:
             raise InputError(f"pressure on '{self.facet_set}' is {self.pressure} kPa")
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names this load takes from theta or the constants."""
-        return () if self.pressure is not None else (self.parameter,)
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What this load takes from theta or the constants; suction is negative."""
+        if self.pressure is not None:
+            return ()
+        return (Quantity(self.parameter, "kPa", -np.inf, hint=f"1 mmHg = {KPA_PER_MMHG} kPa"),)
 
     def describe(self) -> list[object]:
         """What tells this load from another."""

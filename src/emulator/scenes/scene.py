@@ -20,6 +20,7 @@ from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.elastic_support import ElasticSupport
 from emulator.mechanics.laws import Law
 from emulator.mechanics.loads import Load
+from emulator.mechanics.quantity import Quantity
 from emulator.scenes.parameters import Parameter
 from emulator.scenes.supports import Support, free_motions, prescribe
 
@@ -60,30 +61,38 @@ class Scene:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "recipe", MappingProxyType(dict(self.recipe)))
         self._check_names()
+        self._check_quantities()
         self._check_fibres()
         self._check_dilatation()
         if not self.parameters:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
-        for name, value in self.constants.items():
-            if not np.isfinite(value):
-                raise InputError(f"scene '{self.name}': constant '{name}' is {value}")
         self._check_supports()
 
     def _check_names(self) -> None:
-        given = list(self.parameter_names) + list(self.constants)
-        known = self.known_names
+        given = [*self.parameter_names, *self.constants]
+        takers = self._takers
         for name in given:
-            if name not in known:
+            if name not in takers:
                 raise InputError(
                     f"scene '{self.name}': parameter '{name}' is not one of law "
-                    f"'{self.law.name}' and its loads: {', '.join(known)}"
+                    f"'{self.law.name}' and its loads: {', '.join(takers)}"
                 )
             if given.count(name) > 1:
                 raise InputError(f"scene '{self.name}': parameter '{name}' is given twice")
-        for name in known:
+        for name, (_, owner) in takers.items():
             if name not in given:
-                owner = f"law '{self.law.name}'" if name in self.law.parameters else "a load"
                 raise InputError(f"scene '{self.name}': {owner} needs '{name}'")
+
+    def _check_quantities(self) -> None:
+        """Units and values of parameters and constants against what law and loads take."""
+        faults = [self._takers[name][0].value_fault(v) for name, v in self.constants.items()]
+        for parameter in self.parameters:
+            quantity, owner = self._takers[parameter.name]
+            faults.append(quantity.unit_fault(parameter.unit, owner))
+            faults.append(quantity.range_fault(parameter.low, parameter.high))
+        for fault in faults:
+            if fault:
+                raise InputError(f"scene '{self.name}': {fault}")
 
     def _check_fibres(self) -> None:
         if self.fibres is None:
@@ -128,12 +137,13 @@ class Scene:
             )
 
     @property
-    def known_names(self) -> tuple[str, ...]:
-        """Every parameter the law and the loads take."""
-        names = list(self.law.parameters)
+    def _takers(self) -> dict[str, tuple[Quantity, str]]:
+        """Every parameter the law and the loads take, by name, with who takes it."""
+        takers = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
         for load in self.loads:
-            names += [name for name in load.parameters if name not in names]
-        return tuple(names)
+            for quantity in load.quantities:
+                takers.setdefault(quantity.name, (quantity, f"load {type(load).__name__}"))
+        return takers
 
     # ---- parameters -------------------------------------------------------------------------
     @property

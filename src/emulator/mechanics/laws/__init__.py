@@ -3,7 +3,8 @@
 To add one, write a file with its energy, a function of a ``Strain`` (see
 :mod:`emulator.mechanics.kinematics`) and the law's parameters; wrap it in a :class:`Law` and add
 that to ``LAWS``. Stress and tangent follow. The tests in ``tests/emulator/mechanics/test_laws.py``
-take it up from the registry once their ``ARGUMENTS`` have values for it.
+take it up from the registry once their ``ARGUMENTS`` have values for it. ``docs/adding_a_law.md``
+does it step by step.
 """
 
 from emulator.errors import InputError
