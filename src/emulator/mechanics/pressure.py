@@ -85,7 +85,6 @@ class CavityPressure(PotentialPressure):
     def term(self, scene: Scene) -> LocalTerm:
         """The potential ``-p [V(u) - V(0)]``."""
         facets = scene.mesh.facet_set(self.facet_set)
-        _require_held_rim(scene, self.facet_set, facets)
         X = scene.mesh.nodes[facets]
 
         def energy(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
@@ -128,8 +127,9 @@ class PublishedPressure(PotentialPressure):
         return LocalTerm(nodes, data, energy)
 
 
-def _require_held_rim(scene: Scene, name: str, facets: np.ndarray) -> None:
-    loose = np.setdiff1d(rim(facets), np.flatnonzero(scene.held.all(axis=1)))
+def require_held_rim(name: str, facets: np.ndarray, held: np.ndarray) -> None:
+    """Refuse the cavity ``name`` of ``facets`` (k, 3 or 6) unless ``held`` (n, 3) holds its rim."""
+    loose = np.setdiff1d(rim(facets), np.flatnonzero(held.all(axis=1)))
     if loose.size:
         raise InputError(
             f"cavity '{name}': rim node {loose[0]} ({loose.size} such) is not held, so -p V is not "

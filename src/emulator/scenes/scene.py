@@ -19,7 +19,8 @@ from emulator.geometry.discretisation import Discretisation, discretise
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.elastic_support import ElasticSupport
 from emulator.mechanics.laws import Law
-from emulator.mechanics.loads import Load
+from emulator.mechanics.loads import Gravity, Load
+from emulator.mechanics.pressure import CavityPressure, require_held_rim
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.parameters import Parameter
 from emulator.scenes.supports import Support, free_motions, prescribe
@@ -67,6 +68,7 @@ class Scene:
         if not self.parameters:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
         self._check_supports()
+        self._check_loads()
 
     def _check_names(self) -> None:
         given = [*self.parameter_names, *self.constants]
@@ -135,6 +137,13 @@ class Scene:
                 f"scene '{self.name}': its supports leave {free} of the 6 rigid motions free, "
                 "the body could move or turn; hold more nodes or components"
             )
+
+    def _check_loads(self) -> None:
+        for load in self.loads:
+            if not isinstance(load, Gravity):
+                self.mesh.facet_set(load.facet_set)
+            if isinstance(load, CavityPressure):
+                require_held_rim(load.facet_set, self.mesh.facet_set(load.facet_set), self.held)
 
     @property
     def _takers(self) -> dict[str, tuple[Quantity, str]]:

@@ -104,9 +104,8 @@ def test_pressure_as_a_parameter():
 
 
 def test_a_cavity_whose_rim_is_loose_is_refused():
-    scene = replace(block(), loads=(CavityPressure("right", 1.0),))
     with pytest.raises(InputError, match=r"cavity 'right': rim node \d+ .* hold the rim or use"):
-        em.potential_energy(scene)
+        replace(block(), loads=(CavityPressure("right", 1.0),))
 
 
 def test_a_scene_without_pressure_computes_no_facets():
