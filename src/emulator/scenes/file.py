@@ -75,8 +75,10 @@ A ventricle, whose mesh file has groups named base, endocardium and epicardium:
     kappa = 50.0
 
 Other rules for fibres are ``biventricle`` (``angles``, ``axis``; facet sets lv_endocardium,
-rv_endocardium, epicardium) and ``uniform`` (``direction``). Gravity also takes ``acceleration`` in
-m/s2. A pressure that is a parameter is called ``pressure``, or what its key ``parameter`` says.
+rv_endocardium, epicardium) and ``uniform`` (``direction``). They also give the sheets, for a law
+that takes any, as the transmural direction; ``uniform`` has a key ``sheets`` for them. Gravity also
+takes ``acceleration`` in m/s2. A pressure that is a parameter is called ``pressure``, or what its
+key ``parameter`` says.
 """
 
 from __future__ import annotations
@@ -89,8 +91,13 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.fibres import Angles, Axis, biventricular_directions, rule_based_fibres
-from emulator.geometry.io import read_body, read_mesh
+from emulator.geometry.fibres import (
+    Angles,
+    Axis,
+    biventricular_directions,
+    rule_based_directions,
+)
+from emulator.geometry.io import Body, read_body, read_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.elastic_support import ElasticSupport
@@ -102,6 +109,8 @@ from emulator.scenes.parameters import Parameter
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 from emulator.scenes.tables import Table
+
+Parts = tuple[Mesh, np.ndarray | None, np.ndarray | None]
 
 _REQUIRED = ("law", "mesh", "parameters", "supports")
 _OPTIONAL = ("constants", "dilatation", "facet_sets", "fibres", "loads", "node_sets", "order")
@@ -138,10 +147,11 @@ def read_scene(path: str | Path) -> Scene:
 def _scene(path: Path, file: Table) -> Scene:
     file.check(_REQUIRED, _OPTIONAL)
     law = find_law(file.text("law"))
-    mesh, fibres = _mesh(path, file, law)
+    mesh, fibres, sheets = _body(path, file, law)
     dilatation = file.text("dilatation", "pointwise", ("pointwise", "mean"))
     parts: dict[str, Any] = {
         "fibres": fibres,
+        "sheets": sheets,
         "parameters": tuple(_parameter(*item) for item in file.tables("parameters").items()),
         "loads": tuple(map(_load, file.list("loads"))),
         "supports": tuple(map(_support, file.list("supports"))),
@@ -153,26 +163,30 @@ def _scene(path: Path, file: Table) -> Scene:
 
 
 # ---- geometry ------------------------------------------------------------------------------------
-def _mesh(path: Path, file: Table, law: Law) -> tuple[Mesh, np.ndarray | None]:
-    """The mesh with the sets the file adds, and the fibres if the law or the file wants any."""
+def _body(path: Path, file: Table, law: Law) -> Parts:
+    """The mesh with the sets the file adds, and the directions if the law or the file wants any."""
     mesh_path = path.parent / file.text("mesh")
     by_rule = "fibres" in file
-    if law.fibres and not by_rule:
-        body = read_body(mesh_path)
-        if body.fibres is None:
-            raise InputError(
-                f"law '{law.name}' needs fibres, and mesh file {mesh_path.name} has none; give it "
-                "cell data 'fibres' (m, 3), or this file a table [fibres]"
-            )
-        mesh, fibres = body.mesh, body.fibres
-    else:
-        mesh, fibres = read_mesh(mesh_path), None
+    body = read_body(mesh_path) if law.fibres and not by_rule else Body(read_mesh(mesh_path))
+    mesh = body.mesh
     if file.integer("order", mesh.order, (1, 2)) != mesh.order:
         if mesh.order == 2:
             raise InputError(f"order = 1; mesh file {mesh_path.name} has quadratic tetrahedra")
         mesh = to_quadratic(mesh)
     mesh = _with_planes(mesh, file)
-    return mesh, _fibres(mesh, file.table("fibres")) if by_rule else fibres
+    if by_rule:
+        fibres, sheets = _by_rule(mesh, file.table("fibres"))
+        return mesh, fibres, sheets if law.sheets else None
+    for kind, asked, found in (
+        ("fibres", law.fibres, body.fibres),
+        ("sheets", law.sheets, body.sheets),
+    ):
+        if asked and found is None:
+            raise InputError(
+                f"law '{law.name}' needs {kind}, and mesh file {mesh_path.name} has none; give it "
+                f"cell data '{kind}' (m, 3), or this file a table [fibres]"
+            )
+    return mesh, body.fibres, body.sheets if law.sheets else None
 
 
 def _with_planes(mesh: Mesh, file: Table) -> Mesh:
@@ -200,23 +214,31 @@ def _on_plane(mesh: Mesh, table: Table, wanted: str) -> np.ndarray:
     return on_plane
 
 
-def _fibres(mesh: Mesh, table: Table) -> np.ndarray:
+def _by_rule(mesh: Mesh, table: Table) -> tuple[np.ndarray, np.ndarray | None]:
+    """Fibres, and the sheets of those rules that have any."""
     rule = table.text("rule", choices=("helix", "biventricle", "uniform"))
     if rule == "uniform":
-        direction = np.asarray(table.numbers("direction", 3))
+        fibre = _everywhere(mesh, table, "direction")
+        sheet = _everywhere(mesh, table, "sheets") if "sheets" in table else None
         table.done()
-        length = np.linalg.norm(direction)
-        if not length > 0.0:
-            raise InputError(f"{table.where}: direction is zero; expected any length above 0")
-        return np.tile(direction / length, (len(mesh.elements), 1))
+        return fibre, sheet
     angles = cast(Angles, table.numbers("angles", 2))
     axis = cast(Axis, table.numbers("axis", 3, (0.0, 0.0, 1.0)))
     if rule == "biventricle":
         table.done()
-        return biventricular_directions(mesh, angles, axis).fibres
+        return biventricular_directions(mesh, angles, axis)
     walls = [table.text(name, name) for name in ("endocardium", "epicardium")]
     table.done()
-    return rule_based_fibres(mesh, walls[0], walls[1], angles, axis)
+    return rule_based_directions(mesh, walls[0], walls[1], angles, axis)
+
+
+def _everywhere(mesh: Mesh, table: Table, key: str) -> np.ndarray:
+    """The direction at ``key``, made unit length, for every element (m, 3)."""
+    direction = np.asarray(table.numbers(key, 3))
+    length = np.linalg.norm(direction)
+    if not length > 0.0:
+        raise InputError(f"{table.where}: {key} is zero; expected any length above 0")
+    return np.tile(direction / length, (len(mesh.elements), 1))
 
 
 # ---- parameters, supports, loads -----------------------------------------------------------------

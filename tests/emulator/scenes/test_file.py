@@ -8,7 +8,11 @@ import pytest
 from emulator.errors import InputError
 from emulator.geometry.biventricle import biventricle
 from emulator.geometry.ellipsoid import human_ventricle
-from emulator.geometry.fibres import biventricular_directions, rule_based_fibres
+from emulator.geometry.fibres import (
+    biventricular_directions,
+    rule_based_directions,
+    rule_based_fibres,
+)
 from emulator.geometry.generators import box
 from emulator.geometry.io import write_mesh
 from emulator.geometry.quadratic import to_quadratic
@@ -235,6 +239,28 @@ def test_pressures_as_parameters_and_other_rules_for_fibres(folder):
         else:
             expected = biventricular_directions(scene.mesh, (60.0, -60.0)).fibres
             np.testing.assert_allclose(scene.fibres, expected)
+
+
+def test_sheets_from_the_mesh_file_or_by_rule(folder):
+    mesh = human_ventricle(5, 12, 1)
+    fibres, sheets = rule_based_directions(mesh, angles=(60.0, -60.0))
+    write_mesh(folder / "heart.vtu", mesh, fibres, sheets)
+    values = "a_s = 2.0\nb_s = 2.0\na_fs = 0.2\nb_fs = 2.0\nkappa"
+    text = HEART.replace('"holzapfel_ogden"', '"holzapfel_ogden_orthotropic"')
+    text = text.replace("kappa", values).replace("lv_endocardium", "endocardium")
+    text = text.replace("rv_endocardium", "epicardium")
+    by_rule = text.format(rule="helix", options="angles = [60, -60]")
+    for written in (by_rule, text.replace('[fibres]\nrule = "{rule}"\n{options}\n', "")):
+        (folder / "heart.toml").write_text(written)
+        scene = find_scene(str(folder / "heart.toml"))
+        np.testing.assert_allclose(scene.fibres, fibres, atol=1e-9)
+        np.testing.assert_allclose(scene.sheets, sheets, atol=1e-9)
+    write_mesh(folder / "heart.vtu", mesh, fibres)
+    with pytest.raises(InputError, match="needs sheets, and mesh file heart.vtu has none"):
+        find_scene(str(folder / "heart.toml"))
+    options = "direction = [1, 0, 0]\nsheets = [0, 0, 2]"
+    (folder / "heart.toml").write_text(text.format(rule="uniform", options=options))
+    np.testing.assert_array_equal(find_scene(str(folder / "heart.toml")).sheets[0], [0, 0, 1])
 
 
 def test_facet_sets_on_a_plane_and_quadratic_elements(folder):

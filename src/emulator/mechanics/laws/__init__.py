@@ -10,6 +10,7 @@ does it step by step.
 from emulator.errors import InputError
 from emulator.mechanics.laws.guccione import GUCCIONE
 from emulator.mechanics.laws.holzapfel_ogden import HOLZAPFEL_OGDEN, HOLZAPFEL_OGDEN_RELEASED
+from emulator.mechanics.laws.holzapfel_ogden_orthotropic import HOLZAPFEL_OGDEN_ORTHOTROPIC
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.laws.neo_hookean import NEO_HOOKEAN, NEO_HOOKEAN_E_NU
 
@@ -20,6 +21,7 @@ LAWS: dict[str, Law] = {
         NEO_HOOKEAN_E_NU,
         HOLZAPFEL_OGDEN,
         HOLZAPFEL_OGDEN_RELEASED,
+        HOLZAPFEL_OGDEN_ORTHOTROPIC,
         GUCCIONE,
     )
 }

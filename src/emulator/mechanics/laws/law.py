@@ -21,12 +21,14 @@ class Law:
         takes them.
     energy : ``energy(strain, *parameters) -> W``, the strain energy density (kPa) of one point.
     fibres : whether the energy asks for ``strain.fibre``.
+    sheets : whether it asks for ``strain.sheet`` too.
     """
 
     name: str
     quantities: tuple[Quantity, ...]
     energy: Callable[..., jax.Array]
     fibres: bool = False
+    sheets: bool = False
 
     @property
     def parameters(self) -> tuple[str, ...]:
