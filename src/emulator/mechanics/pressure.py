@@ -25,6 +25,7 @@ from emulator.errors import InputError
 from emulator.mechanics.facets import cone_volume, rim
 from emulator.mechanics.kinematics import cofactor
 from emulator.mechanics.local import LocalTerm, Values
+from emulator.mechanics.quantity import Quantity
 
 if TYPE_CHECKING:
     from emulator.scenes.scene import Scene
@@ -39,28 +40,33 @@ class SurfacePressure:
     Parameters
     ----------
     facet_set : where it acts.
-    pressure : kPa, or ``None`` to make ``pressure`` a parameter of the scene.
+    pressure : kPa, or ``None`` to make it a parameter of the scene.
+    parameter : name of that parameter; give each of several pressures its own.
     """
 
     facet_set: str
     pressure: float | None = None
+    parameter: str = "pressure"
 
     def __post_init__(self) -> None:
         if self.pressure is not None and not np.isfinite(self.pressure):
             raise InputError(f"pressure on '{self.facet_set}' is {self.pressure} kPa")
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names this load takes from theta or the constants."""
-        return () if self.pressure is not None else ("pressure",)
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What this load takes from theta or the constants; suction is negative."""
+        if self.pressure is not None:
+            return ()
+        return (Quantity(self.parameter, "kPa", -np.inf, hint=f"1 mmHg = {KPA_PER_MMHG} kPa"),)
 
     def describe(self) -> list[object]:
         """What tells this load from another."""
-        return [type(self).__name__, self.facet_set, self.pressure]
+        named = [] if self.parameter == "pressure" else [self.parameter]
+        return [type(self).__name__, self.facet_set, self.pressure, *named]
 
     def value(self, values: Values) -> jax.Array | float:
         """The pressure in kPa among the scene's resolved parameters."""
-        return values["pressure"] if self.pressure is None else self.pressure
+        return values[self.parameter] if self.pressure is None else self.pressure
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,6 @@ class CavityPressure(PotentialPressure):
     def term(self, scene: Scene) -> LocalTerm:
         """The potential ``-p [V(u) - V(0)]``."""
         facets = scene.mesh.facet_set(self.facet_set)
-        _require_held_rim(scene, self.facet_set, facets)
         X = scene.mesh.nodes[facets]
 
         def energy(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
@@ -122,8 +127,9 @@ class PublishedPressure(PotentialPressure):
         return LocalTerm(nodes, data, energy)
 
 
-def _require_held_rim(scene: Scene, name: str, facets: np.ndarray) -> None:
-    loose = np.setdiff1d(rim(facets), np.flatnonzero(scene.held.all(axis=1)))
+def require_held_rim(name: str, facets: np.ndarray, held: np.ndarray) -> None:
+    """Refuse the cavity ``name`` of ``facets`` (k, 3 or 6) unless ``held`` (n, 3) holds its rim."""
+    loose = np.setdiff1d(rim(facets), np.flatnonzero(held.all(axis=1)))
     if loose.size:
         raise InputError(
             f"cavity '{name}': rim node {loose[0]} ({loose.size} such) is not held, so -p V is not "

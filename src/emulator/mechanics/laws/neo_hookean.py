@@ -13,6 +13,7 @@ import jax
 
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws.law import Law
+from emulator.mechanics.quantity import modulus, number
 
 
 def energy_lame(strain: Strain, mu: jax.Array, lam: jax.Array) -> jax.Array:
@@ -31,5 +32,7 @@ def energy_engineering(strain: Strain, E: jax.Array, nu: jax.Array) -> jax.Array
     return energy_lame(strain, *lame_from_engineering(E, nu))
 
 
-NEO_HOOKEAN = Law("neo_hookean", ("mu", "lam"), energy_lame)
-NEO_HOOKEAN_E_NU = Law("neo_hookean_E_nu", ("E", "nu"), energy_engineering)
+NEO_HOOKEAN = Law("neo_hookean", (modulus("mu"), modulus("lam")), energy_lame)
+NEO_HOOKEAN_E_NU = Law(
+    "neo_hookean_E_nu", (modulus("E"), number("nu", -1.0, 0.5)), energy_engineering
+)
