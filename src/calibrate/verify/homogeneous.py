@@ -2,7 +2,7 @@ r"""Uniaxial and equibiaxial stretch of a cube: the solution of every law in clo
 
 The cube's edges, its fibres along x and its sheets along y, are the principal axes, so that a law
 is a function of three stretches and the first Piola stress is diagonal,
-:math:`P_i = \partial W/\partial\lambda_i`. What is not pulled is free, :math:`P_i = 0`, which is one
+:math:`P_i = \partial W/\partial\lambda_i`. What is not pulled is free, :math:`P_i = 0`: one
 equation for the lateral stretch; two for both of them where there are sheets.
 
 The formulas below are written out by hand in NumPy, for comparison with the laws: they share no
@@ -88,6 +88,12 @@ def neo_hookean_engineering(stretches: np.ndarray, values: Values) -> np.ndarray
     return neo_hookean(stretches, lame)
 
 
+def neo_hookean_split(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r""":math:`P_i = \tfrac{\mu}{2} \partial_i \bar I_1 + \tfrac{\kappa}{2}(J^2 - 1)/\lambda_i`."""
+    volume = 0.5 * values["kappa"] * (np.prod(stretches) ** 2 - 1.0) / stretches
+    return 0.5 * values["mu"] * _isochoric(stretches)[2] + volume
+
+
 def _isochoric(stretches: np.ndarray) -> tuple[np.ndarray, ...]:
     r"""``(I1 - 3, I4 - 1)``, both isochoric, and their derivatives in the stretches.
 
@@ -157,6 +163,7 @@ def guccione(stretches: np.ndarray, values: Values) -> np.ndarray:
 PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
     "neo_hookean": neo_hookean,
     "neo_hookean_E_nu": neo_hookean_engineering,
+    "neo_hookean_split": neo_hookean_split,
     "holzapfel_ogden": holzapfel_ogden,
     "holzapfel_ogden_released": holzapfel_ogden_released,
     "holzapfel_ogden_orthotropic": holzapfel_ogden_orthotropic,
@@ -167,6 +174,7 @@ PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
 PARAMETERS: dict[str, dict[str, float]] = {
     "neo_hookean": {"mu": 10.0, "lam": 30.0},
     "neo_hookean_E_nu": {"E": 30.0, "nu": 0.4},
+    "neo_hookean_split": {"mu": 10.0, "kappa": 60.0},
     "holzapfel_ogden": {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "kappa": 50.0},
     "holzapfel_ogden_released": {"a": 1.0, "b": 3.0, "a_f": 2.5, "b_f": 4.0, "kappa": 50.0},
     "holzapfel_ogden_orthotropic": {

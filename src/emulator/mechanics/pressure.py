@@ -6,8 +6,9 @@ Exact for a cavity closed at a rim that does not move: the pressure does work on
           V = -\frac{1}{3} \int x \cdot n \, da + \text{lid}
 
 for facets whose normals point out of the tissue, into the cavity. The lid is fixed and drops out.
-Elsewhere a pressure that follows the surface has no potential: see
-:mod:`emulator.mechanics.follower`.
+A rim that slides in a plane of symmetry through the origin will do as well: the cone over the
+opening, from the origin, then has no volume. Elsewhere a pressure that follows the surface has no
+potential: see :mod:`emulator.mechanics.follower`.
 """
 
 from __future__ import annotations
@@ -127,9 +128,13 @@ class PublishedPressure(PotentialPressure):
         return LocalTerm(nodes, data, energy)
 
 
-def require_held_rim(name: str, facets: np.ndarray, held: np.ndarray) -> None:
-    """Refuse the cavity ``name`` of ``facets`` (k, 3 or 6) unless ``held`` (n, 3) holds its rim."""
-    loose = np.setdiff1d(rim(facets), np.flatnonzero(held.all(axis=1)))
+def require_held_rim(scene: Scene, name: str) -> None:
+    """Refuse the cavity ``name`` unless its rim is held or slides in a plane through the origin."""
+    edges = rim(scene.mesh.facet_set(name))
+    held = scene.held[edges]  # (e, 2 or 3, 3)
+    there = np.where(held, scene.mesh.nodes[edges] + scene.held_displacement[edges], np.nan)
+    in_symmetry_plane = (np.abs(there) <= 1e-9 * scene.mesh.size).all(axis=1).any(axis=1)
+    loose = np.unique(edges[~(held.all(axis=(1, 2)) | in_symmetry_plane)])
     if loose.size:
         raise InputError(
             f"cavity '{name}': rim node {loose[0]} ({loose.size} such) is not held, so -p V is not "

@@ -154,7 +154,7 @@ class Scene:
             if not isinstance(load, Gravity):
                 self.mesh.facet_set(load.facet_set)
             if isinstance(load, CavityPressure):
-                require_held_rim(load.facet_set, self.mesh.facet_set(load.facet_set), self.held)
+                require_held_rim(self, load.facet_set)
 
     @property
     def _takers(self) -> dict[str, tuple[Quantity, str]]:

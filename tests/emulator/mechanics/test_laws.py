@@ -20,6 +20,7 @@ MU, LAM = 3.0, 7.0
 ARGUMENTS = {
     "neo_hookean": (MU, LAM),
     "neo_hookean_E_nu": (8.0, 0.3),
+    "neo_hookean_split": (3.0, 40.0),
     "holzapfel_ogden": (0.3, 2.0, 3.0, 2.5, 25.0),
     "holzapfel_ogden_released": (0.15, 2.0, 1.5, 2.5, 25.0),
     "holzapfel_ogden_orthotropic": (0.3, 2.0, 3.0, 2.5, 2.0, 1.5, 0.8, 3.0, 25.0),

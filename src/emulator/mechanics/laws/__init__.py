@@ -12,13 +12,18 @@ from emulator.mechanics.laws.guccione import GUCCIONE
 from emulator.mechanics.laws.holzapfel_ogden import HOLZAPFEL_OGDEN, HOLZAPFEL_OGDEN_RELEASED
 from emulator.mechanics.laws.holzapfel_ogden_orthotropic import HOLZAPFEL_OGDEN_ORTHOTROPIC
 from emulator.mechanics.laws.law import Law
-from emulator.mechanics.laws.neo_hookean import NEO_HOOKEAN, NEO_HOOKEAN_E_NU
+from emulator.mechanics.laws.neo_hookean import (
+    NEO_HOOKEAN,
+    NEO_HOOKEAN_E_NU,
+    NEO_HOOKEAN_SPLIT,
+)
 
 LAWS: dict[str, Law] = {
     law.name: law
     for law in (
         NEO_HOOKEAN,
         NEO_HOOKEAN_E_NU,
+        NEO_HOOKEAN_SPLIT,
         HOLZAPFEL_OGDEN,
         HOLZAPFEL_OGDEN_RELEASED,
         HOLZAPFEL_OGDEN_ORTHOTROPIC,
