@@ -2,8 +2,8 @@ r"""Uniaxial and equibiaxial stretch of a cube: the solution of every law in clo
 
 The cube's edges, its fibres along x and its sheets along y, are the principal axes, so that a law
 is a function of three stretches and the first Piola stress is diagonal,
-:math:`P_i = \partial W/\partial\lambda_i`. What is not pulled is free, :math:`P_i = 0`, which is one
-equation for the lateral stretch; two for both of them where there are sheets.
+:math:`P_i = \partial W/\partial\lambda_i`. What is not pulled is free, :math:`P_i = 0`, which is
+one equation for the lateral stretch; two for both of them where there are sheets.
 
 The formulas below are written out by hand in NumPy, for comparison with the laws: they share no
 code with them. :func:`verify_homogeneous` solves the same cubes by finite elements.
