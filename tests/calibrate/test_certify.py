@@ -79,7 +79,7 @@ class LinearSimulator:
         self.forward, self.scene = forward, forward.scene
 
     def solve(self, theta, start=None):
-        return Solution(self.forward(theta), jnp.array(Status.CONVERGED), *[jnp.array(0.0)] * 3)
+        return Solution(self.forward(theta), jnp.array(Status.CONVERGED), *[jnp.array(0.0)] * 4)
 
 
 @pytest.fixture(scope="module")

@@ -86,6 +86,7 @@ def simulate(arguments: argparse.Namespace) -> int:
     from emulator.geometry.io import write_solution
     from emulator.mechanics.energy import potential_energy, volume_ratio
     from emulator.mechanics.fields import element_fields
+    from emulator.mechanics.follower import FollowerPressure
     from emulator.scenes import find_scene
 
     scene = find_scene(arguments.scene, arguments.root)
@@ -98,6 +99,9 @@ def simulate(arguments: argparse.Namespace) -> int:
     solution = Simulator(scene).solve(theta)
     status = Status(int(solution.status))
     J = np.asarray(volume_ratio(scene, solution.displacement))
+    # A pressure that follows an open patch has no potential.
+    open_patch = any(isinstance(load, FollowerPressure) for load in scene.loads)
+    energy = None if open_patch else float(potential_energy(scene)(solution.displacement, theta))
     result = {
         "scene": scene.name,
         "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
@@ -105,7 +109,7 @@ def simulate(arguments: argparse.Namespace) -> int:
         "iterations": int(solution.iterations),
         "residual": float(solution.residual),
         "load_reached": float(solution.load_reached),
-        "energy": float(potential_energy(scene)(solution.displacement, theta)),
+        "energy": energy,
         "max_displacement": float(np.linalg.norm(solution.displacement, axis=1).max()),
         "J_range": [float(J.min()), float(J.max())],
     }
@@ -115,10 +119,8 @@ def simulate(arguments: argparse.Namespace) -> int:
         write_solution(arguments.out, scene.mesh, u, fields)
         result["out"] = arguments.out
     lines = [f"{scene.name}: {status.text}, {result['iterations']} Newton iterations"]
-    lines.append(
-        f"largest displacement {result['max_displacement']:.6g} mm, "
-        f"energy {result['energy']:.8g} mN mm"
-    )
+    told = "no potential energy" if energy is None else f"energy {energy:.8g} mN mm"
+    lines.append(f"largest displacement {result['max_displacement']:.6g} mm, {told}")
     lines.append(
         f"J from {J.min():.4f} to {J.max():.4f}, relative residual {result['residual']:.1e}"
     )

@@ -1,8 +1,9 @@
 r"""Uniaxial and equibiaxial stretch of a cube: the solution of every law in closed form.
 
-The cube's edges, and its fibres along x, are the principal axes, so that a law is a function of
-three stretches and the first Piola stress is diagonal, :math:`P_i = \partial W/\partial\lambda_i`.
-What is not pulled is free, :math:`P_i = 0`, which is one equation for the lateral stretch.
+The cube's edges, its fibres along x and its sheets along y, are the principal axes, so that a law
+is a function of three stretches and the first Piola stress is diagonal,
+:math:`P_i = \partial W/\partial\lambda_i`. What is not pulled is free, :math:`P_i = 0`: one
+equation for the lateral stretch; two for both of them where there are sheets.
 
 The formulas below are written out by hand in NumPy, for comparison with the laws: they share no
 code with them. :func:`verify_homogeneous` solves the same cubes by finite elements.
@@ -38,7 +39,15 @@ class Homogeneous:
 
 def uniaxial(law: str, stretch: float, values: Values) -> Homogeneous:
     """Pulled by ``stretch`` along x, free along y and z; ``values`` are the law's parameters."""
-    return _solve(law, values, lambda free: (stretch, free, free))
+    if not find_law(law).sheets:
+        return _solve(law, values, lambda free: (stretch, free, free))
+    stress = PRINCIPAL_STRESS[law]
+
+    def across(z: float) -> float:
+        """The stretch along y, the sheets, that leaves no stress there."""
+        return _root(lambda y: float(stress(np.array([stretch, y, z]), values)[1]))
+
+    return _solve(law, values, lambda free: (stretch, across(free), free))
 
 
 def equibiaxial(law: str, stretch: float, values: Values) -> Homogeneous:
@@ -50,19 +59,20 @@ def _solve(
     law: str, values: Values, stretches: Callable[[float], tuple[float, float, float]]
 ) -> Homogeneous:
     stress = PRINCIPAL_STRESS[law]
-
-    def free_stress(free: float) -> float:
-        return float(stress(np.array(stretches(free)), values)[2])
-
-    low = high = 1.0
-    while free_stress(low) > 0.0:
-        low *= 0.95
-    while free_stress(high) < 0.0:
-        high *= 1.05
-    free = low if low == high else brentq(free_stress, low, high, xtol=1e-15, rtol=1e-15)
+    free = _root(lambda free: float(stress(np.array(stretches(free)), values)[2]))
     found = stretches(free)
     first, second, third = map(float, stress(np.array(found), values))
     return Homogeneous(found, (first, second, third))
+
+
+def _root(stress: Callable[[float], float]) -> float:
+    """The stretch at which a stress that grows with it vanishes."""
+    low = high = 1.0
+    while stress(low) > 0.0:
+        low *= 0.95
+    while stress(high) < 0.0:
+        high *= 1.05
+    return low if low == high else brentq(stress, low, high, xtol=1e-15, rtol=1e-15)
 
 
 def neo_hookean(stretches: np.ndarray, values: Values) -> np.ndarray:
@@ -76,6 +86,12 @@ def neo_hookean_engineering(stretches: np.ndarray, values: Values) -> np.ndarray
     E, nu = values["E"], values["nu"]
     lame = {"mu": E / 2.0 / (1.0 + nu), "lam": E * nu / (1.0 + nu) / (1.0 - 2.0 * nu)}
     return neo_hookean(stretches, lame)
+
+
+def neo_hookean_split(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r""":math:`P_i = \tfrac{\mu}{2} \partial_i \bar I_1 + \tfrac{\kappa}{2}(J^2 - 1)/\lambda_i`."""
+    volume = 0.5 * values["kappa"] * (np.prod(stretches) ** 2 - 1.0) / stretches
+    return 0.5 * values["mu"] * _isochoric(stretches)[2] + volume
 
 
 def _isochoric(stretches: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -117,6 +133,20 @@ def holzapfel_ogden_released(stretches: np.ndarray, values: Values) -> np.ndarra
     return a * np.exp(b * I1) * d_I1 + 2.0 * a_f * I4 * np.exp(b_f * I4**2) * d_I4 + volume
 
 
+def holzapfel_ogden_orthotropic(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r"""Sheets along y; without shear between them and the fibres, in kPa, (3,).
+
+    .. math::
+        P_i = P_i^{HO} + a_s x\, e^{b_s x^2} \partial_i \bar I_{4s}, \quad
+        x = \max(\bar I_{4s} - 1, 0)
+    """
+    order = [1, 0, 2]  # the sheets in the place of the fibres
+    _, I4, _, d_I4 = _isochoric(stretches[order])
+    x = max(float(I4), 0.0)
+    sheets = values["a_s"] * x * np.exp(values["b_s"] * x**2) * d_I4[order]
+    return holzapfel_ogden(stretches, values) + sheets
+
+
 def guccione(stretches: np.ndarray, values: Values) -> np.ndarray:
     r"""Fibres along x, in kPa, (3,).
 
@@ -133,8 +163,10 @@ def guccione(stretches: np.ndarray, values: Values) -> np.ndarray:
 PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
     "neo_hookean": neo_hookean,
     "neo_hookean_E_nu": neo_hookean_engineering,
+    "neo_hookean_split": neo_hookean_split,
     "holzapfel_ogden": holzapfel_ogden,
     "holzapfel_ogden_released": holzapfel_ogden_released,
+    "holzapfel_ogden_orthotropic": holzapfel_ogden_orthotropic,
     "guccione": guccione,
 }
 
@@ -142,8 +174,20 @@ PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
 PARAMETERS: dict[str, dict[str, float]] = {
     "neo_hookean": {"mu": 10.0, "lam": 30.0},
     "neo_hookean_E_nu": {"E": 30.0, "nu": 0.4},
+    "neo_hookean_split": {"mu": 10.0, "kappa": 60.0},
     "holzapfel_ogden": {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "kappa": 50.0},
     "holzapfel_ogden_released": {"a": 1.0, "b": 3.0, "a_f": 2.5, "b_f": 4.0, "kappa": 50.0},
+    "holzapfel_ogden_orthotropic": {
+        "a": 2.0,
+        "b": 3.0,
+        "a_f": 5.0,
+        "b_f": 4.0,
+        "a_s": 3.0,
+        "b_s": 4.0,
+        "a_fs": 1.0,
+        "b_fs": 2.0,
+        "kappa": 50.0,
+    },
     "guccione": {"C": 2.0, "b_f": 8.0, "b_t": 2.0, "b_fs": 4.0, "kappa": 50.0},
 }
 
@@ -191,6 +235,7 @@ def cube_scene(law: str, kind: str, stretch: float) -> Scene:
         supports=tuple(supports),
         constants=dict(fixed),
         fibres=np.tile([1.0, 0.0, 0.0], (len(mesh.elements), 1)) if found.fibres else None,
+        sheets=np.tile([0.0, 1.0, 0.0], (len(mesh.elements), 1)) if found.sheets else None,
     )
 
 

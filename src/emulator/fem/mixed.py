@@ -59,9 +59,10 @@ def _arguments(scene: Scene, u: jax.Array) -> tuple[tuple, tuple]:
     """Arrays of every element, and the axes to map over."""
     grid = scene.discretisation
     local = (u[grid.connectivity], jnp.asarray(grid.gradients), jnp.asarray(grid.weights))
-    if scene.fibres is None:
+    directions = scene.directions
+    if directions is None:
         return (*local, None), (0, 0, 0, None)
-    return (*local, jnp.asarray(scene.fibres)), (0, 0, 0, 0)
+    return (*local, jnp.asarray(directions)), (0, 0, 0, 0)
 
 
 def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:
@@ -80,11 +81,11 @@ def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) ->
     """Force and tangent of every element at ``u`` (n, 3) and ``volumes``."""
     energy = at_volume(scene, theta)
 
-    def one(change, pressure, local, gradients, weights, fibre):  # noqa: ANN001, ANN202
+    def one(change, pressure, local, gradients, weights, directions):  # noqa: ANN001, ANN202
         V = jnp.sum(weights)
 
         def E(v: jax.Array, t: jax.Array) -> jax.Array:
-            return energy(t, v, gradients, weights, fibre)
+            return energy(t, v, gradients, weights, directions)
 
         def volume(v: jax.Array) -> jax.Array:
             return V * mean_volume_change(v, gradients, weights)
@@ -122,9 +123,9 @@ def carried(
     """
     energy = at_volume(scene, theta)
 
-    def one(change, pressure, at, local, gradients, weights, fibre):  # noqa: ANN001, ANN202
+    def one(change, pressure, at, local, gradients, weights, directions):  # noqa: ANN001, ANN202
         V = jnp.sum(weights)
-        E_t, E_u = jax.grad(energy, (0, 1))(change, local, gradients, weights, fibre)
+        E_t, E_u = jax.grad(energy, (0, 1))(change, local, gradients, weights, directions)
         mean, slope = jax.value_and_grad(mean_volume_change)(local, gradients, weights)
         r_change, r_pressure = E_t - pressure * V, V * (mean - change)
         force = E_u + pressure * V * slope + at.g * r_pressure / V

@@ -1,35 +1,31 @@
 r"""Newton's method with adaptive load steps, as one loop inside ``jax.jit``.
 
-At load level :math:`s \in (0, 1]` the dead loads are :math:`s f` and the held displacements
+At load level :math:`s \in (0, 1]` the loads are :math:`s f` and the held displacements
 :math:`s \bar u`. Each iteration solves
 
 .. math::
-    K(u)\, \Delta u = -\left[r_s(u) + K(u)\, \Delta \bar u\right], \qquad
+    K\, \Delta u = -\left[r_s(u) + K\, \Delta \bar u\right], \qquad
     \Delta \bar u = s \bar u - u|_\text{held}
 
-and steps by the largest :math:`\alpha \in \{1, \tfrac12, \tfrac14, \dots\}` that keeps every
-element's :math:`J` above a fraction of its present least value and, once the supports are met,
-lowers the potential energy (Armijo's rule; where the tangent is indefinite and Newton's direction
-climbs, the opposite one is taken). Exponential laws diverge without it. Loads without a potential
+and steps by an :math:`\alpha \in \{1, \tfrac12, \tfrac14, \dots\}` that keeps every element's
+:math:`J` above a fraction of its present least value and, once the supports are met, lowers the
+potential energy (Armijo's rule; where the tangent is indefinite and Newton's direction climbs, the
+opposite one is taken). Exponential laws diverge without it. Loads without a potential
 are held at their present force for this rule, and a step that lowers the residual instead will do.
-A level that does not converge, or only crawls, is tried again with half the load increment.
+A level that does not converge is tried again with half the load increment.
+
+Two things save factorisations, most of the cost. The tangent of the last iteration is kept while a
+step with it cuts the residual at least tenfold. And as long as the loads are hardly balanced, as
+at rest, their own stiffness is left out: a pressure that nothing resists yet softens the tangent
+and points the step nowhere useful.
 
 With mean dilatation the elements' volumes and pressures are iterates of their own (see
-:mod:`emulator.fem.mixed`). The point sought is then a saddle, and no energy tells a good step from
-a bad one. Deuflhard's natural monotonicity does: from where a step leads, Newton with the tangent
-of where it started must have less far to go,
-
-.. math::
-    \left| K(x)^{-1} r(x + \alpha \Delta x) \right|
-    \le \left(1 - \frac{\alpha}{4}\right) |\Delta x|
-
-(P. Deuflhard, Newton Methods for Nonlinear Problems, 2004, ch. 3.3). The factors are there
-already. Measured in mm, the stiff volumes do not drown all else as they do in a residual.
+:mod:`emulator.fem.mixed`); the point sought is then a saddle, and steps are judged by
+:mod:`emulator.fem.natural` monotonicity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -37,19 +33,18 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
-from emulator.fem.mixed import Condensed, Volumes, advance, carried, consistent, linearise
+from emulator.fem.line_search import Direction, choose_fraction
+from emulator.fem.mixed import Condensed, Volumes, advance, consistent, linearise
+from emulator.fem.natural import natural_monotonicity
 from emulator.fem.solution import Solution, Status
 from emulator.mechanics.energy import volume_ratio
 
-_LEAST_FRACTION = 2.0**-20
-_LEAST_MIXED_FRACTION = 2.0**-7  # natural monotonicity fails early: a lower load is cheaper
-# Steps shorter than this are a crawl, as are those kept short by elements about to be crushed.
-# After so many a level is given up for a lower one.
-_CRAWL, _CRAWLS = 2.0**-6, 8
-# A step that is this much longer than the force over the largest stiffness: a singular tangent.
-_ENDLESS = 1e13
-_ARMIJO = 1e-4
-_ROUND_OFF = 1e-13
+_NEAR = 0.05  # relative residual below which a step is judged by the residual alone
+_UNBALANCED = 0.5  # and above which the stiffness of the loads misleads
+_SQUEEZES = 8  # steps kept short by elements after which a load step is halved
+_ENDLESS = 1e13  # a step this much longer than force over stiffness: a singular tangent
+_KEEP_TANGENT = 0.1  # a step this good earns its tangent another one
+_MIXED_ITERATIONS = 20  # a mixed load step that works takes about ten
 
 
 @dataclass(frozen=True)
@@ -74,20 +69,9 @@ class NewtonOptions:
     shrink: float = 0.2
 
 
-class _Step(NamedTuple):
-    """Newton's full step, and what judges how much of it to take."""
+class NewtonState(NamedTuple):
+    """What the next iteration needs."""
 
-    move: jax.Array  # (n, 3)
-    residual: jax.Array  # (f,)
-    slope: jax.Array  # residual . move, before it was turned round
-    settled: jax.Array  # whether the supports are where they belong
-    solvable: jax.Array
-    condensed: Condensed | None
-    values: jax.Array  # (nnz,) of the tangent
-    pull: jax.Array  # (f,) change of the residual with the held displacement
-
-
-class _State(NamedTuple):
     u: jax.Array  # (n, 3) current iterate
     volumes: Volumes | None  # that go with it, for mean dilatation
     level: jax.Array  # load level being solved
@@ -96,10 +80,30 @@ class _State(NamedTuple):
     increment: jax.Array
     at_level: jax.Array  # iterations spent at this level
     iterations: jax.Array
-    error: jax.Array  # residual relative to the tolerance's scale at `u`, of level `level`
+    factorisations: jax.Array
+    residual: jax.Array  # (f,) at `u` and `level`, unless at_level is 0
+    error: jax.Array  # the same relative to the forces at work; inf until the supports are met
+    tangent: jax.Array  # (nnz,) the last one assembled
+    refresh: jax.Array  # whether the next iteration needs a new one
+    crushed: jax.Array  # whether the last level was given up because elements would invert
+    singular: jax.Array  # whether the last step came of a singular tangent
+    squeezed: jax.Array  # steps at this level that elements about to be crushed kept short
     status: jax.Array
-    obstacle: jax.Array  # the status to end with, should this be the last step
-    crawled: jax.Array  # short steps at this level
+
+    def forget_tangent(self, system: System) -> NewtonState:
+        """The same state for a ``system`` that stores tangents in another way."""
+        empty = jnp.zeros(len(system.pattern.rows))
+        return self._replace(tangent=empty, refresh=jnp.array(True))
+
+
+class _Outcome(NamedTuple):
+    """Where a step leads; fraction 0 means nowhere."""
+
+    u: jax.Array
+    residual: jax.Array
+    error: jax.Array
+    fraction: jax.Array
+    crushed: jax.Array
 
 
 def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array) -> Solution:
@@ -114,272 +118,251 @@ def newton(system: System, options: NewtonOptions, theta: jax.Array, start: jax.
     -------
     Solution, whose status is CONVERGED or names the failure; its displacement is always finite.
     """
-    held = jnp.asarray(system.scene.held)
-    held_values = jnp.asarray(system.scene.held_displacement)
-
-    least = _LEAST_MIXED_FRACTION if system.mixed else _LEAST_FRACTION
-
-    def balanced(u: jax.Array, level: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return balance(system, u, theta, level, options.absolute)
-
-    def volumes_of(u: jax.Array) -> Volumes | None:
-        return consistent(system.scene, u, theta) if system.mixed else None
-
-    def step(state: _State) -> _State:
-        move_held = jnp.where(held, state.level * held_values - state.u, 0.0)
-        step = _full_step(system, state, theta, move_held)
-        crushes = _guard(system, state, step, options.shrink)
-        accepts = _acceptance(system, options, state, theta, step)
-        fraction, crushed = _largest_fraction(crushes, accepts, least)
-        admissible = step.solvable & (fraction > 0.0)
-        u = jnp.where(admissible, state.u + fraction * step.move, state.u)
-        # After a full step the supports are met; setting them avoids the last bit of round-off.
-        u = jnp.where(held & admissible & (fraction == 1.0), state.level * held_values, u)
-        placed = jnp.all(jnp.where(held, u == state.level * held_values, True))
-        _, error = balanced(u, state.level)
-        error = jnp.where(placed & admissible & jnp.isfinite(error), error, jnp.inf)
-        state = state._replace(
-            obstacle=_obstacle(step, crushed),
-            crawled=state.crawled + ((fraction < _CRAWL) | (crushed & (fraction < 0.5))),
+    solver = Newton(system, options, theta)
+    return solution_of(
+        jax.lax.while_loop(
+            lambda state: state.status == Status.RUNNING, solver.step, solver.begin(start)
         )
-        after = _next_level(options, state, u, admissible, error)
-        if state.volumes is None or step.condensed is None:
-            return after
-        moved = advance(system.scene, state.volumes, step.condensed, step.move, fraction)
-        back = volumes_of(after.u)
-        # A level given up starts again from the last solution, whose volumes are its own.
-        kept = after.level == state.level
-        return after._replace(volumes=jax.tree.map(lambda a, b: jnp.where(kept, a, b), moved, back))
-
-    def running(state: _State) -> jax.Array:
-        return state.status == Status.RUNNING
-
-    _, error = balanced(start, jnp.array(1.0))
-    placed = jnp.all(jnp.where(held, start == held_values, True))
-    fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(theta))
-    inverted = ~(jnp.min(volume_ratio(system.scene, start)) > 0.0)
-    status = jnp.where(
-        ~fine,
-        Status.INVALID_INPUT,
-        jnp.where(placed & (error <= options.tolerance), Status.CONVERGED, Status.RUNNING),
     )
-    # An inverted start is no start: begin at rest.
-    u = jnp.where(fine & ~inverted, start, 0.0)
-    state = _State(
-        u=u,
-        volumes=volumes_of(u),
-        level=jnp.array(1.0),
-        u_reached=jnp.zeros_like(u),
-        reached=jnp.array(0.0),
-        increment=jnp.array(1.0),
-        at_level=jnp.array(0),
-        iterations=jnp.array(0),
-        error=jnp.where(fine & placed, error, jnp.inf),
-        status=jnp.asarray(status, dtype=jnp.int64),
-        obstacle=jnp.asarray(Status.LOAD_LIMIT, dtype=jnp.int64),
-        crawled=jnp.array(0),
-    )
-    state = jax.lax.while_loop(running, step, state)
+
+
+def solution_of(state: NewtonState) -> Solution:
+    """What the iteration ended with."""
     converged = state.status == Status.CONVERGED
-    u = jnp.where(converged, state.u, state.u_reached)
     return Solution(
-        displacement=u,
+        displacement=jnp.where(converged, state.u, state.u_reached),
         status=state.status,
         iterations=state.iterations,
+        factorisations=state.factorisations,
         residual=state.error,
         load_reached=jnp.where(converged, 1.0, state.reached),
     )
 
 
-def _full_step(system: System, state: _State, theta: jax.Array, move_held: jax.Array) -> _Step:
-    """Newton's step from ``state``, turned round where it would climb the potential."""
-    u, level = state.u, state.level
-    if state.volumes is None:
-        condensed = None
-        residual = system.residual(u, theta, level)
-        values = system.tangent(u, theta, level)
-        # K times the held displacement, without assembling the held columns.
-        _, pull = jax.jvp(lambda v: system.residual(v, theta, level), (u,), (move_held,))
-    else:
-        condensed = linearise(system.scene, u, state.volumes, theta)
-        residual, pull = system.mixed_residual(u, theta, level, condensed, move_held)
-        values = system.assemble(condensed.tangent, u, theta, level)
-    solvable = system.pattern.solvable(values)
-    values = system.pattern.safe_values(values)
-    move = system.solve(values, -(residual + pull))
-    slope = jnp.vdot(residual, move)
-    settled = jnp.all(move_held == 0.0)
-    if condensed is None:
-        move = jnp.where(settled & (slope > 0.0), -move, move)
-    return _Step(
-        move=system.extend(move) + move_held,
-        residual=residual,
-        slope=slope,
-        settled=settled,
-        solvable=solvable,
-        condensed=condensed,
-        values=values,
-        pull=pull,
-    )
+@dataclass(frozen=True, eq=False)
+class Newton:
+    """The iteration for one theta."""
 
+    system: System
+    options: NewtonOptions
+    theta: jax.Array
 
-def _obstacle(step: _Step, crushed: jax.Array) -> jax.Array:
-    """The status that says why a step was not longer."""
-    force = jnp.max(jnp.abs(step.residual + step.pull))
-    stiffness = jnp.max(jnp.abs(step.values))
-    endless = ~(stiffness * jnp.max(jnp.abs(step.move)) <= _ENDLESS * force)
-    short = jnp.where(crushed, Status.INVERTED_ELEMENT, Status.LOAD_LIMIT)
-    return jnp.where(~step.solvable | endless, Status.SINGULAR_TANGENT, short)
+    def begin(self, start: jax.Array) -> NewtonState:
+        """The state to iterate from: ``start``, or rest where that is no start."""
+        residual, error = self._balance(start, jnp.array(1.0))
+        fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(self.theta))
+        inverted = ~(jnp.min(volume_ratio(self.system.scene, start)) > 0.0)
+        solved = ~inverted & (error <= self.options.tolerance)
+        status = jnp.where(solved, Status.CONVERGED, Status.RUNNING)
+        u = jnp.where(fine & ~inverted, start, 0.0)
+        return NewtonState(
+            u=u,
+            volumes=consistent(self.system.scene, u, self.theta) if self.system.mixed else None,
+            level=jnp.array(1.0),
+            u_reached=jnp.zeros_like(u),
+            reached=jnp.array(0.0),
+            increment=jnp.array(1.0),
+            at_level=jnp.array(0),
+            iterations=jnp.array(0),
+            factorisations=jnp.array(0),
+            residual=residual,
+            error=jnp.where(fine, error, jnp.inf),
+            tangent=jnp.zeros(len(self.system.pattern.rows)),
+            refresh=jnp.array(True),
+            crushed=jnp.array(False),
+            singular=jnp.array(False),
+            squeezed=jnp.array(0),
+            status=jnp.asarray(jnp.where(fine, status, Status.INVALID_INPUT), dtype=jnp.int64),
+        )
 
+    def step(self, state: NewtonState) -> NewtonState:
+        """One iteration."""
+        residual, error = jax.lax.cond(
+            state.at_level == 0,
+            lambda: self._balance(state.u, state.level),
+            lambda: (state.residual, state.error),
+        )
+        state = state._replace(residual=residual, error=error)
+        tangent, direction, condensed = self._direction(state)
+        quick = self._full_step(state, direction)
+        # A kept tangent is worth a full step or nothing: its direction is not searched along.
+        outcome = jax.lax.cond(
+            (quick.fraction > 0.0) | ~state.refresh,
+            lambda: quick,
+            lambda: self._searched_step(state, direction, tangent, condensed),
+        )
+        state = state._replace(singular=direction.singular)
+        after = self._next_level(state, outcome, tangent)
+        if state.volumes is None or condensed is None:
+            return after
+        return after._replace(volumes=self._volumes(state, outcome, direction, condensed, after))
 
-def _size(field: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.sum(field**2))
+    def _balance(self, u: jax.Array, level: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Residual (f,) and its relative size, infinite unless finite and the supports are met."""
+        residual, error = balance(self.system, u, self.theta, level, self.options.absolute)
+        placed = jnp.all(self._offset(u, level) == 0.0)
+        return residual, jnp.where(placed & jnp.isfinite(error), error, jnp.inf)
 
+    def _offset(self, u: jax.Array, level: jax.Array) -> jax.Array:
+        """How far the held displacements are from where the level wants them, (n, 3) mm."""
+        scene = self.system.scene
+        wanted = level * scene.held_displacement
+        # Fused multiply-add would find the last bit of the product missing in the difference.
+        return jnp.where(scene.held & (u != wanted), wanted - u, 0.0)
 
-def _acceptance(
-    system: System, options: NewtonOptions, state: _State, theta: jax.Array, step: _Step
-) -> Callable[[jax.Array], jax.Array]:
-    """Whether a fraction of the step makes progress."""
-    if step.condensed is not None:
-        return _natural(system, options, state, theta, step)
-    return _lowering(system, state, theta, step)
+    def _direction(self, state: NewtonState) -> tuple[jax.Array, Direction, Condensed | None]:
+        """Newton's step, turned round where it would climb the potential, and its tangent."""
+        system, u, level, theta = self.system, state.u, state.level, self.theta
+        offset = self._offset(u, level)
+        # See the module's docstring: loads that nothing balances yet lend no stiffness.
+        stiffening = jnp.where(state.error > _UNBALANCED, 0.0, level)
+        residual, condensed = state.residual, None
+        if state.volumes is None:
+            tangent = jax.lax.cond(
+                state.refresh,
+                lambda: system.tangent(u, theta, stiffening),
+                lambda: state.tangent,
+            )
+            # K times the held displacement, without assembling the held columns.
+            _, pull = jax.jvp(lambda v: system.residual(v, theta, stiffening), (u,), (offset,))
+        else:
+            condensed = linearise(system.scene, u, state.volumes, theta)
+            residual, pull = system.mixed_residual(u, theta, level, condensed, offset)
+            tangent = system.assemble(condensed.tangent, u, theta, level)
+        solvable = system.pattern.solvable(tangent)
+        tangent = system.pattern.safe_values(tangent)
+        move = system.solve(tangent, -(residual + pull))
+        slope = jnp.vdot(residual, move)
+        settled = jnp.all(offset == 0.0)
+        if condensed is None:
+            move = jnp.where(settled & (slope > 0.0), -move, move)
+        move = system.extend(move) + offset
+        direction = Direction(
+            move=jnp.where(solvable, move, jnp.nan),
+            residual=residual,
+            pull=pull,
+            slope=slope,
+            settled=settled,
+            singular=~solvable | self._endless(tangent, move, residual + pull),
+        )
+        return tangent, direction, condensed
 
+    def _endless(self, tangent: jax.Array, move: jax.Array, force: jax.Array) -> jax.Array:
+        """Whether a step is so long for its force that the tangent must be singular."""
+        size = jnp.max(jnp.abs(tangent)) * jnp.max(jnp.abs(move))
+        return ~(size <= _ENDLESS * jnp.max(jnp.abs(force)))
 
-def _natural(
-    system: System, options: NewtonOptions, state: _State, theta: jax.Array, step: _Step
-) -> Callable[[jax.Array], jax.Array]:
-    """Natural monotonicity, for mean dilatation."""
-    volumes, condensed = state.volumes, step.condensed
-    assert volumes is not None
-    assert condensed is not None
+    def _full_step(self, state: NewtonState, direction: Direction) -> _Outcome:
+        """The whole step where the residual alone can tell that it is good."""
+        near = direction.settled & (state.error < _NEAR) & (not self.system.mixed)
+        trial = state.u + direction.move
+        residual, error = self._balance(trial, state.level)
+        J, now = (jnp.min(volume_ratio(self.system.scene, u)) for u in (trial, state.u))
+        good = near & (error <= 0.5 * state.error) & (self.options.shrink * now < J)
+        return _Outcome(
+            u=jnp.where(good, trial, state.u),
+            residual=jnp.where(good, residual, state.residual),
+            error=jnp.where(good, error, state.error),
+            fraction=jnp.where(good, 1.0, 0.0),
+            crushed=jnp.array(False),
+        )
 
-    def approaches(fraction: jax.Array) -> jax.Array:
-        after = advance(system.scene, volumes, condensed, step.move, fraction)
-        u = state.u + fraction * step.move
-        elements = carried(system.scene, u, after, theta, condensed)
-        left = system.spread(elements) + system.others(u, theta, state.level)
-        rest = -(system.restrict(left) + (1.0 - fraction) * step.pull)
-        rest = system.extend(system.solve(step.values, rest))
-        rest = rest + (1.0 - fraction) * jnp.where(system.scene.held, step.move, 0.0)
-        nearer = _size(rest) <= (1.0 - 0.25 * fraction) * _size(step.move)
-        # Where round-off is all that is left, it cannot be told from progress.
-        return nearer | ((state.at_level > 0) & (state.error <= options.round_off))
+    def _searched_step(
+        self,
+        state: NewtonState,
+        direction: Direction,
+        tangent: jax.Array,
+        condensed: Condensed | None,
+    ) -> _Outcome:
+        """The part of the step that makes most progress."""
+        system, u, level, theta = self.system, state.u, state.level, self.theta
+        nearer = None
+        if state.volumes is not None and condensed is not None:
+            natural = natural_monotonicity(
+                system, u, state.volumes, level, theta, condensed, tangent, direction
+            )
+            # Where round-off is all that is left, it cannot be told from progress.
+            drowned = state.error <= self.options.round_off
+            nearer = lambda fraction: drowned | natural(fraction)  # noqa: E731
+        fraction, crushed = choose_fraction(
+            system, u, level, theta, direction, self.options.shrink, nearer
+        )
+        u = jnp.where(fraction > 0.0, state.u + fraction * direction.move, state.u)
+        # After a full step the supports are met; setting them avoids the last bit of round-off.
+        scene = self.system.scene
+        u = jnp.where(scene.held & (fraction == 1.0), state.level * scene.held_displacement, u)
+        residual, error = self._balance(u, state.level)
+        return _Outcome(u, residual, error, fraction, crushed)
 
-    return approaches
+    def _volumes(
+        self,
+        state: NewtonState,
+        outcome: _Outcome,
+        direction: Direction,
+        condensed: Condensed,
+        after: NewtonState,
+    ) -> Volumes:
+        """Volumes after the step; those of the last solution where the level has changed."""
+        assert state.volumes is not None
+        move = jnp.where(outcome.fraction > 0.0, direction.move, 0.0)
+        scene = self.system.scene
+        moved = advance(scene, state.volumes, condensed, move, outcome.fraction)
+        own = consistent(scene, after.u, self.theta)
+        kept = after.level == state.level
+        return jax.tree.map(lambda a, b: jnp.where(kept, a, b), moved, own)
 
-
-def _lowering(
-    system: System, state: _State, theta: jax.Array, step: _Step
-) -> Callable[[jax.Array], jax.Array]:
-    """Armijo's rule on the potential energy."""
-    follower = system.follower_force(state.u, theta)
-    energy, size = system.potential(state.u, theta, state.level, follower)
-    # Near the solution the decrease drowns in the round-off of the energy's parts.
-    ceiling = energy + _ROUND_OFF * size
-    descent = jnp.where(step.settled, -_ARMIJO * jnp.abs(step.slope), jnp.inf)
-
-    def lowers(fraction: jax.Array) -> jax.Array:
-        trial = state.u + fraction * step.move
-        after, _ = system.potential(trial, theta, state.level, follower)
-        lower = after <= ceiling + fraction * descent
-        if system.forces:
-            left = system.residual(trial, theta, state.level)
-            lower |= jnp.sum(left**2) < (1.0 - _ARMIJO * fraction) * jnp.sum(step.residual**2)
-        return lower
-
-    return lowers
-
-
-def _guard(
-    system: System, state: _State, step: _Step, shrink: float
-) -> Callable[[jax.Array], jax.Array]:
-    """Whether a fraction of the step leaves too little of an element's volume."""
-    floor = shrink * jnp.min(volume_ratio(system.scene, state.u))
-
-    def crushes(fraction: jax.Array) -> jax.Array:
-        J = volume_ratio(system.scene, state.u + fraction * step.move)
-        fits = jnp.min(J) > floor  # written so that NaN does not fit
-        if state.volumes is not None and step.condensed is not None:
-            after = advance(system.scene, state.volumes, step.condensed, step.move, fraction)
-            fits &= jnp.min(after.change) > -1.0
-        return ~fits
-
-    return crushes
-
-
-_Search = tuple[jax.Array, jax.Array, jax.Array]
-
-
-def _largest_fraction(
-    crushes: Callable[[jax.Array], jax.Array],
-    accepts: Callable[[jax.Array], jax.Array],
-    least: float,
-) -> tuple[jax.Array, jax.Array]:
-    """Most of a step that will do, among 1, 1/2, 1/4, ... down to ``least``; 0 where none will.
-
-    And whether elements were what forbade more of it.
-    """
-
-    def judged(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-        crush = crushes(fraction)
-        return crush | ~accepts(fraction), crush
-
-    def unfinished(search: _Search) -> jax.Array:
-        fraction, unfit, _ = search
-        return (fraction > least) & unfit
-
-    def halved(search: _Search) -> _Search:
-        fraction, _, before = search
-        unfit, crush = judged(0.5 * fraction)
-        return 0.5 * fraction, unfit, jnp.where(unfit, crush, before)
-
-    unfit, crush = judged(jnp.array(1.0))
-    search = (jnp.array(1.0), unfit, crush)
-    fraction, unfit, crushed = jax.lax.while_loop(unfinished, halved, search)
-    return jnp.where(unfit, 0.0, fraction), crushed
-
-
-def _next_level(
-    options: NewtonOptions,
-    state: _State,
-    u: jax.Array,
-    admissible: jax.Array,
-    error: jax.Array,
-) -> _State:
-    """Stay, move on to a higher load level, or fall back to a lower one."""
-    iterations, at_level = state.iterations + 1, state.at_level + 1
-    stalled = (error <= options.round_off) & (error > 0.3 * state.error) & (at_level > 1)
-    solved = (error <= options.tolerance) | stalled
-    complete = solved & (state.level >= 1.0)
-    # Short steps one after the other lead nowhere, or slowly: a smaller load gets there sooner.
-    halved = 0.5 * (state.level - state.reached)
-    hopeless = (state.crawled >= _CRAWLS) & (halved >= options.min_increment)
-    failed = ~solved & (~admissible | hopeless | (at_level >= options.level_iterations))
-    # Easy levels earn a longer next step, failures a shorter one.
-    increment = jnp.where(solved & (at_level <= 8), 2.0 * state.increment, state.increment)
-    increment = jnp.where(failed, halved, increment)
-    reached = jnp.where(solved, state.level, state.reached)
-    u_reached = jnp.where(solved, u, state.u_reached)
-    status = jnp.where(
-        complete,
-        Status.CONVERGED,
-        jnp.where(
-            failed & (increment < options.min_increment),
-            state.obstacle,
-            jnp.where(iterations >= options.max_iterations, Status.ITERATION_LIMIT, Status.RUNNING),
-        ),
-    )
-    moved = solved | failed
-    level = jnp.where(moved & ~complete, jnp.minimum(1.0, reached + increment), state.level)
-    return state._replace(
-        u=jnp.where(failed, u_reached, u),
-        level=level,
-        u_reached=u_reached,
-        reached=reached,
-        increment=increment,
-        at_level=jnp.where(moved, 0, at_level),
-        crawled=jnp.where(moved, 0, state.crawled),
-        iterations=iterations,
-        error=error,
-        status=jnp.asarray(status, dtype=state.status.dtype),
-    )
+    def _next_level(self, state: NewtonState, outcome: _Outcome, tangent: jax.Array) -> NewtonState:
+        """Stay, move on to a higher load level, or fall back to a lower one."""
+        options, error = self.options, outcome.error
+        iterations, at_level = state.iterations + 1, state.at_level + 1
+        fresh, stuck = state.refresh, state.refresh & ~(outcome.fraction > 0.0)
+        spent = at_level >= options.level_iterations
+        if self.system.mixed:
+            spent |= at_level >= _MIXED_ITERATIONS
+        slow = fresh & (error > 0.3 * state.error) & (at_level > 1)
+        solved = (error <= options.tolerance) | (slow & (error <= options.round_off))
+        complete = solved & (state.level >= 1.0)
+        halved = 0.5 * (state.level - state.reached)
+        squeezed = state.squeezed + (outcome.crushed & (outcome.fraction < 0.5))
+        # Elements flattened again and again lead nowhere: a lower load finds out sooner.
+        spent |= (squeezed >= _SQUEEZES) & (halved >= options.min_increment)
+        failed = ~solved & (stuck | spent)
+        # Easy levels earn a longer next step, failures a shorter one.
+        increment = jnp.where(solved & (at_level <= 8), 2.0 * state.increment, state.increment)
+        increment = jnp.where(failed, halved, increment)
+        reached = jnp.where(solved, state.level, state.reached)
+        u_reached = jnp.where(solved, outcome.u, state.u_reached)
+        crushed = jnp.where(failed, outcome.crushed, state.crushed)
+        limit = jnp.where(crushed, Status.INVERTED_ELEMENT, Status.LOAD_LIMIT)
+        limit = jnp.where(state.singular, Status.SINGULAR_TANGENT, limit)
+        status = jnp.where(
+            complete,
+            Status.CONVERGED,
+            jnp.where(
+                failed & (increment < options.min_increment),
+                limit,
+                jnp.where(
+                    iterations >= options.max_iterations, Status.ITERATION_LIMIT, Status.RUNNING
+                ),
+            ),
+        )
+        moved = solved | failed
+        good = (outcome.fraction == 1.0) & jnp.isfinite(error)
+        good &= error <= _KEEP_TANGENT * state.error
+        return state._replace(
+            u=jnp.where(failed, u_reached, outcome.u),
+            level=jnp.where(moved & ~complete, jnp.minimum(1.0, reached + increment), state.level),
+            u_reached=u_reached,
+            reached=reached,
+            increment=increment,
+            at_level=jnp.where(moved, 0, at_level),
+            iterations=iterations,
+            factorisations=state.factorisations + state.refresh,
+            residual=outcome.residual,
+            error=error,
+            tangent=tangent,
+            refresh=~good | moved | self.system.mixed,
+            crushed=crushed,
+            squeezed=jnp.where(moved, 0, squeezed),
+            status=jnp.asarray(status, dtype=state.status.dtype),
+        )

@@ -10,14 +10,17 @@ gives forward derivatives by one more solve with the tangent, and reverse ones b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
 from emulator.errors import InputError
 from emulator.fem.assembly import System
+from emulator.fem.driver import Driver
 from emulator.fem.newton import NewtonOptions, newton
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import Factorisation, quiet_blas
@@ -32,13 +35,14 @@ class Simulator:
     ----------
     scene : what to simulate.
     options : controls of Newton's method.
-    factorisation : ``umfpack`` (any tangent) or ``cholmod`` (faster; raises where the tangent is
-        indefinite, as it often is on the way from rest).
+    factorisation : ``umfpack`` (any tangent), ``cholmod`` (faster; raises where the tangent is
+        indefinite, as it often is on the way from rest), or ``auto``: CHOLMOD where it works and
+        UMFPACK where it does not, which under ``jit``, ``vmap`` and ``grad`` means UMFPACK.
     """
 
     scene: Scene
     options: NewtonOptions = field(default_factory=NewtonOptions)
-    factorisation: Factorisation = "umfpack"
+    factorisation: Factorisation | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
         quiet_blas()
@@ -46,7 +50,11 @@ class Simulator:
     @cached_property
     def system(self) -> System:
         """Residual and tangent of the scene."""
-        return System(self.scene, self.factorisation)
+        return System(self.scene, "umfpack" if self.factorisation == "auto" else self.factorisation)
+
+    @cached_property
+    def _driver(self) -> Driver:
+        return Driver(System(self.scene, "cholmod"), self.system, self.options)
 
     @property
     def rest(self) -> jax.Array:
@@ -66,7 +74,7 @@ class Simulator:
         """
         theta, start = self._checked(theta, self.rest if start is None else start)
         try:
-            solution = self._solve(theta, jax.lax.stop_gradient(start))
+            solution = self._solver(theta, start)(theta, jax.lax.stop_gradient(start))
             if not isinstance(solution.status, jax.core.Tracer):
                 jax.block_until_ready(solution)
         except jax.errors.JaxRuntimeError as error:
@@ -74,6 +82,13 @@ class Simulator:
                 raise
             return self._singular()
         return solution
+
+    def _solver(self, *arguments: jax.Array) -> Callable[[jax.Array, jax.Array], Solution]:
+        """The driver where Python sees the numbers and CHOLMOD could work, else the closed loop."""
+        traced = any(isinstance(argument, jax.core.Tracer) for argument in arguments)
+        if self.factorisation != "auto" or traced or self.system.forces:
+            return self._solve
+        return self._driver.solve
 
     def _checked(self, theta: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Both in float64. A theta of the wrong length would be read past its end, silently."""
@@ -94,6 +109,7 @@ class Simulator:
             displacement=self.rest,
             status=jnp.asarray(Status.SINGULAR_TANGENT, dtype=jnp.int64),
             iterations=jnp.asarray(0),
+            factorisations=jnp.asarray(0),
             residual=jnp.asarray(jnp.inf),
             load_reached=jnp.asarray(0.0),
         )
@@ -115,9 +131,10 @@ class Simulator:
         thetas, starts = jnp.asarray(thetas, dtype=float), jnp.asarray(starts, dtype=float)
         if len(thetas) != len(starts):
             raise InputError(f"campaign: {len(thetas)} theta, but {len(starts)} starts")
-        if len(thetas):
-            self._checked(thetas[0], starts[0])
-        return self._campaign(thetas, starts)
+        if isinstance(thetas, jax.core.Tracer) or isinstance(starts, jax.core.Tracer):
+            return jax.lax.map(lambda each: self._solve(*each), (thetas, starts))
+        solutions = [self.solve(*each) for each in zip(thetas, starts, strict=True)]
+        return jax.tree.map(lambda *fields: jnp.stack(fields), *solutions)
 
     @cached_property
     def _solve(self):  # noqa: ANN202 - a jitted closure, private
@@ -131,12 +148,6 @@ class Simulator:
             return solution, _inert(solution)._replace(displacement=moved)
 
         return jax.jit(equilibrium)
-
-    @cached_property
-    def _campaign(self):  # noqa: ANN202
-        return jax.jit(
-            lambda thetas, starts: jax.lax.map(lambda x: self._solve(*x), (thetas, starts))
-        )
 
 
 def displacement_derivative(

@@ -34,7 +34,7 @@ _TEXT = {
     Status.LOAD_LIMIT: "load limit reached: no equilibrium found at the full load",
     Status.INVALID_INPUT: "theta or the starting displacement is not finite",
     Status.SINGULAR_TANGENT: "singular tangent: stiffness vanishes or the supports are too few",
-    Status.INVERTED_ELEMENT: "inverted element: every way to the full load turns one inside out",
+    Status.INVERTED_ELEMENT: "an element would invert: no admissible state found at the full load",
     Status.RUNNING: "still running",
 }
 
@@ -45,6 +45,7 @@ class Solution(NamedTuple):
     displacement : (n, 3) mm; when not converged, that of the largest load that was.
     status : a :class:`Status` as an integer.
     iterations : Newton iterations over all load levels.
+    factorisations : tangents factorised on the way; the other iterations kept the last one.
     residual : force out of balance relative to the forces at work.
     load_reached : largest fraction of the load with a converged solution.
     """
@@ -52,6 +53,7 @@ class Solution(NamedTuple):
     displacement: jax.Array
     status: jax.Array
     iterations: jax.Array
+    factorisations: jax.Array
     residual: jax.Array
     load_reached: jax.Array
 

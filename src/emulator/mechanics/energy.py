@@ -53,17 +53,18 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
-    """``W(H, fibre)`` in kPa for one displacement gradient (3, 3) at parameters ``theta`` (p,)."""
+    """``W(H, directions)`` in kPa of one displacement gradient (3, 3), at ``theta`` (p,)."""
     values = scene.resolve(theta)
     arguments = [values[name] for name in scene.law.parameters]
-    return lambda H, fibre=None: scene.law.energy(Strain(H, barriers, fibre), *arguments)
+    return lambda H, directions=None: scene.law.energy(Strain(H, barriers, directions), *arguments)
 
 
 def at_points(scene: Scene, function: Callable, H: jax.Array) -> jax.Array:
-    """``function(H)`` at every point of ``H`` (m, q, 3, 3), with the fibre if the scene has one."""
-    if scene.fibres is None:
+    """``function(H)`` at every point of ``H`` (m, q, 3, 3), with its directions if it has any."""
+    directions = scene.directions
+    if directions is None:
         return jax.vmap(jax.vmap(function))(H)
-    return jax.vmap(jax.vmap(function, (0, None)))(H, jnp.asarray(scene.fibres))
+    return jax.vmap(jax.vmap(function, (0, None)))(H, jnp.asarray(directions))
 
 
 def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -> jax.Array:
@@ -90,10 +91,10 @@ def with_mean_dilatation(
 
 
 def at_volume(scene: Scene, theta: jax.Array) -> Callable:
-    """``(change, u, gradients, weights, fibre) -> ()``: strain energy of an element, mN mm.
+    """``(change, u, gradients, weights, directions) -> ()``: strain energy of an element, mN mm.
 
     Its volume ratio less 1 is ``change`` throughout, whatever ``u`` (a, 3) in mm says;
-    ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``fibre`` (3,) or ``None``.
+    ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``directions`` as in a ``Strain``.
     """
     at_point = point_energy(scene, theta)
 
@@ -102,10 +103,10 @@ def at_volume(scene: Scene, theta: jax.Array) -> Callable:
         u: jax.Array,
         gradients: jax.Array,
         weights: jax.Array,
-        fibre: jax.Array | None,
+        directions: jax.Array | None,
     ) -> jax.Array:
         H = with_volume_change(jnp.einsum("ai,qaj->qij", u, gradients), change)
-        return jnp.vdot(weights, jax.vmap(lambda h: at_point(h, fibre))(H))
+        return jnp.vdot(weights, jax.vmap(lambda h: at_point(h, directions))(H))
 
     return energy
 

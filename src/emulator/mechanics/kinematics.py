@@ -34,19 +34,27 @@ class Strain:
     ----------
     H : (3, 3) displacement gradient, dimensionless.
     barriers : limits on the invariants, for training only. ``None`` leaves them exact.
-    fibre_direction : (3,) unit vector in the reference body, for laws that ask for it.
+    directions : unit vectors in the reference body, for laws that ask for them: the fibre (3,), or
+        the fibre and the sheet (2, 3).
     """
 
     H: jax.Array
     barriers: Barriers | None = None
-    fibre_direction: jax.Array | None = None
+    directions: jax.Array | None = None
 
     @property
     def fibre(self) -> jax.Array:
         """The fibre direction, (3,); a scene gives one to every law that asks for it."""
-        if self.fibre_direction is None:
+        if self.directions is None:
             raise TypeError("this point has no fibre")
-        return self.fibre_direction
+        return self.directions if self.directions.ndim == 1 else self.directions[0]
+
+    @property
+    def sheet(self) -> jax.Array:
+        """The sheet direction, (3,); a scene gives one to every law that asks for it."""
+        if self.directions is None or self.directions.ndim == 1:
+            raise TypeError("this point has no sheet")
+        return self.directions[1]
 
     @property
     def J_minus_1(self) -> jax.Array:
@@ -76,16 +84,37 @@ class Strain:
     @property
     def isochoric_I4f_minus_1(self) -> jax.Array:
         """``J^(-2/3) f . C f - 1``: squared fibre stretch less 1, volume change taken out, ()."""
-        along = self.H @ self.fibre
-        change = 2.0 * jnp.vdot(self.fibre, along) + jnp.vdot(along, along)
-        power = -2.0 / 3.0 * self.ln_J
-        change = change * jnp.exp(power) + jnp.expm1(power)
-        return change if self.barriers is None else self.barriers.limit_I4f(1.0 + change) - 1.0
+        return self._isochoric_stretch(self.fibre)
+
+    @property
+    def isochoric_I4s_minus_1(self) -> jax.Array:
+        """``J^(-2/3) s . C s - 1``: the same of the sheet, shape ()."""
+        return self._isochoric_stretch(self.sheet)
+
+    @property
+    def isochoric_I8fs(self) -> jax.Array:
+        """``J^(-2/3) f . C s``: shear between fibre and sheet, shape ()."""
+        f, s = self.fibre, self.sheet
+        along_f, along_s = self.H @ f, self.H @ s
+        shear = jnp.vdot(f, along_s) + jnp.vdot(along_f, s) + jnp.vdot(along_f, along_s)
+        shear = shear * jnp.exp(-2.0 / 3.0 * self.ln_J)
+        if self.barriers is None:
+            return shear
+        # No barrier is published; that of I4f, either way.
+        limit = self.barriers.limit_I4f
+        return jnp.where(shear < 0.0, 1.0 - limit(1.0 - shear), limit(1.0 + shear) - 1.0)
 
     @property
     def green_lagrange(self) -> jax.Array:
         """``E = (C - I)/2``, shape (3, 3)."""
         return 0.5 * (self.H + self.H.T + self.H.T @ self.H)
+
+    def _isochoric_stretch(self, direction: jax.Array) -> jax.Array:
+        along = self.H @ direction
+        change = 2.0 * jnp.vdot(direction, along) + jnp.vdot(along, along)
+        power = -2.0 / 3.0 * self.ln_J
+        change = change * jnp.exp(power) + jnp.expm1(power)
+        return change if self.barriers is None else self.barriers.limit_I4f(1.0 + change) - 1.0
 
     def _limited_I1(self, change: jax.Array) -> jax.Array:
         return change if self.barriers is None else self.barriers.limit_I1(3.0 + change) - 3.0

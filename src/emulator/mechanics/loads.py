@@ -15,6 +15,7 @@ from emulator.geometry.discretisation import facet_rule
 from emulator.mechanics.facets import nodal_areas
 from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.pressure import CavityPressure, PublishedPressure
+from emulator.mechanics.quantity import Quantity
 
 if TYPE_CHECKING:
     from emulator.scenes.scene import Scene
@@ -47,8 +48,8 @@ class Gravity:
             raise InputError(f"gravity: direction is {self.direction}; give 3 numbers, not all 0")
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names this load takes from theta or the constants: none."""
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What this load takes from theta or the constants: nothing."""
         return ()
 
     def describe(self) -> list[object]:
@@ -89,8 +90,8 @@ class Traction:
             )
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names this load takes from theta or the constants: none."""
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What this load takes from theta or the constants: nothing."""
         return ()
 
     def describe(self) -> list[object]:

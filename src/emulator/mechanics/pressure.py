@@ -6,8 +6,9 @@ Exact for a cavity closed at a rim that does not move: the pressure does work on
           V = -\frac{1}{3} \int x \cdot n \, da + \text{lid}
 
 for facets whose normals point out of the tissue, into the cavity. The lid is fixed and drops out.
-Elsewhere a pressure that follows the surface has no potential: see
-:mod:`emulator.mechanics.follower`.
+A rim that slides in a plane of symmetry through the origin will do as well: the cone over the
+opening, from the origin, then has no volume. Elsewhere a pressure that follows the surface has no
+potential: see :mod:`emulator.mechanics.follower`.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from emulator.errors import InputError
 from emulator.mechanics.facets import cone_volume, rim
 from emulator.mechanics.kinematics import cofactor
 from emulator.mechanics.local import LocalTerm, Values
+from emulator.mechanics.quantity import Quantity
 
 if TYPE_CHECKING:
     from emulator.scenes.scene import Scene
@@ -39,28 +41,33 @@ class SurfacePressure:
     Parameters
     ----------
     facet_set : where it acts.
-    pressure : kPa, or ``None`` to make ``pressure`` a parameter of the scene.
+    pressure : kPa, or ``None`` to make it a parameter of the scene.
+    parameter : name of that parameter; give each of several pressures its own.
     """
 
     facet_set: str
     pressure: float | None = None
+    parameter: str = "pressure"
 
     def __post_init__(self) -> None:
         if self.pressure is not None and not np.isfinite(self.pressure):
             raise InputError(f"pressure on '{self.facet_set}' is {self.pressure} kPa")
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names this load takes from theta or the constants."""
-        return () if self.pressure is not None else ("pressure",)
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What this load takes from theta or the constants; suction is negative."""
+        if self.pressure is not None:
+            return ()
+        return (Quantity(self.parameter, "kPa", -np.inf, hint=f"1 mmHg = {KPA_PER_MMHG} kPa"),)
 
     def describe(self) -> list[object]:
         """What tells this load from another."""
-        return [type(self).__name__, self.facet_set, self.pressure]
+        named = [] if self.parameter == "pressure" else [self.parameter]
+        return [type(self).__name__, self.facet_set, self.pressure, *named]
 
     def value(self, values: Values) -> jax.Array | float:
         """The pressure in kPa among the scene's resolved parameters."""
-        return values["pressure"] if self.pressure is None else self.pressure
+        return values[self.parameter] if self.pressure is None else self.pressure
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,6 @@ class CavityPressure(PotentialPressure):
     def term(self, scene: Scene) -> LocalTerm:
         """The potential ``-p [V(u) - V(0)]``."""
         facets = scene.mesh.facet_set(self.facet_set)
-        _require_held_rim(scene, self.facet_set, facets)
         X = scene.mesh.nodes[facets]
 
         def energy(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
@@ -122,8 +128,13 @@ class PublishedPressure(PotentialPressure):
         return LocalTerm(nodes, data, energy)
 
 
-def _require_held_rim(scene: Scene, name: str, facets: np.ndarray) -> None:
-    loose = np.setdiff1d(rim(facets), np.flatnonzero(scene.held.all(axis=1)))
+def require_held_rim(scene: Scene, name: str) -> None:
+    """Refuse the cavity ``name`` unless its rim is held or slides in a plane through the origin."""
+    edges = rim(scene.mesh.facet_set(name))
+    held = scene.held[edges]  # (e, 2 or 3, 3)
+    there = np.where(held, scene.mesh.nodes[edges] + scene.held_displacement[edges], np.nan)
+    in_symmetry_plane = (np.abs(there) <= 1e-9 * scene.mesh.size).all(axis=1).any(axis=1)
+    loose = np.unique(edges[~(held.all(axis=(1, 2)) | in_symmetry_plane)])
     if loose.size:
         raise InputError(
             f"cavity '{name}': rim node {loose[0]} ({loose.size} such) is not held, so -p V is not "

@@ -1,10 +1,15 @@
 """Scenes: what can be simulated, emulated and calibrated."""
 
 from emulator.scenes.beams import once_clamped_beam, twice_clamped_beam
+from emulator.scenes.biventricle import biventricle
+from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.left_ventricle_neo_hookean import left_ventricle_neo_hookean
+from emulator.scenes.liver import liver
 from emulator.scenes.parameters import Parameter
 from emulator.scenes.registry import BUILT_IN, find_scene, scene_from_recipe
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
+from emulator.scenes.traction_beams import traction_beam_guccione, traction_beam_holzapfel_ogden
 from emulator.scenes.twisting_cube import twisting_cube
 
 __all__ = [
@@ -12,9 +17,15 @@ __all__ = [
     "Parameter",
     "Scene",
     "Support",
+    "biventricle",
     "find_scene",
+    "left_ventricle",
+    "left_ventricle_neo_hookean",
+    "liver",
     "once_clamped_beam",
     "scene_from_recipe",
+    "traction_beam_guccione",
+    "traction_beam_holzapfel_ogden",
     "twice_clamped_beam",
     "twisting_cube",
 ]

@@ -8,13 +8,29 @@ from typing import Any
 
 from emulator.errors import InputError
 from emulator.scenes.beams import once_clamped_beam, twice_clamped_beam
+from emulator.scenes.biventricle import biventricle
 from emulator.scenes.file import read_scene
+from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.left_ventricle_neo_hookean import left_ventricle_neo_hookean
+from emulator.scenes.liver import liver
 from emulator.scenes.published import published_scene
 from emulator.scenes.scene import Scene
+from emulator.scenes.traction_beams import traction_beam_guccione, traction_beam_holzapfel_ogden
 from emulator.scenes.twisting_cube import twisting_cube
 
 BUILT_IN: dict[str, Callable[..., Scene]] = {
-    scene.__name__: scene for scene in (once_clamped_beam, twice_clamped_beam, twisting_cube)
+    scene.__name__: scene
+    for scene in (
+        once_clamped_beam,
+        twice_clamped_beam,
+        traction_beam_holzapfel_ogden,
+        traction_beam_guccione,
+        twisting_cube,
+        liver,
+        left_ventricle,
+        left_ventricle_neo_hookean,
+        biventricle,
+    )
 }
 
 

@@ -19,7 +19,9 @@ from emulator.geometry.discretisation import Discretisation, discretise
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.elastic_support import ElasticSupport
 from emulator.mechanics.laws import Law
-from emulator.mechanics.loads import Load
+from emulator.mechanics.loads import Gravity, Load
+from emulator.mechanics.pressure import CavityPressure, require_held_rim
+from emulator.mechanics.quantity import Quantity
 from emulator.scenes.parameters import Parameter
 from emulator.scenes.supports import Support, free_motions, prescribe
 
@@ -43,6 +45,8 @@ class Scene:
     recipe : how a built-in scene was made, so that a file can make it again.
     dilatation : ``pointwise``, or ``mean`` to take the volume change of each element as one, which
         keeps quadratic elements from locking when the material is nearly incompressible.
+    sheets : (m, 3) unit sheet direction of each element, across its fibre, for laws that ask for
+        it.
     """
 
     name: str
@@ -55,52 +59,70 @@ class Scene:
     fibres: np.ndarray | None = None
     recipe: Mapping[str, Any] = field(default_factory=dict)
     dilatation: Literal["pointwise", "mean"] = "pointwise"
+    sheets: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "recipe", MappingProxyType(dict(self.recipe)))
         self._check_names()
-        self._check_fibres()
+        self._check_quantities()
+        self._check_directions()
         self._check_dilatation()
         if not self.parameters:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
-        for name, value in self.constants.items():
-            if not np.isfinite(value):
-                raise InputError(f"scene '{self.name}': constant '{name}' is {value}")
         self._check_supports()
+        self._check_loads()
 
     def _check_names(self) -> None:
-        given = list(self.parameter_names) + list(self.constants)
-        known = self.known_names
+        given = [*self.parameter_names, *self.constants]
+        takers = self._takers
         for name in given:
-            if name not in known:
+            if name not in takers:
                 raise InputError(
                     f"scene '{self.name}': parameter '{name}' is not one of law "
-                    f"'{self.law.name}' and its loads: {', '.join(known)}"
+                    f"'{self.law.name}' and its loads: {', '.join(takers)}"
                 )
             if given.count(name) > 1:
                 raise InputError(f"scene '{self.name}': parameter '{name}' is given twice")
-        for name in known:
+        for name, (_, owner) in takers.items():
             if name not in given:
-                owner = f"law '{self.law.name}'" if name in self.law.parameters else "a load"
                 raise InputError(f"scene '{self.name}': {owner} needs '{name}'")
 
-    def _check_fibres(self) -> None:
-        if self.fibres is None:
-            if self.law.fibres:
-                raise InputError(f"scene '{self.name}': law '{self.law.name}' needs fibres")
-            return
-        if not self.law.fibres:
-            raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no fibres")
-        fibres = frozen_array(self.fibres)
-        object.__setattr__(self, "fibres", fibres)
-        if fibres.shape != (len(self.mesh.elements), 3):
-            raise InputError(
-                f"scene '{self.name}': fibres have shape {fibres.shape}; "
-                f"expected ({len(self.mesh.elements)}, 3)"
-            )
-        if not np.allclose(np.linalg.norm(fibres, axis=1), 1.0, atol=1e-6):
-            raise InputError(f"scene '{self.name}': fibres are not unit vectors")
+    def _check_quantities(self) -> None:
+        """Units and values of parameters and constants against what law and loads take."""
+        faults = [self._takers[name][0].value_fault(v) for name, v in self.constants.items()]
+        for parameter in self.parameters:
+            quantity, owner = self._takers[parameter.name]
+            faults.append(quantity.unit_fault(parameter.unit, owner))
+            faults.append(quantity.range_fault(parameter.low, parameter.high))
+        for fault in faults:
+            if fault:
+                raise InputError(f"scene '{self.name}': {fault}")
+
+    def _check_directions(self) -> None:
+        for kind, asked in (("fibres", self.law.fibres), ("sheets", self.law.sheets)):
+            given = getattr(self, kind)
+            if given is None:
+                if asked:
+                    raise InputError(f"scene '{self.name}': law '{self.law.name}' needs {kind}")
+                continue
+            if not asked:
+                raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no {kind}")
+            vectors = frozen_array(given)
+            object.__setattr__(self, kind, vectors)
+            if vectors.shape != (len(self.mesh.elements), 3):
+                raise InputError(
+                    f"scene '{self.name}': {kind} have shape {vectors.shape}; "
+                    f"expected ({len(self.mesh.elements)}, 3)"
+                )
+            if not np.allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-6):
+                raise InputError(f"scene '{self.name}': {kind} are not unit vectors")
+        if self.fibres is not None and self.sheets is not None:
+            along = np.abs(np.einsum("mi,mi->m", self.fibres, self.sheets)).max()
+            if not along < 1e-6:
+                raise InputError(
+                    f"scene '{self.name}': sheets are not across the fibres (cosine {along:.2g})"
+                )
 
     def _check_dilatation(self) -> None:
         if self.dilatation not in ("pointwise", "mean"):
@@ -127,13 +149,21 @@ class Scene:
                 "the body could move or turn; hold more nodes or components"
             )
 
-    @property
-    def known_names(self) -> tuple[str, ...]:
-        """Every parameter the law and the loads take."""
-        names = list(self.law.parameters)
+    def _check_loads(self) -> None:
         for load in self.loads:
-            names += [name for name in load.parameters if name not in names]
-        return tuple(names)
+            if not isinstance(load, Gravity):
+                self.mesh.facet_set(load.facet_set)
+            if isinstance(load, CavityPressure):
+                require_held_rim(self, load.facet_set)
+
+    @property
+    def _takers(self) -> dict[str, tuple[Quantity, str]]:
+        """Every parameter the law and the loads take, by name, with who takes it."""
+        takers = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
+        for load in self.loads:
+            for quantity in load.quantities:
+                takers.setdefault(quantity.name, (quantity, f"load {type(load).__name__}"))
+        return takers
 
     # ---- parameters -------------------------------------------------------------------------
     @property
@@ -207,6 +237,13 @@ class Scene:
         """Shape functions and quadrature of the mesh."""
         return discretise(self.mesh)
 
+    @cached_property
+    def directions(self) -> np.ndarray | None:
+        """What a law may know of each element: fibre (m, 3), or fibre and sheet (m, 2, 3)."""
+        if self.fibres is None or self.sheets is None:
+            return self.fibres
+        return frozen_array(np.stack([self.fibres, self.sheets], axis=1))
+
     @property
     def elastic_supports(self) -> tuple[ElasticSupport, ...]:
         """Those of the supports that are springs."""
@@ -239,6 +276,8 @@ class Scene:
         digest.update((np.round(self.held_displacement, 9) + 0.0).tobytes())
         if self.fibres is not None:
             digest.update((np.round(self.fibres, 6) + 0.0).tobytes())
+        if self.sheets is not None:
+            digest.update((np.round(self.sheets, 6) + 0.0).tobytes())
         surfaces = {getattr(part, "facet_set", "") for part in (*self.loads, *self.supports)}
         for name in sorted(surfaces - {""}):
             digest.update(np.sort(np.sort(self.mesh.facet_set(name), axis=1), axis=0).tobytes())

@@ -82,6 +82,63 @@ def test_simulate(capsys, block, tmp_path):
     assert 1.3 < result["max_displacement"] / soft["max_displacement"] < 2.2
 
 
+def test_simulate_under_a_pressure_without_a_potential(capsys, block):
+    push = 'kind = "follower_pressure"\nfacet_set = "end"\npressure = 0.1\n'
+    plane = '[facet_sets.end]\naxis = "x"\nat = 20.0\n'
+    text = SCENE.replace("[constants]", f"{plane}[[loads]]\n{push}[constants]")
+    block.write_text(text)
+    code, result = answer(capsys, "simulate", block)
+    assert code == 0
+    assert result["energy"] is None
+    assert result["max_displacement"] > 0.0
+    block.write_text(text.replace("follower", "cavity"))
+    said = complaint(capsys, "simulate", block)
+    assert "cavity 'end': rim node" in said
+    assert "FollowerPressure" in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('unit = "kPa"', 'unit = "mmHg"', "parameter 'mu' is in mmHg; law 'neo_hookean' takes kPa"),
+        ("lam = 30.0", "lam = -30.0", "parameter 'lam' is -30 kPa; it must be above 0"),
+        ("lam = 30.0", "nu = 0.3", "parameter 'nu' is not one of law 'neo_hookean'"),
+        ('law = "neo_hookean"', 'law = "guccione"', "law 'guccione' needs fibres"),
+        ('kind = "gravity"', 'kind = "weight"', "kind = 'weight'; expected"),
+        (
+            'node_set = "left"',
+            'node_set = "left"\nglue = 1',
+            "unknown key 'glue'; known: components",
+        ),
+        (
+            "[[loads]]",
+            '[[supports]]\nnode_set = "left"\ndisplacement = [1, 0, 0]\n[[loads]]',
+            "support on 'left' contradicts another one at node",
+        ),
+    ],
+)
+def test_bad_scene_files(capsys, block, old, new, message):
+    assert old in SCENE
+    block.write_text(SCENE.replace(old, new))
+    said = complaint(capsys, "simulate", block)
+    assert "scene.toml" in said
+    assert message in said
+
+
+def test_bad_meshes_in_scene_files(capsys, block):
+    mesh = box((20.0, 10.0, 10.0), (2, 1, 1))
+    solid = ("tetra", mesh.elements)
+    brick = ("hexahedron", [[0, 1, 4, 3, 6, 7, 10, 9]])
+    meshio.write(block.parent / "block.vtu", meshio.Mesh(mesh.nodes, [solid, brick]))
+    assert "it has hexahedron cells" in complaint(capsys, "simulate", block)
+    tags = [np.zeros(len(mesh.elements), int), np.array([7])]
+    data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
+    file = meshio.Mesh(mesh.nodes, [solid, ("triangle", mesh.surface[:1])], cell_data=data)
+    meshio.write(block.parent / "block.msh", file, file_format="gmsh22", binary=False)
+    block.write_text(SCENE.replace("block.vtu", "block.msh"))
+    assert "physical group 7 (triangles) has no name" in complaint(capsys, "simulate", block)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -27,12 +27,14 @@ def test_the_laws_agree_with_the_written_out_stress(name, stretch, solve):
     state = solve(name, stretch, PARAMETERS[name])
     assert state.stretches[0] == stretch
     along_y = stretch if solve is equibiaxial else state.stretches[2]
-    assert state.stretches[1] == along_y
+    if not LAWS[name].sheets:
+        assert state.stretches[1] == along_y
     law, values = LAWS[name], map(jnp.asarray, PARAMETERS[name].values())
     arguments = tuple(values)
+    directions = jnp.eye(3)[:2] if law.sheets else jnp.eye(3)[0]
 
     def energy(H):
-        return law.energy(Strain(H, None, jnp.array([1.0, 0.0, 0.0])), *arguments)
+        return law.energy(Strain(H, None, directions), *arguments)
 
     P = jax.grad(energy)(jnp.diag(jnp.array(state.stretches) - 1.0))
     np.testing.assert_allclose(P, np.diag(state.stresses), atol=1e-11)

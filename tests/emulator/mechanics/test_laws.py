@@ -5,6 +5,7 @@ import pytest
 from scipy.optimize import brentq
 
 from emulator.errors import InputError
+from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS, find_law
 from emulator.mechanics.laws.holzapfel_ogden import (
@@ -19,16 +20,21 @@ MU, LAM = 3.0, 7.0
 ARGUMENTS = {
     "neo_hookean": (MU, LAM),
     "neo_hookean_E_nu": (8.0, 0.3),
+    "neo_hookean_split": (3.0, 40.0),
     "holzapfel_ogden": (0.3, 2.0, 3.0, 2.5, 25.0),
     "holzapfel_ogden_released": (0.15, 2.0, 1.5, 2.5, 25.0),
+    "holzapfel_ogden_orthotropic": (0.3, 2.0, 3.0, 2.5, 2.0, 1.5, 0.8, 3.0, 25.0),
     "guccione": (2.0, 8.0, 2.0, 4.0, 50.0),
 }
 FIBRE = np.array([2.0, -1.0, 2.0]) / 3.0
+SHEET = np.array([2.0, 2.0, -1.0]) / 3.0
 
 
 def energy(name, H):
-    strain = Strain(jnp.asarray(H), None, jnp.asarray(FIBRE))
-    return find_law(name).energy(strain, *map(jnp.asarray, ARGUMENTS[name]))
+    law = find_law(name)
+    directions = np.stack([FIBRE, SHEET]) if law.sheets else FIBRE
+    strain = Strain(jnp.asarray(H), None, jnp.asarray(directions))
+    return law.energy(strain, *map(jnp.asarray, ARGUMENTS[name]))
 
 
 def isochoric(F):
@@ -58,6 +64,38 @@ def test_holzapfel_ogden_equals_its_formula(stretched):
     expected = a / b * (np.exp(b * (I1 - 3)) - 1) + af / bf * (np.exp(bf * (I4 - 1) ** 2) - 1)
     released = energy("holzapfel_ogden_released", F - np.eye(3))
     assert released == pytest.approx(expected + volume, rel=1e-12)
+
+
+@pytest.mark.parametrize("stretched", [True, False])
+def test_orthotropic_holzapfel_ogden_equals_its_formula(stretched):
+    F = deformation(True) + (0.2 if stretched else -0.3) * np.outer(SHEET, SHEET)
+    J = np.linalg.det(F)
+    C = J ** (-2 / 3) * F.T @ F
+    I1, I4f, I4s, I8 = np.trace(C), FIBRE @ C @ FIBRE, SHEET @ C @ SHEET, FIBRE @ C @ SHEET
+    assert (I4s > 1) == stretched
+    assert abs(I8) > 0.01
+    a, b, a_f, b_f, a_s, b_s, a_fs, b_fs, kappa = ARGUMENTS["holzapfel_ogden_orthotropic"]
+    expected = (
+        a / (2 * b) * (np.exp(b * (I1 - 3)) - 1)
+        + a_f / (2 * b_f) * (np.exp(b_f * max(I4f - 1, 0) ** 2) - 1)
+        + a_s / (2 * b_s) * (np.exp(b_s * max(I4s - 1, 0) ** 2) - 1)
+        + a_fs / (2 * b_fs) * (np.exp(b_fs * I8**2) - 1)
+        + kappa * (J**2 - 1 - 2 * np.log(J))
+    )
+    found = energy("holzapfel_ogden_orthotropic", F - np.eye(3))
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+def test_barriers_limit_the_shear_of_fibre_and_sheet_either_way():
+    directions = jnp.asarray(np.stack([FIBRE, SHEET]))
+    shear = lambda H, limits: Strain(jnp.asarray(H), limits, directions).isochoric_I8fs
+    simple = np.outer(FIBRE, SHEET)
+    for amount in (-40.0, -0.5, 0.0, 0.5, 40.0):
+        exact, limited = (shear(amount * simple, limits) for limits in (None, Barriers()))
+        assert exact == pytest.approx(amount, abs=1e-9)
+        assert limited == pytest.approx(np.clip(amount, -8.0, 8.0), abs=1e-9)
+    slope_at_rest = jax.grad(lambda H: shear(H, Barriers()))(jnp.zeros((3, 3)))
+    np.testing.assert_allclose(slope_at_rest, simple + simple.T, atol=1e-12)
 
 
 def test_the_two_holzapfel_ogden_forms_agree_in_tension():

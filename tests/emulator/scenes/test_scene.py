@@ -6,6 +6,8 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
+from emulator.mechanics.follower import FollowerPressure
+from emulator.mechanics.laws import find_law
 from emulator.mechanics.loads import Gravity
 from emulator.scenes import BUILT_IN, Parameter, Support, find_scene, scene_from_recipe
 from scene_support import block
@@ -70,7 +72,7 @@ def one_line_held():
         ({"parameters": (), "constants": {"mu": 1.0, "lam": 1.0}}, "no parameter varies"),
         (
             {"parameters": block().parameters[:1], "constants": {"lam": np.nan}},
-            "constant 'lam' is nan",
+            "parameter 'lam' is nan kPa; it must be finite",
         ),
         (
             {"supports": (Support("left", np.array([0.0, np.nan, 0.0])),)},
@@ -87,6 +89,67 @@ def one_line_held():
 def test_scenes_that_make_no_sense(change, message):
     with pytest.raises(InputError, match=message):
         replace(block(), **change)
+
+
+MU, LAM = block().parameters
+
+
+def engineering(*nu: float) -> dict:
+    young = Parameter("E", "kPa", 1.0, 2.0)
+    return {"law": find_law("neo_hookean_E_nu"), "parameters": (young, Parameter("nu", "", *nu))}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"parameters": (Parameter("mu", "Pa", 1e3, 2e3), LAM)},
+            "parameter 'mu' is in Pa; law 'neo_hookean' takes kPa",
+        ),
+        (
+            {"parameters": (Parameter("mu", "", 1.0, 2.0), LAM)},
+            "parameter 'mu' is given no unit; law 'neo_hookean' takes kPa",
+        ),
+        (
+            {"parameters": (Parameter("mu", "kPa", -3.0, 2.0), LAM)},
+            "parameter 'mu' ranges down to -3 kPa; it must stay above 0",
+        ),
+        (
+            {"parameters": (Parameter("mu", "kPa", 0.0, 2.0), LAM)},
+            "parameter 'mu' ranges down to 0 kPa; it must stay above 0",
+        ),
+        (
+            {"parameters": (MU,), "constants": {"lam": -1.0}},
+            "parameter 'lam' is -1 kPa; it must be above 0",
+        ),
+        (engineering(0.1, 0.5), "parameter 'nu' ranges up to 0.5; it must stay below 0.5"),
+        (engineering(-1.5, 0.4), "parameter 'nu' ranges down to -1.5; it must stay above -1"),
+        (
+            {"parameters": (Parameter("E", "kPa", 1.0, 2.0),), "constants": {"nu": 0.5}},
+            "parameter 'nu' is 0.5; it must be below 0.5",
+        ),
+        (
+            {
+                "parameters": (MU, LAM, Parameter("pressure", "mmHg", 4.0, 10.0)),
+                "loads": (FollowerPressure("right"),),
+            },
+            r"parameter 'pressure' is in mmHg; load FollowerPressure takes kPa "
+            r"\(1 mmHg = 0.133322 kPa\)",
+        ),
+    ],
+)
+def test_units_and_values_that_law_or_load_cannot_take(change, message):
+    if "nu" in change.get("constants", {}):
+        change = {**change, "law": find_law("neo_hookean_E_nu")}
+    with pytest.raises(InputError, match=message) as caught:
+        replace(block(), **change)
+    assert "\n" not in str(caught.value)
+
+
+def test_suction_and_dimensionless_parameters_are_welcome():
+    suction = Parameter("pressure", "kPa", -1.0, 1.0)
+    replace(block(), parameters=(MU, LAM, suction), loads=(FollowerPressure("right"),))
+    replace(block(), **engineering(-0.5, 0.499))
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.laws.volumetric import quadratic
+from emulator.mechanics.quantity import modulus, number
 
 
 def energy(
@@ -42,4 +43,5 @@ def energy(
     return 0.5 * C * jnp.expm1(Q) + quadratic(strain, kappa)
 
 
-GUCCIONE = Law("guccione", ("C", "b_f", "b_t", "b_fs", "kappa"), energy, fibres=True)
+_PARAMETERS = (modulus("C"), number("b_f"), number("b_t"), number("b_fs"), modulus("kappa"))
+GUCCIONE = Law("guccione", _PARAMETERS, energy, fibres=True)

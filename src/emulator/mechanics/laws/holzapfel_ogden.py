@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.laws.volumetric import quadratic_logarithmic
+from emulator.mechanics.quantity import modulus, number
 
 
 def energy(
@@ -42,7 +43,7 @@ def energy_released(
     return matrix + fibres + quadratic_logarithmic(strain, kappa)
 
 
-_PARAMETERS = ("a", "b", "a_f", "b_f", "kappa")
+_PARAMETERS = (modulus("a"), number("b"), modulus("a_f"), number("b_f"), modulus("kappa"))
 HOLZAPFEL_OGDEN = Law("holzapfel_ogden", _PARAMETERS, energy, fibres=True)
 HOLZAPFEL_OGDEN_RELEASED = Law(
     "holzapfel_ogden_released", _PARAMETERS, energy_released, fibres=True

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import jax
 
+from emulator.mechanics.quantity import Quantity
+
 
 @dataclass(frozen=True)
 class Law:
@@ -15,12 +17,20 @@ class Law:
     Parameters
     ----------
     name : key in the registry.
-    parameters : names, in the order ``energy`` takes them.
+    quantities : its parameters, each with unit and admissible values, in the order ``energy``
+        takes them.
     energy : ``energy(strain, *parameters) -> W``, the strain energy density (kPa) of one point.
     fibres : whether the energy asks for ``strain.fibre``.
+    sheets : whether it asks for ``strain.sheet`` too.
     """
 
     name: str
-    parameters: tuple[str, ...]
+    quantities: tuple[Quantity, ...]
     energy: Callable[..., jax.Array]
     fibres: bool = False
+    sheets: bool = False
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters, in the order ``energy`` takes them."""
+        return tuple(quantity.name for quantity in self.quantities)

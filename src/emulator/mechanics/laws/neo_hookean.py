@@ -1,10 +1,19 @@
-r"""Compressible Neo-Hookean material.
+r"""Neo-Hookean materials.
+
+Compressible,
 
 .. math::
     W = \frac{\mu}{2}(I_1 - 3) - \mu \ln J + \frac{\lambda}{2} (\ln J)^2
 
 in the Lamé parameters (kPa), Dalton et al. (2023), Section 3.1. The engineering constants give
 :math:`\mu = E / 2(1+\nu)` and :math:`\lambda = E\nu / (1+\nu)(1-2\nu)`.
+
+Split into change of shape and of volume, for nearly incompressible materials,
+
+.. math::
+    W = \frac{\mu}{2}\left(J^{-2/3} I_1 - 3\right) + \frac{\kappa}{4}(J^2 - 1 - 2 \ln J)
+
+with the bulk modulus :math:`\kappa = 2\mu(1+\nu) / 3(1-2\nu)` in kPa.
 """
 
 from __future__ import annotations
@@ -13,6 +22,8 @@ import jax
 
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws.law import Law
+from emulator.mechanics.laws.volumetric import quadratic_logarithmic
+from emulator.mechanics.quantity import modulus, number
 
 
 def energy_lame(strain: Strain, mu: jax.Array, lam: jax.Array) -> jax.Array:
@@ -31,5 +42,18 @@ def energy_engineering(strain: Strain, E: jax.Array, nu: jax.Array) -> jax.Array
     return energy_lame(strain, *lame_from_engineering(E, nu))
 
 
-NEO_HOOKEAN = Law("neo_hookean", ("mu", "lam"), energy_lame)
-NEO_HOOKEAN_E_NU = Law("neo_hookean_E_nu", ("E", "nu"), energy_engineering)
+def energy_split(strain: Strain, mu: jax.Array, kappa: jax.Array) -> jax.Array:
+    """Strain energy density in kPa from shear modulus ``mu`` and bulk modulus ``kappa``."""
+    return 0.5 * mu * strain.isochoric_I1_minus_3 + quadratic_logarithmic(strain, 0.25 * kappa)
+
+
+def bulk_modulus(mu: float, nu: float) -> float:
+    """``kappa`` in the unit of ``mu``; Poisson's ratio ``nu`` in (-1, 1/2)."""
+    return 2.0 * mu * (1.0 + nu) / (3.0 * (1.0 - 2.0 * nu))
+
+
+NEO_HOOKEAN = Law("neo_hookean", (modulus("mu"), modulus("lam")), energy_lame)
+NEO_HOOKEAN_E_NU = Law(
+    "neo_hookean_E_nu", (modulus("E"), number("nu", -1.0, 0.5)), energy_engineering
+)
+NEO_HOOKEAN_SPLIT = Law("neo_hookean_split", (modulus("mu"), modulus("kappa")), energy_split)

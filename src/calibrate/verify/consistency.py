@@ -1,0 +1,184 @@
+"""What must hold exactly whatever the law: patches, rigid motions, closed surfaces, slopes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.verify.homogeneous import PARAMETERS
+from calibrate.verify.row import Row
+from emulator.fem import Simulator
+from emulator.geometry.generators import box
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.quadratic import to_quadratic
+from emulator.mechanics.barriers import Barriers
+from emulator.mechanics.energy import strain_energy
+from emulator.mechanics.follower import FollowerPressure
+from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.laws import find_law
+from emulator.mechanics.loads import Gravity
+from emulator.scenes import Parameter, Scene, Support
+
+_FACES = ("left", "right", "front", "back", "bottom", "top")
+_EXACT = "holds exactly; the tolerance is round-off"
+FORMS = {"P1": (1, "pointwise"), "P2": (2, "pointwise"), "P2, mean dilatation": (2, "mean")}
+
+
+def block(form: str) -> Scene:
+    """A clamped block of 2 x 3 x 4 mm, heavy enough to bend, in one of ``FORMS``."""
+    order, dilatation = FORMS[form]
+    mesh = box((2.0, 3.0, 4.0), (2, 2, 2))
+    return Scene(
+        name=f"block, {form}",
+        mesh=mesh if order == 1 else to_quadratic(mesh),
+        law=find_law("neo_hookean_split"),
+        parameters=(Parameter("mu", "kPa", 5.0, 20.0), Parameter("kappa", "kPa", 20.0, 80.0)),
+        loads=(Gravity(density=40.0, direction=(0.3, -0.2, -1.0)),),
+        supports=(Support("left"),),
+        dilatation="mean" if dilatation == "mean" else "pointwise",
+    )
+
+
+def verify_patch() -> list[Row]:
+    """An affine displacement of the surface is an affine displacement throughout."""
+    H = 0.2 * np.random.default_rng(0).normal(size=(3, 3))
+    rows = []
+    for form in FORMS:
+        scene = block(form)
+        nodes, sets = scene.mesh.nodes, scene.mesh.node_sets
+        faces = tuple(Support(face, nodes[sets[face]] @ H.T) for face in _FACES)
+        scene = replace(scene, supports=faces, loads=())
+        u = Simulator(scene)(scene.centre)
+        error = float(jnp.max(jnp.abs(u - nodes @ H.T)) / np.abs(nodes @ H.T).max())
+        rows.append(Row(f"patch test, {form}: relative error", error, 0.0, 1e-12, _EXACT))
+    return rows
+
+
+def verify_invariance() -> list[Row]:
+    """Rigid rotations cost nothing, laws do not see them, closed surfaces push nowhere."""
+    return [*_rotated_blocks(), *_rotated_points(), *_closed_surfaces()]
+
+
+def _rotation() -> np.ndarray:
+    """A proper rotation far from the identity."""
+    q, r = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def _rotated_blocks() -> list[Row]:
+    rows = []
+    for form in FORMS:
+        scene = block(form)
+        u = jnp.asarray(scene.mesh.nodes @ (_rotation() - np.eye(3)).T)
+        energy, force = jax.jit(jax.value_and_grad(strain_energy(scene)))(u, scene.centre)
+        # What the block would store, and be held by, at strains of order one.
+        mu, volume = float(scene.centre[0]), float(scene.discretisation.weights.sum())
+        name = f"rigid rotation, {form}"
+        rows.append(
+            Row(f"{name}: energy / mu V", float(energy) / (mu * volume), 0.0, 1e-12, _EXACT)
+        )
+        largest = float(jnp.max(jnp.abs(force))) / (mu * volume ** (2 / 3))
+        rows.append(Row(f"{name}: largest force / mu V^(2/3)", largest, 0.0, 1e-12, _EXACT))
+    return rows
+
+
+def _rotated_points() -> list[Row]:
+    """Frame indifference of every law."""
+    F = np.eye(3) + 0.2 * np.random.default_rng(3).normal(size=(3, 3))
+    directions = jnp.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0]]) / 3.0  # fibre, sheet
+    rows = []
+    for name, values in PARAMETERS.items():
+        law = find_law(name)
+
+        def energy(G: np.ndarray, law=law, values=values) -> float:  # noqa: ANN001
+            strain = Strain(jnp.asarray(G - np.eye(3)), None, directions)
+            return float(law.energy(strain, *map(jnp.asarray, values.values())))
+
+        change = energy(_rotation() @ F) / energy(F) - 1.0
+        rows.append(Row(f"frame indifference, {name}", change, 0.0, 1e-12, _EXACT))
+    return rows
+
+
+def _closed_surfaces() -> list[Row]:
+    """Net force of a pressure on the whole, badly deformed surface of a block."""
+    rows = []
+    for form in ("P1", "P2"):
+        scene = block(form)
+        mesh = scene.mesh
+        around = Mesh(mesh.nodes, mesh.elements, mesh.node_sets, {"all": mesh.surface})
+        forces = FollowerPressure("all", 1.0).forces(replace(scene, mesh=around))
+        u = 0.2 * np.random.default_rng(1).normal(size=mesh.nodes.shape)
+        force = np.asarray(forces.total(jnp.asarray(u), {}))
+        net = float(np.linalg.norm(force.sum(axis=0)) / np.abs(force).sum())
+        rows.append(Row(f"closed surface, {form}: net pressure force", net, 0.0, 1e-12, _EXACT))
+    return rows
+
+
+def verify_derivatives() -> list[Row]:
+    """Taylor: what is left after the first derivative falls with the square of the step."""
+    return [row for form in FORMS for row in _taylor(form)]
+
+
+def _taylor(form: str) -> list[Row]:
+    scene = block(form)
+    simulator = Simulator(scene)
+    system, theta = simulator.system, scene.centre
+    rng = np.random.default_rng(2)
+    u = simulator(theta) + system.extend(jnp.asarray(0.02 * rng.normal(size=len(system.free))))
+    v = system.extend(jnp.asarray(rng.normal(size=len(system.free))))
+    energy = jax.jit(lambda w: system.potential(w, theta)[0])
+    residual = jax.jit(lambda w: system.residual(w, theta))
+    K = np.zeros((system.pattern.size,) * 2)
+    K[system.pattern.rows, system.pattern.columns] = np.asarray(system.tangent(u, theta))
+    along = jnp.asarray(K @ np.asarray(system.restrict(v)))
+    work = jnp.vdot(residual(u), system.restrict(v))
+    direction = jnp.array([1.0, -2.0])
+    moved = jax.jit(lambda t: simulator.solve(t).displacement)
+    solution, slope = jax.jvp(moved, (theta,), (direction,))
+    checks: Sequence[tuple[str, Callable, float]] = (
+        ("energy", lambda h: energy(u + h * v) - energy(u) - h * work, 1e-2),
+        ("residual", lambda h: residual(u + h * v) - residual(u) - h * along, 1e-2),
+        ("du/dtheta", lambda h: moved(theta + h * direction) - solution - h * slope, 2.0),
+    )
+    return [
+        Row(f"Taylor, {form}: order of {name}", _order(left, first), 2.0, 0.1, "theory")
+        for name, left, first in checks
+    ]
+
+
+def _order(left: Callable, first: float) -> float:
+    """Slope of log remainder over log step."""
+    steps = first / 2.0 ** np.arange(5)
+    sizes = [float(jnp.linalg.norm(jnp.atleast_1d(left(step)).ravel())) for step in steps]
+    return float(np.polyfit(np.log(steps), np.log(sizes), 1)[0])
+
+
+def verify_barriers() -> list[Row]:
+    """The published barriers, by the formulas and constants of the paper (Eq. 21-23)."""
+    barriers = Barriers()
+    # beta_1 = 1 / (0.05 - 0.001) and beta_2 = ln(0.05 - 0.001) - 0.05 beta_1.
+    beta_1 = 1.0 / 0.049
+    beta_2 = np.log(0.049) - 0.05 * beta_1
+    cases = [
+        *((barriers.limit_J, J, 0.001 + np.exp(beta_1 * J + beta_2)) for J in (0.05, 0.0, -0.5)),
+        (barriers.limit_J, 0.8, 0.8),
+        *((barriers.limit_I1, value, 10.0 + np.tanh(value - 10.0)) for value in (10.0, 10.7, 25.0)),
+        (barriers.limit_I1, 4.0, 4.0),
+        *((barriers.limit_I4f, value, 8.0 + np.tanh(value - 8.0)) for value in (8.0, 8.4, 30.0)),
+    ]
+    source = "Dalton et al. (2023), Eq. 21-23"
+    return [
+        Row(
+            f"barrier {limit.__name__.removeprefix('limit_')} at {value:g}",
+            float(limit(jnp.asarray(value))),
+            float(expected),
+            1e-12,
+            source,
+        )
+        for limit, value, expected in cases
+    ]

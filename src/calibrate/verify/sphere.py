@@ -1,0 +1,104 @@
+r"""A thick incompressible Neo-Hookean sphere under inner pressure, and the work of that pressure.
+
+With the hoop stretch :math:`\lambda = r/R`, incompressibility gives
+:math:`\lambda_b^3 - 1 = (\lambda_a^3 - 1)(A/B)^3`, and radial equilibrium,
+:math:`d\sigma_r/dr = 2\mu(\lambda^2 - \lambda^{-4})/r`,
+
+.. math:: p = \mu\,[f(\lambda_b) - f(\lambda_a)], \qquad
+          f(\lambda) = \frac{2}{\lambda} + \frac{1}{2\lambda^4} .
+
+The pressure has a maximum; loads below it are checked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.verify.row import Row
+from emulator.fem import Simulator
+from emulator.geometry.sphere import sphere_octant
+from emulator.mechanics.laws import find_law
+from emulator.mechanics.laws.neo_hookean import bulk_modulus
+from emulator.mechanics.pressure import CavityPressure, PublishedPressure
+from emulator.scenes import Parameter, Scene, Support
+
+INNER, OUTER, MU = 10.0, 15.0, 10.0
+NU = 0.4999
+_SOURCE = "closed form of the incompressible sphere"
+_WORK = "p dV of the same polyhedron, lambda^2 times that at rest"
+
+
+def pressure_at(stretch: float) -> float:
+    """Pressure in kPa that stretches the inner surface by ``stretch``."""
+
+    def f(value: float) -> float:
+        return 2.0 / value + 0.5 / value**4
+
+    outside = (1.0 + (stretch**3 - 1.0) * (INNER / OUTER) ** 3) ** (1.0 / 3.0)
+    return MU * (f(outside) - f(stretch))
+
+
+def sphere_scene(cells: tuple[int, int], pressure: float, order: int = 2) -> Scene:
+    """One eighth of the sphere, its planes of symmetry held."""
+    return Scene(
+        name="thick sphere",
+        mesh=sphere_octant(INNER, OUTER, cells, grading=1.5, order=order),
+        law=find_law("neo_hookean_split"),
+        parameters=(Parameter("mu", "kPa", 1.0, 100.0),),
+        loads=(CavityPressure("inner", pressure),),
+        supports=tuple(Support(plane, components=plane) for plane in "xyz"),
+        constants={"kappa": bulk_modulus(MU, NU)},
+        dilatation="mean" if order == 2 else "pointwise",
+    )
+
+
+def inner_stretch(cells: tuple[int, int], pressure: float) -> float:
+    """Mean hoop stretch of the inner surface by FEM."""
+    scene = sphere_scene(cells, pressure)
+    solution = Simulator(scene).solve(jnp.array([MU])).require_converged("thick sphere")
+    inner = scene.mesh.node_set("inner")
+    place = scene.mesh.nodes[inner] + np.asarray(solution.displacement)[inner]
+    return float(np.linalg.norm(place, axis=1).mean()) / INNER
+
+
+def verify_sphere() -> list[Row]:
+    """Stretch against pressure, its order of convergence, and the work of the pressure."""
+    rows = []
+    for stretch in (1.1, 1.2, 1.3):
+        found = inner_stretch((6, 4), pressure_at(stretch))
+        name = f"thick sphere, {pressure_at(stretch):.4f} kPa: inner stretch"
+        rows.append(Row(name, found, stretch, 0.005 * stretch, _SOURCE))
+    errors = [abs(inner_stretch((n, n), pressure_at(1.2)) - 1.2) for n in (2, 4, 8)]
+    order = float(np.polyfit(np.log([1 / 2, 1 / 4, 1 / 8]), np.log(errors), 1)[0])
+    rows.append(
+        Row("thick sphere: order of convergence", order, 2.5, 1.0, "2 for a pressure an element")
+    )
+    return rows + verify_pressure_work()
+
+
+def verify_pressure_work() -> list[Row]:
+    """Force of a pressure along a uniform swelling by ``lambda``, over that of ``p dV``."""
+    rows = []
+    for stretch in (1.1, 1.5, 2.0):
+        exact = _work_ratio(CavityPressure("inner", 1.0), stretch)
+        published = _work_ratio(PublishedPressure("inner", 1.0), stretch)
+        name = f"pressure work, swollen by {stretch:g}"
+        rows.append(Row(f"{name}: exact / p dV", exact, 1.0, 1e-10, _WORK))
+        excess = 3.0 - 2.0 / stretch
+        source = "3 - 2/lambda: the released work is differentiated through cof(F) too"
+        rows.append(Row(f"{name}: published / p dV", published, excess, 1e-10, source))
+    return rows
+
+
+def _work_ratio(load: CavityPressure | PublishedPressure, stretch: float) -> float:
+    scene = replace(sphere_scene((4, 2), 1.0, order=1), loads=(load,))
+    term = load.term(scene)
+    X = jnp.asarray(scene.mesh.nodes)
+    slope = jax.grad(lambda value: term.total((value - 1.0) * X, {}))
+    facets = scene.mesh.nodes[scene.mesh.facet_set("inner")]
+    cone = -np.einsum("ki,ki->", facets[:, 0], np.cross(facets[:, 1], facets[:, 2])) / 6.0
+    return float(-slope(stretch) / (3.0 * stretch**2 * cone))

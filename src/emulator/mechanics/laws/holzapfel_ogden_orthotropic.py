@@ -1,0 +1,60 @@
+r"""Holzapfel-Ogden material with fibres f and sheets s (orthotropic).
+
+.. math::
+    W = \frac{a}{2b}\left[e^{b(\bar I_1 - 3)} - 1\right]
+      + \sum_{i = f, s}
+        \frac{a_i}{2b_i}\left[e^{b_i \langle \bar I_{4i} - 1 \rangle^2} - 1\right]
+      + \frac{a_{fs}}{2b_{fs}}\left[e^{b_{fs} \bar I_{8fs}^2} - 1\right] + U(J)
+
+(Holzapfel & Ogden 2009, Eq. 5.38) with isochoric invariants, :math:`\bar I_{8fs} = J^{-2/3} f \cdot
+C s`, and fibres and sheets that resist stretch only. Without its last two terms it is the law of
+:mod:`~emulator.mechanics.laws.holzapfel_ogden`.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.laws import holzapfel_ogden
+from emulator.mechanics.laws.law import Law
+from emulator.mechanics.quantity import modulus, number
+
+
+def energy(
+    strain: Strain,
+    a: jax.Array,
+    b: jax.Array,
+    a_f: jax.Array,
+    b_f: jax.Array,
+    a_s: jax.Array,
+    b_s: jax.Array,
+    a_fs: jax.Array,
+    b_fs: jax.Array,
+    kappa: jax.Array,
+) -> jax.Array:
+    """Strain energy density in kPa; ``a``, ``a_f``, ``a_s``, ``a_fs`` and ``kappa`` in kPa."""
+    stretch = jnp.maximum(strain.isochoric_I4s_minus_1, 0.0)
+    sheets = a_s / (2.0 * b_s) * jnp.expm1(b_s * stretch**2)
+    shear = a_fs / (2.0 * b_fs) * jnp.expm1(b_fs * strain.isochoric_I8fs**2)
+    return holzapfel_ogden.energy(strain, a, b, a_f, b_f, kappa) + sheets + shear
+
+
+HOLZAPFEL_OGDEN_ORTHOTROPIC = Law(
+    "holzapfel_ogden_orthotropic",
+    (
+        modulus("a"),
+        number("b"),
+        modulus("a_f"),
+        number("b_f"),
+        modulus("a_s"),
+        number("b_s"),
+        modulus("a_fs"),
+        number("b_fs"),
+        modulus("kappa"),
+    ),
+    energy,
+    fibres=True,
+    sheets=True,
+)

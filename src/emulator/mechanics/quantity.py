@@ -1,0 +1,65 @@
+"""What the parameters of laws and loads are: names with a unit and the values that make sense."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A parameter of a law or a load.
+
+    Parameters
+    ----------
+    name : as scenes call it.
+    unit : the one its values are in; empty when dimensionless.
+    low, high : values lie between these, both excluded.
+    hint : added where a wrong unit is refused.
+    """
+
+    name: str
+    unit: str = ""
+    low: float = 0.0
+    high: float = math.inf
+    hint: str = ""
+
+    def unit_fault(self, unit: str, owner: str) -> str | None:
+        """What is wrong with a value in ``unit`` for ``owner``; ``None`` when nothing is."""
+        if unit == self.unit:
+            return None
+        found = f"in {unit}" if unit else "given no unit"
+        expected = self.unit or "it without a unit"
+        hint = f" ({self.hint})" if self.hint else ""
+        return f"parameter '{self.name}' is {found}; {owner} takes {expected}{hint}"
+
+    def range_fault(self, low: float, high: float) -> str | None:
+        """What is wrong with the range from ``low`` to ``high``; ``None`` when nothing is."""
+        if not low > self.low:
+            return f"{self._with_unit('ranges down to', low)}; it must stay above {self.low:g}"
+        if not high < self.high:
+            return f"{self._with_unit('ranges up to', high)}; it must stay below {self.high:g}"
+        return None
+
+    def value_fault(self, value: float) -> str | None:
+        """What is wrong with ``value``; ``None`` when nothing is."""
+        if not math.isfinite(value):
+            return f"{self._with_unit('is', value)}; it must be finite"
+        if not value > self.low:
+            return f"{self._with_unit('is', value)}; it must be above {self.low:g}"
+        if not value < self.high:
+            return f"{self._with_unit('is', value)}; it must be below {self.high:g}"
+        return None
+
+    def _with_unit(self, verb: str, value: float) -> str:
+        return f"parameter '{self.name}' {verb} {value:g} {self.unit}".rstrip()
+
+
+def modulus(name: str) -> Quantity:
+    """A stiffness in kPa, above 0."""
+    return Quantity(name, "kPa")
+
+
+def number(name: str, low: float = 0.0, high: float = math.inf) -> Quantity:
+    """A dimensionless parameter between ``low`` and ``high``."""
+    return Quantity(name, "", low, high)

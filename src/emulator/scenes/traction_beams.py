@@ -1,0 +1,95 @@
+"""Fibrous beams pulled aside at their end (Dalton et al. 2023, Appendix A)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emulator.geometry.generators import box
+from emulator.mechanics.laws import find_law
+from emulator.mechanics.loads import Traction
+from emulator.scenes.left_ventricle import MYOCARDIUM
+from emulator.scenes.parameters import Parameter
+from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Support
+
+
+def _beam(
+    name: str,
+    law: str,
+    parameters: tuple[Parameter, ...],
+    cells: tuple[int, int, int],
+    traction: float,
+    fibre_angle: float,
+    kappa: float,
+) -> Scene:
+    mesh = box((100.0, 10.0, 10.0), cells)
+    angle = np.radians(fibre_angle)
+    return Scene(
+        name=name,
+        mesh=mesh,
+        law=find_law(law),
+        parameters=parameters,
+        loads=(Traction("right", (0.0, 0.0, traction)),),
+        supports=(Support("left"),),
+        constants={"kappa": kappa},
+        fibres=np.tile([np.cos(angle), np.sin(angle), 0.0], (len(mesh.elements), 1)),
+        recipe={
+            "scene": name,
+            "cells": list(cells),
+            "traction": traction,
+            "fibre_angle": fibre_angle,
+            "kappa": kappa,
+        },
+    )
+
+
+def traction_beam_holzapfel_ogden(
+    cells: tuple[int, int, int] = (12, 4, 5),
+    traction: float = 0.01,
+    fibre_angle: float = 0.0,
+    kappa: float = 25.0,
+) -> Scene:
+    """A 100 x 10 x 10 mm Holzapfel-Ogden beam, one end held, the other pulled up.
+
+    theta = (a, b, a_f, b_f) with the ranges of
+    :func:`~emulator.scenes.left_ventricle.left_ventricle`. The appendix was not at hand: the
+    dimensions are those of its gravity beams; traction, fibres and ``kappa`` are ours.
+
+    Parameters
+    ----------
+    cells : along x, y, z.
+    traction : along z on the free end, per reference area, kPa.
+    fibre_angle : degrees from the beam's axis x towards y; any but 0 and 90 makes it twist.
+    kappa : resistance to volume change, kPa.
+    """
+    name = "traction_beam_holzapfel_ogden"
+    return _beam(name, "holzapfel_ogden", MYOCARDIUM, cells, traction, fibre_angle, kappa)
+
+
+def traction_beam_guccione(
+    cells: tuple[int, int, int] = (12, 4, 5),
+    traction: float = 0.02,
+    fibre_angle: float = 0.0,
+    kappa: float = 50.0,
+) -> Scene:
+    """A 100 x 10 x 10 mm Guccione beam, one end held, the other pulled up.
+
+    theta = (C, b_f, b_t, b_fs), from half to twice the 2 kPa, 8, 2 and 4 of the benchmark beam in
+    Land et al. (2015). The appendix was not at hand: the dimensions are those of its gravity beams;
+    ranges, traction, fibres and ``kappa`` are ours.
+
+    Parameters
+    ----------
+    cells : along x, y, z.
+    traction : along z on the free end, per reference area, kPa.
+    fibre_angle : degrees from the beam's axis x towards y; any but 0 and 90 makes it twist.
+    kappa : resistance to volume change, kPa.
+    """
+    parameters = (
+        Parameter("C", "kPa", 1.0, 4.0, "log"),
+        Parameter("b_f", "", 4.0, 16.0, "log"),
+        Parameter("b_t", "", 1.0, 4.0, "log"),
+        Parameter("b_fs", "", 2.0, 8.0, "log"),
+    )
+    name = "traction_beam_guccione"
+    return _beam(name, "guccione", parameters, cells, traction, fibre_angle, kappa)
