@@ -110,6 +110,7 @@ def landmarks(scene: Scene, points: np.ndarray) -> Landmarks:
     InputError
         A point that lies in no element, nor just beside one.
     """
+    scene.mesh.require_linear("a set of landmarks")
     points = np.atleast_2d(np.asarray(points, dtype=float))
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError(f"landmarks have shape {points.shape}; expected (d, 3), finite, in mm")

@@ -119,6 +119,11 @@ class Mesh:
         """1 for linear tetrahedra, 2 for quadratic ones."""
         return 1 if self.elements.shape[1] == 4 else 2
 
+    def require_linear(self, user: str) -> None:
+        """Raise :class:`InputError` on a quadratic mesh, on behalf of ``user``."""
+        if self.order != 1:
+            raise InputError(f"mesh: {user} needs linear tetrahedra; these are quadratic")
+
     @property
     def corners(self) -> np.ndarray:
         """Corner nodes of each element, (m, 4)."""
@@ -158,6 +163,5 @@ class Mesh:
 
     def to_skfem(self) -> MeshTet:
         """A linear mesh for scikit-fem (corner order kept, hence no sorting)."""
-        if self.order != 1:
-            raise InputError("mesh: this needs linear tetrahedra; these are quadratic")
+        self.require_linear("scikit-fem's MeshTet")
         return MeshTet(self.nodes.T.copy(), self.elements.T.copy(), sort_t=False)

@@ -52,6 +52,7 @@ class GraphOptions:
 
 def augment(scene: Scene, options: GraphOptions = GraphOptions()) -> AugmentedGraph:
     """The augmented graph of a scene's mesh, the same every time."""
+    scene.mesh.require_linear("the emulator's graph")
     features = node_inputs(scene)
     positions = scene.mesh.nodes
     edges = [mesh_edges(scene.mesh.elements)]

@@ -175,6 +175,8 @@ def test_bad_meshes_in_scene_files(capsys, block):
         (["evaluate", "nothing", "--against", "fem"], "emulator 'nothing' is neither"),
         (["evaluate", "once_clamped_beam", "--against", "/no/OnceClampedBeam"], "is missing"),
         (["verify", "published", "/no/where"], "does not exist"),
+        (["verify", "published"], "give the folder of the released data"),
+        (["verify", "patches"], "case 'patches' is unknown; known: patch"),
         (["certify", "/no/where"], "run.json does not exist"),
     ],
 )

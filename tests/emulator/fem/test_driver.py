@@ -1,0 +1,62 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.fem.newton import Newton
+
+
+def test_the_driver_equals_the_closed_loop(beam):
+    auto, closed = em.Simulator(beam), em.Simulator(beam, factorisation="umfpack")
+    one, other = auto.solve(beam.centre), closed.solve(beam.centre)
+    assert one.converged
+    assert one.iterations == other.iterations
+    np.testing.assert_allclose(one.displacement, other.displacement, atol=1e-9)
+
+
+def test_an_indefinite_tangent_is_left_to_umfpack(cube, monkeypatch):
+    simulator = em.Simulator(cube)
+    theta = cube.centre
+    expected = simulator(theta)
+    definite = simulator._driver._definite_step
+    calls = []
+
+    def refuse_twice(theta, state):
+        calls.append(1)
+        if len(calls) <= 2:
+            raise jax.errors.JaxRuntimeError("sparsax: matrix is not positive definite")
+        return definite(theta, state)
+
+    monkeypatch.setitem(simulator._driver.__dict__, "_definite_step", refuse_twice)
+    np.testing.assert_allclose(simulator(theta), expected, atol=1e-9)
+    assert len(calls) > 2  # CHOLMOD was asked again
+
+
+def test_other_errors_are_not_swallowed(cube, monkeypatch):
+    simulator = em.Simulator(cube)
+
+    def fail(theta, state):
+        raise jax.errors.JaxRuntimeError("out of memory")
+
+    monkeypatch.setitem(simulator._driver.__dict__, "_definite_step", fail)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="out of memory"):
+        simulator.solve(cube.centre)
+
+
+def test_good_tangents_are_kept(beam):
+    simulator = em.Simulator(beam)
+    cold = simulator.solve(beam.centre)
+    warm = simulator.solve(beam.centre * 1.01, cold.displacement)
+    assert warm.factorisations < warm.iterations
+    assert cold.factorisations < cold.iterations
+
+
+def test_one_iteration_is_a_function_of_its_state(beam):
+    system = em.Simulator(beam).system
+    newton = Newton(system, em.NewtonOptions(), beam.centre)
+    begin = newton.begin(jnp.zeros(beam.held.shape))
+    one, again = newton.step(begin), newton.step(begin)
+    np.testing.assert_array_equal(one.u, again.u)
+    assert int(begin.iterations) == 0
+    assert int(one.iterations) == 1
