@@ -197,7 +197,7 @@ def external_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
             force = force + _collect(scene, facets, local)
         elif isinstance(load, CavityPressure | FollowerPressure):
             facets, area, N = _surface(scene, load.facet_set, u)
-            p = values["pressure"] if load.pressure is None else load.pressure
+            p = values[load.parameter] if load.pressure is None else load.pressure
             force = force + _collect(scene, facets, -p * jnp.einsum("kqi,qa->kai", area, N))
         else:
             raise UnknownError(f"load {type(load).__name__}")

@@ -198,7 +198,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             left.barh(families, counts, left=lengths, color=colour, label=status)
             lengths += counts
     left.set(xlabel="cases")
-    left.legend(frameon=False, fontsize=8, loc="lower right")
+    figure.legend(frameon=False, fontsize=9, loc="outside upper center", ncols=7)
     for height, family in enumerate(families):
         found = [r for r in rows if r["family"] == family and r["residual"] is not None]
         spread = np.linspace(-0.3, 0.3, max(len(found), 2))
