@@ -117,3 +117,10 @@ def test_beam_coverage_in_full(tmp_path, published):
     results = run("beam_coverage", published, "--out", tmp_path)
     assert results["summary"]["accepted"] >= 48
     assert all(40 <= hits <= 50 for hits in results["summary"]["covered"].values())
+
+
+def test_many_solves(tmp_path):
+    results = run("many_solves", "--solves", 3, "--out", tmp_path)
+    assert [case["status"] for case in results["cases"]] == ["converged"] * 3
+    assert results["summary"]["solves"] == 3
+    assert (tmp_path / "many_solves.png").stat().st_size > 10_000

@@ -43,7 +43,6 @@ _NEAR = 0.05  # relative residual below which a step is judged by the residual a
 _UNBALANCED = 0.5  # and above which the stiffness of the loads misleads
 _SQUEEZES = 8  # steps kept short by elements after which a load step is halved
 _ENDLESS = 1e13  # a step this much longer than force over stiffness: a singular tangent
-_KEEP_TANGENT = 0.1  # a step this good earns its tangent another one
 _MIXED_ITERATIONS = 20  # a mixed load step that works takes about ten
 
 
@@ -58,6 +57,8 @@ class NewtonOptions:
     level_iterations : after which a load level is given up and its increment halved.
     min_increment : smallest load increment, as a fraction of the whole.
     shrink : least fraction of the present smallest ``J`` that a step may leave.
+    keep_tangent : a step that leaves less than this fraction of the residual has its tangent used
+        again; 0 is Newton's method to the letter.
     """
 
     tolerance: float = 1e-11
@@ -67,6 +68,7 @@ class NewtonOptions:
     level_iterations: int = 40
     min_increment: float = 1.0 / 256.0
     shrink: float = 0.2
+    keep_tangent: float = 0.1
 
 
 class NewtonState(NamedTuple):
@@ -348,7 +350,7 @@ class Newton:
         )
         moved = solved | failed
         good = (outcome.fraction == 1.0) & jnp.isfinite(error)
-        good &= error <= _KEEP_TANGENT * state.error
+        good &= error <= self.options.keep_tangent * state.error
         return state._replace(
             u=jnp.where(failed, u_reached, outcome.u),
             level=jnp.where(moved & ~complete, jnp.minimum(1.0, reached + increment), state.level),
