@@ -218,24 +218,33 @@ class Newton:
         offset = self._offset(u, level)
         # See the module's docstring: loads that nothing balances yet lend no stiffness.
         stiffening = jnp.where(state.error > _UNBALANCED, 0.0, level)
+        settled = jnp.all(offset == 0.0)
         residual, condensed = state.residual, None
+
+        def checked(tangent: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return system.pattern.safe_values(tangent), system.pattern.solvable(tangent)
+
         if state.volumes is None:
-            tangent = jax.lax.cond(
+            # A kept tangent stays the same to the bit: the solver knows its factor by its values.
+            tangent, solvable = jax.lax.cond(
                 state.refresh,
-                lambda: system.tangent(u, theta, stiffening),
-                lambda: state.tangent,
+                lambda: checked(system.tangent(u, theta, stiffening)),
+                lambda: (state.tangent, jnp.array(True)),
             )
             # K times the held displacement, without assembling the held columns.
-            _, pull = jax.jvp(lambda v: system.residual(v, theta, stiffening), (u,), (offset,))
+            pull = jax.lax.cond(
+                settled,
+                lambda: jnp.zeros_like(residual),
+                lambda: jax.jvp(lambda v: system.residual(v, theta, stiffening), (u,), (offset,))[
+                    1
+                ],
+            )
         else:
             condensed = linearise(system.scene, u, state.volumes, theta)
             residual, pull = system.mixed_residual(u, theta, level, condensed, offset)
-            tangent = system.assemble(condensed.tangent, u, theta, level)
-        solvable = system.pattern.solvable(tangent)
-        tangent = system.pattern.safe_values(tangent)
+            tangent, solvable = checked(system.assemble(condensed.tangent, u, theta, level))
         move = system.solve(tangent, -(residual + pull))
         slope = jnp.vdot(residual, move)
-        settled = jnp.all(offset == 0.0)
         if condensed is None:
             move = jnp.where(settled & (slope > 0.0), -move, move)
         move = system.extend(move) + offset
