@@ -60,3 +60,9 @@ def test_one_iteration_is_a_function_of_its_state(beam):
     np.testing.assert_array_equal(one.u, again.u)
     assert int(begin.iterations) == 0
     assert int(one.iterations) == 1
+
+
+def test_a_constant_theta_inside_jit_takes_the_closed_loop(cube):
+    simulator = em.Simulator(cube)
+    inside = jax.jit(lambda scale: scale * simulator.solve(cube.centre).displacement)(2.0)
+    np.testing.assert_allclose(inside, 2.0 * simulator(cube.centre), atol=1e-8)
