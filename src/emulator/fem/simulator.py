@@ -85,9 +85,7 @@ class Simulator:
 
     def _solver(self, *arguments: jax.Array) -> Callable[[jax.Array, jax.Array], Solution]:
         """The driver where Python sees the numbers and CHOLMOD could work, else the closed loop."""
-        # Under jit even constants are staged, which a sum of two of them tells.
-        seen = (*arguments, jnp.add(0.0, 0.0))
-        traced = any(isinstance(value, jax.core.Tracer) for value in seen)
+        traced = any(isinstance(argument, jax.core.Tracer) for argument in arguments)
         if self.factorisation != "auto" or traced or self.system.forces:
             return self._solve
         return self._driver.solve
