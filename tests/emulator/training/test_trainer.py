@@ -88,9 +88,9 @@ def test_a_step_without_a_finite_gradient_is_not_taken(beam):
 
 
 def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
-    emulator = train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=15.0)
+    emulator = train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=25.0)
     assert emulator.record["plan"]["steps"] > WARMUP
-    assert emulator.record["seconds"] < 30.0  # whatever else the machine is doing
+    assert emulator.record["seconds"] < 50.0  # whatever else the machine is doing
 
 
 def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
