@@ -5,7 +5,6 @@ itself and asserts what the README of the study says.
 """
 
 import argparse
-import json
 import multiprocessing
 import queue
 import threading
@@ -246,21 +245,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def updated(path: Path, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Header and rows of the results in ``path``, those of ``rows`` replaced and marked."""
-    old = json.loads(path.read_text())
-    commit = study_header(HERE, SEED)["commit"]
-    new = {row["name"]: {**row, "commit": commit} for row in rows}
-    header = {key: old[key] for key in ("hardware", "versions", "commit", "seed")}
-    return header, [new.get(row["name"], row) for row in old["cases"]]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", nargs="*", help="names, or beginnings of names; all by default")
-    parser.add_argument(
-        "--update", action="store_true", help="put the chosen cases into the results there are"
-    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--limit", type=float, default=LIMIT, help="seconds a case")
     parser.add_argument("--out", type=Path, default=HERE)
@@ -269,8 +256,6 @@ def main() -> None:
     names = [name for name in CASES if name.startswith(chosen)]
     rows = study(names, arguments.workers, arguments.limit)
     header = study_header(HERE, SEED)
-    if arguments.update:
-        header, rows = updated(arguments.out / "results.json", rows)
     found = summary(rows)
     write_json(arguments.out / "results.json", {**header, "summary": found, "cases": rows})
     draw(rows, arguments.out / "stability.png")

@@ -314,13 +314,14 @@ class Newton:
         after: NewtonState,
     ) -> Volumes:
         """Volumes after the step; those of the last solution where the level has changed."""
-        assert state.volumes is not None
+        volumes, scene = state.volumes, self.system.scene
+        assert volumes is not None
         move = jnp.where(outcome.fraction > 0.0, direction.move, 0.0)
-        scene = self.system.scene
-        moved = advance(scene, state.volumes, condensed, move, outcome.fraction)
-        own = consistent(scene, after.u, self.theta)
-        kept = after.level == state.level
-        return jax.tree.map(lambda a, b: jnp.where(kept, a, b), moved, own)
+        return jax.lax.cond(
+            after.level == state.level,
+            lambda: advance(scene, volumes, condensed, move, outcome.fraction),
+            lambda: consistent(scene, after.u, self.theta),
+        )
 
     def _next_level(self, state: NewtonState, outcome: _Outcome, tangent: jax.Array) -> NewtonState:
         """Stay, move on to a higher load level, or fall back to a lower one."""
