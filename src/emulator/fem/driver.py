@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import jax
+import jax.numpy as jnp
 
 from emulator.fem.assembly import System
 from emulator.fem.newton import Newton, NewtonOptions, NewtonState, solution_of
@@ -59,6 +60,36 @@ class Driver:
                 state = state.forget_tangent(self.definite)
         return solution_of(state)
 
+    @property
+    def systems(self) -> tuple[System, ...]:
+        """Both."""
+        return self.definite, self.general
+
+    def linearise(self, u: jax.Array, theta: jax.Array) -> tuple[System, jax.Array]:
+        """The system that can factorise the tangent at ``u`` (n, 3), and that tangent (nnz,)."""
+        tangent = self._definite_tangent(u, theta)
+        try:
+            # The factor is kept by the tangent's values: solving for nothing is not in vain.
+            jax.block_until_ready(self._definite_trial(tangent))
+        except jax.errors.JaxRuntimeError as error:
+            if "not positive definite" not in str(error):
+                raise
+            return self.general, self._general_tangent(u, theta)
+        return self.definite, tangent
+
+    @cached_property
+    def _definite_tangent(self):  # noqa: ANN202
+        return jax.jit(partial(_safe_tangent, self.definite))
+
+    @cached_property
+    def _general_tangent(self):  # noqa: ANN202
+        return jax.jit(partial(_safe_tangent, self.general))
+
+    @cached_property
+    def _definite_trial(self):  # noqa: ANN202
+        nothing = jnp.zeros(self.definite.pattern.size)
+        return jax.jit(lambda tangent: self.definite.solve(tangent, nothing))
+
     @cached_property
     def _begin(self):  # noqa: ANN202 - jitted closures, private
         return jax.jit(lambda theta, start: Newton(self.definite, self.options, theta).begin(start))
@@ -76,3 +107,7 @@ def _step(
     system: System, options: NewtonOptions, theta: jax.Array, state: NewtonState
 ) -> NewtonState:
     return Newton(system, options, theta).step(state)
+
+
+def _safe_tangent(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
+    return system.pattern.safe_values(system.tangent(u, theta))

@@ -66,3 +66,51 @@ def test_a_constant_theta_inside_jit_takes_the_closed_loop(cube):
     simulator = em.Simulator(cube)
     inside = jax.jit(lambda scale: scale * simulator.solve(cube.centre).displacement)(2.0)
     np.testing.assert_allclose(inside, 2.0 * simulator(cube.centre), atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def ventricle():
+    return em.Simulator(em.scenes.left_ventricle(rings=4, around=8, layers=1))
+
+
+def test_sensitivities_against_central_differences(ventricle):
+    """Every entry of theta, the pressure among them."""
+    scene = ventricle.scene
+    u = ventricle(scene.centre)
+    columns = ventricle.sensitivities(u, scene.centre)
+    for k in range(len(scene.parameters)):
+        step = jnp.zeros_like(scene.centre).at[k].set(1e-4 * scene.centre[k])
+        ahead, behind = (ventricle.solve(scene.centre + s, u).displacement for s in (step, -step))
+        expected = (ahead - behind) / (2.0 * step[k])
+        np.testing.assert_allclose(columns[k], expected, atol=1e-6 * jnp.abs(expected).max())
+
+
+def test_a_gradient_outside_jit_uses_the_cheap_factor(beam, monkeypatch):
+    simulator = em.Simulator(beam)
+
+    def never(*arguments):
+        raise AssertionError("UMFPACK was asked for")
+
+    monkeypatch.setitem(simulator._driver.__dict__, "_general_step", never)
+    monkeypatch.setitem(simulator._driver.__dict__, "_general_tangent", never)
+
+    def squared(theta):
+        return jnp.sum(simulator.solve(theta).displacement ** 2)
+
+    slope = jax.grad(squared)(beam.centre)
+    assert simulator._linearised(simulator(beam.centre), beam.centre)[0].factorisation == "cholmod"
+    np.testing.assert_allclose(slope, jax.jit(jax.grad(squared))(beam.centre), rtol=1e-8)
+
+
+def test_sensitivities_where_cholesky_is_refused(ventricle):
+    """Away from equilibrium the tangent may be indefinite; the equation still has to hold."""
+    theta = ventricle.scene.centre
+    blown = 0.9 * ventricle(theta)
+    soft = theta.at[:4].multiply(0.3).at[4].multiply(10.0)
+    system, _ = ventricle._linearised(blown, soft)
+    assert system.factorisation == "umfpack"
+    columns = ventricle.sensitivities(blown, soft)
+    forces = jax.jacfwd(lambda t: system.residual(blown, t))(soft)
+    for k in range(len(theta)):
+        balanced = jax.jvp(lambda v: system.residual(v, soft), (blown,), (columns[k],))[1]
+        np.testing.assert_allclose(balanced, -forces[:, k], atol=1e-8 * jnp.abs(forces).max())
