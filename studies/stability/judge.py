@@ -159,6 +159,13 @@ def internal_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
         raise UnknownError(f"law '{scene.law.name}'")
     values = scene.resolve(theta)
     arguments = [values[name] for name in scene.law.parameters]
+    law, factor = ENERGIES[scene.law.name], jnp.ones(len(weights))
+    if scene.regions is not None:
+        if not scene.law.name.startswith("holzapfel_ogden"):
+            raise UnknownError(f"regions of law '{scene.law.name}'")
+        labels = np.unique(scene.regions)
+        factors = jnp.array([values[f"stiffness_{label}"] for label in labels])
+        factor = factors[np.searchsorted(labels, scene.regions)]
     fibres = jnp.zeros((len(weights), 3)) if scene.fibres is None else jnp.asarray(scene.fibres)
 
     def energy(local: jax.Array) -> jax.Array:
@@ -167,8 +174,15 @@ def internal_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
             J = jax.vmap(jax.vmap(det))(at)
             mean = jnp.sum(weights * J, axis=1) / jnp.sum(weights, axis=1)
             at = at * jnp.cbrt(mean[:, None] / J)[..., None, None]
-        one = lambda f, fibre: ENERGIES[scene.law.name](f, fibre, *arguments)  # noqa: E731
-        return jnp.sum(weights * jax.vmap(jax.vmap(one, (0, None)))(at, fibres))
+
+        def one(f: jax.Array, fibre: jax.Array, s: jax.Array) -> jax.Array:
+            if scene.regions is None:
+                return law(f, fibre, *arguments)
+            # Split into change of shape and of volume, it has the latter alone where F is even.
+            volume = law(jnp.cbrt(det(f)) * jnp.eye(3), fibre, *arguments)
+            return s * (law(f, fibre, *arguments) - volume) + volume
+
+        return jnp.sum(weights * jax.vmap(jax.vmap(one, (0, None, None)))(at, fibres, factor))
 
     local = jnp.asarray(u)[scene.mesh.elements]
     force = _collect(scene, scene.mesh.elements, jax.grad(energy)(local))

@@ -23,12 +23,13 @@ the energy in u alone, so both formulations have the same solutions.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from emulator.mechanics.energy import at_volume, mean_volume_change
+from emulator.mechanics.tissue import tissue
 from emulator.scenes.scene import Scene
 
 
@@ -55,37 +56,33 @@ class Condensed(NamedTuple):
     stiffness: jax.Array
 
 
-def _arguments(scene: Scene, u: jax.Array) -> tuple[tuple, tuple]:
-    """Arrays of every element, and the axes to map over."""
+def _arguments(scene: Scene, u: jax.Array) -> tuple:
+    """Displacements, gradients, weights and tissue of every element, to map over."""
     grid = scene.discretisation
     local = (u[grid.connectivity], jnp.asarray(grid.gradients), jnp.asarray(grid.weights))
-    directions = scene.directions
-    if directions is None:
-        return (*local, None), (0, 0, 0, None)
-    return (*local, jnp.asarray(directions)), (0, 0, 0, 0)
+    return (*local, tissue(scene))
 
 
 def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:
     """Volumes and pressures that belong to the displacement ``u`` (n, 3)."""
 
-    def one(*element: jax.Array) -> Volumes:
+    def one(*element: Any) -> Volumes:
         change = mean_volume_change(*element[:3])
         slope = jax.grad(at_volume(scene, theta), argnums=0)(change, *element)
         return Volumes(change, slope / jnp.sum(element[2]))
 
-    arguments, axes = _arguments(scene, u)
-    return jax.vmap(one, axes)(*arguments)
+    return jax.vmap(one)(*_arguments(scene, u))
 
 
 def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) -> Condensed:
     """Force and tangent of every element at ``u`` (n, 3) and ``volumes``."""
     energy = at_volume(scene, theta)
 
-    def one(change, pressure, local, gradients, weights, directions):  # noqa: ANN001, ANN202
+    def one(change, pressure, local, gradients, weights, own):  # noqa: ANN001, ANN202
         V = jnp.sum(weights)
 
         def E(v: jax.Array, t: jax.Array) -> jax.Array:
-            return energy(t, v, gradients, weights, directions)
+            return energy(t, v, gradients, weights, own)
 
         def volume(v: jax.Array) -> jax.Array:
             return V * mean_volume_change(v, gradients, weights)
@@ -109,8 +106,7 @@ def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) ->
         size = local.size
         return Condensed(force, tangent.reshape(size, size), b, g, r_change, r_pressure, E_tt)
 
-    arguments, axes = _arguments(scene, u)
-    return jax.vmap(one, (0, 0, *axes))(*volumes, *arguments)
+    return jax.vmap(one)(*volumes, *_arguments(scene, u))
 
 
 def carried(
@@ -123,16 +119,15 @@ def carried(
     """
     energy = at_volume(scene, theta)
 
-    def one(change, pressure, at, local, gradients, weights, directions):  # noqa: ANN001, ANN202
+    def one(change, pressure, at, local, gradients, weights, own):  # noqa: ANN001, ANN202
         V = jnp.sum(weights)
-        E_t, E_u = jax.grad(energy, (0, 1))(change, local, gradients, weights, directions)
+        E_t, E_u = jax.grad(energy, (0, 1))(change, local, gradients, weights, own)
         mean, slope = jax.value_and_grad(mean_volume_change)(local, gradients, weights)
         r_change, r_pressure = E_t - pressure * V, V * (mean - change)
         force = E_u + pressure * V * slope + at.g * r_pressure / V
         return force + at.b * (r_change + at.stiffness * r_pressure / V) / V
 
-    arguments, axes = _arguments(scene, u)
-    return jax.vmap(one, (0, 0, 0, *axes))(*volumes, at, *arguments)
+    return jax.vmap(one)(*volumes, at, *_arguments(scene, u))
 
 
 def advance(

@@ -70,6 +70,20 @@ def read_fibres(path: str | Path) -> np.ndarray:
     return fibres
 
 
+def read_regions(path: str | Path, name: str) -> np.ndarray:
+    """Whole number (m,) of each element from cell data ``name``; :class:`InputError` if none."""
+    found = _load(Path(path))
+    if name not in found.cell_data:
+        there = ", ".join(f"'{key}'" for key in found.cell_data) or "none"
+        raise InputError(f"mesh file {path}: it has no cell data '{name}' for regions; has {there}")
+    kind = _tetrahedra(found)
+    blocks = zip(found.cells, found.cell_data[name], strict=True)
+    values = np.concatenate([data for block, data in blocks if block.type == kind])
+    if values.ndim != 1 or not (values == np.round(values)).all():
+        raise InputError(f"mesh file {path}: '{name}' are not one whole number for each element")
+    return values.astype(np.int64)
+
+
 def write_mesh(
     path: str | Path,
     mesh: Mesh,

@@ -33,6 +33,7 @@ from emulator.mechanics.kinematics import Strain, determinant
 from emulator.mechanics.loads import DeadLoad
 from emulator.mechanics.local import LocalForce, LocalTerm
 from emulator.mechanics.pressure import PotentialPressure
+from emulator.mechanics.tissue import Tissue, factors, tissue
 
 if TYPE_CHECKING:  # a scene is made of mechanics, so mechanics only names its type
     from emulator.scenes.scene import Scene
@@ -53,18 +54,23 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
-    """``W(H, directions)`` in kPa of one displacement gradient (3, 3), at ``theta`` (p,)."""
-    values = scene.resolve(theta)
-    arguments = [values[name] for name in scene.law.parameters]
-    return lambda H, directions=None: scene.law.energy(Strain(H, barriers, directions), *arguments)
+    """``W(H, tissue)`` in kPa of one displacement gradient (3, 3), at ``theta`` (p,)."""
+    values, law = scene.resolve(theta), scene.law
+    scale = factors(scene, values)
+
+    def energy(H: jax.Array, at: Tissue = Tissue()) -> jax.Array:
+        here = {}
+        if scale is not None:
+            here = {name: scale[at.region] * values[name] for name in law.shape_moduli}
+        arguments = [here.get(name, values[name]) for name in law.parameters]
+        return law.energy(Strain(H, barriers, at.directions), *arguments)
+
+    return energy
 
 
 def at_points(scene: Scene, function: Callable, H: jax.Array) -> jax.Array:
-    """``function(H)`` at every point of ``H`` (m, q, 3, 3), with its directions if it has any."""
-    directions = scene.directions
-    if directions is None:
-        return jax.vmap(jax.vmap(function))(H)
-    return jax.vmap(jax.vmap(function, (0, None)))(H, jnp.asarray(directions))
+    """``function(H, tissue)`` at every point of ``H`` (m, q, 3, 3), with its element's tissue."""
+    return jax.vmap(jax.vmap(function, (0, None)))(H, tissue(scene))
 
 
 def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -> jax.Array:
@@ -91,10 +97,10 @@ def with_mean_dilatation(
 
 
 def at_volume(scene: Scene, theta: jax.Array) -> Callable:
-    """``(change, u, gradients, weights, directions) -> ()``: strain energy of an element, mN mm.
+    """``(change, u, gradients, weights, tissue) -> ()``: strain energy of an element, mN mm.
 
     Its volume ratio less 1 is ``change`` throughout, whatever ``u`` (a, 3) in mm says;
-    ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``directions`` as in a ``Strain``.
+    ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3.
     """
     at_point = point_energy(scene, theta)
 
@@ -103,10 +109,10 @@ def at_volume(scene: Scene, theta: jax.Array) -> Callable:
         u: jax.Array,
         gradients: jax.Array,
         weights: jax.Array,
-        directions: jax.Array | None,
+        at: Tissue,
     ) -> jax.Array:
         H = with_volume_change(jnp.einsum("ai,qaj->qij", u, gradients), change)
-        return jnp.vdot(weights, jax.vmap(lambda h: at_point(h, directions))(H))
+        return jnp.vdot(weights, jax.vmap(lambda h: at_point(h, at))(H))
 
     return energy
 

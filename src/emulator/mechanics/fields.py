@@ -37,7 +37,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     -------
     ``J`` (m,), ``cauchy_stress`` (m, 3, 3) in kPa, ``green_lagrange`` (m, 3, 3); and where the
     scene has fibres ``fibres`` (m, 3), ``deformed_fibres`` (m, 3), unit length both, and
-    ``fibre_stretch`` (m,).
+    ``fibre_stretch`` (m,); and where it has regions their ``regions`` (m,).
     """
     H = displacement_gradient(scene, jnp.asarray(u))
     F = H + jnp.eye(3, dtype=H.dtype)
@@ -60,6 +60,8 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
         fields["fibres"] = fibres
         fields["deformed_fibres"] = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         fields["fibre_stretch"] = mean(jnp.linalg.norm(along, axis=-1))
+    if scene.regions is not None:
+        fields["regions"] = scene.regions
     return fields
 
 

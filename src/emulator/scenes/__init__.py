@@ -4,6 +4,7 @@ from emulator.scenes.beams import once_clamped_beam, twice_clamped_beam
 from emulator.scenes.biventricle import biventricle
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.left_ventricle_neo_hookean import left_ventricle_neo_hookean
+from emulator.scenes.left_ventricle_segments import left_ventricle_segments
 from emulator.scenes.liver import liver
 from emulator.scenes.parameters import Parameter
 from emulator.scenes.registry import BUILT_IN, find_scene, scene_from_recipe
@@ -21,6 +22,7 @@ __all__ = [
     "find_scene",
     "left_ventricle",
     "left_ventricle_neo_hookean",
+    "left_ventricle_segments",
     "liver",
     "once_clamped_beam",
     "scene_from_recipe",

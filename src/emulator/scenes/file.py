@@ -79,6 +79,10 @@ rv_endocardium, epicardium) and ``uniform`` (``direction``). They also give the 
 that takes any, as the transmural direction; ``uniform`` has a key ``sheets`` for them. Gravity also
 takes ``acceleration`` in m/s2. A pressure that is a parameter is called ``pressure``, or what its
 key ``parameter`` says.
+
+``regions = "segment"`` names cell data of the mesh file, a whole number for each tetrahedron, such
+as gmsh's own ``gmsh:physical``. In region 3 the law's energy is then multiplied by the parameter or
+constant ``stiffness_3``, its resistance to volume change excepted.
 """
 
 from __future__ import annotations
@@ -97,7 +101,7 @@ from emulator.geometry.fibres import (
     biventricular_directions,
     rule_based_directions,
 )
-from emulator.geometry.io import Body, read_body, read_mesh
+from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.elastic_support import ElasticSupport
@@ -113,7 +117,16 @@ from emulator.scenes.tables import Table
 Parts = tuple[Mesh, np.ndarray | None, np.ndarray | None]
 
 _REQUIRED = ("law", "mesh", "parameters", "supports")
-_OPTIONAL = ("constants", "dilatation", "facet_sets", "fibres", "loads", "node_sets", "order")
+_OPTIONAL = (
+    "constants",
+    "dilatation",
+    "facet_sets",
+    "fibres",
+    "loads",
+    "node_sets",
+    "order",
+    "regions",
+)
 _AXES = {"x": 0, "y": 1, "z": 2}
 # A node this far from a plane, as a fraction of the body's size, is on it.
 _ON_PLANE = 1e-8
@@ -147,11 +160,14 @@ def read_scene(path: str | Path) -> Scene:
 def _scene(path: Path, file: Table) -> Scene:
     file.check(_REQUIRED, _OPTIONAL)
     law = find_law(file.text("law"))
-    mesh, fibres, sheets = _body(path, file, law)
+    mesh_path = path.parent / file.text("mesh")
+    mesh, fibres, sheets = _body(mesh_path, file, law)
+    regions = read_regions(mesh_path, file.text("regions")) if "regions" in file else None
     dilatation = file.text("dilatation", "pointwise", ("pointwise", "mean"))
     parts: dict[str, Any] = {
         "fibres": fibres,
         "sheets": sheets,
+        "regions": regions,
         "parameters": tuple(_parameter(*item) for item in file.tables("parameters").items()),
         "loads": tuple(map(_load, file.list("loads"))),
         "supports": tuple(map(_support, file.list("supports"))),
@@ -163,9 +179,8 @@ def _scene(path: Path, file: Table) -> Scene:
 
 
 # ---- geometry ------------------------------------------------------------------------------------
-def _body(path: Path, file: Table, law: Law) -> Parts:
+def _body(mesh_path: Path, file: Table, law: Law) -> Parts:
     """The mesh with the sets the file adds, and the directions if the law or the file wants any."""
-    mesh_path = path.parent / file.text("mesh")
     by_rule = "fibres" in file
     body = read_body(mesh_path) if law.fibres and not by_rule else Body(read_mesh(mesh_path))
     mesh = body.mesh

@@ -12,6 +12,7 @@ from emulator.scenes.biventricle import biventricle
 from emulator.scenes.file import read_scene
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.left_ventricle_neo_hookean import left_ventricle_neo_hookean
+from emulator.scenes.left_ventricle_segments import left_ventricle_segments
 from emulator.scenes.liver import liver
 from emulator.scenes.published import published_scene
 from emulator.scenes.scene import Scene
@@ -29,6 +30,7 @@ BUILT_IN: dict[str, Callable[..., Scene]] = {
         liver,
         left_ventricle,
         left_ventricle_neo_hookean,
+        left_ventricle_segments,
         biventricle,
     )
 }

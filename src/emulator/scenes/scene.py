@@ -22,6 +22,7 @@ from emulator.mechanics.laws import Law
 from emulator.mechanics.loads import Gravity, Load
 from emulator.mechanics.pressure import CavityPressure, require_held_rim
 from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.tissue import checked_regions, region_quantities
 from emulator.scenes.parameters import Parameter
 from emulator.scenes.supports import Support, free_motions, prescribe
 
@@ -47,6 +48,9 @@ class Scene:
         keeps quadratic elements from locking when the material is nearly incompressible.
     sheets : (m, 3) unit sheet direction of each element, across its fibre, for laws that ask for
         it.
+    regions : (m,) whole number of the region each element lies in. Region 3 takes a parameter or a
+        constant ``stiffness_3``, by which the law's energy there is multiplied, its volumetric part
+        excepted; see :mod:`emulator.mechanics.tissue`.
     """
 
     name: str
@@ -60,10 +64,12 @@ class Scene:
     recipe: Mapping[str, Any] = field(default_factory=dict)
     dilatation: Literal["pointwise", "mean"] = "pointwise"
     sheets: np.ndarray | None = None
+    regions: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "recipe", MappingProxyType(dict(self.recipe)))
+        self._check_regions()
         self._check_names()
         self._check_quantities()
         self._check_directions()
@@ -72,6 +78,14 @@ class Scene:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
         self._check_supports()
         self._check_loads()
+
+    def _check_regions(self) -> None:
+        if self.regions is not None:
+            try:
+                labels = checked_regions(self.regions, len(self.mesh.elements), self.law)
+            except InputError as error:
+                raise InputError(f"scene '{self.name}': {error}") from error
+            object.__setattr__(self, "regions", labels)
 
     def _check_names(self) -> None:
         given = [*self.parameter_names, *self.constants]
@@ -158,8 +172,10 @@ class Scene:
 
     @property
     def _takers(self) -> dict[str, tuple[Quantity, str]]:
-        """Every parameter the law and the loads take, by name, with who takes it."""
+        """Every parameter law, loads and regions take, by name, with who takes it."""
         takers = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
+        if self.regions is not None:
+            takers |= {q.name: (q, "a region") for q in region_quantities(self.regions)}
         for load in self.loads:
             for quantity in load.quantities:
                 takers.setdefault(quantity.name, (quantity, f"load {type(load).__name__}"))
@@ -226,7 +242,7 @@ class Scene:
         return jnp.stack(columns, axis=-1)
 
     def resolve(self, theta: jax.Array) -> dict[str, jax.Array]:
-        """Every parameter of law and loads by name, from theta (p,) and the constants."""
+        """Every parameter of law, loads and regions by name, from theta (p,) and the constants."""
         values: dict[str, Any] = dict(self.constants)
         values.update({name: theta[k] for k, name in enumerate(self.parameter_names)})
         return values
@@ -278,6 +294,8 @@ class Scene:
             digest.update((np.round(self.fibres, 6) + 0.0).tobytes())
         if self.sheets is not None:
             digest.update((np.round(self.sheets, 6) + 0.0).tobytes())
+        if self.regions is not None:
+            digest.update(self.regions.astype(np.int64).tobytes())
         surfaces = {getattr(part, "facet_set", "") for part in (*self.loads, *self.supports)}
         for name in sorted(surfaces - {""}):
             digest.update(np.sort(np.sort(self.mesh.facet_set(name), axis=1), axis=0).tobytes())

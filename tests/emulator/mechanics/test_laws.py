@@ -155,6 +155,26 @@ def test_rest_is_free_of_energy_and_stress(name):
     np.testing.assert_allclose(jax.grad(lambda H: energy(name, H))(rest), 0.0, atol=1e-14)
 
 
+@pytest.mark.parametrize("name", sorted(name for name in LAWS if LAWS[name].shape_moduli))
+def test_shape_moduli_scale_all_but_the_resistance_to_volume_change(name):
+    law = find_law(name)
+    assert set(law.shape_moduli) <= {q.name for q in law.quantities if q.unit == "kPa"}
+
+    def scaled(factor, F):
+        values = dict(zip(law.parameters, ARGUMENTS[name], strict=True))
+        values |= {modulus: factor * values[modulus] for modulus in law.shape_moduli}
+        directions = jnp.asarray(np.stack([FIBRE, SHEET]) if law.sheets else FIBRE)
+        strain = Strain(jnp.asarray(F - np.eye(3)), None, directions)
+        return float(law.energy(strain, *map(jnp.asarray, values.values())))
+
+    F = deformation(True)
+    volume, whole = scaled(0.0, F), scaled(1.0, F)
+    even = np.cbrt(np.linalg.det(F)) * np.eye(3)  # as much volume change, and no other
+    assert volume == pytest.approx(scaled(0.0, even), rel=1e-12)
+    assert whole - volume > 0.1 * whole
+    assert scaled(3.0, F) - volume == pytest.approx(3.0 * (whole - volume), rel=1e-12)
+
+
 @pytest.mark.parametrize("name", sorted(LAWS))
 def test_frame_indifference(name):
     F = np.eye(3) + 0.2 * np.random.default_rng(3).normal(size=(3, 3))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.laws.volumetric import logarithmic, quadratic
@@ -109,3 +110,30 @@ def test_without_fibres_no_direction_is_looked_up():
     assert "max" not in bare  # the fibres' tension switch
     assert one["max"] >= 1
     assert flops > bare_flops
+
+
+def test_without_regions_the_law_is_evaluated_and_no_more():
+    scene = scene_of(SHAPE)
+    grid, theta = scene.discretisation, scene.centre
+
+    def by_hand(u, theta):
+        H = jnp.einsum("mai,mqaj->mqij", u[grid.connectivity], grid.gradients)
+        W = jax.vmap(jax.vmap(lambda h: 0.5 * theta[0] * Strain(h).I1_minus_3))(H)
+        return jnp.sum(grid.weights * W)
+
+    arguments = (jnp.zeros(scene.held.shape), theta)
+    expected = operations(jax.make_jaxpr(jax.value_and_grad(by_hand))(*arguments).jaxpr)
+    assert cost(scene)[0] == expected
+
+
+def test_regions_add_one_look_up_and_one_product_a_modulus():
+    law = replace(SHAPE, shape_moduli=("mu",))
+    bare, bare_flops = cost(scene_of(law))
+    elements = len(block(cells=(3, 3, 3)).mesh.elements)
+    regions = np.arange(elements) % 4
+    factors = {f"stiffness_{label}": 1.0 + label for label in range(4)}
+    one, flops = cost(scene_of(law, factors, regions=regions))
+    assert one["gather"] == bare["gather"] + 1
+    assert one["mul"] == bare["mul"] + 1  # of the modulus; its transpose is not asked for
+    assert set(one) - set(bare) == {"stack", "lt"}  # the factors, and a look-up's own checks
+    assert 0 < flops - bare_flops <= 8 * elements

@@ -13,6 +13,7 @@ from emulator.scenes import BUILT_IN, find_scene
 COARSE = {
     "left_ventricle": {"rings": 5, "around": 12, "layers": 1},
     "left_ventricle_neo_hookean": {"rings": 5, "around": 12, "layers": 1},
+    "left_ventricle_segments": {"rings": 5, "around": 12, "layers": 1},
     "biventricle": {"rings": 6, "around": 16, "layers": (1, 1)},
     "liver": {"shells": 3},
     "traction_beam_holzapfel_ogden": {"cells": (6, 2, 2)},
@@ -35,7 +36,13 @@ def test_the_centre_is_solved(name):
 def test_every_corner_of_the_box_is_solved(name):
     scene = find_scene(name)
     simulator = em.Simulator(scene)
-    for corner in product((0.0, 1.0), repeat=len(scene.parameters)):
+    corners = list(product((0.0, 1.0), repeat=min(len(scene.parameters), 5)))
+    if len(scene.parameters) > 5:  # of 2^18, the two ends of the diagonal and 30 at random
+        rng = np.random.default_rng(0)
+        rest = rng.integers(0, 2, (30, len(scene.parameters)))
+        ends = np.outer((0, 1), np.ones(len(scene.parameters)))
+        corners = [tuple(row) for row in np.vstack([ends, rest])]
+    for corner in corners:
         solution = simulator.solve(scene.from_unit(jnp.array(corner)))
         assert Status(int(solution.status)) is Status.CONVERGED, corner
 

@@ -319,6 +319,30 @@ def test_named_groups_and_fibres_come_from_the_mesh_file(folder):
     np.testing.assert_array_equal(find_scene(str(folder / "scene.toml")).fibres, fibres)
 
 
+def test_regions_come_from_cell_data(folder):
+    mesh = box((2.0, 1.0, 1.0), (2, 1, 1))
+    labels = np.where(mesh.nodes[mesh.elements, 0].mean(axis=1) < 1.0, 1, 2)
+    cells = [("triangle", mesh.surface), ("tetra", mesh.elements)]
+
+    def write(values):
+        data = {"segment": [np.zeros(len(mesh.surface)), values]}
+        meshio.write(folder / "block.vtu", meshio.Mesh(mesh.nodes, cells, cell_data=data))
+
+    write(labels.astype(float))
+    factor = '[parameters.stiffness_1]\nrange = [0.5, 2.0]\nscale = "log"\n'
+    text = SCENE.replace("[constants]", factor + "[constants]\nstiffness_2 = 1.0")
+    (folder / "scene.toml").write_text('regions = "segment"\n' + text)
+    scene = find_scene(str(folder / "scene.toml"))
+    np.testing.assert_array_equal(scene.regions, labels)
+    assert scene.parameter_names == ("mu", "stiffness_1")
+    write(labels + 0.5)
+    with pytest.raises(InputError, match="'segment' are not one whole number for each element"):
+        find_scene(str(folder / "scene.toml"))
+    (folder / "scene.toml").write_text('regions = "zone"\n' + text)
+    with pytest.raises(InputError, match="no cell data 'zone' for regions; has 'segment'"):
+        find_scene(str(folder / "scene.toml"))
+
+
 def test_unknown_names(tmp_path):
     with pytest.raises(InputError, match="scene 'beam' is unknown; built in: biventricle"):
         find_scene("beam")

@@ -44,9 +44,10 @@ def energy_released(
 
 
 _PARAMETERS = (modulus("a"), number("b"), modulus("a_f"), number("b_f"), modulus("kappa"))
-HOLZAPFEL_OGDEN = Law("holzapfel_ogden", _PARAMETERS, energy, fibres=True)
+_SHAPE = ("a", "a_f")
+HOLZAPFEL_OGDEN = Law("holzapfel_ogden", _PARAMETERS, energy, fibres=True, shape_moduli=_SHAPE)
 HOLZAPFEL_OGDEN_RELEASED = Law(
-    "holzapfel_ogden_released", _PARAMETERS, energy_released, fibres=True
+    "holzapfel_ogden_released", _PARAMETERS, energy_released, fibres=True, shape_moduli=_SHAPE
 )
 
 

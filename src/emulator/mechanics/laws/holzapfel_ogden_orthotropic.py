@@ -57,4 +57,5 @@ HOLZAPFEL_OGDEN_ORTHOTROPIC = Law(
     energy,
     fibres=True,
     sheets=True,
+    shape_moduli=("a", "a_f", "a_s", "a_fs"),
 )

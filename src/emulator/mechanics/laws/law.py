@@ -22,6 +22,8 @@ class Law:
     energy : ``energy(strain, *parameters) -> W``, the strain energy density (kPa) of one point.
     fibres : whether the energy asks for ``strain.fibre``.
     sheets : whether it asks for ``strain.sheet`` too.
+    shape_moduli : parameters that its energy, volumetric part apart, is proportional to all
+        together; regions of a scene scale these. Without any, its scenes have no regions.
     """
 
     name: str
@@ -29,6 +31,7 @@ class Law:
     energy: Callable[..., jax.Array]
     fibres: bool = False
     sheets: bool = False
+    shape_moduli: tuple[str, ...] = ()
 
     @property
     def parameters(self) -> tuple[str, ...]:

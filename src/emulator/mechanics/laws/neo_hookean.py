@@ -52,8 +52,10 @@ def bulk_modulus(mu: float, nu: float) -> float:
     return 2.0 * mu * (1.0 + nu) / (3.0 * (1.0 - 2.0 * nu))
 
 
-NEO_HOOKEAN = Law("neo_hookean", (modulus("mu"), modulus("lam")), energy_lame)
+NEO_HOOKEAN = Law("neo_hookean", (modulus("mu"), modulus("lam")), energy_lame, shape_moduli=("mu",))
 NEO_HOOKEAN_E_NU = Law(
     "neo_hookean_E_nu", (modulus("E"), number("nu", -1.0, 0.5)), energy_engineering
 )
-NEO_HOOKEAN_SPLIT = Law("neo_hookean_split", (modulus("mu"), modulus("kappa")), energy_split)
+NEO_HOOKEAN_SPLIT = Law(
+    "neo_hookean_split", (modulus("mu"), modulus("kappa")), energy_split, shape_moduli=("mu",)
+)

@@ -1,0 +1,45 @@
+"""A human left ventricle whose stiffness differs from segment to segment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from emulator.geometry.segments import SEGMENTS, aha_segments
+from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE, left_ventricle
+from emulator.scenes.parameters import Parameter
+from emulator.scenes.scene import Scene
+
+STIFFNESSES = tuple(
+    Parameter(f"stiffness_{label}", "", 0.5, 2.0, "log") for label in range(1, SEGMENTS + 1)
+)
+"""Half to twice the stiffness of healthy myocardium, whose own is 1."""
+
+
+def left_ventricle_segments(
+    rings: int = 15,
+    around: int = 30,
+    layers: int = 3,
+    angles: tuple[float, float] = HELIX,
+    kappa: float = 25.0,
+) -> Scene:
+    """:func:`~emulator.scenes.left_ventricle.left_ventricle` with a stiffness for each segment.
+
+    theta = (stiffness_1, ..., stiffness_17, pressure). Each stiffness multiplies the energy of the
+    law in one of the 17 segments of :mod:`emulator.geometry.segments`, ``kappa`` excepted; ``a``,
+    ``b``, ``a_f`` and ``b_f`` are the geometric means of their ranges. With all stiffnesses 1 it is
+    that scene at the centre of those ranges.
+
+    Parameters
+    ----------
+    rings, around, layers, angles, kappa : as there.
+    """
+    plain = left_ventricle(rings, around, layers, angles, kappa)
+    centre = {p.name: float((p.low * p.high) ** 0.5) for p in MYOCARDIUM}
+    return replace(
+        plain,
+        name="left_ventricle_segments",
+        parameters=(*STIFFNESSES, PRESSURE),
+        constants={**plain.constants, **centre},
+        regions=aha_segments(plain.mesh),
+        recipe={**plain.recipe, "scene": "left_ventricle_segments"},
+    )
