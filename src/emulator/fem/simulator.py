@@ -95,7 +95,7 @@ class Simulator:
             A tangent singular to the last bit.
         """
         theta, u = self._checked(theta, u)
-        system, tangent = self._linearised(u, theta)
+        system, tangent = self.linearised(u, theta)
         return self._columns[system.factorisation](tangent, u, theta)
 
     def _drives(self, *arguments: jax.Array) -> bool:
@@ -103,7 +103,7 @@ class Simulator:
         traced = any(isinstance(argument, jax.core.Tracer) for argument in arguments)
         return not (self.factorisation != "auto" or traced or self.system.forces)
 
-    def _linearised(self, u: jax.Array, theta: jax.Array) -> tuple[System, jax.Array]:
+    def linearised(self, u: jax.Array, theta: jax.Array) -> tuple[System, jax.Array]:
         """The system that can factorise the tangent at ``u``, and that tangent (nnz,)."""
         if self._drives(u, theta):
             return self._driver.linearise(u, theta)
@@ -168,7 +168,7 @@ class Simulator:
         def derivative(primals, tangents):  # noqa: ANN001, ANN202
             theta, start = primals
             solution = equilibrium(theta, start)
-            system, tangent = self._linearised(solution.displacement, theta)
+            system, tangent = self.linearised(solution.displacement, theta)
             moved = self._moved[system.factorisation](
                 tangent, solution.displacement, theta, tangents[0]
             )

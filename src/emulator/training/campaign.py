@@ -1,4 +1,4 @@
-"""FEM runs over the parameter box, each started from the nearest one already done."""
+"""FEM runs over the parameter box, each started from what the earlier ones say of it."""
 
 from __future__ import annotations
 
@@ -10,19 +10,47 @@ import numpy as np
 from tqdm import tqdm
 
 from emulator.fem import Simulator
-from emulator.mechanics.energy import potential_energy
+from emulator.fem.assembly import relative_residual
+from emulator.fem.expansion import Expansion
+from emulator.mechanics.energy import potential_energy, volume_ratio
+from emulator.scenes.scene import Scene
 
 
 class Runs(NamedTuple):
-    """Converged FEM solutions: theta (c, p), displacement (c, n, 3) mm, energy (c,) mN mm."""
+    """Converged FEM solutions.
+
+    theta : (c, p). displacement : (c, n, 3) mm. energy : (c,) mN mm.
+    slopes : (c, p, n, 3) mm, derivatives of the displacement in theta's position in its box; or
+        None where they were not asked for.
+    """
 
     theta: jax.Array
     displacement: jax.Array
     energy: jax.Array
+    slopes: jax.Array | None = None
+
+    def take(self, rows: slice | np.ndarray) -> Runs:
+        """Some of the runs."""
+        return Runs(*(None if part is None else part[rows] for part in self))
 
 
-def run_campaign(simulator: Simulator, thetas: jax.Array, *, progress: bool = False) -> Runs:
+def run_campaign(
+    simulator: Simulator,
+    thetas: jax.Array,
+    *,
+    slopes: bool = False,
+    expansion: Expansion | None = None,
+    progress: bool = False,
+) -> Runs:
     """Solve at every theta (c, p).
+
+    Each run starts from the nearest one done, moved along its slopes where there are any, or from
+    ``expansion`` where that leaves less force out of balance.
+
+    Parameters
+    ----------
+    slopes : find the derivatives in theta too, from each run's own factor: a tenth of its time on
+        a ventricle with five parameters.
 
     Raises
     ------
@@ -31,13 +59,44 @@ def run_campaign(simulator: Simulator, thetas: jax.Array, *, progress: bool = Fa
     """
     scene = simulator.scene
     positions = np.asarray(scene.to_unit(thetas))
+    scales = jax.vmap(lambda x: jnp.diagonal(jax.jacfwd(scene.from_unit)(x)))(positions)
     fields: list[jax.Array] = []
+    derivatives: list[jax.Array] = []
+    best = _chooser(simulator)
     for k, theta in enumerate(tqdm(thetas, "FEM", disable=not progress, unit="run")):
-        start = None
+        starts = []
         if fields:
-            start = fields[int(np.argmin(np.sum((positions[:k] - positions[k]) ** 2, axis=1)))]
+            near = int(np.argmin(np.sum((positions[:k] - positions[k]) ** 2, axis=1)))
+            starts.append(fields[near])
+            if slopes:
+                step = positions[k] - positions[near]
+                starts.append(fields[near] + jnp.tensordot(step, derivatives[near], axes=1))
+        if expansion is not None:
+            starts.append(expansion(jnp.asarray(positions[k])))
+        start = best(jnp.stack(starts), theta) if len(starts) > 1 else next(iter(starts), None)
         solution = simulator.solve(theta, start)
+        if not solution.converged and starts:
+            solution = simulator.solve(theta)
         fields.append(solution.require_converged(f"FEM run {k}").displacement)
+        if slopes:
+            columns = simulator.sensitivities(fields[-1], theta)
+            derivatives.append(columns * scales[k][:, None, None])
     displacement = jnp.stack(fields)
     energy = jax.jit(jax.vmap(potential_energy(scene)))(displacement, thetas)
-    return Runs(thetas, displacement, energy)
+    return Runs(thetas, displacement, energy, jnp.stack(derivatives) if slopes else None)
+
+
+def _chooser(simulator: Simulator):  # noqa: ANN202 - a jitted closure, private
+    """Of several starts (s, n, 3), the one with the least force out of balance."""
+    scene: Scene = simulator.scene
+
+    @jax.jit
+    def choose(starts: jax.Array, theta: jax.Array) -> jax.Array:
+        def imbalance(u: jax.Array) -> jax.Array:
+            error = relative_residual(simulator.system, u, theta)
+            sound = jnp.isfinite(error) & (jnp.min(volume_ratio(scene, u)) > 0.0)
+            return jnp.where(sound, error, jnp.inf)
+
+        return starts[jnp.argmin(jax.lax.map(imbalance, starts))]
+
+    return choose

@@ -98,7 +98,7 @@ def test_a_gradient_outside_jit_uses_the_cheap_factor(beam, monkeypatch):
         return jnp.sum(simulator.solve(theta).displacement ** 2)
 
     slope = jax.grad(squared)(beam.centre)
-    assert simulator._linearised(simulator(beam.centre), beam.centre)[0].factorisation == "cholmod"
+    assert simulator.linearised(simulator(beam.centre), beam.centre)[0].factorisation == "cholmod"
     np.testing.assert_allclose(slope, jax.jit(jax.grad(squared))(beam.centre), rtol=1e-8)
 
 
@@ -107,7 +107,7 @@ def test_sensitivities_where_cholesky_is_refused(ventricle):
     theta = ventricle.scene.centre
     blown = 0.9 * ventricle(theta)
     soft = theta.at[:4].multiply(0.3).at[4].multiply(10.0)
-    system, _ = ventricle._linearised(blown, soft)
+    system, _ = ventricle.linearised(blown, soft)
     assert system.factorisation == "umfpack"
     columns = ventricle.sensitivities(blown, soft)
     forces = jax.jacfwd(lambda t: system.residual(blown, t))(soft)

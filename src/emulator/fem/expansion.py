@@ -1,0 +1,172 @@
+r"""The equilibrium as a Taylor series in the parameters, from one FEM solution and one factor.
+
+Along :math:`x` (theta's position in its box) the equilibrium satisfies
+:math:`r(u(x), x) = 0` identically. Differentiating once, twice, three times,
+
+.. math::
+    K u_{,a} = -r_{,a}, \qquad
+    K u_{,ab} = -\left.\partial^2_{\epsilon_1 \epsilon_2}
+        r(u_0 + \epsilon_1 u_{,a} + \epsilon_2 u_{,b},\;
+          x_0 + \epsilon_1 e_a + \epsilon_2 e_b)\right|_0
+
+and so on with the path's own mixed terms, every order uses the tangent :math:`K` of the first: what
+follows a solve are residuals differentiated along paths and back-substitutions. On a ventricle with
+five parameters, over the whole box, orders 1, 2, 3 and 4 leave a median error of 0.20, 0.047, 0.010
+and 0.003 mm; at the corners, near the series' radius of convergence, the error is much larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations, combinations_with_replacement
+from math import comb, factorial, prod
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.fem.assembly import System
+from emulator.fem.simulator import Simulator
+
+_MOST_TERMS = 200  # of one order; 18 parameters have 171 of the second and 1140 of the third
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """Taylor series of a scene's equilibrium about one theta.
+
+    centre : (p,) position in the box.
+    displacement : (n, 3) mm, the equilibrium there.
+    indices : (t, order) parameters each term is differentiated in, -1 for none; sorted by order.
+    derivatives : (t, n, 3) mm, with respect to position.
+    """
+
+    centre: np.ndarray
+    displacement: jax.Array
+    indices: np.ndarray
+    derivatives: jax.Array
+
+    def monomials(self, position: jax.Array) -> jax.Array:
+        """What each derivative is multiplied by at ``position`` (..., p), shape (..., t)."""
+        return monomials(self.indices, position - self.centre)
+
+    def __call__(self, position: jax.Array) -> jax.Array:
+        """Displacement (..., n, 3) mm at ``position`` (..., p) in the box."""
+        return self.displacement + jnp.tensordot(
+            self.monomials(position), self.derivatives, axes=1
+        )
+
+    @property
+    def order(self) -> int:
+        """Of the highest derivative there is."""
+        return int(np.max(np.sum(self.indices >= 0, axis=1), initial=0))
+
+
+def constant(position: np.ndarray, displacement: jax.Array) -> Expansion:
+    """The series of order 0: ``displacement`` (n, 3) everywhere."""
+    return Expansion(
+        np.asarray(position),
+        jnp.asarray(displacement),
+        np.zeros((0, 1), dtype=int),
+        jnp.zeros((0, *displacement.shape)),
+    )
+
+
+def monomials(indices: np.ndarray, step: jax.Array) -> jax.Array:
+    """Taylor monomials (..., t) of ``step`` (..., p): products over the multi-indices' factorials.
+
+    The term of ``u,aab`` is ``s_a s_a s_b / (2! 1!)``: each multi-index stands once.
+    """
+    if not len(indices):
+        return jnp.zeros((*step.shape[:-1], 0))
+    ones = jnp.ones((*step.shape[:-1], 1))
+    powers = jnp.concatenate([step, ones], axis=-1)[..., indices]  # index -1 is the one
+    counts = [np.unique(row[row >= 0], return_counts=True)[1] for row in indices]
+    return jnp.prod(powers, axis=-1) / np.array([prod(map(factorial, c)) for c in counts])
+
+
+def expand(simulator: Simulator, theta: jax.Array | None = None, order: int = 3) -> Expansion:
+    """The Taylor series of the equilibrium about ``theta`` (p,), the centre of the box by default.
+
+    Parameters
+    ----------
+    order : 1 to 4; an order with more than 200 terms is left out.
+
+    Raises
+    ------
+    SolverError
+        No equilibrium was found at ``theta``.
+    """
+    if order not in (1, 2, 3, 4):
+        raise InputError(f"expansion of order {order}; give 1 to 4")
+    scene = simulator.scene
+    theta = scene.centre if theta is None else theta
+    u = simulator.solve(theta).require_converged("the expansion's centre").displacement
+    return expand_at(simulator, u, theta, order)
+
+
+def expand_at(simulator: Simulator, u: jax.Array, theta: jax.Array, order: int) -> Expansion:
+    """The same about a known equilibrium ``u`` (n, 3) mm."""
+    position = simulator.scene.to_unit(theta)
+    system, tangent = simulator.linearised(u, theta)
+    count = len(position)
+    found: dict[tuple[int, ...], jax.Array] = {}
+    for degree in range(1, order + 1):
+        if comb(count + degree - 1, degree) > _MOST_TERMS:
+            break
+        terms = list(combinations_with_replacement(range(count), degree))
+        forces = _forces(system, u, position, terms, found)
+        moved = jax.vmap(system.extend, in_axes=1)(-jax.jit(system.solve)(tangent, forces.T))
+        found.update(zip(terms, moved, strict=True))
+    indices = np.array([[*term, *(-1,) * (order - len(term))] for term in found])
+    return Expansion(np.asarray(position), u, indices, jnp.stack(list(found.values())))
+
+
+def _forces(
+    system: System,
+    u: jax.Array,
+    position: jax.Array,
+    terms: list[tuple[int, ...]],
+    found: dict[tuple[int, ...], jax.Array],
+) -> jax.Array:
+    """Mixed derivative (t, f) of the residual along each term's path, its own term left out."""
+    degree = len(terms[0])
+    # Every proper part of the multi-index has its term on the path.
+    parts = [s for size in range(1, degree) for s in _subsets(degree, size)]
+    paths = [
+        jnp.stack([found[tuple(term[k] for k in part)] for part in parts])
+        if parts
+        else jnp.zeros((0, *u.shape))
+        for term in terms
+    ]
+
+    def one(argument: tuple[jax.Array, jax.Array]) -> jax.Array:
+        directions, fields = argument
+
+        def along(*steps: jax.Array) -> jax.Array:
+            v = u
+            for part, field in zip(parts, fields, strict=True):
+                v = v + prod((steps[k] for k in part), start=jnp.ones(())) * field
+            x = position + sum(s * d for s, d in zip(steps, directions, strict=True))
+            return system.residual(v, system.scene.from_unit(x))
+
+        return _mixed(along, degree)()
+
+    directions = jnp.stack([jnp.eye(len(position))[jnp.array(term)] for term in terms])
+    return jax.jit(lambda d, f: jax.lax.map(one, (d, f)))(directions, jnp.stack(paths))
+
+
+def _mixed(function: Callable[..., jax.Array], degree: int) -> Callable[[], jax.Array]:
+    """The derivative of ``function`` once in each of its ``degree`` scalars, at zero."""
+    if degree == 0:
+        return function
+    derivative = lambda *rest: jax.jvp(  # noqa: E731
+        lambda last: function(*rest, last), (jnp.zeros(()),), (jnp.ones(()),)
+    )[1]
+    return _mixed(derivative, degree - 1)
+
+
+def _subsets(count: int, size: int) -> list[tuple[int, ...]]:
+    return list(combinations(range(count), size))

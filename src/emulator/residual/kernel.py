@@ -1,0 +1,147 @@
+r"""Gaussian processes of values and slopes, several outputs sharing one kernel.
+
+The kernel is Matern's of smoothness 7/2 (three times differentiable) of the squared distance
+
+.. math:: \rho = |\Lambda\,[\psi(x) - \psi(y)]|^2, \qquad
+          \kappa = \left(1 + a + \tfrac25 a^2 + \tfrac1{15} a^3\right) e^{-a}, \quad a = \sqrt{7\rho}
+
+between features :math:`\psi` of two inputs, scaled by inverse lengths :math:`\Lambda`. With
+:math:`\delta = \Lambda[\psi(x) - \psi(y)]` and :math:`J = \Lambda\,\partial\psi`,
+
+.. math::
+    \partial_y \kappa = -2\kappa'\, \delta J_y, \qquad
+    \partial_x \partial_y \kappa = -4 \kappa''\, (\delta J_x)(\delta J_y)^T - 2\kappa'\, J_x^T J_y,
+    \qquad
+    \kappa' = -\tfrac7{10}\left(1 + a + \tfrac13 a^2\right) e^{-a}, \quad
+    \kappa'' = \tfrac{49}{60}(1 + a) e^{-a}
+
+so a run's value and p slopes are p + 1 observations. None of these is singular where two inputs
+meet (Solak et al. 2003; Rasmussen & Williams 2006, Section 9.4).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve, solve_triangular
+from scipy.optimize import minimize
+
+JITTER = 1e-9  # of observations of unit variance; FEM has no noise
+_LOG_BOUNDS = (-6.0, 3.0)  # of inverse lengths, inputs being of order one
+
+
+class Features(NamedTuple):
+    """Features (c, q) of c inputs and their derivatives (c, q, p), not yet scaled."""
+
+    value: jax.Array
+    slope: jax.Array
+
+    def scaled(self, inverse_lengths: jax.Array) -> Features:
+        """The same divided by their lengths."""
+        return Features(self.value * inverse_lengths, self.slope * inverse_lengths[:, None])
+
+
+class Radial(NamedTuple):
+    """The kernel and its first two derivatives in the squared distance."""
+
+    value: jax.Array
+    first: jax.Array
+    second: jax.Array
+
+
+def radial(squared: jax.Array) -> Radial:
+    """Matern 7/2 at squared distances of any shape; smooth where they are zero."""
+    a = jnp.sqrt(7.0 * squared + 1e-24)  # the root's own slope is infinite at zero
+    decay = jnp.exp(-a)
+    return Radial(
+        value=(1.0 + a + 0.4 * a**2 + a**3 / 15.0) * decay,
+        first=-0.7 * (1.0 + a + a**2 / 3.0) * decay,
+        second=49.0 / 60.0 * (1.0 + a) * decay,
+    )
+
+
+def covariance(features: Features) -> jax.Array:
+    """Covariance (c (1 + p), c (1 + p)) of values and slopes, run by run, of scaled features."""
+    psi, J = features
+    count, parameters = len(psi), J.shape[2]
+    gap = psi[:, None] - psi[None]
+    k = radial(jnp.sum(gap**2, axis=-1))
+    left = jnp.einsum("ijq,iqa->ija", gap, J)  # delta J_x
+    right = jnp.einsum("ijq,jqb->ijb", gap, J)
+    crossed = -4.0 * k.second[..., None, None] * left[..., :, None] * right[..., None, :]
+    crossed += -2.0 * k.first[..., None, None] * jnp.einsum("iqa,jqb->ijab", J, J)
+    top = jnp.concatenate([k.value[..., None], -2.0 * k.first[..., None] * right], axis=-1)
+    rest = jnp.concatenate([2.0 * k.first[..., None, None] * left[..., None], crossed], axis=-1)
+    blocks = jnp.concatenate([top[:, :, None], rest], axis=2)
+    return blocks.transpose(0, 2, 1, 3).reshape([count * (1 + parameters)] * 2)
+
+
+def _factor(features: Features) -> tuple[jax.Array, jax.Array]:
+    """Standard deviations (N,) of the observations, and the factor of their correlations."""
+    K = covariance(features)
+    spread = jnp.sqrt(jnp.diagonal(K))
+    correlation = K / spread[:, None] / spread + JITTER * jnp.eye(len(K))
+    return spread, jnp.linalg.cholesky(correlation)
+
+
+def fit_lengths(features: Features, observations: jax.Array) -> np.ndarray:
+    """Inverse lengths (q,) of greatest likelihood, each output's variance profiled out.
+
+    Parameters
+    ----------
+    observations : (c (1 + p), r) values and slopes of r outputs, run by run.
+    """
+
+    @jax.jit
+    @jax.value_and_grad
+    def objective(logs: jax.Array) -> jax.Array:
+        spread, factor = _factor(features.scaled(jnp.exp(logs)))
+        white = solve_triangular(factor, observations / spread[:, None], lower=True)
+        variances = jnp.mean(white**2, axis=0)
+        determinant = jnp.mean(jnp.log(jnp.diagonal(factor)) + jnp.log(spread))
+        return 0.5 * jnp.mean(jnp.log(variances)) + determinant
+
+    def safe(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = (np.asarray(part) for part in objective(jnp.asarray(logs)))
+        if np.isfinite(value) and np.isfinite(slope).all():
+            return float(value), slope
+        return 1e10, np.zeros_like(logs)  # a step the line search takes back
+
+    count = features.value.shape[1]
+    start = np.zeros(count)
+    start[features.slope.shape[2] :] = -1.0
+    found = minimize(
+        safe, start, jac=True, method="L-BFGS-B", bounds=[_LOG_BOUNDS] * count,
+        options={"maxiter": 80},
+    )  # fmt: skip
+    return np.exp(found.x)
+
+
+def fit_weights(features: Features, observations: jax.Array) -> jax.Array:
+    """Weights (c (1 + p), r) that make the mean pass through the observations."""
+    spread, factor = _factor(features)
+    return cho_solve((factor, True), observations / spread[:, None]) / spread[:, None]
+
+
+def fold(features: Features, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Weights of the values (c, r), and those of the slopes folded with the features (c, q, r)."""
+    count, _, parameters = features.slope.shape
+    each = weights.reshape(count, 1 + parameters, -1)
+    return each[:, 0], jnp.einsum("cqp,cpr->cqr", features.slope, each[:, 1:])
+
+
+def mean(
+    at: jax.Array, known: jax.Array, values: jax.Array, slopes: jax.Array
+) -> jax.Array:
+    """Posterior mean (r,) at scaled features ``at`` (q,).
+
+    known : (c, q) scaled features of the runs. values, slopes : from :func:`fold`.
+    """
+    gap = at - known
+    k = radial(jnp.sum(gap**2, axis=-1))
+    count, width, outputs = slopes.shape
+    along = (-2.0 * k.first[:, None] * gap).reshape(count * width)
+    return k.value @ values + along @ slopes.reshape(count * width, outputs)
