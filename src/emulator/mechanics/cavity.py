@@ -59,9 +59,10 @@ class Cavity:
         facets = outward(scene.mesh, scene.mesh.facet_set(self.facet_set))
         self.nodes: np.ndarray = np.unique(facets)
         X = scene.mesh.nodes[self.nodes]
-        self._X = jnp.asarray(X - X.mean(axis=0))  # cancels less
+        self._X = X - X.mean(axis=0)  # cancels less
         self._volume = enclosed_volume(np.searchsorted(self.nodes, facets))
-        signed = float(self._volume(self._X))
+        with jax.ensure_compile_time_eval():  # a number, also where a trace is going on
+            signed = float(self._volume(self._X))
         if abs(signed) <= _FLAT * scene.mesh.size**3:
             raise InputError(
                 f"facet set '{self.facet_set}' encloses no volume: it is flat, or has no inside"
@@ -82,7 +83,8 @@ class Cavity:
     @cached_property
     def rest(self) -> float:
         """Volume of the undeformed cavity, mL."""
-        return float(self(jnp.zeros(self._X.shape)))
+        with jax.ensure_compile_time_eval():
+            return float(self(jnp.zeros(self._X.shape)))
 
 
 def cavity_sets(scene: Scene) -> tuple[str, ...]:
