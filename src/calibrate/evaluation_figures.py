@@ -69,15 +69,12 @@ def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
         2, columns, figsize=(4.2 * columns, 6.4), layout="constrained", squeeze=False
     )
     for axes, name in zip(grid.flat, names, strict=False):
-        _draw_density(axes, inside.fields[name], _INSIDE, "inside the box" if outside else "")
+        _draw_density(axes, inside.fields[name], _INSIDE, "inside" if outside else "")
         if outside is not None:
             _draw_density(axes, outside.fields[name], _OUTSIDE, "outside")
         axes.set(xscale="log", xlabel=_LABELS[name], ylim=(0.0, None), yticks=[])
-        axes.margins(y=0.12)
-        axes.legend(frameon=False, fontsize=8, loc="upper left")
+        axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
         axes.spines[["top", "right", "left"]].set_visible(False)
-        low, high = axes.get_ylim()
-        axes.set_ylim(low, 1.45 * high)  # room for the legend
     for axes in grid.flat[len(names) :]:
         axes.set_axis_off()
     figure.suptitle(title)
@@ -89,15 +86,17 @@ def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> No
     head = f"{label}: " if label else ""
     for name, style, text in (("median", "-", "median"), ("q97_5", "--", "97.5 %")):
         if found[name] > 0.0:
-            line = f"{head}{text} {found[name]:.2g}"
+            line = f"{head}{text} {found[name]:.3g}"
             axes.axvline(found[name], color=colour, ls=style, lw=1.2, label=line)
     positive = values[values > 0.0]  # held nodes have no error, and no logarithm
     logs = np.log10(positive[:: max(1, len(positive) // _MOST)])
     if len(logs) < 2 or np.ptp(logs) < 1e-6:
         return  # one value: the lines say it all
+    estimate = gaussian_kde(logs)
+    width = 3.0 * float(np.sqrt(estimate.covariance[0, 0]))
     low, high = np.quantile(logs, [0.001, 0.999])
-    at = np.linspace(low - 0.3, high + 0.3, 300)
-    density = gaussian_kde(logs)(at)
+    at = np.linspace(low - width, high + width, 300)
+    density = estimate(at)
     axes.plot(10.0**at, density, color=colour, lw=1.5)
     axes.fill_between(10.0**at, density, color=colour, alpha=0.2, lw=0)
 
@@ -135,9 +134,9 @@ def _draw_map(scene: Scene, cases: list[Any]) -> Any:
         )
     figure.colorbar(scatter, ax=axes, label="median error in displacement of a case (mm)")
     x, y = scene.parameters
+    size = (x.high - x.low, y.high - y.low)
+    axes.add_patch(Rectangle((x.low, y.low), *size, fill=False, ls="--", lw=1.0))
     if len(cases) > 1:
-        size = (x.high - x.low, y.high - y.low)
-        axes.add_patch(Rectangle((x.low, y.low), *size, fill=False, ls="--", lw=1.0))
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
     axes.set(xlabel=_name(x), ylabel=_name(y))
     _scale(axes.set_xscale, axes.xaxis, x)
@@ -166,12 +165,12 @@ def _draw_panels(scene: Scene, cases: list[Any]) -> Any:
                 thetas[:, k], errors, marker=marker, color=colour, s=22, alpha=0.75, lw=0,
                 label=label,
             )  # fmt: skip
-        if len(cases) > 1:
-            axes.axvspan(parameter.low, parameter.high, color="0.92", zorder=0)
+        axes.axvspan(parameter.low, parameter.high, color="0.93", zorder=0)
         axes.set(xlabel=_name(parameter), yscale="log")
         _scale(axes.set_xscale, axes.xaxis, parameter)
     for axes in grid.flat[count:]:
         axes.set_axis_off()
+    _plain(grid[0, 0].yaxis, (1.0, 2.0, 5.0))  # shared
     for axes in grid[:, 0]:
         axes.set_ylabel("median err_u of a case (mm)")
     if len(cases) > 1:
@@ -189,12 +188,17 @@ def _name(parameter: Parameter) -> str:
 def _scale(set_scale: Any, axis: Any, parameter: Parameter) -> None:
     """The parameter's own scale, with plain numbers at its ticks."""
     if parameter.scale == "log":
-        from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
         set_scale("log")
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)))
-        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axis.set_minor_formatter(NullFormatter())
+        _plain(axis, (1.0, 2.0, 3.0, 5.0, 7.0))
+
+
+def _plain(axis: Any, digits: tuple[float, ...]) -> None:
+    """Ticks of a logarithmic axis at these leading digits, as plain numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    axis.set_major_locator(LogLocator(subs=digits))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 # ---- on the body ------------------------------------------------------------------------------
@@ -202,6 +206,7 @@ def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
     """The undeformed body's surface coloured by ``error`` (n,) mm at its nodes, from two sides."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
+    from matplotlib.ticker import MaxNLocator, NullFormatter
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     plt = pyplot()
@@ -212,19 +217,21 @@ def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
     extent = np.ptp(nodes, axis=0)
     figure = plt.figure(figsize=(11.0, 5.2), layout="constrained")
     panels = []
-    for k, azimuth in enumerate((-60.0, 120.0)):
-        axes = figure.add_subplot(1, 2, k + 1, projection="3d", azim=azimuth, elev=22.0)
+    for column, (azimuth, elevation) in enumerate(((-60.0, 15.0), (120.0, 40.0)), 1):
+        axes = figure.add_subplot(1, 2, column, projection="3d", azim=azimuth, elev=elevation)
         axes.add_collection3d(
             Poly3DCollection(nodes[triangles], facecolors=colour.to_rgba(values), lw=0.0)
         )
-        for set_limits, low, high in zip(
-            (axes.set_xlim, axes.set_ylim, axes.set_zlim),
-            nodes.min(axis=0), nodes.max(axis=0), strict=True,
-        ):  # fmt: skip
-            set_limits(low, high)
-        axes.set_box_aspect(extent)
-        axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
-        axes.locator_params(nbins=4)
+        thin = extent < 0.25 * extent.max()
+        for k, name in enumerate("xyz"):
+            axis = (axes.xaxis, axes.yaxis, axes.zaxis)[k]
+            getattr(axes, f"set_{name}lim")(nodes[:, k].min(), nodes[:, k].max())
+            axis.set_major_locator(MaxNLocator(4))
+            if thin[k]:  # its numbers would lie on top of one another
+                axis.set_major_formatter(NullFormatter())
+            else:
+                getattr(axes, f"set_{name}label")(f"{name} (mm)", labelpad=14 if thin.any() else 4)
+        axes.set_box_aspect(extent, zoom=0.88)
         panels.append(axes)
     label = f"mean err_u of the cases ({UNITS['err_u']})"
     figure.colorbar(colour, ax=panels, label=label, shrink=0.75)
