@@ -10,6 +10,7 @@ from scipy.stats import gaussian_kde
 
 from calibrate.figures import pyplot
 from emulator.evaluation import UNITS, Errors, quantiles
+from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameters import Parameter
 from emulator.scenes.scene import Scene
 from emulator.store import replacing
@@ -73,7 +74,12 @@ def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
         if outside is not None:
             _draw_density(axes, outside.fields[name], _OUTSIDE, "outside")
         axes.set(xscale="log", xlabel=_LABELS[name], ylim=(0.0, None), yticks=[])
-        axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+        if axes.lines:
+            axes.legend(
+                frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2
+            )
+        else:
+            axes.text(0.5, 0.5, "no error", transform=axes.transAxes, ha="center")
         axes.spines[["top", "right", "left"]].set_visible(False)
     for axes in grid.flat[len(names) :]:
         axes.set_axis_off()
@@ -202,6 +208,12 @@ def _plain(axis: Any, digits: tuple[float, ...]) -> None:
 
 
 # ---- on the body ------------------------------------------------------------------------------
+def surface_triangles(mesh: Mesh) -> np.ndarray:
+    """The surface as flat triangles (k, 3), four for each quadratic facet."""
+    facets = mesh.surface
+    return facets if facets.shape[1] == 3 else facets[:, _QUARTERS].reshape(-1, 3)
+
+
 def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
     """The undeformed body's surface coloured by ``error`` (n,) mm at its nodes, from two sides."""
     from matplotlib.cm import ScalarMappable
@@ -210,8 +222,7 @@ def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     plt = pyplot()
-    nodes, facets = scene.mesh.nodes, scene.mesh.surface
-    triangles = facets if facets.shape[1] == 3 else facets[:, _QUARTERS].reshape(-1, 3)
+    nodes, triangles = scene.mesh.nodes, surface_triangles(scene.mesh)
     values = error[triangles].mean(axis=1)
     colour = ScalarMappable(Normalize(0.0, max(float(values.max()), 1e-17)), "viridis")
     extent = np.ptp(nodes, axis=0)

@@ -65,6 +65,6 @@ def test_cases_without_an_answer_are_counted_not_averaged(beam):
     both = case_errors(Extrapolated(forward), thetas, zero)
     assert (len(both.thetas), both.invalid) == (2, 0)
     distance = np.linalg.norm(np.asarray(forward(outside)) - 1.0, axis=-1)
-    np.testing.assert_allclose(both.fields["err_u"][1], distance, rtol=1e-12)
+    np.testing.assert_allclose(both.fields["err_u"][1], distance, rtol=1e-5)  # float32 inside
     with pytest.raises(SolverError, match="emulator map has no valid answer for any of 1"):
         case_errors(forward, outside[None], zero[:1])
