@@ -31,6 +31,7 @@ def test_fem_has_no_error(beam, simulator):
     assert report["err_u"]["max"] < 1e-9
     assert report["cases"] == 1
     assert report["units"]["err_Pi"] == "%"
+    assert not {"err_V"} & {*report, *report["units"]}  # a beam has no cavity
 
 
 def test_volume_error_by_hand():
@@ -42,16 +43,10 @@ def test_volume_error_by_hand():
     assert errors["err_V"] == pytest.approx([100.0 * (1.0 - (1.01 / 1.02) ** 3)], rel=1e-10)
 
 
-def test_a_scene_without_a_cavity_has_no_volume_error(beam, simulator):
-    report = evaluate(fem_forward(simulator), beam.centre[None], simulator(beam.centre)[None])
-    assert "err_V" not in report
-    assert "err_V" not in report["units"]
-
-
-def test_size_of_the_reference(beam, simulator):
+def test_size_of_the_reference(beam):
     u = jnp.zeros((2, *beam.held.shape)).at[0, 5].set(jnp.array([3.0, 0.0, 4.0]))
     u = u.at[1, 5].set(jnp.array([0.0, 1.0, 0.0]))
-    report = evaluate(fem_forward(simulator), jnp.stack([beam.centre] * 2), u)
+    report = evaluate(untrained(beam).cache(), jnp.stack([beam.centre] * 2), u)
     assert report["max_u"]["max"] == 5.0
     assert report["mean_u"]["mean"] == pytest.approx(3.0 / len(beam.mesh.nodes))
 
