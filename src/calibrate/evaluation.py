@@ -68,14 +68,16 @@ class Evaluated:
     report: Mapping[str, Any]
 
 
-def build(plan: Evaluation, emulator: Emulator, *, progress: bool = False) -> ForwardMap:
+def build(
+    plan: Evaluation, emulator: Emulator, simulator: Simulator, *, progress: bool = False
+) -> ForwardMap:
     """The forward map to evaluate, over all nodes and also outside the box."""
     scene = emulator.scene
     if plan.forward == "reduced":
-        runs = run_campaign(Simulator(scene), sobol(scene, plan.fem_runs, 0), progress=progress)
+        runs = run_campaign(simulator, sobol(scene, plan.fem_runs, 0), progress=progress)
         return Extrapolated(fit_reduced(scene, runs))
     base = Extrapolated(emulator.cache())
-    return base if plan.forward == "emulator" else corrected(base, Simulator(scene), plan.steps)
+    return base if plan.forward == "emulator" else corrected(base, simulator, plan.steps)
 
 
 def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
@@ -90,11 +92,12 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
     """
     emulator = load(plan.emulator)
     scene = emulator.scene
+    simulator = Simulator(scene)  # one for all: it compiles once
     if plan.against == "fem":
-        reference = fem_reference(scene, plan.cases, progress=progress)
+        reference = fem_reference(simulator, plan.cases, progress=progress)
     else:
         reference = published_reference(scene, plan.against, progress=progress)
-    forward = build(plan, emulator, progress=progress)
+    forward = build(plan, emulator, simulator, progress=progress)
     inside = case_errors(forward, reference.thetas, reference.displacement)
     report = {
         **inside.report(),
@@ -110,7 +113,9 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
         report["fem_runs"] = plan.fem_runs
     outside = None
     if plan.outside is not None:
-        beyond = outside_reference(scene, plan.cases, plan.outside, reference, progress=progress)
+        beyond = outside_reference(
+            simulator, plan.cases, plan.outside, reference, progress=progress
+        )
         outside, report["outside"] = _outside(forward, beyond, plan.outside)
     return Evaluated(forward, inside, outside, report)
 

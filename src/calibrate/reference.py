@@ -31,9 +31,9 @@ class Reference(NamedTuple):
     failed: int = 0
 
 
-def fem_reference(scene: Scene, cases: int, *, progress: bool = False) -> Reference:
+def fem_reference(simulator: Simulator, cases: int, *, progress: bool = False) -> Reference:
     """Our FEM at ``cases`` theta over the box; :class:`SolverError` when one fails."""
-    runs = run_campaign(Simulator(scene), sobol(scene, cases, SEED), progress=progress)
+    runs = run_campaign(simulator, sobol(simulator.scene, cases, SEED), progress=progress)
     return Reference(runs.theta, runs.displacement, "our FEM")
 
 
@@ -147,13 +147,18 @@ def _admissible(scene: Scene, thetas: np.ndarray) -> np.ndarray:
 
 
 def outside_reference(
-    scene: Scene, cases: int, fraction: float, inside: Reference, *, progress: bool = False
+    simulator: Simulator,
+    cases: int,
+    fraction: float,
+    inside: Reference,
+    *,
+    progress: bool = False,
 ) -> Reference:
     """Our FEM outside the box, each from the nearest solution there is, else from rest.
 
     What does not converge is left out and counted.
     """
-    simulator = Simulator(scene)
+    scene = simulator.scene
     thetas = sample_outside(scene, cases, fraction)
     positions = list(np.asarray(scene.to_unit(inside.thetas)))
     fields, solved = list(inside.displacement), []
