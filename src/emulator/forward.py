@@ -94,6 +94,44 @@ def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
     return Prediction(forward(safe), inside)
 
 
+@dataclass(frozen=True, eq=False)
+class Extrapolated:
+    """``base``, taken at its word outside the box too, wherever it is finite.
+
+    To measure how fast a map gets worse there; never to calibrate with.
+    """
+
+    base: ForwardMap
+
+    @property
+    def kind(self) -> str:
+        """That of ``base``."""
+        return self.base.kind
+
+    @property
+    def scene(self) -> Scene:
+        """What is mapped."""
+        return self.base.scene
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Nodes returned, (k,)."""
+        return self.base.nodes
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Displacement (k, 3) in mm."""
+        return self.base(theta)
+
+    def evaluate(self, theta: jax.Array) -> Prediction:
+        """Displacement (k, 3) in mm, and whether it is finite."""
+        u = self.base(theta)
+        return Prediction(u, jnp.all(jnp.isfinite(u)))
+
+    def at(self, nodes: np.ndarray) -> Extrapolated:
+        """The same map restricted to ``nodes``."""
+        return Extrapolated(self.base.at(nodes))
+
+
 def rows_of(forward: ForwardMap, nodes: np.ndarray) -> np.ndarray:
     """Positions of ``nodes`` among those of ``forward``; :class:`InputError` when one is not."""
     nodes = check_nodes(forward.scene, nodes)

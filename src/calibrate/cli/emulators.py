@@ -1,10 +1,9 @@
-"""``calibrate train`` and ``calibrate evaluate``."""
+"""``calibrate train``."""
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from calibrate.cli.common import (
@@ -14,12 +13,11 @@ from calibrate.cli.common import (
     emit,
     seconds,
     show_progress,
-    table,
 )
 
 
 def register(commands: Any) -> None:
-    """Add the commands."""
+    """Add the command."""
     parser = commands.add_parser("train", help="train an emulator")
     add_scene(parser)
     parser.add_argument("--objective", choices=("energy", "simulations", "both"))
@@ -37,14 +35,6 @@ def register(commands: Any) -> None:
     parser.add_argument("--out", required=True, metavar="DIR")
     add_json(parser)
     parser.set_defaults(run=train)
-    parser = commands.add_parser("evaluate", help="errors of an emulator against FEM")
-    parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
-    parser.add_argument(
-        "--against", required=True, metavar="DIR|fem", help="a published model's folder, or our FEM"
-    )
-    parser.add_argument("--cases", type=int, default=50, help="FEM runs when against fem")
-    add_json(parser)
-    parser.set_defaults(run=evaluate)
 
 
 def train(arguments: argparse.Namespace) -> int:
@@ -95,77 +85,3 @@ def command_line(scene: str, plan: dict[str, Any]) -> str:
     names = ("objective", "steps", "simulations", "batch", "seed")
     options = " ".join(f"--{name} {plan[name]}" for name in names)
     return f"calibrate train {scene} {options} --out DIR"
-
-
-def evaluate(arguments: argparse.Namespace) -> int:
-    """Compare an emulator with stored or fresh FEM solutions."""
-    from emulator.evaluation import evaluate as errors_of
-    from emulator.network import load
-
-    emulator = load(arguments.emulator)
-    if arguments.against == "fem":
-        from emulator.fem import Simulator
-        from emulator.training import run_campaign, sobol
-
-        # A seed of its own: the test points are not training points.
-        thetas = sobol(emulator.scene, arguments.cases, seed=90_210)
-        runs = run_campaign(Simulator(emulator.scene), thetas, progress=show_progress(arguments))
-        reference = runs.displacement
-    else:
-        thetas, reference = _published(emulator, Path(arguments.against))
-    report = errors_of(emulator.cache(), thetas, reference)
-    report["emulator"] = arguments.emulator
-    report["training"] = dict(emulator.record)
-    names = [name for name in report["units"] if name in report]
-    text = table(
-        (f"{report['cases']} cases", "median", "mean", "97.5 %", "max", "unit"),
-        [
-            (
-                name,
-                *(report[name][q] for q in ("median", "mean", "q97_5", "max")),
-                report["units"][name],
-            )
-            for name in names
-        ],
-    )
-    emit(report, as_json=arguments.json, text=text)
-    return DONE
-
-
-def _published(emulator: Any, folder: Path) -> Any:
-    """Theta and displacements of a released model whose mesh is the emulator's."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from emulator.errors import InputError
-    from emulator.scenes.published import published_scene, published_tests
-
-    model, root = folder.resolve().name, folder.resolve().parent
-    scene, ours = published_scene(model, root), emulator.scene
-    same = (
-        scene.mesh.nodes.shape == ours.mesh.nodes.shape
-        and np.allclose(scene.mesh.nodes, ours.mesh.nodes, atol=1e-6 * ours.mesh.size)
-        and np.array_equal(_as_set(scene.mesh.elements), _as_set(ours.mesh.elements))
-        and np.array_equal(scene.held, ours.held)
-        and np.allclose(scene.held_displacement, ours.held_displacement)
-        and scene.law.name == ours.law.name
-        and scene.loads == ours.loads
-    )
-    if not same:
-        raise InputError(
-            f"published model '{model}' is not the scene '{ours.name}' of the emulator "
-            "(mesh, supports, law and loads must agree)"
-        )
-    thetas, tests = published_tests(model, root)
-    if tests.displacement is None:
-        raise InputError(
-            f"published model '{model}' comes without displacements; use --against fem"
-        )
-    order = [scene.parameter_names.index(name) for name in ours.parameter_names]
-    return thetas[:, jnp.array(order)], jnp.asarray(tests.displacement)
-
-
-def _as_set(elements: Any) -> Any:
-    import numpy as np
-
-    return np.unique(np.sort(elements, axis=1), axis=0)

@@ -7,9 +7,13 @@ tissue. The cone from the origin over it has the volume :math:`\frac13 \int x \c
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from emulator.geometry.discretisation import FacetRule, facet_rule
 
@@ -43,3 +47,46 @@ def rim(facets: np.ndarray) -> np.ndarray:
         np.sort(edges[:, :2], axis=1), axis=0, return_index=True, return_counts=True
     )
     return edges[first[counts == 1]]
+
+
+def openings(facets: np.ndarray) -> list[np.ndarray]:
+    """The rim of ``facets``, one array (e, 2 or 3) of edges for each opening it goes round."""
+    edges = rim(facets)
+    if not len(edges):
+        return []
+    names, ends = np.unique(edges[:, :2], return_inverse=True)
+    start, end = ends.reshape(-1, 2).T
+    graph = coo_array((np.ones(len(edges)), (start, end)), shape=(len(names),) * 2)
+    count, label = connected_components(graph, directed=False)
+    return [edges[label[start] == k] for k in range(count)]
+
+
+def enclosed_volume(facets: np.ndarray) -> Callable[[jax.Array], jax.Array]:
+    r"""``x -> V`` in mm3: the volume that ``facets`` (k, 3 or 6) and lids on its openings enclose.
+
+    .. math:: V = \frac13 \oint x \cdot n \, da
+
+    by the divergence theorem, with ``n`` the facets' own normals: positive where they point out of
+    the enclosed space. The lid of an opening is a fan from the mean of its rim's corners; ``x`` is
+    (n, 3) in mm.
+    """
+    rims = [(edges, np.unique(edges[:, :2])) for edges in openings(facets)]
+
+    def volume(x: jax.Array) -> jax.Array:
+        total = jnp.sum(jax.vmap(cone_volume)(x[facets]))
+        for edges, ends in rims:
+            middle = jnp.mean(x[ends], axis=0)
+            fan = jax.vmap(lambda edge, middle=middle: cone_volume(_lid(edge, middle)))(x[edges])
+            total = total + jnp.sum(fan)
+        return total
+
+    return volume
+
+
+def _lid(edge: jax.Array, middle: jax.Array) -> jax.Array:
+    """Facet between a rim edge (2 or 3, 3) and ``middle`` (3,), against the wall's orientation."""
+    start, end = edge[0], edge[1]
+    if len(edge) == 2:
+        return jnp.stack([end, start, middle])
+    spokes = [0.5 * (start + middle), 0.5 * (middle + end)]
+    return jnp.stack([end, start, middle, edge[2], *spokes])

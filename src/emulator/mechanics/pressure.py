@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.mechanics.facets import cone_volume, rim
+from emulator.mechanics.facets import cone_volume, enclosed_volume, rim
 from emulator.mechanics.kinematics import cofactor
 from emulator.mechanics.local import LocalTerm, Values
 from emulator.mechanics.quantity import Quantity
@@ -145,27 +145,10 @@ def require_held_rim(scene: Scene, name: str) -> None:
 def cavity_volume(scene: Scene, facet_set: str) -> Callable[[jax.Array], jax.Array]:
     """``u -> V`` in mL of a cavity, its opening closed by a fan from the rim's middle.
 
-    Differentiable. Lengths are mm, so the volume in mm3 is divided by 1000.
+    Differentiable; positive where the facets' normals point into the cavity. Lengths are mm, so the
+    volume in mm3 is divided by 1000. :class:`~emulator.mechanics.cavity.Cavity` needs only the
+    facets' own nodes, and is positive whatever the winding.
     """
-    facets = scene.mesh.facet_set(facet_set)
-    edges = rim(facets)
-    ends = np.unique(edges[:, :2])
-
-    def volume(u: jax.Array) -> jax.Array:
-        x = scene.mesh.nodes + u
-        wall = jnp.sum(jax.vmap(cone_volume)(x[facets]))
-        if len(edges):
-            middle = jnp.mean(x[ends], axis=0)
-            wall = wall + jnp.sum(jax.vmap(lambda edge: cone_volume(_lid(edge, middle)))(x[edges]))
-        return -wall / 1000.0
-
-    return volume
-
-
-def _lid(edge: jax.Array, middle: jax.Array) -> jax.Array:
-    """Facet between a rim edge (2 or 3, 3) and ``middle`` (3,), against the wall's orientation."""
-    start, end = edge[0], edge[1]
-    if len(edge) == 2:
-        return jnp.stack([end, start, middle])
-    spokes = [0.5 * (start + middle), 0.5 * (middle + end)]
-    return jnp.stack([end, start, middle, edge[2], *spokes])
+    outward = enclosed_volume(scene.mesh.facet_set(facet_set))
+    X = jnp.asarray(scene.mesh.nodes)
+    return lambda u: -outward(X + u) / 1000.0

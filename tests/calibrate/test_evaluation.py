@@ -1,0 +1,89 @@
+"""The command's work, on a coarse beam with a small network that is off by about 0.1 mm."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import emulator as em
+from calibrate.cli import main
+from calibrate.evaluation import Evaluation, run_evaluation
+from calibrate.reference import fem_reference
+from emulator.errors import InputError
+from emulator.network import load, save_emulator
+from network_support import untrained
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1))
+    centre = np.asarray(em.Simulator(scene)(scene.centre))
+    path = tmp_path_factory.mktemp("emulator")
+    save_emulator(replace(untrained(scene), offset=centre, scale=np.full(3, 0.1)), path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def reference(folder):
+    return fem_reference(em.Simulator(load(folder).scene), 3)
+
+
+def test_newton_steps_square_the_error(folder, reference, monkeypatch):
+    monkeypatch.setattr("calibrate.evaluation.fem_reference", lambda *_, **__: reference)
+    base = run_evaluation(Evaluation(folder)).report
+    once, thrice = (
+        run_evaluation(Evaluation(folder, forward="corrected", steps=k)).report for k in (1, 3)
+    )
+    medians = [report["err_u"]["median"] for report in (base, once, thrice)]
+    assert medians[0] > 2.0 * medians[1]
+    assert medians[2] < 1e-3 * medians[1]
+    assert (once["forward"], once["steps"], once["reference"]) == ("corrected", 1, "our FEM")
+    assert "steps" not in base
+
+
+def test_outside_comes_separately_with_files_and_figures(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ["--forward", "reduced", "--fem-runs", "10", "--cases", "4", "--outside", "0.5"]
+    words += ["--against", "fem", "--out", str(out), "--json"]
+    assert main(["evaluate", folder, *words]) == 0
+    report = json.loads(capsys.readouterr().out)
+    kept = json.loads((out / "evaluation.json").read_text())
+    assert kept == {name: value for name, value in report.items() if name != "files"}
+    assert (kept["forward"], kept["fem_runs"]) == ("reduced", 10)
+    assert kept["err_u"]["median"] < 1e-3 * kept["mean_u"]["median"]
+    outside = kept["outside"]
+    assert outside["cases"] + outside["failed"] + outside["invalid"] == 4
+    # Extrapolating is worse than interpolating.
+    assert outside["err_u"]["median"] > 3.0 * kept["err_u"]["median"]
+    assert {path.name for path in out.iterdir()} == {
+        "evaluation.json",
+        "error_densities.png",
+        "error_over_parameters.png",
+        "error_on_surface.png",
+    }
+    from matplotlib.image import imread
+
+    for path in out.glob("*.png"):
+        assert len(np.unique(imread(path).reshape(-1, 4), axis=0)) > 100
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--against", "fem", "--steps", "2"], "--steps has no effect without --forward corrected"),
+        (["--against", "fem", "--fem-runs", "9"], "--fem-runs has no effect without --forward red"),
+        (["--against", "fem", "--forward", "corrected", "--steps", "0"], "steps is 0"),
+        (["--against", "fem", "--outside", "0"], "outside is 0.0; give a fraction above 0"),
+        (["--against", "x", "--outside", "0.2"], "nothing was released outside the box"),
+        (["--against", "fem", "--out", "/dev/null"], "cannot write to /dev/null"),
+    ],
+)
+def test_bad_calls(folder, capsys, words, message):
+    assert main(["evaluate", folder, *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_map_that_is_none_of_ours():
+    with pytest.raises(InputError, match="forward map 'fem': use emulator, corrected, reduced"):
+        Evaluation("x", forward="fem")
