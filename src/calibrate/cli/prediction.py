@@ -38,6 +38,9 @@ def register(commands: Any) -> None:
 
 def predict(arguments: argparse.Namespace) -> int:
     """Evaluate once and say what speaks against it."""
+    from functools import partial
+
+    import jax
     import numpy as np
 
     from emulator.geometry.io import write_solution
@@ -52,7 +55,7 @@ def predict(arguments: argparse.Namespace) -> int:
     values = assignments(arguments.theta)
     theta = anywhere(scene, values) if values else scene.centre
     u = forward(theta)
-    estimate, against = None, guard(scene, theta, u)
+    estimate, against = None, jax.jit(partial(guard, scene))(theta, u)
     if arguments.error_bar:
         from emulator import Simulator
         from emulator.error_bar import error_bar
