@@ -9,7 +9,6 @@ from emulator.correct import newton_step
 from emulator.error_bar import error_bar
 from emulator.errors import InputError
 from emulator.forward import Prediction, all_nodes, fem_forward
-from emulator.mechanics.pressure import cavity_volume
 
 
 class Off:
@@ -89,23 +88,30 @@ def test_error_of_a_quantity(beam, bar, exact, off):
     np.testing.assert_allclose(estimate.of(quantity), true, rtol=0.2)
 
 
-def test_where_one_step_is_wild_the_bar_is_not(beam, simulator, bar, exact, off):
-    """Outside as inside ``jit``; the true error is known."""
-    error = off(-3.0).error
+@pytest.fixture(scope="module")
+def wild(beam, exact):
+    """Far too bent, and rough: Newton's step is too short by half, and much too long."""
+    rough = np.random.default_rng(0).normal(0.0, 0.3, exact.shape)
+    return {"bent": np.asarray(exact), "rough": np.where(beam.held, 0.0, rough)}
+
+
+@pytest.mark.parametrize("how", ["bent", "rough"])
+def test_where_one_step_is_wild_the_bar_is_not(beam, simulator, bar, exact, wild, how):
+    error = wild[how]
     u = exact + error
     once = u - newton_step(simulator.system, u, beam.centre)
     assert not 0.5 < float(jnp.linalg.norm(once)) / np.linalg.norm(error) < 2.0
     estimate = bar.of_field(u, beam.centre)
     assert estimate.iterations > 0
     assert estimate.valid
-    assert far(estimate.field, error) < 0.2
+    assert far(estimate.field, error) < 0.1
     Pi = em.potential_energy(beam)
     gap = Pi(u, beam.centre) - Pi(exact, beam.centre)
-    assert estimate.energy_gap == pytest.approx(float(gap), rel=0.1)
+    assert estimate.energy_gap == pytest.approx(float(gap), rel=0.05)
 
 
-def test_the_same_inside_jit_and_vmap(beam, bar, exact, off):
-    fields = jnp.stack([exact + off(size).error for size in (0.05, -3.0)])
+def test_the_same_inside_jit_and_vmap(beam, bar, exact, off, wild):
+    fields = jnp.stack([exact + off(0.05).error, exact + wild["bent"]])
     thetas = jnp.stack([beam.centre, beam.centre])
     many = jax.jit(jax.vmap(bar.of_field))(fields, thetas)
     for k, u in enumerate(fields):
@@ -143,25 +149,18 @@ def test_nothing_that_is_not_finite_comes_out(beam, bar, exact, what):
     assert estimate.max > 0.0  # not known to be wrong is not known to be right
 
 
-def test_the_tangent_of_the_centre_is_factorised_once():
-    scene = em.scenes.left_ventricle(rings=4, around=8, layers=1)
-    simulator = em.Simulator(scene)
-    exact = [simulator(scene.from_unit(jnp.full(5, at))) for at in (0.5, 0.6)]
-    off = Off(scene, exact[1], 0.3)
-    bar = error_bar(off, simulator, "centre", iterations=3)
-    theta = scene.from_unit(jnp.full(5, 0.6))
-    estimate = bar(theta)
-    assert estimate.valid
-    assert far(estimate.field, off.error) < 0.5
-    present = error_bar(off, simulator)(theta)
-    volume = cavity_volume(scene, "endocardium")
-    true = float(volume(exact[1] + off.error) - volume(exact[1]))
-    assert float(present.of(volume)) == pytest.approx(true, rel=0.1)
+def test_the_tangent_of_the_centre_is_factorised_once(beam, simulator, bar):
+    theta = beam.from_unit(jnp.array([0.55, 0.5]))
+    map_there = Off(beam, simulator(theta), 0.02)
+    present = bar.of_field(map_there(theta), theta)
+    bars = [error_bar(map_there, simulator, "centre", iterations=k) for k in (2, 6)]
+    few, more = (each(theta) for each in bars)
+    assert few.valid
+    assert 0.5 < float(few.max / np.linalg.norm(map_there.error, axis=1).max()) < 2.0
     # More conjugate gradients, closer to what the tangent of the prediction gives.
-    more = error_bar(off, simulator, "centre", iterations=8)
-    assert far(more(theta).field, present.field) < 0.3 * far(estimate.field, present.field)
+    assert far(more.field, present.field) < 0.2 * far(few.field, present.field)
     before = sparsax.factorization_count()
-    more(scene.from_unit(jnp.full(5, 0.61)))
+    bars[1](beam.from_unit(jnp.array([0.6, 0.5])))
     assert sparsax.factorization_count() == before
 
 

@@ -2,10 +2,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene_support import block
 
 import emulator as em
 from emulator.guard import guard, invariants, outside_box
+from scene_support import block
 
 
 @pytest.fixture(scope="module")
