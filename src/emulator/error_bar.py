@@ -1,4 +1,4 @@
-r"""The error of a prediction, from the forces it leaves out of balance; no simulation needed.
+r"""The error of a prediction, from the forces it leaves out of balance: no solution needed.
 
 A prediction :math:`u = u^* + e` near the equilibrium :math:`u^*`, where :math:`r(u^*) = 0`, has
 the residual of the energy's expansion about :math:`u`,
@@ -125,16 +125,15 @@ class ErrorBar:
         it is indefinite; inside, by UMFPACK.
         """
         theta = jnp.asarray(theta, dtype=float)
-        if theta.shape != (len(self.scene.parameters),):
-            raise InputError(
-                f"scene '{self.scene.name}': theta has shape {theta.shape}; "
-                f"expected {(len(self.scene.parameters),)}"
-            )
+        self._check_shape("theta", theta, (len(self.scene.parameters),))
         traced = isinstance(theta, jax.core.Tracer)
         return self.of_field(self.forward(theta) if traced else self._forward(theta), theta)
 
     def of_field(self, u: jax.Array, theta: jax.Array) -> ErrorEstimate:
         """Error of any displacement ``u`` (n, 3) mm, said to be the one at ``theta`` (p,)."""
+        u, theta = jnp.asarray(u, dtype=float), jnp.asarray(theta, dtype=float)
+        self._check_shape("theta", theta, (len(self.scene.parameters),))
+        self._check_shape("displacement", u, self.scene.held.shape)
         traced = isinstance(u, jax.core.Tracer) or isinstance(theta, jax.core.Tracer)
         if traced or self.tangent == "centre" or self.simulator.system.forces:
             return self._estimate(u, theta)
@@ -149,6 +148,12 @@ class ErrorBar:
             if not step.settled:
                 step = self._guarded(sound, safe_theta)
         return self._finish(u, theta, sound, step)
+
+    def _check_shape(self, name: str, array: jax.Array, expected: tuple[int, ...]) -> None:
+        if array.shape != expected:
+            raise InputError(
+                f"scene '{self.scene.name}': {name} has shape {array.shape}; expected {expected}"
+            )
 
     # ---- compiled parts ------------------------------------------------------------------------
     @cached_property

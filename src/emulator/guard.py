@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.fem.distance import ENDLESS
 from emulator.forward import inside_box
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.energy import at_points, displacement_gradient
@@ -74,7 +75,7 @@ class Guard(NamedTuple):
 
 def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
     """What theta (p,) and the prediction ``u`` (n, 3) mm themselves say; nothing is factorised."""
-    finite = jnp.all(jnp.isfinite(u)) & jnp.all(jnp.isfinite(theta))
+    finite = jnp.all(jnp.abs(u) < ENDLESS) & jnp.all(jnp.isfinite(theta))
     J, I1, I4f = invariants(scene, jnp.where(finite, u, 0.0))
     limits = Barriers()
     active = jnp.any(limits.J_start > J) | jnp.any(limits.I1_start < I1)

@@ -136,9 +136,9 @@ def test_off_its_supports(beam, bar, exact):
     assert far(estimate.field, np.broadcast_to(shift, exact.shape)) < 0.05
 
 
-@pytest.mark.parametrize("what", ["theta", "prediction"])
+@pytest.mark.parametrize("what", ["theta", "prediction", "overflow"])
 def test_nothing_that_is_not_finite_comes_out(beam, bar, exact, what):
-    u = exact.at[3, 1].set(jnp.nan) if what == "prediction" else exact
+    u = {"theta": exact, "prediction": exact.at[3, 1].set(jnp.nan), "overflow": 1e200 * exact}[what]
     theta = beam.centre.at[1].set(jnp.nan) if what == "theta" else beam.centre
     estimate = bar.of_field(u, theta)
     numbers = estimate._replace(guard=estimate.guard._replace(theta=0.0))
@@ -175,3 +175,5 @@ def test_refusals(beam, simulator, off, cube):
         error_bar(off(0.1), em.Simulator(cube))
     with pytest.raises(InputError, match=r"theta has shape \(3,\)"):
         error_bar(off(0.1), simulator)(jnp.ones(3))
+    with pytest.raises(InputError, match=r"displacement has shape \(4, 3\); expected \(45, 3\)"):
+        error_bar(off(0.1), simulator).of_field(jnp.ones((4, 3)), jnp.ones(2))

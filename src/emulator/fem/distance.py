@@ -20,7 +20,8 @@ from emulator.fem.solution import Status
 from emulator.mechanics.energy import volume_ratio
 from emulator.scenes.scene import Scene
 
-_CONTRACTION = 0.25  # above which one step says too little; see the module's docstring
+ENDLESS = 1e100  # mm; beyond this, squares overflow
+_CONTRACTION = 0.25  # above which one step says too little; see emulator.error_bar
 _SHRINK = 0.2  # least fraction of the smallest J that a step may leave
 _ROUND_OFF = 1e-9  # an error this small beside the displacement is round-off, and does not contract
 _GOOD_STEP = 0.1  # of the residual is the most that a step to be believed leaves
@@ -62,7 +63,7 @@ def sound_state(
 
     With it a theta that is finite.
     """
-    fine = jnp.all(jnp.isfinite(u))
+    fine = jnp.all(jnp.abs(u) < ENDLESS)
     placed = jnp.where(scene.held, scene.held_displacement, jnp.where(fine, u, centre))
     fractions = jnp.array(_FRACTIONS)[:, None, None]
     states = jnp.where(fractions == 1.0, placed, centre + fractions * (placed - centre))
