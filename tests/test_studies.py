@@ -124,3 +124,17 @@ def test_many_solves(tmp_path):
     assert [case["status"] for case in results["cases"]] == ["converged"] * 3
     assert results["summary"]["solves"] == 3
     assert (tmp_path / "many_solves.png").stat().st_size > 10_000
+
+
+def test_error_bar(tmp_path):
+    words = ("--scenes", "once_clamped_beam", "--cases", 3, "--outside", 1, "--out", tmp_path)
+    cases = {case["name"]: case for case in run("error_bar", *words)["cases"]}
+    inside = cases["once_clamped_beam, shipped 'once_clamped_beam', inside"]
+    assert inside["effectivity"]["error bar"]["within_factor_2"] == 1.0
+    assert cases["once_clamped_beam, reduced, 5 FEM runs, 50 % outside"]["theta"] == 4
+    assert (tmp_path / "effectivity.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_error_bar_in_full(tmp_path):
+    run("error_bar", "--out", tmp_path)  # asserts its own claims

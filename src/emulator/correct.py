@@ -18,10 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.fem.assembly import System
 from emulator.fem.simulator import Simulator, displacement_derivative
 from emulator.forward import ForwardMap, Prediction, all_nodes, check_nodes
 from emulator.mechanics.energy import volume_ratio
 from emulator.scenes.scene import Scene
+
+
+def newton_step(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
+    """``u`` (n, 3) mm after one full Newton step, unguarded."""
+    tangent = system.pattern.safe_values(system.tangent(u, theta))
+    return u - system.extend(system.solve(tangent, system.residual(u, theta)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +55,7 @@ class CorrectedForward:
         def polish(theta: jax.Array) -> jax.Array:
             u = self.base(theta)
             for _ in range(self.steps):
-                tangent = system.pattern.safe_values(system.tangent(u, theta))
-                u = u - system.extend(system.solve(tangent, system.residual(u, theta)))
+                u = newton_step(system, u, theta)
             return u
 
         @polish.defjvp

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from calibrate.cli import emulators, evaluation, inference, scenes, verification
+from calibrate.cli import emulators, evaluation, inference, prediction, scenes, verification
 from calibrate.cli.common import BAD_INPUT, FAILED, Parser
 from emulator.errors import InputError, SolverError
 
@@ -19,7 +19,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND", parser_class=Parser
     )
-    for group in (inference, scenes, emulators, evaluation, verification):
+    for group in (inference, scenes, emulators, evaluation, prediction, verification):
         group.register(commands)
     return parser
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from emulator.errors import InputError
@@ -56,6 +57,14 @@ def seconds(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise InputError(f"duration '{text}' must be above 0")
     return value
+
+
+def check_vtu(path: str) -> None:
+    """Refuse a file to write that is not a ``.vtu`` in a folder that exists, before the work."""
+    if not path.endswith(".vtu"):
+        raise InputError(f"--out {path}: the file name must end in .vtu")
+    if not Path(path).resolve().parent.is_dir():
+        raise InputError(f"--out {path}: its folder does not exist")
 
 
 def emit(result: Any, *, as_json: bool, text: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from calibrate.cli.common import (
@@ -12,6 +11,7 @@ from calibrate.cli.common import (
     add_json,
     add_scene,
     assignments,
+    check_vtu,
     emit,
     table,
 )
@@ -81,7 +81,6 @@ def simulate(arguments: argparse.Namespace) -> int:
     """Solve at one theta and say how it went."""
     import numpy as np
 
-    from emulator.errors import InputError
     from emulator.fem import Simulator, Status
     from emulator.geometry.io import write_solution
     from emulator.mechanics.energy import potential_energy, volume_ratio
@@ -92,10 +91,7 @@ def simulate(arguments: argparse.Namespace) -> int:
     scene = find_scene(arguments.scene, arguments.root)
     theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
     if arguments.out:
-        if not arguments.out.endswith(".vtu"):
-            raise InputError(f"--out {arguments.out}: the file name must end in .vtu")
-        if not Path(arguments.out).resolve().parent.is_dir():
-            raise InputError(f"--out {arguments.out}: its folder does not exist")
+        check_vtu(arguments.out)
     solution = Simulator(scene).solve(theta)
     status = Status(int(solution.status))
     J = np.asarray(volume_ratio(scene, solution.displacement))
