@@ -20,6 +20,11 @@ def register(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser("train", help="train an emulator")
     add_scene(parser)
+    parser.add_argument(
+        "--recipe",
+        choices=("hybrid", "network", "paper"),
+        help="default hybrid: Taylor series, network trained on the energy, residual of FEM runs",
+    )
     parser.add_argument("--objective", choices=("energy", "simulations", "both"))
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
@@ -44,7 +49,7 @@ def train(arguments: argparse.Namespace) -> int:
     from emulator.network import save_emulator
     from emulator.scenes import find_scene
     from emulator.store import check_folder
-    from emulator.training import Plan, remove_checkpoint
+    from emulator.training import recipe, remove_checkpoint
     from emulator.training import train as train_emulator
 
     scene = find_scene(arguments.scene, arguments.root)
@@ -52,13 +57,14 @@ def train(arguments: argparse.Namespace) -> int:
     names = ("objective", "steps", "simulations", "batch", "seed")
     given = {name: getattr(arguments, name) for name in names}
     given = {name: value for name, value in given.items() if value is not None}
-    if arguments.resume and (given or arguments.budget):
-        option = next(iter(given), "budget")
+    if arguments.resume and (given or arguments.budget or arguments.recipe):
+        option = next(iter(given), "recipe" if arguments.recipe else "budget")
         raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
+    plan = recipe(arguments.recipe or "hybrid")
     fixed = arguments.resume or "steps" in given
     result = train_emulator(
         scene,
-        Plan(**given),
+        replace(plan, **given),
         arguments.out,
         budget=None if fixed else seconds(arguments.budget or "10m"),
         resume=arguments.resume,
@@ -82,6 +88,6 @@ def train(arguments: argparse.Namespace) -> int:
 
 def command_line(scene: str, plan: dict[str, Any]) -> str:
     """The command that repeats a training exactly, whatever interrupted or hurried it."""
-    names = ("objective", "steps", "simulations", "batch", "seed")
+    names = ("recipe", "objective", "steps", "simulations", "batch", "seed")
     options = " ".join(f"--{name} {plan[name]}" for name in names)
     return f"calibrate train {scene} {options} --out DIR"

@@ -54,9 +54,7 @@ class Expansion:
 
     def __call__(self, position: jax.Array) -> jax.Array:
         """Displacement (..., n, 3) mm at ``position`` (..., p) in the box."""
-        return self.displacement + jnp.tensordot(
-            self.monomials(position), self.derivatives, axes=1
-        )
+        return self.displacement + jnp.tensordot(self.monomials(position), self.derivatives, axes=1)
 
     @property
     def order(self) -> int:

@@ -5,33 +5,47 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from emulator.errors import InputError
-from emulator.network.emulator import Emulator
+from emulator.fem.expansion import Expansion, constant
+from emulator.network.emulator import BASES, Emulator
 from emulator.network.graph import AugmentedGraph
 from emulator.network.pignn import Architecture, build
+from emulator.residual import Residual
+from emulator.residual.fit import Warp
 from emulator.scenes.registry import scene_from_recipe
 from emulator.scenes.scene import Scene
 from emulator.store import fill_tree, read_arrays, read_json, save_tree, write_json
 
-FORMAT = 1
+FORMAT = 2
+_READABLE = (1, 2)  # 1 had an offset where there is a series now, and no residual
 SHIPPED = Path(__file__).parent.parent / "shipped"
 _GRAPH = ("node_features", "edge_features", "senders", "receivers")
+_SERIES = ("centre", "displacement", "indices", "derivatives")
+_RESIDUAL = ("known", "values", "slopes", "offset", "modes")
 
 
 def save_emulator(emulator: Emulator, folder: str | Path) -> None:
     """Write ``emulator`` into ``folder``."""
     folder = Path(folder)
-    arrays = {
+    arrays: dict[str, Any] = {
         "weights": nnx.to_pure_dict(emulator.weights),
         "graph": {name: getattr(emulator.graph, name) for name in _GRAPH},
-        "offset": emulator.offset,
+        "series": {name: _narrow(getattr(emulator.series, name)) for name in _SERIES},
         "scale": emulator.scale,
+        "basis": emulator.basis,
     }
+    if emulator.residual is not None:
+        arrays["residual"] = {
+            "warp": emulator.residual.warp._asdict(),
+            **{name: _narrow(getattr(emulator.residual, name)) for name in _RESIDUAL},
+        }
     digest = save_tree(folder / "weights.safetensors", arrays)
     write_json(
         folder / "emulator.json",
@@ -40,10 +54,20 @@ def save_emulator(emulator: Emulator, folder: str | Path) -> None:
             "scene": dict(emulator.scene.recipe),
             "fingerprint": emulator.scene.fingerprint,
             "architecture": asdict(emulator.architecture),
+            "base": emulator.base,
             "weights_sha256": digest,
             "record": dict(emulator.record),
         },
     )
+
+
+def _narrow(array: Any) -> np.ndarray:
+    """The array in float32 where that loses nothing, which halves the file."""
+    wide = np.asarray(array)
+    if wide.dtype != np.float64 or np.abs(wide).max(initial=0.0) > np.finfo(np.float32).max:
+        return wide
+    narrow = wide.astype(np.float32)
+    return narrow if np.array_equal(narrow.astype(np.float64), wide) else wide
 
 
 def shipped() -> list[str]:
@@ -73,37 +97,81 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
         )
     description = read_json(folder / "emulator.json")
     try:
-        if description["format"] != FORMAT:
+        if description["format"] not in _READABLE:
             raise InputError(
                 f"{folder}/emulator.json has format {description['format']}; "
-                f"this version reads {FORMAT}"
+                f"this version reads {', '.join(map(str, _READABLE))}"
             )
         sizes = description["architecture"]
-        architecture = Architecture(sizes["steps"], sizes["latent"], tuple(sizes["hidden"]))
-        fingerprint, digest = description["fingerprint"], description["weights_sha256"]
+        architecture = Architecture(**{**sizes, "hidden": tuple(sizes["hidden"])})
+        fingerprint, base = description["fingerprint"], description.get("base", "network")
+        if base not in BASES:
+            raise InputError(f"{folder}/emulator.json: base '{base}'; expected {', '.join(BASES)}")
         scene = scene_from_recipe(description["scene"]) if scene is None else scene
+        if scene.fingerprint != fingerprint:
+            raise InputError(
+                f"emulator '{name}' was trained for a scene with fingerprint {fingerprint}; "
+                f"'{scene.name}' has {scene.fingerprint}: train one for this scene"
+            )
+        arrays = _arrays(folder / "weights.safetensors", description["weights_sha256"])
     except (KeyError, TypeError) as error:
         raise InputError(f"{folder}/emulator.json lacks or garbles {error}") from error
-    if scene.fingerprint != fingerprint:
-        raise InputError(
-            f"emulator '{name}' was trained for a scene with fingerprint {fingerprint}; "
-            f"'{scene.name}' has {scene.fingerprint}: train one for this scene"
-        )
-    return _read(folder, scene, architecture, digest, description.get("record", {}))
+    try:
+        return _assemble(scene, architecture, arrays, base, description.get("record", {}))
+    except KeyError as error:
+        raise InputError(f"{folder}/weights.safetensors: array {error} is missing") from error
 
 
-def _read(
-    folder: Path, scene: Scene, architecture: Architecture, digest: str, record: dict
-) -> Emulator:
-    path = folder / "weights.safetensors"
+def _arrays(path: Path, digest: str) -> dict[str, np.ndarray]:
     arrays, _ = read_arrays(path)
     if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
         raise InputError(f"{path} is not the file emulator.json was written with")
+    return arrays
+
+
+def _assemble(
+    scene: Scene, architecture: Architecture, arrays: dict[str, np.ndarray], base: Any, record: dict
+) -> Emulator:
     stored = {name: arrays[f"['graph']['{name}']"] for name in _GRAPH}
     graph = AugmentedGraph(**stored, real=len(scene.mesh.nodes))
-    state = nnx.state(nnx.eval_shape(lambda: build(architecture, graph, len(scene.parameters), 0)))
-    pure = fill_tree({"weights": nnx.to_pure_dict(state)}, arrays, str(path))["weights"]
-    nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))
-    return Emulator(
-        scene, architecture, graph, state, arrays["['offset']"], arrays["['scale']"], record
+    basis = arrays.get("['basis']", np.zeros((0, *scene.held.shape), dtype=np.float32))
+    state = nnx.state(
+        nnx.eval_shape(lambda: build(architecture, graph, len(scene.parameters), len(basis), 0))
     )
+    pure = fill_tree({"weights": nnx.to_pure_dict(state)}, arrays, "weights.safetensors")
+    nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure["weights"]))
+    return Emulator(
+        scene=scene,
+        architecture=architecture,
+        graph=graph,
+        weights=state,
+        series=_series(scene, arrays),
+        scale=arrays["['scale']"],
+        basis=basis,
+        residual=_residual(arrays),
+        base=base,
+        record=record,
+    )
+
+
+def _wide(array: np.ndarray) -> np.ndarray:
+    """Floating point numbers in float64, whatever they were kept in."""
+    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array
+
+
+def _series(scene: Scene, arrays: dict[str, np.ndarray]) -> Expansion:
+    if "['offset']" in arrays:
+        return constant(np.full(len(scene.parameters), 0.5), jnp.asarray(arrays["['offset']"]))
+    centre, u, indices, derivatives = (_wide(arrays[f"['series']['{name}']"]) for name in _SERIES)
+    return Expansion(centre, jnp.asarray(u), indices, jnp.asarray(derivatives))
+
+
+def _residual(arrays: dict[str, np.ndarray]) -> Residual | None:
+    if "['residual']['modes']" not in arrays:
+        return None
+    parts = {name: jnp.asarray(_wide(arrays[f"['residual']['{name}']"])) for name in _RESIDUAL}
+    centre, indices, coefficients, lengths = (
+        _wide(arrays[f"['residual']['warp']['{name}']"]) for name in Warp._fields
+    )
+    warp = Warp(centre, indices, jnp.asarray(coefficients), jnp.asarray(lengths))
+    return Residual(warp=warp, **parts)

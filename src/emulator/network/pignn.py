@@ -7,18 +7,24 @@ Encode every node and edge; pass K rounds of messages
     v_i \leftarrow v_i + \phi_v\Big(v_i, \sum_j m_{ij}\Big), \quad e_{ij} \leftarrow e_{ij} + m_{ij}
 
 (equal and opposite, as forces are); take :math:`z_i = \text{LN}(v_i, \sum_j e_{ij})` of the real
-nodes; and decode each displacement component by its own network of :math:`z_i` and an encoding of
-theta. Nothing before the decoder knows theta, so it is run once per geometry.
+nodes; and decode. The pointwise decoder, the paper's, has a network of :math:`z_i` and an encoding
+of theta for each displacement component. The separable one is
+:math:`\sum_k c_k(\theta)\, \phi_k(z_i)`: a branch that knows only theta and a trunk that knows
+only the node, so that the modes :math:`\phi_k` can be kept and a field is one matrix product. Modes
+found by mechanics may stand beside the learned ones. Nothing before the decoder knows theta, so it
+is run once per geometry.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from emulator.errors import InputError
 from emulator.network.graph import AugmentedGraph
 from emulator.network.mlp import MLP
 
@@ -30,11 +36,19 @@ class Architecture:
     steps : K, message-passing steps.
     latent : M, width of node, edge and theta states.
     hidden : widths of each network's hidden layers.
+    decoder : ``pointwise``, Algorithm 1's, or ``separable``.
+    modes : learned modes of the separable decoder.
     """
 
     steps: int = 5
     latent: int = 40
     hidden: tuple[int, ...] = (128, 128)
+    decoder: Literal["pointwise", "separable"] = "pointwise"
+    modes: int = 16
+
+    def __post_init__(self) -> None:
+        if self.decoder not in ("pointwise", "separable"):
+            raise InputError(f"decoder '{self.decoder}': use pointwise or separable")
 
 
 class MessagePassing(nnx.Module):
@@ -103,7 +117,7 @@ def _recomputed(
     )
 
 
-class Decoder(nnx.Module):
+class PointwiseDecoder(nnx.Module):
     """Node states and theta to displacement, one network a component (Algorithm 1)."""
 
     def __init__(self, architecture: Architecture, parameters: int, rngs: nnx.Rngs) -> None:
@@ -116,8 +130,9 @@ class Decoder(nnx.Module):
             ]
         )
 
-    def prepare(self, states: jax.Array) -> jax.Array:
+    def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
         """The part of each first layer that knows only the node: (3, n, hidden[0])."""
+        del basis  # has no coefficients here
         return jnp.stack([component.project(1, states) for component in self.components])
 
     def __call__(self, prepared: jax.Array, theta: jax.Array) -> jax.Array:
@@ -130,6 +145,40 @@ class Decoder(nnx.Module):
         return jnp.concatenate(parts, axis=-1)
 
 
+class SeparableDecoder(nnx.Module):
+    """Coefficients that know theta times modes that know the node."""
+
+    def __init__(
+        self, architecture: Architecture, parameters: int, fixed: int, rngs: nnx.Rngs
+    ) -> None:
+        M, hidden = architecture.latent, architecture.hidden
+        self.branch = MLP(
+            (parameters,),
+            hidden,
+            fixed + architecture.modes,
+            layer_norm=False,
+            zero_last=True,
+            rngs=rngs,
+        )
+        self.trunk = MLP((2 * M,), hidden, 3 * architecture.modes, layer_norm=False, rngs=rngs)
+
+    def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
+        """Modes (r, n, 3): the given ``basis`` (f, n, 3), then the learned ones."""
+        learned = self.trunk(states).reshape(len(states), 3, -1)
+        return jnp.concatenate([basis.astype(learned.dtype), jnp.moveaxis(learned, -1, 0)])
+
+    def coefficients(self, theta: jax.Array) -> jax.Array:
+        """Of the modes (..., r) for normalised ``theta`` (..., p)."""
+        return self.branch(theta)
+
+    def __call__(self, prepared: jax.Array, theta: jax.Array) -> jax.Array:
+        """Raw output (..., n, 3)."""
+        return jnp.tensordot(self.coefficients(theta), prepared, axes=1)
+
+
+Decoder = PointwiseDecoder | SeparableDecoder
+
+
 class PIGNN(nnx.Module):
     """Processor and decoder of one scene."""
 
@@ -139,18 +188,26 @@ class PIGNN(nnx.Module):
         node_width: int,
         edge_width: int,
         parameters: int,
+        fixed: int,
         rngs: nnx.Rngs,
     ) -> None:
         self.processor = Processor(architecture, node_width, edge_width, rngs)
-        self.decoder = Decoder(architecture, parameters, rngs)
+        self.decoder = (
+            PointwiseDecoder(architecture, parameters, rngs)
+            if architecture.decoder == "pointwise"
+            else SeparableDecoder(architecture, parameters, fixed, rngs)
+        )
 
 
-def build(architecture: Architecture, graph: AugmentedGraph, parameters: int, seed: int) -> PIGNN:
-    """A network for ``graph`` with weights drawn from ``seed``."""
+def build(
+    architecture: Architecture, graph: AugmentedGraph, parameters: int, fixed: int, seed: int
+) -> PIGNN:
+    """A network for ``graph``, with ``fixed`` given modes and weights drawn from ``seed``."""
     return PIGNN(
         architecture,
         graph.node_features.shape[1],
         graph.edge_features.shape[1],
         parameters,
+        fixed,
         nnx.Rngs(seed),
     )

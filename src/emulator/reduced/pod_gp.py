@@ -19,9 +19,9 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from emulator.errors import InputError
+from emulator.fem.campaign import Runs
 from emulator.forward import Prediction, all_nodes, inside_only, rows_of
 from emulator.scenes.scene import Scene
-from emulator.training.campaign import Runs
 
 _JITTER = 1e-10  # of unit-variance coefficients; FEM has no noise
 

@@ -28,7 +28,7 @@ from emulator.errors import InputError
 from emulator.fem.expansion import Expansion, monomials
 from emulator.residual.kernel import Features, fit_lengths, fit_weights, fold, mean
 from emulator.scenes.scene import Scene
-from emulator.training.campaign import Runs
+from emulator.fem.campaign import Runs
 
 Mean = Callable[[jax.Array], jax.Array]
 """Position in the box (p,) to displacement (n, 3) mm."""
@@ -134,9 +134,7 @@ def fit_residual(
     )
 
 
-def _left(
-    runs: Runs, positions: jax.Array, mean_map: Mean | None
-) -> tuple[np.ndarray, np.ndarray]:
+def _left(runs: Runs, positions: jax.Array, mean_map: Mean | None) -> tuple[np.ndarray, np.ndarray]:
     """What the mean leaves of the fields (c, n, 3) and of their slopes (c, p, n, 3)."""
     fields, slopes = np.asarray(runs.displacement), np.array(runs.slopes)
     if mean_map is None:

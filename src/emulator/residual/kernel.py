@@ -133,9 +133,7 @@ def fold(features: Features, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
     return each[:, 0], jnp.einsum("cqp,cpr->cqr", features.slope, each[:, 1:])
 
 
-def mean(
-    at: jax.Array, known: jax.Array, values: jax.Array, slopes: jax.Array
-) -> jax.Array:
+def mean(at: jax.Array, known: jax.Array, values: jax.Array, slopes: jax.Array) -> jax.Array:
     """Posterior mean (r,) at scaled features ``at`` (q,).
 
     known : (c, q) scaled features of the runs. values, slopes : from :func:`fold`.

@@ -1,7 +1,19 @@
 """Training of emulators."""
 
-from emulator.training.campaign import Runs, run_campaign
-from emulator.training.sampling import sobol, uniform
-from emulator.training.trainer import Plan, remove_checkpoint, train
+from emulator.fem.campaign import Runs, run_campaign
+from emulator.training.plan import RECIPES, Plan, recipe
+from emulator.training.sampling import design, sobol, uniform
+from emulator.training.trainer import remove_checkpoint, train
 
-__all__ = ["Plan", "Runs", "remove_checkpoint", "run_campaign", "sobol", "train", "uniform"]
+__all__ = [
+    "RECIPES",
+    "Plan",
+    "Runs",
+    "design",
+    "recipe",
+    "remove_checkpoint",
+    "run_campaign",
+    "sobol",
+    "train",
+    "uniform",
+]

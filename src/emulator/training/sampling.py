@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from scipy.stats import qmc
 
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
+
+_CORNER_EVERY = 5
+_MOST_CORNERED = 6  # parameters
 
 
 def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
@@ -24,3 +30,23 @@ def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
 def uniform(scene: Scene, count: int, key: jax.Array) -> jax.Array:
     """``count`` independent theta (count, p), uniform over the box on its scales."""
     return scene.from_unit(jax.random.uniform(key, (count, len(scene.parameters))))
+
+
+def design(scene: Scene, count: int, seed: int) -> jax.Array:
+    """``count`` theta (count, p) for FEM runs: a Sobol sequence, and with it the box's corners.
+
+    A surrogate is worst at the corners, which no sequence reaches. Every fifth theta is one, in
+    random order, until they run out; more than 64 of them are left out. A shorter design is the
+    beginning of a longer one.
+    """
+    parameters = len(scene.parameters)
+    ends = np.zeros((0, parameters))
+    if parameters <= _MOST_CORNERED:
+        ends = np.array(list(product((0.0, 1.0), repeat=parameters)))
+        ends = np.random.default_rng(seed).permutation(ends)[: count // _CORNER_EVERY]
+    inside = np.asarray(scene.to_unit(sobol(scene, max(count - len(ends), 1), seed)))
+    places = _CORNER_EVERY * np.arange(1, len(ends) + 1) - 1
+    positions = np.zeros((count, parameters))
+    positions[places] = ends
+    positions[np.setdiff1d(np.arange(count), places)] = inside[: count - len(ends)]
+    return scene.from_unit(jnp.asarray(positions))

@@ -1,4 +1,4 @@
-"""Training: Adam on a cosine schedule, one processor pass a step, resumable at any moment."""
+"""Training: Adam, one processor pass a step, then the residual; resumable at any moment."""
 
 from __future__ import annotations
 
@@ -18,56 +18,29 @@ from tqdm import tqdm
 
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
+from emulator.fem.campaign import Runs, run_campaign
+from emulator.fem.expansion import Expansion, constant, expand_at
 from emulator.network.emulator import Emulator, fresh
 from emulator.network.graph import augment
 from emulator.network.pignn import Architecture
 from emulator.scenes.scene import Scene
 from emulator.store import fill_tree, read_arrays, save_tree
-from emulator.training.campaign import Runs, run_campaign
-from emulator.training.objectives import Batch, Objective, make_loss
-from emulator.training.sampling import sobol, uniform
+from emulator.training.basis import mechanical_modes
+from emulator.training.objectives import Batch, make_loss
+from emulator.training.plan import Plan
+from emulator.training.residual_stage import add_residual, rounded
+from emulator.training.sampling import design, sobol, uniform
 
 CHECKPOINT = "checkpoint.safetensors"
 WARMUP = 100
 # Without FEM runs the spread of the displacements is unknown; this much of the centre's will do.
 _GUESS = 0.2
+# Parts of a time budget: until when FEM runs may start, and until when the network trains.
+_FEM_SHARE = 0.3
+_NETWORK_SHARE = 0.85
 
-
-@dataclass(frozen=True)
-class Plan:
-    """How to train.
-
-    objective : ``energy`` (no FEM run but the centre), ``simulations``, or ``both``.
-    steps : optimiser steps.
-    simulations : FEM runs to train on (not used by ``energy``).
-    batch : theta a step.
-    learning_rate : of Adam at its peak; cosine to zero.
-    energy_weight : weight of the energy gap in ``both``.
-    centred : start from the FEM solution at the centre of the box rather than from zero.
-    checkpoint_every : steps between checkpoints.
-    seed : of the weights, the FEM runs' theta, and the batches.
-    """
-
-    objective: Objective = "both"
-    steps: int = 3000
-    simulations: int = 256
-    batch: int = 16
-    learning_rate: float = 1e-3
-    energy_weight: float = 0.3
-    centred: bool = True
-    checkpoint_every: int = 500
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.objective not in ("energy", "simulations", "both"):
-            raise InputError(f"objective '{self.objective}': use energy, simulations or both")
-        for name in ("steps", "batch", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise InputError(f"training: {name} is {getattr(self, name)}; it must be 1 or more")
-        if self.objective != "energy" and self.simulations < self.batch:
-            raise InputError(
-                f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"
-            )
+Weights = nnx.State
+Step = Callable[..., tuple[Weights, Any, jax.Array]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +49,13 @@ class Problem:
 
     ``step(weights, state, number, total) -> (weights, state, loss)``; its batch and its learning
     rate follow from ``number`` and ``total`` alone, so that a resumed run repeats them.
+    With the decoder's prepared part as a last argument, a step leaves that as it is.
     """
 
     emulator: Emulator
     runs: Runs
     optimiser: optax.GradientTransformation
-    step: Callable[..., tuple[nnx.State, Any, jax.Array]]
+    step: Step
 
 
 def prepare(
@@ -89,28 +63,64 @@ def prepare(
     plan: Plan,
     architecture: Architecture | None = None,
     *,
+    deadline: float = np.inf,
     progress: bool = False,
 ) -> Problem:
-    """Run the FEM solutions a plan needs and set up its emulator; the same for equal inputs."""
-    wanted = 0 if plan.objective == "energy" else plan.simulations
-    centre = scene.centre[None]
-    thetas = jnp.concatenate([centre, sobol(scene, wanted, plan.seed)]) if wanted else centre
-    runs = run_campaign(Simulator(scene), thetas, progress=progress)
-    offset = np.asarray(runs.displacement[0])
-    deviation = np.asarray(runs.displacement[1:]) - offset if wanted else _GUESS * offset[None]
-    free = ~scene.held
-    component = [float(np.sqrt(np.mean(deviation[:, free[:, k], k] ** 2))) for k in range(3)]
-    spread = float(np.sqrt(np.mean(np.sum(deviation**2, axis=-1))))
-    scale = np.maximum(component, 1e-3 * max(component))
-    if not plan.centred:
-        offset, scale = np.zeros_like(offset), np.full(3, np.sqrt(np.mean(offset**2)))
-    emulator = fresh(
-        scene, augment(scene), architecture or Architecture(), offset, scale, plan.seed
+    """Run the FEM solutions a plan needs and set up its emulator; the same for equal inputs.
+
+    Parameters
+    ----------
+    deadline : of the performance counter, after which no further FEM run is begun.
+    """
+    simulator = Simulator(scene)
+    series = _series(simulator, plan)
+    thetas = scene.centre[None]
+    if plan.runs:
+        draw = design if plan.residual else sobol
+        thetas = jnp.concatenate([thetas, draw(scene, plan.runs, plan.seed)])
+    runs = run_campaign(
+        simulator,
+        thetas,
+        slopes=plan.residual,
+        expansion=series if plan.order else None,
+        deadline=deadline,
+        progress=progress,
     )
+    scale, spread = _scales(scene, plan, runs)
+    if not plan.centred:
+        series = constant(series.centre, jnp.zeros_like(series.displacement))
+    architecture = architecture or Architecture()
+    architecture = replace(architecture, decoder=plan.decoder)
+    basis = None
+    if plan.decoder == "separable":
+        basis = (mechanical_modes(simulator, series, plan.modes) / scale).astype(np.float32)
+    emulator = fresh(scene, augment(scene), architecture, series, scale, plan.seed, basis)
     energy_scale = float(jnp.abs(runs.energy[0]))
     loss = make_loss(scene, plan.objective, spread, energy_scale, plan.energy_weight)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
     return Problem(emulator, runs, optimiser, _make_step(emulator, plan, runs, loss, optimiser))
+
+
+def _series(simulator: Simulator, plan: Plan) -> Expansion:
+    """The Taylor series about the centre, its numbers rounded to what a file keeps."""
+    theta = simulator.scene.centre
+    u = simulator.solve(theta).require_converged("the centre of the box").displacement
+    if plan.order:
+        return rounded(expand_at(simulator, u, theta, plan.order))
+    return constant(np.asarray(simulator.scene.to_unit(theta)), u)
+
+
+def _scales(scene: Scene, plan: Plan, runs: Runs) -> tuple[np.ndarray, float]:
+    """Of the network's output by component, (3,) mm, and of the displacements, mm."""
+    centre = np.asarray(runs.displacement[0])
+    known = len(runs.theta) > 1 and plan.objective != "energy"
+    deviation = np.asarray(runs.displacement[1:]) - centre if known else _GUESS * centre[None]
+    free = ~scene.held
+    component = [float(np.sqrt(np.mean(deviation[:, free[:, k], k] ** 2))) for k in range(3)]
+    spread = float(np.sqrt(np.mean(np.sum(deviation**2, axis=-1))))
+    if not plan.centred:
+        return np.full(3, np.sqrt(np.mean(centre**2))), spread
+    return np.maximum(component, 1e-3 * max(component)), spread
 
 
 def _make_step(
@@ -119,7 +129,7 @@ def _make_step(
     runs: Runs,
     loss: Callable[[jax.Array, Batch], jax.Array],
     optimiser: optax.GradientTransformation,
-) -> Callable[..., tuple[nnx.State, Any, jax.Array]]:
+) -> Step:
     def draw(number: jax.Array) -> Batch:
         key = jax.random.fold_in(jax.random.key(plan.seed), number)
         if plan.objective == "energy":
@@ -128,16 +138,24 @@ def _make_step(
         rows = jax.random.choice(key, len(runs.theta), (plan.batch,), replace=False)
         return Batch(runs.theta[rows], runs.displacement[rows], runs.energy[rows])
 
+    def decoded(weights: Weights, thetas: jax.Array, kept: jax.Array) -> jax.Array:
+        decoder = nnx.merge(emulator.definition, weights).decoder
+        return emulator.decode(decoder, kept, thetas)
+
     def step(
-        weights: nnx.State, state: Any, number: jax.Array, total: jax.Array
-    ) -> tuple[nnx.State, Any, jax.Array]:
+        weights: Weights, state: Any, number: jax.Array, total: jax.Array, *kept: jax.Array
+    ) -> tuple[Weights, Any, jax.Array]:
         batch = draw(number)
-        value, slope = jax.value_and_grad(lambda w: loss(emulator.predict(w, batch.theta), batch))(
+        predict = decoded if kept else emulator.predict
+        value, slope = jax.value_and_grad(lambda w: loss(predict(w, batch.theta, *kept), batch))(
             weights
         )
         updates, moved = optimiser.update(slope, state, weights)
-        rate = learning_rate(plan.learning_rate, number, total)
+        rate = learning_rate(plan, number, total)
         updates = jax.tree.map(lambda d: (-rate * d).astype(d.dtype), updates)
+        if kept:
+            # Momentum would go on moving what the kept modes were made from.
+            updates = jax.tree_util.tree_map_with_path(_branch_only, updates)
         new = optax.apply_updates(weights, updates), moved
         # A step whose gradient is not finite is not taken.
         fine = jnp.isfinite(optax.tree.norm(slope))
@@ -147,8 +165,15 @@ def _make_step(
     return jax.jit(step, donate_argnums=(0, 1))
 
 
-def learning_rate(peak: float, number: jax.Array, total: jax.Array) -> jax.Array:
-    """Linear warm-up over ``WARMUP`` steps to ``peak``, then a cosine to zero at ``total``."""
+def _branch_only(path: Any, update: jax.Array) -> jax.Array:
+    return update if "'branch'" in jax.tree_util.keystr(path) else jnp.zeros_like(update)
+
+
+def learning_rate(plan: Plan, number: jax.Array, total: jax.Array) -> jax.Array:
+    """Of step ``number``: see :class:`Plan`; a cosine follows ``WARMUP`` steps of warm-up."""
+    peak = plan.learning_rate
+    if plan.schedule == "halves":
+        return jnp.where(number < total // 2, peak, 0.1 * peak)
     warm = jnp.minimum(1.0, (number + 1) / WARMUP)
     return peak * warm * 0.5 * (1.0 + jnp.cos(jnp.pi * number / total))
 
@@ -169,8 +194,10 @@ def train(
     ----------
     folder : where checkpoints go. The finished emulator is returned, not written; remove the last
         checkpoint with :func:`remove_checkpoint` once it is safe.
-    budget : seconds for everything (FEM runs, compilation, training); replaces ``plan.steps`` by
-        as many as fit, aimed again as the machine gets busier or less so.
+    budget : seconds for everything (FEM runs, compilation, training, the residual); replaces
+        ``plan.steps`` by as many as fit, aimed again as the machine gets busier or less so, and
+        ``plan.simulations`` by as many as were done in its first third. Where a residual follows,
+        which soon outdoes the network, neither is made larger.
     resume : continue from the checkpoint in ``folder``, under the plan it was written with. For a
         plan in steps the result equals that of a run never interrupted; one on a budget keeps the
         number of steps it was aiming at.
@@ -180,42 +207,64 @@ def train(
     saved = _read_checkpoint(checkpoint, scene) if resume else None
     plan = saved.plan if saved else plan
     spent = saved.seconds if saved else 0.0
-    problem = prepare(scene, plan, architecture, progress=progress)
+    timed = budget is not None and not saved
+    latest = started + _FEM_SHARE * budget if timed and budget is not None else np.inf
+    problem = prepare(scene, plan, architecture, deadline=latest, progress=progress)
     weights, first = problem.emulator.weights, 0
     state = problem.optimiser.init(weights)
+    if plan.runs:
+        plan = replace(plan, simulations=len(problem.runs.theta) - 1)
+    deadline, most = None, plan.steps if plan.residual else np.iinfo(np.int64).max
     if saved:
         tree = fill_tree({"weights": weights, "state": state}, saved.arrays, str(checkpoint))
         weights, state = jax.tree.map(jnp.asarray, (tree["weights"], tree["state"]))
         first = int(saved.arrays["['step']"])
     elif budget is not None:
-        left = budget - (time.perf_counter() - started)
-        plan = replace(plan, steps=_steps_within(left, problem, plan.steps))
-    deadline = None if budget is None or saved else started + 0.99 * budget
+        share = _NETWORK_SHARE if plan.residual else 0.99
+        deadline = started + share * budget
+        fitting = _steps_within(deadline - time.perf_counter(), problem, plan)
+        plan = replace(plan, steps=min(fitting, most))
+
+    loss = saved.loss if saved else float("nan")
+
+    def keep(weights: Weights, state: Any, done: int) -> None:
+        seconds = spent + time.perf_counter() - started
+        _write_checkpoint(checkpoint, scene, plan, (weights, state, done), seconds, loss)
+
+    if not saved:
+        keep(weights, state, 0)
     bar = tqdm(desc="train", initial=first, total=plan.steps, disable=not progress)
-    done, loss, began = first, float("nan"), time.perf_counter()
+    done, began = first, time.perf_counter()
+    kept: tuple[jax.Array, ...] = ()
     while done < plan.steps:
-        arguments = (jnp.asarray(done), jnp.asarray(plan.steps))
+        if plan.decoder == "separable" and done >= plan.freeze and not kept:
+            kept = (jax.jit(lambda w: problem.emulator.prepared(w)[1])(weights),)
+            began, first = time.perf_counter(), done
+        arguments = (jnp.asarray(done), jnp.asarray(plan.steps), *kept)
         weights, state, value = problem.step(weights, state, *arguments)
         done += 1
         bar.update()
         if done % 50 == 0 or done == plan.steps:
             loss = float(value)
             bar.set_postfix(loss=f"{loss:.3e}")
-        if deadline is not None and done % 200 == 0:
+        if deadline is not None and done % 200 == 0 and done > first:
             # The machine may have become busier, or less so: aim again at the deadline.
             now = time.perf_counter()
             left = int((deadline - now) / ((now - began) / (done - first)))
-            plan = replace(plan, steps=done + max(left, 0))
+            plan = replace(plan, steps=min(done + max(left, 0), most))
             bar.total = plan.steps
         if done % plan.checkpoint_every == 0 and done < plan.steps:
-            seconds = spent + time.perf_counter() - started
-            _write_checkpoint(checkpoint, scene, plan, (weights, state, done), seconds)
+            keep(weights, state, done)
     bar.close()
     if not np.isfinite(loss):
         raise SolverError("training ended in a loss that is not finite; lower the learning rate")
-    seconds = round(spent + time.perf_counter() - started, 1)
-    record = {"plan": asdict(plan), "seconds": seconds, "final_loss": loss}
-    return replace(problem.emulator, weights=weights, record=record)
+    record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
+    emulator = replace(problem.emulator, weights=weights)
+    if plan.residual:
+        keep(weights, state, done)
+        emulator, record["residual"] = add_residual(emulator, problem.runs)
+    record["seconds"] = round(spent + time.perf_counter() - started, 1)
+    return replace(emulator, record=record)
 
 
 def remove_checkpoint(folder: str | Path) -> None:
@@ -223,21 +272,17 @@ def remove_checkpoint(folder: str | Path) -> None:
     (Path(folder) / CHECKPOINT).unlink(missing_ok=True)
 
 
-def _steps_within(seconds: float, problem: Problem, total: int) -> int:
+def _steps_within(seconds: float, problem: Problem, plan: Plan) -> int:
     """How many steps fit into ``seconds``, from a few of them; their effect is thrown away."""
     started = time.perf_counter()
-    weights = jax.tree.map(jnp.copy, problem.emulator.weights)  # a step consumes its arguments
-    state = problem.optimiser.init(weights)
-    durations = []
-    for number in range(8):
-        begin = time.perf_counter()
-        arguments = (jnp.asarray(number), jnp.asarray(total))
-        weights, state, value = problem.step(weights, state, *arguments)
-        value.block_until_ready()
-        durations.append(time.perf_counter() - begin)
-    one = float(np.median(durations[1:]))
+    one = _seconds_a_step(problem, plan)
+    late = one
+    if plan.decoder == "separable":
+        weights = problem.emulator.weights
+        late = _seconds_a_step(problem, plan, problem.emulator.prepared(weights)[1])
     left = 0.98 * seconds - (time.perf_counter() - started)
-    steps = int(left / one)
+    early = min(left / one, plan.freeze) if late < one else left / one
+    steps = int(early + max(left - early * one, 0.0) / late)
     if steps < WARMUP:
         raise InputError(
             f"the budget leaves {max(steps, 0)} training steps of {1e3 * one:.0f} ms after FEM "
@@ -246,20 +291,40 @@ def _steps_within(seconds: float, problem: Problem, total: int) -> int:
     return steps
 
 
+def _seconds_a_step(problem: Problem, plan: Plan, *kept: jax.Array) -> float:
+    weights = jax.tree.map(jnp.copy, problem.emulator.weights)  # a step consumes its arguments
+    state = problem.optimiser.init(weights)
+    durations = []
+    for number in range(8):
+        begin = time.perf_counter()
+        arguments = (jnp.asarray(number), jnp.asarray(plan.steps), *kept)
+        weights, state, value = problem.step(weights, state, *arguments)
+        value.block_until_ready()
+        durations.append(time.perf_counter() - begin)
+    return float(np.median(durations[1:]))
+
+
 class _Checkpoint(NamedTuple):
     plan: Plan
     seconds: float
+    loss: float
     arrays: dict[str, np.ndarray]
 
 
 def _write_checkpoint(
-    path: Path, scene: Scene, plan: Plan, progress: tuple[Any, Any, int], seconds: float
+    path: Path,
+    scene: Scene,
+    plan: Plan,
+    progress: tuple[Any, Any, int],
+    seconds: float,
+    loss: float,
 ) -> None:
     weights, state, step = progress
     metadata = {
         "plan": json.dumps(asdict(plan)),
         "fingerprint": scene.fingerprint,
         "seconds": repr(seconds),
+        "loss": repr(loss),
     }
     save_tree(path, {"weights": weights, "state": state, "step": np.asarray(step)}, metadata)
 
@@ -270,4 +335,5 @@ def _read_checkpoint(path: Path, scene: Scene) -> _Checkpoint:
     arrays, metadata = read_arrays(path)
     if metadata.get("fingerprint") != scene.fingerprint:
         raise InputError(f"{path} belongs to another scene than '{scene.name}'; train afresh")
-    return _Checkpoint(Plan(**json.loads(metadata["plan"])), float(metadata["seconds"]), arrays)
+    plan = Plan(**json.loads(metadata["plan"]))
+    return _Checkpoint(plan, float(metadata["seconds"]), float(metadata.get("loss", "nan")), arrays)

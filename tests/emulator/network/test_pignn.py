@@ -8,6 +8,7 @@ from flax import nnx
 
 import emulator as em
 from emulator.errors import InputError
+from emulator.fem.expansion import constant
 from emulator.network import Architecture, augment
 from emulator.network.emulator import fresh
 from emulator.network.graph import AugmentedGraph
@@ -23,7 +24,7 @@ def emulator(beam):
 
 def test_the_published_sizes_have_the_published_number_of_weights():
     graph = augment(em.scenes.once_clamped_beam())
-    network = build(Architecture(), graph, parameters=2, seed=0)
+    network = build(Architecture(), graph, parameters=2, fixed=0, seed=0)
     count = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(network)))
     assert count == pytest.approx(510_000, rel=0.005)
 
@@ -71,7 +72,7 @@ def test_renumbering_the_nodes_renumbers_the_states(beam):
 
 def test_an_untrained_emulator_is_its_offset(beam):
     offset = np.random.default_rng(0).normal(size=beam.held.shape)
-    emulator = fresh(beam, augment(beam), SMALL, offset, np.ones(3), 0)
+    emulator = fresh(beam, augment(beam), SMALL, constant(np.full(2, 0.5), offset), np.ones(3), 0)
     expected = np.where(beam.held, 0.0, offset)
     np.testing.assert_array_equal(emulator(beam.centre), expected)
     np.testing.assert_array_equal(emulator(beam.centre * 1.2), expected)

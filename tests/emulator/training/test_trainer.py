@@ -112,7 +112,9 @@ def test_plans_that_cannot_work(options, message):
 
 
 def test_learning_rate_rises_then_falls():
-    rates = np.array([learning_rate(1e-3, jnp.asarray(k), jnp.asarray(1000)) for k in range(1000)])
+    rates = np.array(
+        [learning_rate(Plan(), jnp.asarray(k), jnp.asarray(1000)) for k in range(1000)]
+    )
     assert rates[0] == pytest.approx(1e-3 / WARMUP)
     assert 90 < rates.argmax() < 110
     assert rates.max() < 1e-3

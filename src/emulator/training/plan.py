@@ -1,0 +1,105 @@
+"""How to train: what an emulator is made of, from how many FEM runs, by which optimiser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from emulator.errors import InputError
+from emulator.training.objectives import Objective
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to train.
+
+    recipe : the name in :data:`RECIPES` it came from, for the record.
+    objective : of the network: ``energy`` (no FEM run but the centre), ``simulations``, or
+        ``both``.
+    steps : optimiser steps.
+    simulations : FEM runs to train the network on (not used by ``energy``) and the residual.
+    batch : theta a step.
+    learning_rate : of Adam at its peak.
+    schedule : ``cosine`` to zero after a warm-up, or ``halves``: the peak, then a tenth of it.
+    energy_weight : weight of the energy gap in ``both``.
+    centred : start from the FEM solution at the centre of the box rather than from zero.
+    order : of the Taylor series about the centre; 0 is the solution alone.
+    decoder : ``pointwise`` or ``separable``.
+    modes : mechanical modes given to a separable decoder, at most.
+    freeze : step after which a separable decoder keeps its modes and trains its branch alone.
+    residual : learn what is left from the FEM runs and their slopes.
+    checkpoint_every : steps between checkpoints.
+    seed : of the weights, the FEM runs' theta, and the batches.
+    """
+
+    recipe: str = "network"
+    objective: Objective = "both"
+    steps: int = 3000
+    simulations: int = 256
+    batch: int = 16
+    learning_rate: float = 1e-3
+    schedule: Literal["cosine", "halves"] = "cosine"
+    energy_weight: float = 0.3
+    centred: bool = True
+    order: int = 0
+    decoder: Literal["pointwise", "separable"] = "pointwise"
+    modes: int = 40
+    freeze: int = 200
+    residual: bool = False
+    checkpoint_every: int = 500
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.objective not in ("energy", "simulations", "both"):
+            raise InputError(f"objective '{self.objective}': use energy, simulations or both")
+        for name in ("steps", "batch", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise InputError(f"training: {name} is {getattr(self, name)}; it must be 1 or more")
+        if self.objective != "energy" and self.simulations < self.batch:
+            raise InputError(
+                f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"
+            )
+        if not 0 <= self.order <= 4 or (self.order and not self.centred):
+            raise InputError(
+                f"training: a series of order {self.order}"
+                f"{'' if self.centred else ' without a centre'}; give 0 to 4, 0 without a centre"
+            )
+
+    @property
+    def runs(self) -> int:
+        """FEM runs besides the centre's."""
+        return self.simulations if self.residual or self.objective != "energy" else 0
+
+
+RECIPES: dict[str, Plan] = {
+    "hybrid": Plan(
+        recipe="hybrid",
+        objective="energy",
+        order=3,
+        decoder="separable",
+        residual=True,
+        simulations=200,
+        steps=2000,
+    ),
+    "network": Plan(),
+    "paper": Plan(
+        recipe="paper",
+        objective="energy",
+        centred=False,
+        batch=1,
+        learning_rate=1e-4,
+        schedule="halves",
+        steps=100_000,
+    ),
+}
+"""``hybrid``: a Taylor series, a network trained on the energy in mechanical modes, and the
+residual of some FEM runs. ``network``: Algorithm 1 about the centre, trained on FEM runs and the
+energy. ``paper``: Algorithm 1 from zero, the energy at one theta a step, Adam at 1e-4 and then
+1e-5, as released by Dalton et al. (2023)."""
+
+
+def recipe(name: str) -> Plan:
+    """The plan of that name; :class:`InputError` lists the names."""
+    if name not in RECIPES:
+        raise InputError(f"recipe '{name}' is unknown; known: {', '.join(RECIPES)}")
+    return RECIPES[name]
