@@ -98,8 +98,8 @@ def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.n
         zorder=3,
         label="posterior mean",
     )
-    observe = posterior.model.observe
-    data = observe.points + np.asarray(posterior.data)
+    observe = posterior.model.observe.parts["displacement"]
+    data = observe.points + np.asarray(posterior.data["displacement"])
     axes.scatter(
         data[:, 0], data[:, 2], marker="x", c="tab:red", s=30, lw=1.2, zorder=4, label="data"
     )
