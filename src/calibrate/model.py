@@ -68,7 +68,7 @@ class Model:
         """What is inferred: theta's entries, then the noises that are unknown."""
         return (*self.forward.scene.parameter_names, *self.inferred_noise.values())
 
-    def __call__(self, data: np.ndarray | Data | None = None) -> None:
+    def __call__(self, data: jax.Array | Data | None = None) -> None:
         """The NumPyro program; ``data`` by name, or as it is when one thing is observed."""
         scene = self.forward.scene
         theta = jnp.stack(

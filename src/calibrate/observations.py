@@ -23,6 +23,8 @@ from emulator.scenes.scene import Scene
 # How far outside the body a point may lie, as a fraction of the body's size.
 _SLACK = 1e-3
 
+SEVERAL = "several"
+
 
 class Observation(Protocol):
     """A function of the displacement of a few nodes.
@@ -217,7 +219,7 @@ class Observations:
             if name == part.quantity:
                 return part.describe()
         return {
-            "kind": "several",
+            "kind": SEVERAL,
             "parts": {name: part.describe() for name, part in self.parts.items()},
         }
 
@@ -295,8 +297,8 @@ def _locate(scene: Scene, k: int, point: np.ndarray) -> tuple[int, np.ndarray]:
     return element, inside[element]
 
 
-def observation_from(scene: Scene, description: dict[str, Any]) -> Observation | Observations:
-    """What :meth:`Observation.describe` or :meth:`Observations.describe` described."""
+def observation_from(scene: Scene, description: dict[str, Any]) -> Observation:
+    """The operator that :meth:`Observation.describe` described."""
     kind = description.get("kind")
     if kind == "nodes":
         return nodal_displacements(scene, np.asarray(description["nodes"]))
@@ -304,12 +306,15 @@ def observation_from(scene: Scene, description: dict[str, Any]) -> Observation |
         return landmarks(scene, np.asarray(description["points"]))
     if kind == "volume":
         return CavityVolume(scene, description["facet_set"])
-    if kind == "several":
-        parts = description["parts"].items()
-        return Observations({name: observation_from(scene, part) for name, part in parts})
-    raise InputError(
-        f"observation kind '{kind}' is unknown: nodes, landmarks, volume or several"
-    )
+    raise InputError(f"observation kind '{kind}' is unknown: nodes, landmarks or volume")
+
+
+def observations_from(scene: Scene, description: dict[str, Any]) -> Observations:
+    """What :meth:`Observations.describe` described."""
+    if description.get("kind") != SEVERAL:
+        return observations(observation_from(scene, description))
+    parts = description["parts"].items()
+    return Observations({name: observation_from(scene, part) for name, part in parts})
 
 
 def spread_nodes(scene: Scene, count: int, seed: int) -> np.ndarray:

@@ -198,7 +198,9 @@ def _places(
     observe: Observations,
 ) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
     """Reference positions of observed points, and how arrays of data are labelled."""
-    constants, dims, coords = {}, {}, {"component": ["x", "y", "z"]}
+    constants: dict[str, np.ndarray] = {}
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {"component": ["x", "y", "z"]}
     for name, part in observe.parts.items():
         if isinstance(part, NodalDisplacements | Landmarks):
             # Only one part can be called by its quantity, and it keeps the plain labels.

@@ -30,7 +30,7 @@ def register(commands: Any) -> None:
     parser = commands.add_parser("infer", help="sample a posterior")
     add_scene(parser)
     parser.add_argument(
-        "--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm"
+        "--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm and mL"
     )
     parser.add_argument(
         "--truth", nargs="+", default=[], metavar="NAME=VALUE", help="of synthetic data"
@@ -39,17 +39,10 @@ def register(commands: Any) -> None:
         "--observe",
         default="nodes:20",
         metavar="WHAT",
-        help="nodes:N, landmarks:N, all, a node set, 3,14,15",
+        help="of synthetic data: nodes:N, landmarks:N, all, a node set, 3,14,15, volume, "
+        "volume:FACETSET; several joined by +, as in landmarks:24+volume",
     )
-    parser.add_argument(
-        "--noise", type=float, metavar="MM", default=0.2, help="standard deviation (default 0.2)"
-    )
-    parser.add_argument(
-        "--noise-scale",
-        type=float,
-        metavar="MM",
-        help="infer the noise; scale of its half-normal prior",
-    )
+    _add_noise(parser)
     parser.add_argument("--forward", choices=_FORWARDS, default="emulator")
     parser.add_argument(
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
@@ -74,6 +67,27 @@ def register(commands: Any) -> None:
     parser.add_argument("--draws", type=int, default=200, help="FEM runs")
     add_json(parser)
     parser.set_defaults(run=certify)
+
+
+def _add_noise(parser: argparse.ArgumentParser) -> None:
+    """Noise of displacements and of volumes, known or to be inferred."""
+    for option, quantity, unit, default in (
+        ("--noise", "displacements", "MM", 0.2),
+        ("--volume-noise", "volumes", "ML", 1.0),
+    ):
+        parser.add_argument(
+            option,
+            type=float,
+            metavar=unit,
+            default=default,
+            help=f"standard deviation of {quantity} (default {default})",
+        )
+        parser.add_argument(
+            f"{option}-scale",
+            type=float,
+            metavar=unit,
+            help=f"infer the noise of {quantity}; scale of its half-normal prior",
+        )
 
 
 def demo(arguments: argparse.Namespace) -> int:
@@ -108,6 +122,8 @@ def infer(arguments: argparse.Namespace) -> int:
         observe=arguments.observe,
         noise_sd=arguments.noise,
         noise_scale=arguments.noise_scale,
+        volume_noise_sd=arguments.volume_noise,
+        volume_noise_scale=arguments.volume_noise_scale,
         forward=arguments.forward,
         emulator=_emulator(arguments.emulator),
         fem_runs=arguments.fem_runs,
