@@ -89,11 +89,11 @@ def _draw_body(figure: Any, posterior: Posterior, fields: np.ndarray) -> None:
     )  # fmt: skip
     low, high = mean.min(axis=0), mean.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.4)
+    axes.set_box_aspect(high - low, zoom=1.25)
     axes.view_init(elev=18.0, azim=-80.0)
     axes.set_axis_off()
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.0), frameon=False)
-    axes.set_title("posterior mean, front half cut away", y=1.0)
+    axes.set_title("posterior mean, front half cut away", y=1.03)
     figure.colorbar(body, ax=axes, label="posterior sd of the position (mm)", shrink=0.6)
 
 
@@ -134,5 +134,5 @@ def _draw_volume(axes: Axes, posterior: Posterior, truth: np.ndarray, prior: jax
         yticks=[],
         title=f"prior: {low:.0f} to {high:.0f} mL",
     )
-    axes.margins(x=0.25)
-    axes.legend(loc="upper right", frameon=False, fontsize=8)
+    axes.margins(x=0.25, y=0.25)
+    axes.legend(loc="upper center", ncols=2, frameon=False, fontsize=8)
