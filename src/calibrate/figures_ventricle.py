@@ -93,7 +93,7 @@ def _draw_body(figure: Any, posterior: Posterior, fields: np.ndarray) -> None:
     axes.view_init(elev=18.0, azim=-80.0)
     axes.set_axis_off()
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.0), frameon=False)
-    axes.set_title("posterior mean, front half cut away", y=1.03)
+    axes.set_title("posterior mean, front half cut away")
     figure.colorbar(body, ax=axes, label="posterior sd of the position (mm)", shrink=0.6)
 
 
