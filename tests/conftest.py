@@ -33,6 +33,12 @@ def cube() -> Scene:
 
 
 @pytest.fixture(scope="session")
+def ventricle() -> Scene:
+    """A coarse left ventricle: one layer."""
+    return em.scenes.left_ventricle(rings=4, around=8, layers=1)
+
+
+@pytest.fixture(scope="session")
 def simulator(beam: Scene) -> em.Simulator:
     return em.Simulator(beam)
 

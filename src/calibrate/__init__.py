@@ -8,7 +8,7 @@ import emulator
 from calibrate.certify import Certificate, certify
 from calibrate.model import Model, model
 from calibrate.noise import GaussianNoise
-from calibrate.observations import landmarks, nodal_displacements
+from calibrate.observations import CavityVolume, landmarks, nodal_displacements
 from calibrate.posterior import Posterior, sample
 from calibrate.priors import box_prior
 from calibrate.samplers import NUTSOptions
@@ -16,6 +16,7 @@ from calibrate.samplers import NUTSOptions
 __version__ = emulator.__version__
 
 __all__ = [
+    "CavityVolume",
     "Certificate",
     "GaussianNoise",
     "Model",

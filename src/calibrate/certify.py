@@ -11,18 +11,17 @@ posterior standard deviations, says whether reweighting is needed at all.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 from tqdm import tqdm
 
-from calibrate.model import NOISE_SD, Model
+from calibrate.model import Data, Model
 from calibrate.posterior import Posterior
 from emulator.errors import InputError
 from emulator.fem import Simulator
@@ -163,24 +162,31 @@ def certify(
         raise InputError(f"certify: {draws} draws asked for; give 25 to {available}")
     rows = np.linspace(0, available - 1, draws).astype(int)
     chosen = {name: values[rows] for name, values in everything.items()}
-    ratio = _log_ratio(model, simulator)
-    sds = chosen.get(NOISE_SD, np.full(draws, model.noise.sd))
+    start, ratio = _compiled(model)
     thetas = posterior.thetas()[rows]
-    bar = tqdm(range(draws), "FEM check", disable=not progress, unit="run")
-    log_ratios = np.array([float(ratio(thetas[s], sds[s], data)) for s in bar])
+    log_ratios = np.full(draws, -np.inf)
+    for s in tqdm(range(draws), "FEM check", disable=not progress, unit="run"):
+        # Outside jit, where the solver may use CHOLMOD.
+        solution = simulator.solve(thetas[s], start(thetas[s]))
+        if solution.converged:
+            sds = model.noise_sds({name: values[s] for name, values in chosen.items()})
+            log_ratios[s] = ratio(thetas[s], solution.displacement, sds, data)
     worst = max(row["r_hat"] for row in posterior.summary().values())
     return judge(log_ratios, chosen, r_hat=worst)
 
 
 @lru_cache(maxsize=4)
-def _log_ratio(model: Model, simulator: Simulator) -> Callable[..., jax.Array]:
-    """Jitted log likelihood ratio of one draw, ``-inf`` where FEM fails; compiled once a model."""
+def _compiled(model: Model) -> tuple[Callable, Callable]:
+    """The cheap map over all nodes, and the log likelihood ratio of FEM's displacement over it.
+
+    Compiled once a model.
+    """
 
     @jax.jit
-    def ratio(theta: jax.Array, sd: jax.Array, data: jax.Array) -> jax.Array:
-        solution = simulator.solve(theta, model.full(theta))
-        fem = model.log_likelihood(solution.displacement[model.observe.nodes], sd, data)
-        cheap = model.log_likelihood(model.forward(theta), sd, data)
-        return jnp.where(solution.converged, fem - cheap, -jnp.inf)
+    def ratio(
+        theta: jax.Array, displacement: jax.Array, sds: Mapping[str, jax.Array], data: Data
+    ) -> jax.Array:
+        fem = model.log_likelihood(displacement[model.observe.nodes], sds, data)
+        return fem - model.log_likelihood(model.forward(theta), sds, data)
 
-    return ratio
+    return jax.jit(model.full), ratio

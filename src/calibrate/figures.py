@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from calibrate.certify import Certificate
+from calibrate.observations import Landmarks, NodalDisplacements
 from calibrate.posterior import Posterior
 from emulator.errors import InputError
 from emulator.network.graph import mesh_edges
@@ -38,6 +39,14 @@ def displacement_draws(posterior: Posterior, count: int = 200) -> np.ndarray:
     thetas = posterior.thetas()
     rows = np.linspace(0, len(thetas) - 1, count).astype(int)
     return np.asarray(jax.jit(lambda t: jax.lax.map(posterior.model.full, t))(thetas[rows]))
+
+
+def displacement_part(posterior: Posterior) -> NodalDisplacements | Landmarks:
+    """The observation of displacements; :class:`InputError` when there is none."""
+    part = posterior.model.observe.parts.get("displacement")
+    if not isinstance(part, NodalDisplacements | Landmarks):
+        raise InputError("figure: the posterior observes no displacements")
+    return part
 
 
 def beam_figure(
@@ -98,8 +107,8 @@ def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.n
         zorder=3,
         label="posterior mean",
     )
-    observe = posterior.model.observe
-    data = observe.points + np.asarray(posterior.data)
+    observe = displacement_part(posterior)
+    data = observe.points + np.asarray(posterior.data["displacement"])
     axes.scatter(
         data[:, 0], data[:, 2], marker="x", c="tab:red", s=30, lw=1.2, zorder=4, label="data"
     )

@@ -10,12 +10,12 @@ from emulator.errors import InputError
 
 @dataclass(frozen=True)
 class GaussianNoise:
-    """Independent Gaussian noise on every component of every observed displacement.
+    """Independent Gaussian noise on every number of an observation, in the observation's unit.
 
     Parameters
     ----------
-    sd : standard deviation in mm, when known.
-    sd_scale : otherwise the scale (mm) of its half-normal prior; the sd is then inferred.
+    sd : standard deviation, when known: mm for displacements, on each component; mL for a volume.
+    sd_scale : otherwise the scale of its half-normal prior; the sd is then inferred.
     """
 
     sd: float | None = None
@@ -23,10 +23,10 @@ class GaussianNoise:
 
     def __post_init__(self) -> None:
         if (self.sd is None) == (self.sd_scale is None):
-            raise InputError("noise: give either sd (known, mm) or sd_scale (of its prior, mm)")
+            raise InputError("noise: give either sd (known) or sd_scale (of its prior)")
         value = self.sd if self.sd is not None else self.sd_scale
         if value is None or not 0.0 < value < float("inf"):
-            raise InputError(f"noise: standard deviation is {value} mm; it must be above 0")
+            raise InputError(f"noise: standard deviation is {value}; it must be above 0")
 
     def describe(self) -> dict[str, Any]:
         """Plain JSON, the constructor's arguments."""

@@ -1,8 +1,14 @@
-"""Observation operators: what of a displacement field was measured."""
+"""Observation operators: what of a displacement field was measured.
+
+Each stands for one kind of measurement; :class:`Observations` holds those made at once, by name.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import jax
@@ -11,18 +17,24 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.forward import all_nodes, check_nodes
+from emulator.mechanics.cavity import Cavity
 from emulator.scenes.scene import Scene
 
 # How far outside the body a point may lie, as a fraction of the body's size.
 _SLACK = 1e-3
 
+SEVERAL = "several"
+
 
 class Observation(Protocol):
-    """Linear in the displacement of a few nodes.
+    """A function of the displacement of a few nodes.
 
-    nodes : (k,) the nodes a forward map must return.
-    points : (d, 3) mm, where in the reference body each row of the data lies.
+    quantity : what is measured, ``displacement`` or ``volume``; its name where it is alone.
+    unit : of the data.
     """
+
+    quantity: str
+    unit: str
 
     @property
     def nodes(self) -> np.ndarray:
@@ -30,12 +42,12 @@ class Observation(Protocol):
         ...
 
     @property
-    def points(self) -> np.ndarray:
-        """Reference positions of the data's rows, (d, 3) mm."""
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the data: (d, 3) for displacements of d points, () for a volume."""
         ...
 
     def __call__(self, displacement: jax.Array) -> jax.Array:
-        """Observed displacements (..., d, 3) in mm from those of ``nodes`` (..., k, 3)."""
+        """Data without noise (..., *shape) from the displacement of ``nodes`` (..., k, 3) mm."""
         ...
 
     def describe(self) -> dict[str, Any]:
@@ -45,10 +57,18 @@ class Observation(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class NodalDisplacements:
-    """Displacements of some nodes, in mm."""
+    """Displacements of some nodes ``nodes`` (d,), at rest at ``points`` (d, 3), in mm."""
 
     nodes: np.ndarray
     points: np.ndarray
+
+    quantity = "displacement"
+    unit = "mm"
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(d, 3)."""
+        return self.points.shape
 
     def __call__(self, displacement: jax.Array) -> jax.Array:
         """The displacements themselves."""
@@ -63,6 +83,7 @@ class NodalDisplacements:
 class Landmarks:
     """Displacements of material points between nodes, by linear interpolation in their element.
 
+    points : (d, 3) mm, where in the reference body they are.
     corners : (d, 4) positions in ``nodes`` of each point's element.
     weights : (d, 4) barycentric coordinates.
     """
@@ -72,6 +93,14 @@ class Landmarks:
     corners: np.ndarray
     weights: np.ndarray
 
+    quantity = "displacement"
+    unit = "mm"
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(d, 3)."""
+        return self.points.shape
+
     def __call__(self, displacement: jax.Array) -> jax.Array:
         """Interpolated displacements (..., d, 3)."""
         corner_values = displacement[..., self.corners, :]
@@ -80,6 +109,126 @@ class Landmarks:
     def describe(self) -> dict[str, Any]:
         """Kind and reference positions."""
         return {"kind": "landmarks", "points": self.points.tolist()}
+
+
+@dataclass(frozen=True, eq=False)
+class CavityVolume:
+    """The volume of a cavity, one number in mL.
+
+    Parameters
+    ----------
+    scene : with the cavity in its mesh.
+    facet_set : its wall; needed where the scene has several cavities.
+
+    Raises
+    ------
+    InputError
+        No such set, one that encloses nothing, or several cavities and no name.
+    """
+
+    scene: Scene
+    facet_set: str | None = None
+
+    quantity = "volume"
+    unit = "mL"
+    shape = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "facet_set", self.cavity.facet_set)
+
+    @cached_property
+    def cavity(self) -> Cavity:
+        """The volume as a function of its wall's displacement."""
+        return Cavity(self.scene, self.facet_set)
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Nodes of the cavity's wall, (k,)."""
+        return self.cavity.nodes
+
+    def __call__(self, displacement: jax.Array) -> jax.Array:
+        """Volume (...) in mL."""
+        return self.cavity(displacement)
+
+    def describe(self) -> dict[str, Any]:
+        """Kind and facet set."""
+        return {"kind": "volume", "facet_set": self.facet_set}
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What was measured at once, by name; one forward map serves all of it.
+
+    nodes : (k,) the union of the nodes that the parts need, each once.
+    """
+
+    parts: Mapping[str, Observation]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", MappingProxyType(dict(self.parts)))
+        if not self.parts:
+            raise InputError("nothing is observed; name one observation or more")
+        for name in self.parts:
+            if not isinstance(name, str) or not name or "/" in name:
+                raise InputError(f"observation is called {name!r}; use a name without '/'")
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """Nodes a forward map must return, (k,)."""
+        return np.unique(np.concatenate([part.nodes for part in self.parts.values()]))
+
+    @cached_property
+    def _rows(self) -> dict[str, np.ndarray]:
+        return {name: np.searchsorted(self.nodes, part.nodes) for name, part in self.parts.items()}
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each part's data."""
+        return {name: part.shape for name, part in self.parts.items()}
+
+    def __call__(self, displacement: jax.Array) -> dict[str, jax.Array]:
+        """Data of each part without noise, from the displacement of ``nodes`` (..., k, 3) mm."""
+        return {
+            name: part(displacement[..., self._rows[name], :]) for name, part in self.parts.items()
+        }
+
+    def name[T](self, values: T | Mapping[str, T], what: str) -> dict[str, T]:
+        """``values`` by the parts' names, in their order; one alone belongs to a single part.
+
+        Raises
+        ------
+        InputError
+            A part without a value, or a value without a part; ``what`` they are is said.
+        """
+        known = ", ".join(self.parts)
+        if not isinstance(values, Mapping):
+            if len(self.parts) > 1:
+                raise InputError(f"{what}: give one for each of {known}, by name")
+            return dict.fromkeys(self.parts, values)
+        for name in (*values, *self.parts):
+            if name not in self.parts:
+                raise InputError(f"{what}: '{name}' is not observed; observed: {known}")
+            if name not in values:
+                raise InputError(f"{what}: nothing for '{name}'; observed: {known}")
+        return {name: values[name] for name in self.parts}
+
+    def describe(self) -> dict[str, Any]:
+        """The description of each part; of a single one that bears its usual name, just that."""
+        if len(self.parts) == 1:
+            ((name, part),) = self.parts.items()
+            if name == part.quantity:
+                return part.describe()
+        return {
+            "kind": SEVERAL,
+            "parts": {name: part.describe() for name, part in self.parts.items()},
+        }
+
+
+def observations(observe: Observation | Mapping[str, Observation] | Observations) -> Observations:
+    """What was observed, by name; a single observation is called by its quantity."""
+    if isinstance(observe, Observations):
+        return observe
+    return Observations(observe if isinstance(observe, Mapping) else {observe.quantity: observe})
 
 
 def nodal_displacements(
@@ -150,11 +299,22 @@ def _locate(scene: Scene, k: int, point: np.ndarray) -> tuple[int, np.ndarray]:
 
 def observation_from(scene: Scene, description: dict[str, Any]) -> Observation:
     """The operator that :meth:`Observation.describe` described."""
-    if description.get("kind") == "nodes":
+    kind = description.get("kind")
+    if kind == "nodes":
         return nodal_displacements(scene, np.asarray(description["nodes"]))
-    if description.get("kind") == "landmarks":
+    if kind == "landmarks":
         return landmarks(scene, np.asarray(description["points"]))
-    raise InputError(f"observation kind '{description.get('kind')}' is unknown: nodes or landmarks")
+    if kind == "volume":
+        return CavityVolume(scene, description["facet_set"])
+    raise InputError(f"observation kind '{kind}' is unknown: nodes, landmarks or volume")
+
+
+def observations_from(scene: Scene, description: dict[str, Any]) -> Observations:
+    """What :meth:`Observations.describe` described."""
+    if description.get("kind") != SEVERAL:
+        return observations(observation_from(scene, description))
+    parts = description["parts"].items()
+    return Observations({name: observation_from(scene, part) for name, part in parts})
 
 
 def spread_nodes(scene: Scene, count: int, seed: int) -> np.ndarray:

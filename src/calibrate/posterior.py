@@ -16,7 +16,8 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
-from calibrate.model import Model
+from calibrate.model import Data, Model
+from calibrate.observations import Landmarks, NodalDisplacements, Observations
 from calibrate.provenance import versions
 from calibrate.samplers import NUTSOptions, nuts
 from emulator.correct import CorrectedForward
@@ -32,12 +33,12 @@ class Posterior:
 
     tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; attributes
         hold the provenance.
-    model, data : the model and the data (d, 3) mm it was conditioned on.
+    model, data : the model and the data, by the observation's name, it was conditioned on.
     """
 
     tree: xr.DataTree
     model: Model
-    data: jax.Array
+    data: Data
 
     def draws(self) -> dict[str, np.ndarray]:
         """All draws by name, chains joined, each (s,)."""
@@ -100,7 +101,7 @@ def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> d
         "scene_fingerprint": scene.fingerprint,
         "forward": model.forward.kind,
         "observe": model.observe.describe(),
-        "noise": model.noise.describe(),
+        "noise": _describe_noise(model),
         "prior": {name: describe_distribution(d) for name, d in model.prior.items()},
         "sampler": sampler,
         "sampler_options": asdict(options),
@@ -111,6 +112,12 @@ def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> d
     if fingerprint is not None:
         record["emulator_fingerprint"] = fingerprint
     return record
+
+
+def _describe_noise(model: Model) -> dict[str, Any]:
+    """The noise of each observation by name; of a single one just that."""
+    described = {name: noise.describe() for name, noise in model.noise.items()}
+    return described if len(described) > 1 else next(iter(described.values()))
 
 
 def emulator_fingerprint(forward: ForwardMap) -> str | None:
@@ -141,14 +148,16 @@ def _plain(value: Any) -> str:
 
 def sample(
     model: Model,
-    data: np.ndarray,
+    data: np.ndarray | Mapping[str, np.ndarray],
     *,
     sampler: str = "nuts",
     options: NUTSOptions = NUTSOptions(),
     seed: int = 0,
     progress: bool = False,
 ) -> Posterior:
-    """Draw from the posterior of ``model`` given ``data`` (d, 3) mm.
+    """Draw from the posterior of ``model`` given ``data``.
+
+    ``data`` is by name where several things are observed: displacements (d, 3) mm, a volume in mL.
 
     Raises
     ------
@@ -171,19 +180,32 @@ def sample(
 
 def _tree(
     model: Model,
-    data: jax.Array,
+    data: Data,
     draws: Mapping[str, np.ndarray],
     stats: Mapping[str, np.ndarray],
 ) -> xr.DataTree:
+    constants, dims, coords = _places(model.observe)
     groups: dict[str, Any] = {
         "posterior": dict(draws),
         "sample_stats": dict(stats),
-        "observed_data": {"displacement": np.asarray(data)},
-        "constant_data": {"position": model.observe.points},
+        "observed_data": {name: np.asarray(values) for name, values in data.items()},
+        **({"constant_data": constants} if constants else {}),
     }
-    labelled = ["point", "component"]
-    return arviz_base.from_dict(
-        groups,
-        dims={"displacement": labelled, "position": labelled},
-        coords={"component": ["x", "y", "z"], "point": np.arange(len(data))},
-    )
+    return arviz_base.from_dict(groups, dims=dims, coords=coords)
+
+
+def _places(
+    observe: Observations,
+) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
+    """Reference positions of observed points, and how arrays of data are labelled."""
+    constants: dict[str, np.ndarray] = {}
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {"component": ["x", "y", "z"]}
+    for name, part in observe.parts.items():
+        if isinstance(part, NodalDisplacements | Landmarks):
+            # Only one part can be called by its quantity, and it keeps the plain labels.
+            suffix = "" if name == part.quantity else f"_{name}"
+            constants[f"position{suffix}"] = part.points
+            coords[f"point{suffix}"] = np.arange(len(part.points))
+            dims[name] = dims[f"position{suffix}"] = [f"point{suffix}", "component"]
+    return constants, dims, coords

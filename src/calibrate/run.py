@@ -8,21 +8,24 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from calibrate.certify import Certificate, certify
-from calibrate.data import read_data, write_data
+from calibrate.data import DISPLACEMENT, is_volume, read_data, volume_of, write_data
 from calibrate.model import Model, model
 from calibrate.noise import GaussianNoise
 from calibrate.observations import (
+    Landmarks,
+    NodalDisplacements,
     Observation,
+    Observations,
     landmarks,
     nodal_displacements,
-    observation_from,
+    observations_from,
     spread_landmarks,
     spread_nodes,
 )
@@ -50,8 +53,10 @@ class Run:
     scene, root : a scene's name or file; where published data is.
     data : a file, or ``synthetic``: FEM at ``truth`` plus noise.
     truth : named parameters of synthetic data.
-    observe : of synthetic data: ``nodes:20``, ``landmarks:24``, ``all``, a node set, ``3,14,15``.
-    noise_sd : mm; known unless ``noise_scale``, the scale of its prior, asks to infer it.
+    observe : of synthetic data: ``nodes:20``, ``landmarks:24``, ``all``, a node set, ``3,14,15``,
+        ``volume``, ``volume:<facet set>``, or several of these joined by ``+``.
+    noise_sd : of displacements, mm; known unless ``noise_scale``, the scale of its prior, asks to
+        infer it. volume_noise_sd, volume_noise_scale : the same of volumes, mL.
     forward : one of :data:`FORWARDS`; ``emulator`` a shipped name or folder; ``fem_runs`` those
         the reduced model is fitted to.
     """
@@ -63,6 +68,8 @@ class Run:
     observe: str = "nodes:20"
     noise_sd: float | None = 0.2
     noise_scale: float | None = None
+    volume_noise_sd: float | None = 1.0
+    volume_noise_scale: float | None = None
     forward: str = "emulator"
     emulator: str | None = None
     fem_runs: int = 30
@@ -79,12 +86,40 @@ class Run:
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be 0 or more")
 
-    @property
-    def noise(self) -> GaussianNoise:
-        """The noise of the likelihood; that of synthetic data is always ``noise_sd``."""
-        if self.noise_scale is not None:
-            return GaussianNoise(None, self.noise_scale)
-        return GaussianNoise(self.noise_sd)
+    def noise(self, observe: Observations) -> dict[str, GaussianNoise]:
+        """The noise of each observation's likelihood."""
+        return {
+            name: self._noise(part, *self._given_noise(part))
+            for name, part in observe.parts.items()
+        }
+
+    def synthetic_sd(self, part: Observation) -> float:
+        """Standard deviation of a synthetic observation's noise, in its unit."""
+        sd, _ = self._given_noise(part)
+        if sd is None:
+            raise InputError(
+                f"synthetic data needs a noise standard deviation of the {part.quantity}, "
+                f"{part.unit}"
+            )
+        self._noise(part, sd, None)
+        return sd
+
+    def _given_noise(self, part: Observation) -> tuple[float | None, float | None]:
+        if part.quantity == "volume":
+            return self.volume_noise_sd, self.volume_noise_scale
+        return self.noise_sd, self.noise_scale
+
+    def _noise(self, part: Observation, sd: float | None, scale: float | None) -> GaussianNoise:
+        try:
+            return GaussianNoise(sd if scale is None else None, scale)
+        except InputError as error:
+            raise InputError(f"{part.quantity} ({part.unit}): {error}") from error
+
+
+@lru_cache(maxsize=2)
+def simulator_of(scene: Scene) -> Simulator:
+    """The simulator of a scene, compiled once for data, campaign and certificate."""
+    return Simulator(scene)
 
 
 def build_forward(run: Run, scene: Scene, *, progress: bool = False) -> ForwardMap:
@@ -93,15 +128,27 @@ def build_forward(run: Run, scene: Scene, *, progress: bool = False) -> ForwardM
         raise InputError(f"forward map '{run.forward}' is unknown; known: {', '.join(FORWARDS)}")
     if run.forward == "reduced":
         thetas = sobol(scene, run.fem_runs, run.seed)
-        return fit_reduced(scene, run_campaign(Simulator(scene), thetas, progress=progress))
+        return fit_reduced(scene, run_campaign(simulator_of(scene), thetas, progress=progress))
     if run.forward == "fem":
-        return fem_forward(Simulator(scene))
+        return fem_forward(simulator_of(scene))
     cached = load(run.emulator or scene.name, scene).cache()
-    return cached if run.forward == "emulator" else corrected(cached, Simulator(scene))
+    return cached if run.forward == "emulator" else corrected(cached, simulator_of(scene))
 
 
-def parse_observation(scene: Scene, text: str, seed: int) -> Observation:
-    """The observation a word stands for; see :class:`Run`."""
+def parse_observation(scene: Scene, text: str, seed: int) -> Observations:
+    """What the words joined by ``+`` stand for; see :class:`Run`."""
+    parts: dict[str, Observation] = {}
+    for word in text.split("+"):
+        name = word if is_volume(word) else DISPLACEMENT
+        if name in parts:
+            raise InputError(f"observe '{text}': {name} is given twice; once is enough")
+        parts[name] = (
+            volume_of(scene, word) if is_volume(word) else _displacements(scene, word, seed)
+        )
+    return Observations(parts)
+
+
+def _displacements(scene: Scene, text: str, seed: int) -> NodalDisplacements | Landmarks:
     kind, _, count = text.partition(":")
     if kind in ("nodes", "landmarks") and count:
         if not count.isdigit() or int(count) < 1:
@@ -115,29 +162,32 @@ def parse_observation(scene: Scene, text: str, seed: int) -> Observation:
         nodes = [int(word) for word in text.split(",")]
     except ValueError as error:
         raise InputError(
-            f"observe '{text}': give nodes:N, landmarks:N, all, node numbers like 3,14,15, "
-            f"or a node set: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
+            f"observe '{text}': give nodes:N, landmarks:N, all, volume, node numbers like "
+            f"3,14,15, or a node set: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
         ) from error
     return nodal_displacements(scene, nodes)
 
 
-def make_data(run: Run, scene: Scene) -> tuple[Observation, np.ndarray]:
-    """The observation and data (d, 3) mm of a run, read from a file or made by FEM."""
+def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarray]]:
+    """The observations and data of a run by name, read from a file or made by FEM."""
     if run.data != "synthetic":
         return read_data(scene, run.data)
     theta = scene.theta(**run.truth)
-    if run.noise_sd is None:
-        raise InputError("synthetic data needs a noise standard deviation: --noise MM")
     observe = parse_observation(scene, run.observe, run.seed)
-    exact = observe(Simulator(scene)(theta)[observe.nodes])
-    noise = np.random.default_rng([run.seed, 1]).normal(0.0, run.noise_sd, exact.shape)
-    return observe, np.asarray(exact) + noise
+    sds = {name: run.synthetic_sd(part) for name, part in observe.parts.items()}
+    exact = observe(simulator_of(scene)(theta)[observe.nodes])
+    rng = np.random.default_rng([run.seed, 1])
+    return observe, {
+        name: np.asarray(exact[name]) + rng.normal(0.0, sds[name], part.shape)
+        for name, part in observe.parts.items()
+    }
 
 
 def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
     """Sample the posterior of a run; with ``folder``, keep run, data and posterior there."""
-    scene, noise = find_scene(run.scene, run.root), run.noise
+    scene = find_scene(run.scene, run.root)
     observe, data = make_data(run, scene)
+    noise = run.noise(observe)
     built = model(build_forward(run, scene, progress=progress), observe, noise)
     options = NUTSOptions(run.warmup, run.draws, run.chains)
     posterior = sample(
@@ -167,9 +217,9 @@ def read_posterior(folder: str | Path, *, progress: bool = False) -> tuple[Run, 
     tree = read_tree(folder / POSTERIOR)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{folder / POSTERIOR} was made for another scene than '{run.scene}'")
-    observe = observation_from(scene, json.loads(tree.attrs["observe"]))
-    data = jnp.asarray(tree["observed_data"]["displacement"].values)
-    built: Model = model(build_forward(run, scene, progress=progress), observe, run.noise)
+    observe = observations_from(scene, json.loads(tree.attrs["observe"]))
+    built: Model = model(build_forward(run, scene, progress=progress), observe, run.noise(observe))
+    data = built.check_data({n: np.asarray(tree["observed_data"][n]) for n in observe.parts})
     made_with = tree.attrs.get("emulator_fingerprint")
     if made_with != (found := emulator_fingerprint(built.full)):
         raise InputError(
@@ -183,7 +233,7 @@ def certify_and_keep(
     posterior: Posterior, folder: str | Path, *, draws: int = 200, progress: bool = False
 ) -> Certificate:
     """Check a posterior against FEM and write certificate.json."""
-    simulator = Simulator(posterior.model.forward.scene)
+    simulator = simulator_of(posterior.model.forward.scene)
     certificate = certify(posterior, simulator, draws=draws, progress=progress)
     write_json(Path(folder) / CERTIFICATE, certificate.to_json())
     return certificate

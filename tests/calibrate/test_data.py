@@ -4,6 +4,7 @@ import xarray as xr
 
 import calibrate as cal
 from calibrate.data import read_data, write_data
+from calibrate.observations import observations, spread_landmarks
 from emulator.errors import InputError
 
 VALUES = np.array([[0.1, 0.2, -3.0], [1.0, -2.0, 1e-7]])
@@ -16,9 +17,10 @@ def test_csv_round_trip(beam, tmp_path):
     ):
         write_data(tmp_path / "d.csv", observe, VALUES)
         back, values = read_data(beam, tmp_path / "d.csv")
-        np.testing.assert_array_equal(values, VALUES)
-        np.testing.assert_array_equal(back.points, observe.points)
-        assert type(back) is type(observe)
+        (name,) = values
+        np.testing.assert_array_equal(values[name], VALUES)
+        np.testing.assert_array_equal(back.parts[name].points, observe.points)
+        assert type(back.parts[name]) is type(observe)
 
 
 def test_netcdf(beam, tmp_path):
@@ -28,7 +30,7 @@ def test_netcdf(beam, tmp_path):
     data.to_netcdf(tmp_path / "d.nc", engine="h5netcdf")
     observe, values = read_data(beam, tmp_path / "d.nc")
     np.testing.assert_array_equal(observe.nodes, [7, 30])
-    np.testing.assert_array_equal(values, VALUES)
+    np.testing.assert_array_equal(values["displacement"], VALUES)
     data.drop_vars("node").to_netcdf(tmp_path / "e.nc", engine="h5netcdf")
     with pytest.raises(InputError, match="needs variables displacement and node"):
         read_data(beam, tmp_path / "e.nc")
@@ -57,3 +59,83 @@ def test_one_line_for_every_mistake(beam, tmp_path, text, message):
         read_data(beam, tmp_path / "d.csv")
     assert "\n" not in str(caught.value)
     assert "d.csv" in str(caught.value)
+
+
+LANDMARKS = np.array([[2.0, 3.0, 4.0], [-5.0, 0.5, 1e-7]])
+
+
+@pytest.fixture
+def points(ventricle):
+    return spread_landmarks(ventricle, 2, seed=0)
+
+
+def test_a_volume_beside_displacements_survives_a_csv_file(ventricle, points, tmp_path):
+    several = {
+        "displacement": cal.landmarks(ventricle, points),
+        "volume": cal.CavityVolume(ventricle),
+    }
+    alone = {"volume": cal.CavityVolume(ventricle)}
+    named = {"volume:endocardium": cal.CavityVolume(ventricle, "endocardium")}
+    data = {"displacement": LANDMARKS, "volume": 123.4, "volume:endocardium": 99.5}
+    for parts in (several, alone, named, {**several, **named}):
+        given = {name: data[name] for name in parts}
+        write_data(tmp_path / "d.csv", observations(parts), given)
+        back, values = read_data(ventricle, tmp_path / "d.csv")
+        assert list(back.parts) == list(values) == list(parts)
+        for name in parts:
+            np.testing.assert_array_equal(values[name], given[name])
+        np.testing.assert_array_equal(back.nodes, observations(parts).nodes)
+
+
+def test_a_volume_written_beside_the_first_point(ventricle, tmp_path):
+    text = "node,ux,uy,uz,volume\n30,1,2,3,140.5\n31,4,5,6,\n"
+    (tmp_path / "d.csv").write_text(text)
+    back, values = read_data(ventricle, tmp_path / "d.csv")
+    np.testing.assert_array_equal(values["displacement"], [[1, 2, 3], [4, 5, 6]])
+    assert values["volume"] == 140.5
+    np.testing.assert_array_equal(back.parts["displacement"].nodes, [30, 31])
+
+
+def test_a_volume_in_netcdf(ventricle, points, tmp_path):
+    data = xr.Dataset(
+        {
+            "displacement": (("point", "component"), LANDMARKS),
+            "position": (("point", "component"), points),
+            "volume": 123.4,
+        }
+    )
+    data.to_netcdf(tmp_path / "d.nc", engine="h5netcdf")
+    back, values = read_data(ventricle, tmp_path / "d.nc")
+    assert values["volume"] == 123.4
+    np.testing.assert_array_equal(back.parts["displacement"].points, points)
+    data[["volume"]].to_netcdf(tmp_path / "v.nc", engine="h5netcdf")
+    assert list(read_data(ventricle, tmp_path / "v.nc")[0].parts) == ["volume"]
+    data.assign(volume=("point", [1.0, 2.0])).to_netcdf(tmp_path / "w.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match=r"volume has shape \(2,\); give one number, in mL"):
+        read_data(ventricle, tmp_path / "w.nc")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("volume\n120\n130\n", "column 'volume' has 2 values; give one, in mL"),
+        ("node,ux,uy,uz,volume\n3,0,0,0,\n", "column 'volume' has 0 values"),
+        ("volume\nmuch\n", "row 1, column 'volume' is 'much', not a number"),
+        ("volume\n-120\n", "volume is -120.0 mL; it must be above 0"),
+        ("volume\nnan\n", "volume is nan mL"),
+        ("volume:atrium\n120\n", "facet set 'atrium' is not in the mesh"),
+        ("ux,uy,uz,volume\n0,0,0,1\n", "column 'x' is missing"),
+    ],
+)
+def test_one_line_for_every_mistake_with_a_volume(ventricle, tmp_path, text, message):
+    (tmp_path / "d.csv").write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_data(ventricle, tmp_path / "d.csv")
+    assert "\n" not in str(caught.value)
+    assert "d.csv" in str(caught.value)
+
+
+def test_what_no_file_can_hold(beam, tmp_path):
+    two = {"left": cal.nodal_displacements(beam, [3]), "right": cal.nodal_displacements(beam, [4])}
+    with pytest.raises(InputError, match="observations left, right do not fit in one CSV file"):
+        write_data(tmp_path / "d.csv", observations(two), dict.fromkeys(two, np.zeros((1, 3))))

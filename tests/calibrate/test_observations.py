@@ -1,9 +1,17 @@
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.observations import observation_from, spread_landmarks, spread_nodes
+from calibrate.observations import (
+    observation_from,
+    observations,
+    observations_from,
+    spread_landmarks,
+    spread_nodes,
+)
 from emulator.errors import InputError
 
 
@@ -89,3 +97,52 @@ def test_spread_nodes_are_free_and_repeatable(beam):
     assert not beam.held[nodes].any()
     np.testing.assert_array_equal(nodes, spread_nodes(beam, 20, seed=3))
     assert len(set(nodes)) == 20
+
+
+def test_a_cavity_volume_is_that_of_the_endocardium(ventricle):
+    observe = cal.CavityVolume(ventricle)
+    assert observe.shape == ()
+    np.testing.assert_array_equal(observe.nodes, np.unique(ventricle.mesh.facet_set("endocardium")))
+    # A uniform stretch by 1.1 about the centre: volume times 1.1 cubed.
+    u = 0.1 * ventricle.mesh.nodes
+    rest = observe(jnp.zeros((len(observe.nodes), 3)))
+    assert observe(jnp.asarray(u[observe.nodes])) == pytest.approx(1.1**3 * float(rest), rel=1e-12)
+
+
+def test_several_observations_need_the_union_of_their_nodes(ventricle):
+    points = spread_landmarks(ventricle, 4, seed=2)
+    parts = {
+        "displacement": cal.landmarks(ventricle, points),
+        "volume": cal.CavityVolume(ventricle),
+    }
+    several = observations(parts)
+    np.testing.assert_array_equal(
+        several.nodes, sorted({*parts["displacement"].nodes, *parts["volume"].nodes})
+    )
+    u = np.random.default_rng(0).normal(size=(2, *ventricle.mesh.nodes.shape))
+    seen = several(jnp.asarray(u[:, several.nodes]))
+    for name, part in parts.items():
+        np.testing.assert_allclose(seen[name], part(jnp.asarray(u[:, part.nodes])), rtol=1e-13)
+    again = observations_from(ventricle, json.loads(json.dumps(several.describe())))
+    assert list(again.parts) == ["displacement", "volume"]
+    np.testing.assert_array_equal(again.nodes, several.nodes)
+    # A single one is described as it always was, and is called by what it measures.
+    alone = observations(parts["displacement"])
+    assert alone.describe()["kind"] == "landmarks"
+    assert list(observations_from(ventricle, alone.describe()).parts) == ["displacement"]
+
+
+def test_names_of_observations_are_checked(ventricle):
+    with pytest.raises(InputError, match="nothing is observed"):
+        observations({})
+    with pytest.raises(InputError, match="is called 'a/b'; use a name without '/'"):
+        observations({"a/b": cal.CavityVolume(ventricle)})
+    several = observations({"v": cal.CavityVolume(ventricle), "w": cal.CavityVolume(ventricle)})
+    with pytest.raises(InputError, match="noise: give one for each of v, w, by name"):
+        several.name(1.0, "noise")
+    with pytest.raises(InputError, match="data: nothing for 'w'; observed: v, w"):
+        several.name({"v": 1.0}, "data")
+    with pytest.raises(InputError, match="data: 'x' is not observed; observed: v, w"):
+        several.name({"x": 1.0}, "data")
+    with pytest.raises(InputError, match="facet set 'atrium' is not in the mesh"):
+        cal.CavityVolume(ventricle, "atrium")

@@ -17,12 +17,20 @@ from calibrate.cli.common import (
     table,
 )
 
+# Named here too, so that --help needs no imports; a test compares them with calibrate.demo.DEMOS.
+_DEMOS = ("once_clamped_beam", "left_ventricle")
 _FORWARDS = ("emulator", "corrected", "reduced", "fem")
 
 
 def register(commands: Any) -> None:
     """Add the commands."""
     parser = commands.add_parser("demo", help="the whole job on a built-in beam, in under a minute")
+    parser.add_argument(
+        "--scene",
+        choices=_DEMOS,
+        default=_DEMOS[0],
+        help="the beam (default), or the left ventricle from a volume and 24 landmarks, in minutes",
+    )
     parser.add_argument("--out", default="demo-output", metavar="DIR")
     add_json(parser)
     parser.set_defaults(run=demo)
@@ -30,7 +38,7 @@ def register(commands: Any) -> None:
     parser = commands.add_parser("infer", help="sample a posterior")
     add_scene(parser)
     parser.add_argument(
-        "--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm"
+        "--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm and mL"
     )
     parser.add_argument(
         "--truth", nargs="+", default=[], metavar="NAME=VALUE", help="of synthetic data"
@@ -39,17 +47,10 @@ def register(commands: Any) -> None:
         "--observe",
         default="nodes:20",
         metavar="WHAT",
-        help="nodes:N, landmarks:N, all, a node set, 3,14,15",
+        help="of synthetic data: nodes:N, landmarks:N, all, a node set, 3,14,15, volume, "
+        "volume:FACETSET; several joined by +, as in landmarks:24+volume",
     )
-    parser.add_argument(
-        "--noise", type=float, metavar="MM", default=0.2, help="standard deviation (default 0.2)"
-    )
-    parser.add_argument(
-        "--noise-scale",
-        type=float,
-        metavar="MM",
-        help="infer the noise; scale of its half-normal prior",
-    )
+    _add_noise(parser)
     parser.add_argument("--forward", choices=_FORWARDS, default="emulator")
     parser.add_argument(
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
@@ -76,6 +77,27 @@ def register(commands: Any) -> None:
     parser.set_defaults(run=certify)
 
 
+def _add_noise(parser: argparse.ArgumentParser) -> None:
+    """Noise of displacements and of volumes, known or to be inferred."""
+    for option, quantity, unit, default in (
+        ("--noise", "displacements", "MM", 0.2),
+        ("--volume-noise", "volumes", "ML", 1.0),
+    ):
+        parser.add_argument(
+            option,
+            type=float,
+            metavar=unit,
+            default=default,
+            help=f"standard deviation of {quantity} (default {default})",
+        )
+        parser.add_argument(
+            f"{option}-scale",
+            type=float,
+            metavar=unit,
+            help=f"infer the noise of {quantity}; scale of its half-normal prior",
+        )
+
+
 def demo(arguments: argparse.Namespace) -> int:
     """Run the demo and show what came out."""
     import time
@@ -83,12 +105,19 @@ def demo(arguments: argparse.Namespace) -> int:
     started = time.perf_counter()
     from calibrate.demo import demo as run_demo
 
-    report = run_demo(arguments.out, progress=show_progress(arguments))
+    report = run_demo(arguments.out, arguments.scene, progress=show_progress(arguments))
     report["seconds"] = round(time.perf_counter() - started, 1)
     report["files"] = [
-        f"{arguments.out}/{name}" for name in ("posterior.nc", "certificate.json", "beam.png")
+        f"{arguments.out}/{name}"
+        for name in ("posterior.nc", "certificate.json", report.pop("picture"))
     ]
-    text = f"{summary(report)}\nwritten: {', '.join(report['files'])} ({report['seconds']:.0f} s)"
+    lines = [summary(report)]
+    if "identifiability" in report:
+        from calibrate.identifiability import in_words
+
+        lines.append(in_words(report["identifiability"]))
+    lines.append(f"written: {', '.join(report['files'])} ({report['seconds']:.0f} s)")
+    text = "\n".join(lines)
     emit(report, as_json=arguments.json, text=text)
     return DONE if report["verdict"] == "accepted" else FAILED
 
@@ -108,6 +137,8 @@ def infer(arguments: argparse.Namespace) -> int:
         observe=arguments.observe,
         noise_sd=arguments.noise,
         noise_scale=arguments.noise_scale,
+        volume_noise_sd=arguments.volume_noise,
+        volume_noise_scale=arguments.volume_noise_scale,
         forward=arguments.forward,
         emulator=_emulator(arguments.emulator),
         fem_runs=arguments.fem_runs,

@@ -22,7 +22,7 @@ from numpyro.infer.hmc import hmc
 from numpyro.infer.util import initialize_model
 from tqdm import tqdm
 
-from calibrate.model import Model
+from calibrate.model import Data, Model
 from calibrate.samplers import shear
 from emulator.errors import InputError, SolverError
 
@@ -67,16 +67,16 @@ class _Compiled(NamedTuple):
 @lru_cache(maxsize=4)
 def _compiled(model: Model, options: NUTSOptions) -> _Compiled:
     """The programs of one model, in straightened coordinates; data and map are their arguments."""
-    example = np.zeros_like(model.observe.points)
+    example = {name: np.zeros(shape) for name, shape in model.observe.shapes.items()}
     info = initialize_model(jax.random.key(0), model, model_args=(example,), dynamic_args=True)
     flat, unravel = ravel_pytree(info.param_info.z)
 
-    def potential(data: jax.Array, map_: shear.Shear) -> Callable:
+    def potential(data: Data, map_: shear.Shear) -> Callable:
         return lambda zeta: info.potential_fn(data)(unravel(shear.apply(map_, zeta)))
 
     init_kernel, sample_kernel = hmc(potential_fn_gen=potential, algo="NUTS")
 
-    def start(key: jax.Array, data: jax.Array, map_: shear.Shear) -> Any:
+    def start(key: jax.Array, data: Data, map_: shear.Shear) -> Any:
         here, onwards = jax.random.split(key)
         candidates = jax.random.uniform(here, (_CANDIDATES, flat.size), float, -2.0, 2.0)
         heights = jax.lax.map(potential(data, map_), candidates)
@@ -89,7 +89,7 @@ def _compiled(model: Model, options: NUTSOptions) -> _Compiled:
             rng_key=onwards,
         )
 
-    def advance(state: Any, data: jax.Array, map_: shear.Shear, count: int) -> Any:
+    def advance(state: Any, data: Data, map_: shear.Shear, count: int) -> Any:
         def step(state: Any, _: None) -> Any:
             state = sample_kernel(state, (data, map_), {})
             statistics = {
@@ -123,7 +123,7 @@ class _Chains:
     def __init__(
         self,
         compiled: _Compiled,
-        data: jax.Array,
+        data: Data,
         map_: shear.Shear,
         key: jax.Array,
         options: NUTSOptions,
@@ -164,7 +164,7 @@ def _agree(draws: dict[str, np.ndarray], options: NUTSOptions) -> bool:
 
 
 def nuts(
-    model: Model, data: jax.Array, options: NUTSOptions, seed: int, *, progress: bool = False
+    model: Model, data: Data, options: NUTSOptions, seed: int, *, progress: bool = False
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Draws and statistics by name, each (chains, draws).
 

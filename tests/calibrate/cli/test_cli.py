@@ -197,7 +197,15 @@ def test_bad_calls(capsys, monkeypatch, tmp_path, words, message):
         (["--truth", "mu=73", "lam=61", "--observe", "4000"], "node 4000 is unknown"),
         (["--truth", "mu=73", "lam=61", "--observe", "apex"], "observe 'apex': give nodes:N"),
         (["--truth", "mu=73", "lam=61", "--observe", "nodes:x"], "'x' is not a number of nodes"),
-        (["--truth", "mu=73", "lam=61", "--noise", "-1"], "noise: standard deviation is -1.0 mm"),
+        (
+            ["--truth", "mu=73", "lam=61", "--observe", "nodes:9+volume"],
+            "scene 'once_clamped_beam' has 0 cavities",
+        ),
+        (["--truth", "mu=73", "lam=61", "--observe", "all+right"], "displacement is given twice"),
+        (
+            ["--truth", "mu=73", "lam=61", "--noise", "-1"],
+            "displacement (mm): noise: standard deviation is -1.0",
+        ),
         (
             ["--truth", "mu=73", "lam=61", "--emulator", "broken"],
             "is truncated or not a safetensors",
