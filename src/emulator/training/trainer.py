@@ -207,7 +207,7 @@ def train(
     saved = _read_checkpoint(checkpoint, scene) if resume else None
     plan = saved.plan if saved else plan
     spent = saved.seconds if saved else 0.0
-    timed = budget is not None and not saved
+    timed = budget is not None and not saved and plan.residual
     latest = started + _FEM_SHARE * budget if timed and budget is not None else np.inf
     problem = prepare(scene, plan, architecture, deadline=latest, progress=progress)
     weights, first = problem.emulator.weights, 0

@@ -7,7 +7,7 @@ import emulator as em
 from emulator.errors import InputError
 from emulator.evaluation import evaluate
 from emulator.network import Architecture
-from emulator.training import Plan, run_campaign, sobol, train, uniform
+from emulator.training import Plan, recipe, run_campaign, sobol, train, uniform
 from emulator.training.objectives import Batch, make_loss
 from emulator.training.trainer import CHECKPOINT, WARMUP, learning_rate
 
@@ -123,7 +123,7 @@ def test_learning_rate_rises_then_falls():
 
 def test_objectives_by_hand(beam, tests):
     u = tests.displacement + 0.1
-    batch = Batch(*tests)
+    batch = Batch(*tests[:3])
     Pi = em.potential_energy(beam)
     values = np.array([Pi(v, t) for v, t in zip(u, tests.theta, strict=True)])
     misfit = 3 * 0.1**2 / 4.0
@@ -148,3 +148,100 @@ def test_samples_fill_the_box(beam):
         counts = np.histogram2d(*position.T, bins=2, range=[[0, 1], [0, 1]])[0]
         assert counts.min() >= 8
     np.testing.assert_array_equal(sobol(beam, 5, 3), sobol(beam, 8, 3)[:5])
+
+
+HYBRID = Plan(
+    recipe="hybrid",
+    objective="energy",
+    order=2,
+    decoder="separable",
+    residual=True,
+    simulations=11,
+    steps=30,
+    freeze=10,
+    batch=4,
+    modes=4,
+    checkpoint_every=8,
+)
+
+
+@pytest.fixture(scope="module")
+def hybrid(beam, tmp_path_factory):
+    return train(beam, HYBRID, tmp_path_factory.mktemp("hybrid"), architecture=SMALL)
+
+
+def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
+    from dataclasses import replace
+
+    series = replace(hybrid, residual=None, base="series")
+    before, after = (
+        evaluate(e.cache(), tests.theta, tests.displacement)["err_u"]["median"]
+        for e in (series, hybrid)
+    )
+    assert after < 0.05 * before
+    chosen = hybrid.record["residual"]
+    assert chosen["runs"] == 12
+    errors = chosen["held_out_err_u_mm"]
+    assert chosen["base"] == hybrid.base == min(errors, key=errors.get)
+
+
+@pytest.mark.parametrize("writes", [1, 3, 5])
+def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatch, hybrid, writes):
+    """Before the first step, after its modes are frozen, and in the residual's fit."""
+    from emulator.training import trainer
+
+    write, kept = trainer._write_checkpoint, []
+
+    def killed(*arguments):
+        write(*arguments)
+        kept.append(arguments)
+        if len(kept) == writes:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(trainer, "_write_checkpoint", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(beam, HYBRID, tmp_path, architecture=SMALL)
+    monkeypatch.setattr(trainer, "_write_checkpoint", write)
+    resumed = train(beam, Plan(), tmp_path, architecture=SMALL, resume=True)
+    assert resumed.fingerprint == hybrid.fingerprint
+    assert resumed.record["plan"] == hybrid.record["plan"]
+
+
+def test_frozen_modes_do_not_move(beam):
+    from emulator.training.trainer import prepare
+
+    problem = prepare(beam, HYBRID, SMALL)
+    weights = jax.tree.map(jnp.copy, problem.emulator.weights)
+    state = problem.optimiser.init(weights)
+    number, total = jnp.asarray(0), jnp.asarray(30)
+    for _ in range(2):  # momentum that would move them
+        weights, state, _ = problem.step(weights, state, number, total)
+    kept = problem.emulator.prepared(weights)[1]
+    before = jax.tree.map(np.array, weights)
+    weights, state, _ = problem.step(weights, state, number, total, kept)
+    moved = {
+        jax.tree_util.keystr(path)
+        for (path, a), b in zip(
+            jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(weights), strict=True
+        )
+        if not np.array_equal(a, b)
+    }
+    assert moved
+    assert all("branch" in name for name in moved)
+    np.testing.assert_array_equal(problem.emulator.prepared(weights)[1], kept)
+
+
+def test_the_papers_recipe_is_the_papers():
+    plan = recipe("paper")
+    assert (plan.objective, plan.batch, plan.centred, plan.order) == ("energy", 1, False, 0)
+    rates = [float(learning_rate(plan, jnp.asarray(k), jnp.asarray(100))) for k in (0, 49, 50, 99)]
+    assert rates == pytest.approx([1e-4, 1e-4, 1e-5, 1e-5])
+    with pytest.raises(InputError, match="recipe 'quick' is unknown; known: hybrid, network, pap"):
+        recipe("quick")
+
+
+def test_plans_that_contradict_themselves():
+    with pytest.raises(InputError, match="series of order 2 without a centre"):
+        Plan(order=2, centred=False)
+    with pytest.raises(InputError, match="series of order 5"):
+        Plan(order=5)
