@@ -17,6 +17,7 @@ from emulator.forward import inside_box
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.energy import at_points, displacement_gradient
 from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.tissue import Tissue
 from emulator.scenes.scene import Scene
 
 
@@ -107,13 +108,11 @@ def invariants(scene: Scene, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     fibres I4f is 0.
     """
 
-    def measures(
-        H: jax.Array, directions: jax.Array | None = None
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        strain = Strain(H, directions=directions)
+    def measures(H: jax.Array, own: Tissue) -> tuple[jax.Array, jax.Array, jax.Array]:
+        strain = Strain(H, directions=own.directions)
         J = 1.0 + strain.J_minus_1
         I1 = 3.0 + jnp.fmax(strain.I1_minus_3, strain.isochoric_I1_minus_3)
-        if directions is None:
+        if own.directions is None:
             return J, I1, jnp.zeros_like(J)
         stretched = strain.fibre + H @ strain.fibre
         isochoric = 1.0 + strain.isochoric_I4f_minus_1

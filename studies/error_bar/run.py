@@ -26,7 +26,7 @@ from emulator.forward import ForwardMap
 from emulator.reduced import fit_reduced
 from emulator.scenes import Scene
 from emulator.store import replacing, write_json
-from emulator.training import Runs, run_campaign, sobol
+from emulator.training import run_campaign, sobol
 
 HERE = Path(__file__).parent
 SEED = 4
@@ -176,7 +176,7 @@ def judge(scene: Scene, maps: dict[str, ForwardMap], inside: int, outside: int) 
     court = Judge(scene)
     campaign = run_campaign(court.simulator, sobol(scene, max(RUNS), SEED))
     for runs in RUNS:
-        some = Runs(*(field[:runs] for field in campaign))
+        some = campaign.take(slice(runs))
         maps[f"reduced, {runs} FEM runs"] = fit_reduced(scene, some)
     sets = {"inside": sobol(scene, inside, TEST_SEED)}
     sets |= {f"{100 * reach:.0f} % outside": beyond(scene, reach, outside) for reach in REACHES}

@@ -95,11 +95,16 @@ def wild(beam, exact):
     return {"bent": np.asarray(exact), "rough": np.where(beam.held, 0.0, rough)}
 
 
+@pytest.fixture(scope="module")
+def one_step(simulator):
+    return jax.jit(lambda u, theta: newton_step(simulator.system, u, theta))
+
+
 @pytest.mark.parametrize("how", ["bent", "rough"])
-def test_where_one_step_is_wild_the_bar_is_not(beam, simulator, bar, exact, wild, how):
+def test_where_one_step_is_wild_the_bar_is_not(beam, one_step, bar, exact, wild, how):
     error = wild[how]
     u = exact + error
-    once = u - newton_step(simulator.system, u, beam.centre)
+    once = u - one_step(u, beam.centre)
     assert not 0.5 < float(jnp.linalg.norm(once)) / np.linalg.norm(error) < 2.0
     estimate = bar.of_field(u, beam.centre)
     assert estimate.iterations > 0
@@ -119,6 +124,21 @@ def test_the_same_inside_jit_and_vmap(beam, bar, exact, off, wild):
         np.testing.assert_allclose(many.field[k], one.field, rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(many.energy_gap[k], one.energy_gap, rtol=1e-5)
         assert bool(many.valid[k]) == bool(one.valid)
+
+
+def test_a_climbing_step_is_seen(beam, simulator, bar, exact):
+    """Squeezed along its axis beyond buckling, a beam's tangent is indefinite."""
+    squeezed = jnp.asarray(-0.4 * beam.mesh.nodes * np.array([1.0, 0.0, 0.0]))
+    system = simulator.system
+    along = lambda v: system.residual(squeezed + system.extend(v), beam.centre)
+    K = jax.jit(jax.jacfwd(along))(jnp.zeros(len(system.free)))
+    assert np.linalg.eigvalsh(np.asarray(K)).min() < 0.0
+    estimate = bar.of_field(squeezed, beam.centre)
+    assert estimate.guard.indefinite
+    assert "indefinite" in estimate.guard.sentence(beam)
+    true = np.asarray(squeezed - exact)
+    ratio = float(estimate.max) / np.linalg.norm(true, axis=1).max()
+    assert 0.5 < ratio < 2.0
 
 
 def test_a_prediction_that_inverts_elements(beam, bar, exact):

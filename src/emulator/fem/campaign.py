@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from emulator.fem.simulator import Simulator
 from emulator.fem.assembly import relative_residual
 from emulator.fem.expansion import Expansion
+from emulator.fem.simulator import Simulator
 from emulator.mechanics.energy import potential_energy, volume_ratio
 from emulator.scenes.scene import Scene
 
@@ -46,8 +46,9 @@ def run_campaign(
 ) -> Runs:
     """Solve at every theta (c, p).
 
-    Each run starts from the nearest one done, moved along its slopes where there are any, or from
-    ``expansion`` where that leaves less force out of balance.
+    Each run starts from the nearest one done, from the same moved along its slopes, or from
+    ``expansion``: of those there are, the one with the least force out of balance. Where that start
+    fails, from rest.
 
     Parameters
     ----------
@@ -67,17 +68,9 @@ def run_campaign(
     derivatives: list[jax.Array] = []
     best = _chooser(simulator)
     for k, theta in enumerate(tqdm(thetas, "FEM", disable=not progress, unit="run")):
-        starts = []
         if fields and time.perf_counter() > deadline:
             break
-        if fields:
-            near = int(np.argmin(np.sum((positions[:k] - positions[k]) ** 2, axis=1)))
-            starts.append(fields[near])
-            if slopes:
-                step = positions[k] - positions[near]
-                starts.append(fields[near] + jnp.tensordot(step, derivatives[near], axes=1))
-        if expansion is not None:
-            starts.append(expansion(jnp.asarray(positions[k])))
+        starts = _starts(positions[: k + 1], fields, derivatives, expansion)
         start = best(jnp.stack(starts), theta) if len(starts) > 1 else next(iter(starts), None)
         solution = simulator.solve(theta, start)
         if not solution.converged and starts:
@@ -90,6 +83,25 @@ def run_campaign(
     displacement = jnp.stack(fields)
     energy = jax.jit(jax.vmap(potential_energy(scene)))(displacement, thetas)
     return Runs(thetas, displacement, energy, jnp.stack(derivatives) if slopes else None)
+
+
+def _starts(
+    positions: np.ndarray,
+    fields: list[jax.Array],
+    derivatives: list[jax.Array],
+    expansion: Expansion | None,
+) -> list[jax.Array]:
+    """Displacements (n, 3) to start from at the last of ``positions`` (k + 1, p)."""
+    starts = []
+    if fields:
+        steps = positions[-1] - positions[:-1]
+        near = int(np.argmin(np.sum(steps**2, axis=1)))
+        starts.append(fields[near])
+        if derivatives:
+            starts.append(fields[near] + jnp.tensordot(steps[near], derivatives[near], axes=1))
+    if expansion is not None:
+        starts.append(expansion(jnp.asarray(positions[-1])))
+    return starts
 
 
 def _chooser(simulator: Simulator):  # noqa: ANN202 - a jitted closure, private

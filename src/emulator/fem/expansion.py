@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.errors import InputError, SolverError
 from emulator.fem.assembly import System
 from emulator.fem.simulator import Simulator
 
@@ -82,7 +82,8 @@ def monomials(indices: np.ndarray, step: jax.Array) -> jax.Array:
     ones = jnp.ones((*step.shape[:-1], 1))
     powers = jnp.concatenate([step, ones], axis=-1)[..., indices]  # index -1 is the one
     counts = [np.unique(row[row >= 0], return_counts=True)[1] for row in indices]
-    return jnp.prod(powers, axis=-1) / np.array([prod(map(factorial, c)) for c in counts])
+    factorials = np.array([prod(map(factorial, c)) for c in counts], dtype=float)
+    return jnp.prod(powers, axis=-1) / factorials
 
 
 def expand(simulator: Simulator, theta: jax.Array | None = None, order: int = 3) -> Expansion:
@@ -90,24 +91,26 @@ def expand(simulator: Simulator, theta: jax.Array | None = None, order: int = 3)
 
     Parameters
     ----------
-    order : 1 to 4; an order with more than 200 terms is left out.
+    order : 1 to 4; the series stops before an order with more than 200 terms.
 
     Raises
     ------
+    InputError
+        ``order`` is another, or ``theta`` has the wrong shape.
     SolverError
-        No equilibrium was found at ``theta``.
+        No equilibrium was found at ``theta``, or it has no derivatives.
     """
-    if order not in (1, 2, 3, 4):
-        raise InputError(f"expansion of order {order}; give 1 to 4")
-    scene = simulator.scene
-    theta = scene.centre if theta is None else theta
+    _check_order(order)
+    theta = simulator.scene.centre if theta is None else theta
     u = simulator.solve(theta).require_converged("the expansion's centre").displacement
     return expand_at(simulator, u, theta, order)
 
 
 def expand_at(simulator: Simulator, u: jax.Array, theta: jax.Array, order: int) -> Expansion:
     """The same about a known equilibrium ``u`` (n, 3) mm."""
-    position = simulator.scene.to_unit(theta)
+    _check_order(order)
+    scene, theta, u = simulator.scene, jnp.asarray(theta, dtype=float), jnp.asarray(u, dtype=float)
+    position = scene.to_unit(theta)
     system, tangent = simulator.linearised(u, theta)
     count = len(position)
     found: dict[tuple[int, ...], jax.Array] = {}
@@ -117,9 +120,20 @@ def expand_at(simulator: Simulator, u: jax.Array, theta: jax.Array, order: int) 
         terms = list(combinations_with_replacement(range(count), degree))
         forces = _forces(system, u, position, terms, found)
         moved = jax.vmap(system.extend, in_axes=1)(-jax.jit(system.solve)(tangent, forces.T))
+        if not jnp.isfinite(moved).all():
+            raise SolverError(
+                f"scene '{scene.name}': derivatives of order {degree} in theta are not finite"
+            )
         found.update(zip(terms, moved, strict=True))
+    if not found:
+        return constant(np.asarray(position), u)
     indices = np.array([[*term, *(-1,) * (order - len(term))] for term in found])
     return Expansion(np.asarray(position), u, indices, jnp.stack(list(found.values())))
+
+
+def _check_order(order: int) -> None:
+    if order not in (1, 2, 3, 4):
+        raise InputError(f"expansion of order {order}; give 1 to 4")
 
 
 def _forces(
@@ -129,31 +143,34 @@ def _forces(
     terms: list[tuple[int, ...]],
     found: dict[tuple[int, ...], jax.Array],
 ) -> jax.Array:
-    """Mixed derivative (t, f) of the residual along each term's path, its own term left out."""
+    """Mixed derivative (t, f) of the residual along each term's path, its own term left out.
+
+    The fields on the paths are looked up term by term: side by side they would fill the memory.
+    """
     degree = len(terms[0])
     # Every proper part of the multi-index has its term on the path.
     parts = [s for size in range(1, degree) for s in _subsets(degree, size)]
-    paths = [
-        jnp.stack([found[tuple(term[k] for k in part)] for part in parts])
-        if parts
-        else jnp.zeros((0, *u.shape))
-        for term in terms
-    ]
+    places = {term: k for k, term in enumerate(found)}
+    paths = [[places[tuple(term[k] for k in part)] for part in parts] for term in terms]
+    known = jnp.stack(list(found.values())) if found else jnp.zeros((0, *u.shape))
 
-    def one(argument: tuple[jax.Array, jax.Array]) -> jax.Array:
-        directions, fields = argument
+    def one(argument: tuple[jax.Array, jax.Array], known: jax.Array) -> jax.Array:
+        directions, path = argument
 
         def along(*steps: jax.Array) -> jax.Array:
             v = u
-            for part, field in zip(parts, fields, strict=True):
-                v = v + prod((steps[k] for k in part), start=jnp.ones(())) * field
+            for part, place in zip(parts, path, strict=True):
+                v = v + prod((steps[k] for k in part), start=jnp.ones(())) * known[place]
             x = position + sum(s * d for s, d in zip(steps, directions, strict=True))
             return system.residual(v, system.scene.from_unit(x))
 
         return _mixed(along, degree)()
 
     directions = jnp.stack([jnp.eye(len(position))[jnp.array(term)] for term in terms])
-    return jax.jit(lambda d, f: jax.lax.map(one, (d, f)))(directions, jnp.stack(paths))
+    indices = jnp.array(paths, dtype=int).reshape(len(terms), len(parts))
+    return jax.jit(lambda d, i, k: jax.lax.map(lambda each: one(each, k), (d, i)))(
+        directions, indices, known
+    )
 
 
 def _mixed(function: Callable[..., jax.Array], degree: int) -> Callable[[], jax.Array]:

@@ -94,7 +94,7 @@ class Simulator:
         jax.errors.JaxRuntimeError
             A tangent singular to the last bit.
         """
-        theta, u = self._checked(theta, u)
+        theta, u = self._checked(theta, u, "displacement")
         system, tangent = self.linearised(u, theta)
         return self._columns[system.factorisation](tangent, u, theta)
 
@@ -109,12 +109,14 @@ class Simulator:
             return self._driver.linearise(u, theta)
         return self.system, self.system.pattern.safe_values(self.system.tangent(u, theta))
 
-    def _checked(self, theta: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _checked(
+        self, theta: jax.Array, start: jax.Array, what: str = "start"
+    ) -> tuple[jax.Array, jax.Array]:
         """Both in float64. A theta of the wrong length would be read past its end, silently."""
         theta, start = jnp.asarray(theta, dtype=float), jnp.asarray(start, dtype=float)
         for name, array, shape in (
             ("theta", theta, (len(self.scene.parameters),)),
-            ("start", start, self.scene.held.shape),
+            (what, start, self.scene.held.shape),
         ):
             if array.shape != shape:
                 raise InputError(

@@ -25,10 +25,10 @@ import numpy as np
 from sklearn.utils.extmath import randomized_svd
 
 from emulator.errors import InputError
+from emulator.fem.campaign import Runs
 from emulator.fem.expansion import Expansion, monomials
 from emulator.residual.kernel import Features, fit_lengths, fit_weights, fold, mean
 from emulator.scenes.scene import Scene
-from emulator.fem.campaign import Runs
 
 Mean = Callable[[jax.Array], jax.Array]
 """Position in the box (p,) to displacement (n, 3) mm."""
@@ -106,21 +106,17 @@ def fit_residual(
     Raises
     ------
     InputError
-        Fewer than two runs, or runs without slopes.
+        Fewer than two runs, runs without slopes or not finite, an expansion of another scene, or a
+        map that leaves nothing to fit.
     """
-    if len(runs.theta) < 2 or runs.slopes is None:
-        raise InputError("a residual needs 2 FEM runs or more, with their slopes")
-    positions = scene.to_unit(runs.theta)
+    _check(scene, runs, expansion)
+    positions = scene.to_unit(jnp.asarray(runs.theta))
     fields, slopes = _left(runs, positions, mean_map)
     offset = fields.mean(axis=0)
     modes, observations = _project(fields - offset, slopes)
-    count, parameters = positions.shape
-    warp = _warp(expansion, runs, parameters)
+    warp = _warp(expansion, positions.shape[1])
     features = warp.with_slopes(positions)
-    chosen = _spread(np.asarray(positions), max(4, _MOST_OBSERVATIONS // (1 + parameters)))
-    rows = (chosen[:, None] * (1 + parameters) + np.arange(1 + parameters)).ravel()
-    some = Features(features.value[chosen], features.slope[chosen])
-    lengths = jnp.asarray(fit_lengths(some, observations[rows][:, :_FITTED_MODES]))
+    lengths = _lengths(features, np.asarray(positions), observations)
     warp = warp._replace(inverse_lengths=lengths)
     scaled = features.scaled(lengths)
     values, folded = fold(scaled, fit_weights(scaled, observations))
@@ -134,6 +130,24 @@ def fit_residual(
     )
 
 
+def _check(scene: Scene, runs: Runs, expansion: Expansion) -> None:
+    count = len(runs.theta)
+    if runs.slopes is None:
+        raise InputError(f"a residual needs FEM runs with slopes; these {count} have none")
+    if count < 2:
+        raise InputError(f"a residual needs 2 FEM runs or more; there is {count}")
+    parameters = len(scene.parameters)
+    if len(expansion.centre) != parameters:
+        raise InputError(
+            f"scene '{scene.name}' has {parameters} parameters; "
+            f"the expansion is in {len(expansion.centre)}"
+        )
+    for what in ("theta", "displacement", "slopes"):
+        each = np.isfinite(np.asarray(getattr(runs, what))).reshape(count, -1).all(axis=1)
+        if not each.all():
+            raise InputError(f"FEM run {int(np.argmin(each))}: {what} not finite")
+
+
 def _left(runs: Runs, positions: jax.Array, mean_map: Mean | None) -> tuple[np.ndarray, np.ndarray]:
     """What the mean leaves of the fields (c, n, 3) and of their slopes (c, p, n, 3)."""
     fields, slopes = np.asarray(runs.displacement), np.array(runs.slopes)
@@ -143,6 +157,8 @@ def _left(runs: Runs, positions: jax.Array, mean_map: Mean | None) -> tuple[np.n
     jacobian = jax.jit(jax.jacfwd(mean_map))
     for k, position in enumerate(positions):
         slopes[k] -= np.moveaxis(np.asarray(jacobian(position)), -1, 0)
+    if not (np.isfinite(fields).all() and np.isfinite(slopes).all()):
+        raise InputError("a residual was asked for, but the map is not finite at every FEM run")
     return fields, slopes
 
 
@@ -161,8 +177,20 @@ def _project(fields: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, jax.Ar
     return right[kept] * scale[:, None], jnp.asarray(both.reshape(-1, kept.sum()))
 
 
-def _warp(expansion: Expansion, runs: Runs, parameters: int) -> Warp:
+def _lengths(features: Features, positions: np.ndarray, observations: jax.Array) -> jax.Array:
+    """Inverse lengths (q,) from some of the runs and the leading modes."""
+    each = 1 + positions.shape[1]
+    chosen = _spread(positions, max(4, _MOST_OBSERVATIONS // each))
+    rows = (chosen[:, None] * each + np.arange(each)).ravel()
+    some = Features(features.value[chosen], features.slope[chosen])
+    return jnp.asarray(fit_lengths(some, observations[rows][:, :_FITTED_MODES]))
+
+
+def _warp(expansion: Expansion, parameters: int) -> Warp:
     """Position, and the coefficients of the series' own leading modes over the box."""
+    if not len(expansion.indices):
+        plain = jnp.zeros((0, 0))
+        return Warp(expansion.centre, expansion.indices, plain, jnp.ones(parameters))
     derivatives = np.asarray(expansion.derivatives).reshape(len(expansion.indices), -1)
     samples = np.random.default_rng(0).random((_FEATURE_SAMPLES, parameters))
     weights = np.asarray(expansion.monomials(jnp.asarray(samples)))
@@ -181,10 +209,12 @@ def _warp(expansion: Expansion, runs: Runs, parameters: int) -> Warp:
 
 
 def _spread(positions: np.ndarray, count: int) -> np.ndarray:
-    """Rows of at most ``count`` positions, each far from those before it."""
+    """Rows of at most ``count`` different positions, each far from those before it."""
     chosen = [0]
     distance = np.full(len(positions), np.inf)
     while len(chosen) < min(count, len(positions)):
         distance = np.minimum(distance, np.sum((positions - positions[chosen[-1]]) ** 2, axis=1))
+        if not distance.max() > 0.0:
+            break
         chosen.append(int(np.argmax(distance)))
     return np.array(chosen)

@@ -3,20 +3,23 @@ r"""Gaussian processes of values and slopes, several outputs sharing one kernel.
 The kernel is Matern's of smoothness 7/2 (three times differentiable) of the squared distance
 
 .. math:: \rho = |\Lambda\,[\psi(x) - \psi(y)]|^2, \qquad
-          \kappa = \left(1 + a + \tfrac25 a^2 + \tfrac1{15} a^3\right) e^{-a}, \quad a = \sqrt{7\rho}
+          a = \sqrt{7\rho}, \qquad
+          \kappa = \left(1 + a + \tfrac25 a^2 + \tfrac1{15} a^3\right) e^{-a}
 
 between features :math:`\psi` of two inputs, scaled by inverse lengths :math:`\Lambda`. With
 :math:`\delta = \Lambda[\psi(x) - \psi(y)]` and :math:`J = \Lambda\,\partial\psi`,
 
 .. math::
     \partial_y \kappa = -2\kappa'\, \delta J_y, \qquad
-    \partial_x \partial_y \kappa = -4 \kappa''\, (\delta J_x)(\delta J_y)^T - 2\kappa'\, J_x^T J_y,
-    \qquad
+    \partial_x \partial_y \kappa
+        = -4 \kappa''\, (\delta J_x)(\delta J_y)^T - 2\kappa'\, J_x^T J_y, \\
     \kappa' = -\tfrac7{10}\left(1 + a + \tfrac13 a^2\right) e^{-a}, \quad
-    \kappa'' = \tfrac{49}{60}(1 + a) e^{-a}
+    \kappa'' = \tfrac{49}{60}(1 + a) e^{-a}, \quad
+    \kappa''' = -\tfrac{343}{120} e^{-a}
 
 so a run's value and p slopes are p + 1 observations. None of these is singular where two inputs
-meet (Solak et al. 2003; Rasmussen & Williams 2006, Section 9.4).
+meet (Solak et al. 2003; Rasmussen & Williams 2006, Section 9.4). JAX is told them: through the root
+it would lose four digits there.
 """
 
 from __future__ import annotations
@@ -54,13 +57,34 @@ class Radial(NamedTuple):
 
 def radial(squared: jax.Array) -> Radial:
     """Matern 7/2 at squared distances of any shape; smooth where they are zero."""
-    a = jnp.sqrt(7.0 * squared + 1e-24)  # the root's own slope is infinite at zero
-    decay = jnp.exp(-a)
-    return Radial(
-        value=(1.0 + a + 0.4 * a**2 + a**3 / 15.0) * decay,
-        first=-0.7 * (1.0 + a + a**2 / 3.0) * decay,
-        second=49.0 / 60.0 * (1.0 + a) * decay,
-    )
+    return Radial(_value(squared), _first(squared), _second(squared))
+
+
+def _root(squared: jax.Array) -> jax.Array:
+    return jnp.sqrt(7.0 * squared + 1e-24)  # the root's own slope is infinite at zero
+
+
+@jax.custom_jvp
+def _value(squared: jax.Array) -> jax.Array:
+    a = _root(squared)
+    return (1.0 + a + 0.4 * a**2 + a**3 / 15.0) * jnp.exp(-a)
+
+
+@jax.custom_jvp
+def _first(squared: jax.Array) -> jax.Array:
+    a = _root(squared)
+    return -0.7 * (1.0 + a + a**2 / 3.0) * jnp.exp(-a)
+
+
+@jax.custom_jvp
+def _second(squared: jax.Array) -> jax.Array:
+    a = _root(squared)
+    return 49.0 / 60.0 * (1.0 + a) * jnp.exp(-a)
+
+
+_value.defjvps(lambda change, _, squared: _first(squared) * change)
+_first.defjvps(lambda change, _, squared: _second(squared) * change)
+_second.defjvps(lambda change, _, squared: -343.0 / 120.0 * jnp.exp(-_root(squared)) * change)
 
 
 def covariance(features: Features) -> jax.Array:
@@ -87,6 +111,18 @@ def _factor(features: Features) -> tuple[jax.Array, jax.Array]:
     return spread, jnp.linalg.cholesky(correlation)
 
 
+def misfit(features: Features, observations: jax.Array) -> jax.Array:
+    """Negative log-likelihood a number observed, but for a constant, of scaled features.
+
+    Each output's variance is the most likely one, the mean square of its whitened observations.
+    """
+    spread, factor = _factor(features)
+    white = solve_triangular(factor, observations / spread[:, None], lower=True)
+    variances = jnp.mean(white**2, axis=0)
+    determinant = jnp.mean(jnp.log(jnp.diagonal(factor)) + jnp.log(spread))
+    return 0.5 * jnp.mean(jnp.log(variances)) + determinant
+
+
 def fit_lengths(features: Features, observations: jax.Array) -> np.ndarray:
     """Inverse lengths (q,) of greatest likelihood, each output's variance profiled out.
 
@@ -98,11 +134,7 @@ def fit_lengths(features: Features, observations: jax.Array) -> np.ndarray:
     @jax.jit
     @jax.value_and_grad
     def objective(logs: jax.Array) -> jax.Array:
-        spread, factor = _factor(features.scaled(jnp.exp(logs)))
-        white = solve_triangular(factor, observations / spread[:, None], lower=True)
-        variances = jnp.mean(white**2, axis=0)
-        determinant = jnp.mean(jnp.log(jnp.diagonal(factor)) + jnp.log(spread))
-        return 0.5 * jnp.mean(jnp.log(variances)) + determinant
+        return misfit(features.scaled(jnp.exp(logs)), observations)
 
     def safe(logs: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = (np.asarray(part) for part in objective(jnp.asarray(logs)))
