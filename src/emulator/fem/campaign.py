@@ -32,7 +32,8 @@ class Runs(NamedTuple):
 
     def take(self, rows: slice | np.ndarray) -> Runs:
         """Some of the runs."""
-        return Runs(*(None if part is None else part[rows] for part in self))
+        slopes = None if self.slopes is None else self.slopes[rows]
+        return Runs(self.theta[rows], self.displacement[rows], self.energy[rows], slopes)
 
 
 def run_campaign(

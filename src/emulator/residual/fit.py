@@ -61,7 +61,8 @@ class Warp(NamedTuple):
 
     def with_slopes(self, positions: jax.Array) -> Features:
         """Features of ``positions`` (c, p) and their derivatives."""
-        return Features(jax.vmap(self)(positions), jax.vmap(jax.jacfwd(self))(positions))
+        features: Callable[[jax.Array], jax.Array] = self.__call__
+        return Features(jax.vmap(features)(positions), jax.vmap(jax.jacfwd(features))(positions))
 
 
 @dataclass(frozen=True, eq=False)
