@@ -30,8 +30,8 @@ DEMO = Run(
 )
 
 # Off the centre of the box in every parameter; 1 kPa is 7.5 mmHg, a normal end-diastolic pressure.
-# The noise is that of careful work, assumed: two observers of one heart differ by 7.8 mL sd in the
-# end-diastolic volume (Benjelloun et al. 1991), automatic tracking by millimetres.
+# The noise is assumed, that of careful work: observers of one heart differ by several mL in its
+# end-diastolic volume, automatic tracking by millimetres.
 VENTRICLE = Run(
     scene="left_ventricle",
     truth={"a": 0.36, "b": 1.8, "a_f": 4.6, "b_f": 2.4, "pressure": 1.0},
