@@ -22,8 +22,9 @@ def register(commands: Any) -> None:
     add_scene(parser)
     parser.add_argument(
         "--recipe",
-        choices=("hybrid", "network", "paper"),
-        help="default hybrid: Taylor series, network trained on the energy, residual of FEM runs",
+        choices=("hybrid", "mechanics", "network", "paper"),
+        help="default hybrid: Taylor series, network trained on the energy, residual of FEM runs; "
+        "mechanics: the same without the network, in a minute",
     )
     parser.add_argument("--objective", choices=("energy", "simulations", "both"))
     length = parser.add_mutually_exclusive_group()

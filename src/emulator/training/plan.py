@@ -16,7 +16,7 @@ class Plan:
     recipe : the name in :data:`RECIPES` it came from, for the record.
     objective : of the network: ``energy`` (no FEM run but the centre), ``simulations``, or
         ``both``.
-    steps : optimiser steps.
+    steps : optimiser steps; 0 with a residual is no network.
     simulations : FEM runs to train the network on (not used by ``energy``) and the residual.
     batch : theta a step.
     learning_rate : of Adam at its peak.
@@ -52,9 +52,12 @@ class Plan:
     def __post_init__(self) -> None:
         if self.objective not in ("energy", "simulations", "both"):
             raise InputError(f"objective '{self.objective}': use energy, simulations or both")
-        for name in ("steps", "batch", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise InputError(f"training: {name} is {getattr(self, name)}; it must be 1 or more")
+        least = {"steps": 0 if self.residual else 1, "batch": 1, "checkpoint_every": 1}
+        for name, value in least.items():
+            if getattr(self, name) < value:
+                raise InputError(
+                    f"training: {name} is {getattr(self, name)}; it must be {value} or more"
+                )
         if self.objective != "energy" and self.simulations < self.batch:
             raise InputError(
                 f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"
@@ -81,6 +84,15 @@ RECIPES: dict[str, Plan] = {
         simulations=200,
         steps=2000,
     ),
+    "mechanics": Plan(
+        recipe="mechanics",
+        objective="energy",
+        order=3,
+        decoder="separable",
+        residual=True,
+        simulations=60,
+        steps=0,
+    ),
     "network": Plan(),
     "paper": Plan(
         recipe="paper",
@@ -93,7 +105,8 @@ RECIPES: dict[str, Plan] = {
     ),
 }
 """``hybrid``: a Taylor series, a network trained on the energy in mechanical modes, and the
-residual of some FEM runs. ``network``: Algorithm 1 about the centre, trained on FEM runs and the
+residual of some FEM runs. ``mechanics``: the same without a network, from a mesh to an emulator in
+a minute. ``network``: Algorithm 1 about the centre, trained on FEM runs and the
 energy. ``paper``: Algorithm 1 from zero, the energy at one theta a step, Adam at 1e-4 and then
 1e-5, as released by Dalton et al. (2023)."""
 

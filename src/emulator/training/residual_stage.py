@@ -34,11 +34,14 @@ def _round(array: jax.Array) -> jax.Array:
     return array.astype(jnp.float32).astype(jnp.float64)
 
 
-def add_residual(emulator: Emulator, runs: Runs) -> tuple[Emulator, dict[str, Any]]:
+def add_residual(
+    emulator: Emulator, runs: Runs, bases: tuple[Base, ...] = BASES
+) -> tuple[Emulator, dict[str, Any]]:
     """``emulator`` with the residual of ``runs``, and a record of how it was chosen.
 
     A network trained for minutes is worth standing on when runs are few, and a rough ground when
-    they are many: what to add the residual to is judged by runs held out, then fitted to all.
+    they are many: which of ``bases`` to add the residual to is judged by runs held out, then fitted
+    to all.
 
     Raises
     ------
@@ -55,10 +58,10 @@ def add_residual(emulator: Emulator, runs: Runs) -> tuple[Emulator, dict[str, An
     best: Base = "series"
     if count >= _FEWEST:
         test = np.arange(count) % _HELD_OUT == _HELD_OUT - 1
-        for base in BASES:
+        for base in bases:
             fitted = replace(bare, base=base, residual=_fit(bare, runs.take(~test), base))
             errors[base] = _error(fitted, runs.take(test))
-        best = min(BASES, key=errors.__getitem__)
+        best = min(bases, key=errors.__getitem__)
     residual = _fit(bare, runs, best)
     record = {
         "base": best,

@@ -20,7 +20,7 @@ from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.expansion import Expansion, constant, expand_at
-from emulator.network.emulator import Emulator, fresh
+from emulator.network.emulator import BASES, Emulator, fresh
 from emulator.network.graph import augment
 from emulator.network.pignn import Architecture
 from emulator.scenes.scene import Scene
@@ -38,6 +38,8 @@ _GUESS = 0.2
 # Parts of a time budget: until when FEM runs may start, and until when the network trains.
 _FEM_SHARE = 0.3
 _NETWORK_SHARE = 0.85
+
+_NO_NETWORK = Architecture(steps=0, latent=1, hidden=(1,), modes=0)
 
 Weights = nnx.State
 Step = Callable[..., tuple[Weights, Any, jax.Array]]
@@ -89,7 +91,7 @@ def prepare(
     scale, spread = _scales(scene, plan, runs)
     if not plan.centred:
         series = constant(series.centre, jnp.zeros_like(series.displacement))
-    architecture = architecture or Architecture()
+    architecture = architecture or (Architecture() if plan.steps else _NO_NETWORK)
     architecture = replace(architecture, decoder=plan.decoder)
     basis = None
     if plan.decoder == "separable":
@@ -219,7 +221,7 @@ def train(
         tree = fill_tree({"weights": weights, "state": state}, saved.arrays, str(checkpoint))
         weights, state = jax.tree.map(jnp.asarray, (tree["weights"], tree["state"]))
         first = int(saved.arrays["['step']"])
-    elif budget is not None:
+    elif budget is not None and plan.steps:
         share = _NETWORK_SHARE if plan.residual else 0.99
         deadline = started + share * budget
         fitting = _steps_within(deadline - time.perf_counter(), problem, plan)
@@ -256,13 +258,14 @@ def train(
         if done % plan.checkpoint_every == 0 and done < plan.steps:
             keep(weights, state, done)
     bar.close()
-    if not np.isfinite(loss):
+    if plan.steps and not np.isfinite(loss):
         raise SolverError("training ended in a loss that is not finite; lower the learning rate")
     record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
     emulator = replace(problem.emulator, weights=weights)
     if plan.residual:
         keep(weights, state, done)
-        emulator, record["residual"] = add_residual(emulator, problem.runs)
+        bases = BASES if plan.steps else BASES[:-1]
+        emulator, record["residual"] = add_residual(emulator, problem.runs, bases)
     record["seconds"] = round(spent + time.perf_counter() - started, 1)
     return replace(emulator, record=record)
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -171,8 +173,6 @@ def hybrid(beam, tmp_path_factory):
 
 
 def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
-    from dataclasses import replace
-
     series = replace(hybrid, residual=None, base="series")
     before, after = (
         evaluate(e.cache(), tests.theta, tests.displacement)["err_u"]["median"]
@@ -236,7 +236,9 @@ def test_the_papers_recipe_is_the_papers():
     assert (plan.objective, plan.batch, plan.centred, plan.order) == ("energy", 1, False, 0)
     rates = [float(learning_rate(plan, jnp.asarray(k), jnp.asarray(100))) for k in (0, 49, 50, 99)]
     assert rates == pytest.approx([1e-4, 1e-4, 1e-5, 1e-5])
-    with pytest.raises(InputError, match="recipe 'quick' is unknown; known: hybrid, network, pap"):
+    with pytest.raises(
+        InputError, match="recipe 'quick' is unknown; known: hybrid, mechanics, net"
+    ):
         recipe("quick")
 
 
@@ -245,3 +247,13 @@ def test_plans_that_contradict_themselves():
         Plan(order=2, centred=False)
     with pytest.raises(InputError, match="series of order 5"):
         Plan(order=5)
+
+
+def test_mechanics_alone(beam, tests, tmp_path):
+    """No network: none is evaluated, and resuming before the residual's fit changes nothing."""
+    plan = replace(recipe("mechanics"), simulations=5, order=2)
+    emulator = train(beam, plan, tmp_path)
+    assert emulator.base == "series"
+    report = evaluate(emulator.cache(), tests.theta, tests.displacement)
+    assert report["err_u"]["median"] < 1e-2
+    assert train(beam, Plan(), tmp_path, resume=True).fingerprint == emulator.fingerprint
