@@ -138,3 +138,11 @@ def test_error_bar(tmp_path):
 @pytest.mark.slow
 def test_error_bar_in_full(tmp_path):
     run("error_bar", "--out", tmp_path)  # asserts its own claims
+
+
+@pytest.mark.slow
+def test_new_ventricle(tmp_path):
+    words = ("--ventricles", 1, "--runs", 8, "--tests", 3, "--out", tmp_path)
+    (case,) = run("new_ventricle", *words)["cases"]
+    assert case["fem_runs"] == 9
+    assert case["err_V"]["median"] < 0.1

@@ -172,9 +172,9 @@ def check(cases: list[dict[str, Any]]) -> None:
     by_name = {case["name"]: case for case in cases}
     error = {name: case["err_u_mm"]["median"] for name, case in by_name.items()}
     assert error["FEM from rest"] < 1e-6
-    assert error["emulator, full field"] < 2e-2
-    assert error["emulator + 1 Newton step"] < 0.1 * error["emulator, full field"]
-    assert error["POD + GP, 30 FEM runs"] < error["emulator, full field"], "the rival wins here"
+    assert error["emulator, full field"] < 1e-6
+    assert error["emulator + 1 Newton step"] < error["emulator, full field"]
+    assert error["emulator, full field"] < 0.1 * error["POD + GP, 60 FEM runs"]
 
 
 def check_times(cases: list[dict[str, Any]]) -> None:
