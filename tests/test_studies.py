@@ -146,3 +146,17 @@ def test_new_ventricle(tmp_path):
     (case,) = run("new_ventricle", *words)["cases"]
     assert case["fem_runs"] == 9
     assert case["err_V"]["median"] < 0.1
+
+
+def test_decoder_speed(tmp_path):
+    results = run("decoder_speed", "--quick", "--out", tmp_path)  # asserts equal gradients
+    cases = {case["name"]: case for case in results["cases"]}
+    assert 20 < cases["emulator"]["observed_nodes"] < cases["emulator"]["nodes"]
+    assert cases["twisting cube, 27 nodes"]["landmark_nodes"] <= 27
+    assert results["summary"]["times_faster_than_fem"] > 1.0
+    assert (tmp_path / "decoder_speed.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_decoder_speed_in_full(tmp_path):
+    run("decoder_speed", "--out", tmp_path)  # asserts its own claims

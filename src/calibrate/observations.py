@@ -159,7 +159,7 @@ class CavityVolume:
 class Observations:
     """What was measured at once, by name; one forward map serves all of it.
 
-    nodes : (k,) the union of the nodes that the parts need, each once.
+    nodes : (k,) the union of the nodes that the parts need, each once, the largest part's first.
     """
 
     parts: Mapping[str, Observation]
@@ -174,12 +174,26 @@ class Observations:
 
     @cached_property
     def nodes(self) -> np.ndarray:
-        """Nodes a forward map must return, (k,)."""
-        return np.unique(np.concatenate([part.nodes for part in self.parts.values()]))
+        """Nodes a forward map must return, (k,): those of the largest part first, in its order.
+
+        A slice is what its rows then are: its reverse derivative scatters nothing, which for many
+        theta at once is most of the time.
+        """
+        parts = sorted((part.nodes for part in self.parts.values()), key=len, reverse=True)
+        nodes, first = np.unique(np.concatenate(parts), return_index=True)
+        return nodes[np.argsort(first)]
 
     @cached_property
-    def _rows(self) -> dict[str, np.ndarray]:
-        return {name: np.searchsorted(self.nodes, part.nodes) for name, part in self.parts.items()}
+    def _rows(self) -> dict[str, np.ndarray | slice]:
+        order = np.argsort(self.nodes)
+        rows = {
+            name: order[np.searchsorted(self.nodes, part.nodes, sorter=order)]
+            for name, part in self.parts.items()
+        }
+        return {
+            name: slice(len(k)) if np.array_equal(k, np.arange(len(k))) else k
+            for name, k in rows.items()
+        }
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:

@@ -1,5 +1,6 @@
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -117,7 +118,7 @@ def test_several_observations_need_the_union_of_their_nodes(ventricle):
     }
     several = observations(parts)
     np.testing.assert_array_equal(
-        several.nodes, sorted({*parts["displacement"].nodes, *parts["volume"].nodes})
+        np.sort(several.nodes), sorted({*parts["displacement"].nodes, *parts["volume"].nodes})
     )
     u = np.random.default_rng(0).normal(size=(2, *ventricle.mesh.nodes.shape))
     seen = several(jnp.asarray(u[:, several.nodes]))
@@ -130,6 +131,32 @@ def test_several_observations_need_the_union_of_their_nodes(ventricle):
     alone = observations(parts["displacement"])
     assert alone.describe()["kind"] == "landmarks"
     assert list(observations_from(ventricle, alone.describe()).parts) == ["displacement"]
+
+
+def test_the_largest_part_is_a_slice_of_the_union(ventricle):
+    """Its derivative needs no scatter; the others find their nodes wherever they are."""
+    points = spread_landmarks(ventricle, 6, seed=0)
+    parts = {
+        "displacement": cal.landmarks(ventricle, points),
+        "volume": cal.CavityVolume(ventricle),
+    }
+    both = observations(parts)
+    largest = parts["volume"].nodes
+    np.testing.assert_array_equal(both.nodes[: len(largest)], largest)
+    assert len(np.unique(both.nodes)) == len(both.nodes) > len(largest)
+    fields = jnp.asarray(np.random.default_rng(4).normal(size=(2, *ventricle.mesh.nodes.shape)))
+
+    def through(seen):
+        return sum((jnp.sum(value**2) for value in seen.values()), jnp.zeros(()))
+
+    together = jax.vmap(jax.grad(lambda u: through(both(u[both.nodes]))))(fields)
+    alone = [
+        jax.grad(lambda u: through({k: part(u[part.nodes]) for k, part in parts.items()}))(u)
+        for u in fields
+    ]
+    np.testing.assert_allclose(together, jnp.stack(alone), rtol=1e-12, atol=1e-12)
+    alone_rows = observations(parts["volume"])._rows["volume"]
+    assert alone_rows == slice(len(largest))
 
 
 def test_names_of_observations_are_checked(ventricle):

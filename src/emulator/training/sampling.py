@@ -39,12 +39,13 @@ def design(scene: Scene, count: int, seed: int) -> jax.Array:
     random order, until they run out; more than 64 of them are left out. A shorter design is the
     beginning of a longer one.
     """
+    whole = sobol(scene, count, seed)
     parameters = len(scene.parameters)
     ends = np.zeros((0, parameters))
     if parameters <= _MOST_CORNERED:
         ends = np.array(list(product((0.0, 1.0), repeat=parameters)))
         ends = np.random.default_rng(seed).permutation(ends)[: count // _CORNER_EVERY]
-    inside = np.asarray(scene.to_unit(sobol(scene, max(count - len(ends), 1), seed)))
+    inside = np.asarray(scene.to_unit(whole))
     places = _CORNER_EVERY * np.arange(1, len(ends) + 1) - 1
     positions = np.zeros((count, parameters))
     positions[places] = ends

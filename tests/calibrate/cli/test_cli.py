@@ -162,7 +162,7 @@ def test_bad_meshes_in_scene_files(capsys, block):
             ["train", "once_clamped_beam", "--budget", "soon", "--out", "x"],
             "duration 'soon' is not",
         ),
-        (["train", "once_clamped_beam", "--steps", "0", "--out", "x"], "steps is 0"),
+        (["train", "once_clamped_beam", "--steps", "-1", "--out", "x"], "steps is -1"),
         (
             ["train", "once_clamped_beam", "--resume", "--steps", "9", "--out", "x"],
             "--steps has no effect with --resume",
@@ -267,7 +267,10 @@ def test_train_evaluate_infer_certify(capsys, block, tmp_path):
         capsys, "train", block, "--steps", 100, "--simulations", 16, "--batch", 8, "--out", out
     )
     assert code == 0
-    assert "--objective both --steps 100 --simulations 16 --batch 8 --seed 0" in record["command"]
+    assert (
+        "--recipe hybrid --objective energy --steps 100 --simulations 16 --batch 8 --seed 0"
+        in record["command"]
+    )
     assert {path.name for path in out.iterdir()} == {"emulator.json", "weights.safetensors"}
     code, errors = answer(capsys, "evaluate", out, "--against", "fem", "--cases", 5)
     assert code == 0

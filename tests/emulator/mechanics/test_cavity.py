@@ -70,8 +70,9 @@ def test_positive_whatever_the_winding(order):
     assert Cavity(plain).rest > 0.0
 
 
-def test_the_derivative_is_that_of_a_central_difference():
-    cavity = Cavity(hollow(order=2))
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_derivative_is_that_of_a_central_difference(order):
+    cavity = Cavity(hollow(order=order))
     rng = np.random.default_rng(1)
     u, along = (jnp.asarray(rng.normal(size=(len(cavity.nodes), 3))) for _ in range(2))
     # A cubic in u: its central difference is off by h^2 times a constant only.

@@ -70,7 +70,7 @@ def test_damaged_descriptions(folder, edit, message):
 
 def test_missing_ones_are_named(tmp_path):
     with pytest.raises(
-        InputError, match="neither shipped nor a folder with emulator.json; shipped: once"
+        InputError, match="neither shipped nor a folder with emulator.json; shipped: left_v"
     ):
         load("no_such_emulator")
     (tmp_path / "emulator.json").write_text("{")

@@ -1,0 +1,58 @@
+"""Clocks. No theta is ever timed twice: direct solvers keep factors of values they have met."""
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.scenes import Scene
+from emulator.training import uniform
+
+Function = Callable[[jax.Array], Any]
+
+
+def unseen(scene: Scene, count: int, *, keys: Iterator[int] = itertools.count()) -> jax.Array:
+    """Theta (count, p) that no call has seen yet."""
+    return uniform(scene, count, jax.random.key(2000 + next(keys)))
+
+
+def per_call(function: Function, arguments: jax.Array) -> float:
+    """Median seconds of one call from Python, dispatch included."""
+    each = [jax.block_until_ready(row) for row in arguments]
+    jax.block_until_ready(function(each[0]))
+    durations = []
+    for argument in each[1:]:
+        begin = time.perf_counter()
+        jax.block_until_ready(function(argument))
+        durations.append(time.perf_counter() - begin)
+    return float(np.median(durations))
+
+
+def loop(function: Function) -> Function:
+    """``function`` of one theta after the other in one program, summed so that all is done."""
+
+    def step(total: jax.Array, theta: jax.Array) -> tuple[jax.Array, None]:
+        leaves = jax.tree.leaves(function(theta))
+        return total + sum(jnp.sum(leaf) for leaf in leaves), None
+
+    return jax.jit(lambda thetas: jax.lax.scan(step, jnp.zeros(()), thetas)[0])
+
+
+def in_loop(function: Function, scene: Scene, count: int, repeats: int = 5) -> float:
+    """Median over ``repeats`` of the seconds a theta in a compiled loop over ``count`` of them."""
+    batches = unseen(scene, count * (repeats + 1)).reshape(repeats + 1, count, -1)
+    return per_call(loop(function), batches) / count
+
+
+def batched(function: Function, scene: Scene, size: int, repeats: int = 5) -> float:
+    """Median over ``repeats`` of the seconds a theta in one call of ``size`` of them, ``vmap``."""
+    batches = unseen(scene, size * (repeats + 1)).reshape(repeats + 1, size, -1)
+    return per_call(jax.jit(jax.vmap(function)), batches) / size
+
+
+def milliseconds(seconds: float | None) -> str:
+    return "" if seconds is None else f"{1e3 * seconds:.4f} ms"

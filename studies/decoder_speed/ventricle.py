@@ -1,0 +1,151 @@
+"""One value with its gradient on the left ventricle: emulator, rival, polish and FEM."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from timing import Function, batched, in_loop, milliseconds, per_call, unseen
+
+import emulator as em
+from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
+from emulator.correct import corrected
+from emulator.forward import ForwardMap
+from emulator.network import CachedEmulator
+from emulator.reduced import fit_reduced
+from emulator.training import run_campaign, sobol
+
+SCENE = "left_ventricle"
+LANDMARKS = 24
+NOISE_MM, NOISE_ML = 0.2, 1.0
+AWAY = 0.03  # how far, relatively, the theta of FEM's start is from the one to solve
+
+
+class Misfit:
+    """24 landmarks and the cavity's volume against data: the scalar a sampler differentiates."""
+
+    def __init__(self, forward: ForwardMap, seed: int) -> None:
+        scene = forward.scene
+        points = spread_landmarks(scene, LANDMARKS, seed)
+        self.observe = Observations(
+            {"displacement": landmarks(scene, points), "volume": CavityVolume(scene)}
+        )
+        truth = scene.from_unit(jnp.full(len(scene.parameters), 0.4))
+        self.data = self.observe(forward.at(self.observe.nodes)(truth))
+
+    def __call__(self, displacement: jax.Array) -> jax.Array:
+        """Of the displacement (k, 3) mm of the observed nodes."""
+        seen = self.observe(displacement)
+        moved = (seen["displacement"] - self.data["displacement"]) / NOISE_MM
+        volume = (seen["volume"] - self.data["volume"]) / NOISE_ML
+        return 0.5 * (jnp.sum(moved**2) + volume**2)
+
+    def of(self, forward: ForwardMap) -> Function:
+        """Value and gradient in theta through ``forward``, compiled."""
+        observed = forward.at(self.observe.nodes)
+        return jax.jit(jax.value_and_grad(lambda theta: self(observed(theta))))
+
+
+def fem_gradients(
+    simulator: em.Simulator, misfit: Misfit, thetas: jax.Array, directions: jax.Array
+) -> tuple[float, list[jax.Array]]:
+    """Median seconds of FEM's value and gradient started 3 % away, and the gradients.
+
+    Outside ``jit``, where the simulator may use CHOLMOD. The first theta warms up.
+    """
+    nodes = misfit.observe.nodes
+    starts = [
+        simulator.solve(theta * (1.0 + AWAY * way)).require_converged().displacement
+        for theta, way in zip(thetas, directions, strict=True)
+    ]
+    found: list[jax.Array] = []
+    jobs = iter(zip(thetas, starts, strict=True))
+
+    def one(_: Any) -> jax.Array:
+        theta, start = next(jobs)
+
+        def scalar(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+            solution = simulator.solve(theta, start)
+            return misfit(solution.displacement[nodes]), solution.converged
+
+        (value, converged), slope = jax.value_and_grad(scalar, has_aux=True)(theta)
+        assert converged
+        found.append(slope)
+        return value
+
+    return per_call(one, thetas), found
+
+
+def gap(function: Function, thetas: jax.Array, exact: list[jax.Array]) -> float:
+    """Median relative difference of the gradients from FEM's."""
+    gaps = [
+        jnp.linalg.norm(function(theta)[1] - slope) / jnp.linalg.norm(slope)
+        for theta, slope in zip(thetas, exact, strict=True)
+    ]
+    return float(np.median(gaps))
+
+
+def row(name: str, call: float, loop: float | None, batch: float | None, **more: Any) -> dict:
+    print(
+        f"{name:44s} call {milliseconds(call):>12s}  in a loop {milliseconds(loop):>10s}"
+        f"  in a batch {milliseconds(batch):>10s}",
+        flush=True,
+    )
+    return {
+        "name": name,
+        "status": "done",
+        "call_s": call,
+        "loop_s": loop,
+        "batch_s": batch,
+        **more,
+    }
+
+
+def stages(cached: CachedEmulator, misfit: Misfit, calls: int) -> list[dict]:
+    """Value and gradient of more and more of the emulator: where its time goes."""
+    trained = cached.emulator
+    scene, residual = trained.scene, trained.residual
+    parts: dict[str, Function] = {"position in the box": scene.to_unit}
+    if trained.base != "nothing":
+        parts["Taylor monomials"] = lambda theta: trained.series.monomials(scene.to_unit(theta))
+    if residual is not None:
+        parts["kernel's features"] = lambda theta: residual.warp(scene.to_unit(theta))
+    parts["all coefficients"] = cached.coefficients
+    parts["displacement of the observed nodes"] = cached
+    cases = []
+    for name, part in parts.items():
+        square = jax.jit(jax.value_and_grad(lambda theta, part=part: jnp.sum(part(theta) ** 2)))
+        cases.append(row(f"up to: {name}", *_both(square, scene, calls), None))
+    return [*cases, row("up to: the misfit", *_both(misfit.of(cached), scene, calls), None)]
+
+
+def _both(function: Function, scene: em.Scene, calls: int) -> tuple[float, float]:
+    return per_call(function, unseen(scene, calls)), in_loop(function, scene, calls)
+
+
+def study(calls: int, fem_calls: int, runs: int, batch: int, seed: int) -> list[dict]:
+    """Every method's value and gradient, in one run."""
+    trained = em.load(SCENE)
+    scene, whole = trained.scene, trained.cache()
+    misfit = Misfit(whole, seed)
+    simulator = em.Simulator(scene)
+    reduced = fit_reduced(scene, run_campaign(simulator, sobol(scene, runs, seed)))
+    polished = corrected(whole, simulator, steps=1)
+    thetas = unseen(scene, fem_calls + 1)
+    directions = jnp.sign(jax.random.normal(jax.random.key(seed), thetas.shape))
+    fem_s, exact = fem_gradients(simulator, misfit, thetas, directions)
+    common = {"nodes": len(scene.mesh.nodes), "observed_nodes": len(misfit.observe.nodes)}
+    fem_name = "FEM, started 3 % away"
+    cases = [row(fem_name, fem_s, None, None, **common, gradient_gap=0.0)]
+    for name, forward in (("emulator", whole), (f"POD + GP, {runs} FEM runs", reduced)):
+        function = misfit.of(forward)
+        seconds = (*_both(function, scene, calls), batched(function, scene, batch))
+        cases.append(row(name, *seconds, **common, gradient_gap=gap(function, thetas, exact)))
+    function = misfit.of(polished)
+    seconds = per_call(function, unseen(scene, fem_calls + 1))
+    polish_gap = gap(function, thetas, exact)
+    name = "emulator + 1 Newton step"
+    cases.append(row(name, seconds, None, None, **common, gradient_gap=polish_gap))
+    for case in cases:
+        case["times_faster_than_fem"] = fem_s / case["call_s"]
+    return [*cases, *stages(whole.at(misfit.observe.nodes), misfit, calls)]
