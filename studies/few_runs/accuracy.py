@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from methods import (
+    RIVAL_MODES,
     clock,
     fit_rival,
     fit_values,
@@ -26,7 +27,7 @@ from emulator.training import Runs, sobol
 
 SEED = 0
 TEST_SEED = 90_210
-ABLATED = (5, 10, 30, 60, 120)
+ABLATED = (10, 30, 120)
 CHECKED_MODES, CHECKED_RUNS = 80, 120
 
 RIVAL = "POD + GP"
@@ -85,8 +86,15 @@ def seconds(pair: np.ndarray) -> dict[str, float]:
     return {"wall": round(float(pair[0]), 3), "processor": round(float(pair[1]), 3)}
 
 
-def accuracy(name: str, counts: list[int], tests: int, order: int, shape=None) -> list[dict]:
-    """All rows of one scene."""
+def accuracy(
+    name: str,
+    counts: list[int],
+    tests: int,
+    order: int,
+    shape: tuple[int, int, int] | None = None,
+    keep: Callable[[list[dict]], None] = lambda cases: None,
+) -> list[dict]:
+    """All rows of one scene; ``keep`` is handed those so far whenever there is one more."""
     scene = scene_of(name, shape)
     thetas = design(scene, max(counts))
     series, ours, expanded, elapsed = our_campaign(scene, thetas, order)
@@ -114,6 +122,7 @@ def accuracy(name: str, counts: list[int], tests: int, order: int, shape=None) -
             **more,
         }
         cases.append(case)
+        keep(cases)
         print(
             f"{case['name']:60s} err_u {case['err_u_mm']['median']:.2e} mm  "
             f"total {case['total_s']['processor']:.1f} s",
@@ -126,20 +135,21 @@ def accuracy(name: str, counts: list[int], tests: int, order: int, shape=None) -
         order=series.order, terms=len(series.indices), test_run_s=seconds(court.run_s),
         compile_fem_s=seconds(court.compile_s), displacement_mm=quantiles(size),
     )  # fmt: skip
-    for count in counts:
-        if count == 1:
-            continue
-        some = ours.take(slice(count))
-        done = elapsed[count - 1]
+    for count in (n for n in counts if n > 1):
+        some, done = ours.take(slice(count)), elapsed[count - 1]
         fitted, took = _timed(lambda some=some: fit_residual(scene, some, series, series))
         note(OVER, count, base + court.predict(fitted), done, took, modes=len(fitted.modes))
         alone, took = _timed(lambda some=some: fit_residual(scene, some, series))
         note(PLAIN, count, court.predict(alone), done, took, modes=len(alone.modes))
         if count >= 3:
-            _note_rival(note, court, some, rival_elapsed[count - 1])
-        if count in ABLATED:
-            for method, fields, took in _ablations(court, some, series, base, fitted.warp):
-                note(method, count, fields, done, took, ablation=True)
+            _note_rival(note, court, some, rival_elapsed[count - 1], RIVAL_MODES)
+    for count in (n for n in counts if n in ABLATED):
+        some, done = ours.take(slice(count)), elapsed[count - 1]
+        for method, fields, took in _ablations(court, some, series, base, fitted.warp):
+            note(method, count, fields, done, took, ablation=True)
+    if CHECKED_RUNS in counts:
+        some, done = ours.take(slice(CHECKED_RUNS)), rival_elapsed[CHECKED_RUNS - 1]
+        _note_rival(note, court, some, done, CHECKED_MODES)
     return cases
 
 
@@ -150,14 +160,11 @@ def _timed(function: Callable[[], Any]) -> tuple[Any, np.ndarray]:
     return result, clock() - begin
 
 
-def _note_rival(note, court: Court, some: Runs, done: np.ndarray) -> None:
-    for modes in (None, CHECKED_MODES) if len(some.theta) == CHECKED_RUNS else (None,):
-        words = {} if modes is None else {"modes": modes}
-        fitted, took = _timed(lambda words=words: fit_rival(court.scene, some, **words))
-        fields = jax.jit(jax.vmap(fitted))(court.thetas)
-        method = RIVAL if modes is None else f"{RIVAL}, {modes} modes"
-        more = {"modes": len(fitted.modes)} | ({} if modes is None else {"ablation": True})
-        note(method, len(some.theta), fields, done, took, **more)
+def _note_rival(note, court: Court, some: Runs, done: np.ndarray, modes: int) -> None:
+    fitted, took = _timed(lambda: fit_rival(court.scene, some, modes))
+    fields = jax.jit(jax.vmap(fitted))(court.thetas)
+    method = RIVAL if modes == RIVAL_MODES else f"{RIVAL}, {modes} modes"
+    note(method, len(some.theta), fields, done, took, modes=len(fitted.modes))
 
 
 def _ablations(court: Court, some: Runs, series: Expansion, base: jax.Array, warp):

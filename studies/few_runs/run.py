@@ -24,10 +24,7 @@ from calibrate.provenance import study_header
 from emulator.store import write_json
 
 HERE = Path(__file__).parent
-RUNS = {
-    "left_ventricle": [1, 5, 10, 20, 30, 60, 120, 240],
-    "left_ventricle_segments": [1, 5, 10, 20, 30, 60, 120],
-}
+RUNS = [1, 5, 10, 20, 30, 60, 120]
 TESTS = 60
 ORDER = 3
 MESHES = {"mesh_10_20_2": (10, 20, 2), "mesh_22_44_4": (22, 44, 4), "mesh_28_56_6": (28, 56, 6)}
@@ -41,8 +38,10 @@ def part(name: str, arguments: argparse.Namespace) -> list[dict]:
     if name in MESHES:
         return [mesh_case(MESHES[name], MESH_RUNS, MESH_TESTS, arguments.order)]
     shape = None if arguments.mesh is None else tuple(arguments.mesh)
-    runs = sorted(arguments.runs or RUNS[name])
-    return accuracy(name, runs, arguments.tests, arguments.order, shape)
+    return accuracy(
+        name, sorted(arguments.runs), arguments.tests, arguments.order, shape,
+        lambda cases: write_json(arguments.out / "part.json", cases),
+    )  # fmt: skip
 
 
 def in_own_process(name: str, words: list[str]) -> list[dict]:
@@ -56,7 +55,7 @@ def in_own_process(name: str, words: list[str]) -> list[dict]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS, metavar="PART")
-    parser.add_argument("--runs", nargs="+", type=int, help="numbers of FEM runs")
+    parser.add_argument("--runs", nargs="+", type=int, default=RUNS, help="numbers of FEM runs")
     parser.add_argument("--tests", type=int, default=TESTS, help="test theta")
     parser.add_argument("--order", type=int, default=ORDER, help="of the Taylor series")
     parser.add_argument("--mesh", nargs=3, type=int, help="rings, around, layers of a smaller one")
@@ -69,7 +68,7 @@ def main() -> None:
         write_json(arguments.out / "part.json", part(arguments.only, arguments))
         return
     words = ["--tests", str(arguments.tests), "--order", str(arguments.order)]
-    words += [] if arguments.runs is None else ["--runs", *map(str, arguments.runs)]
+    words += ["--runs", *map(str, arguments.runs)]
     words += [] if arguments.mesh is None else ["--mesh", *map(str, arguments.mesh)]
     with ThreadPoolExecutor(arguments.workers) as pool:
         parts = pool.map(lambda name: in_own_process(name, words), arguments.parts)
