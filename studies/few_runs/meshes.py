@@ -32,6 +32,7 @@ def mesh_case(shape: tuple[int, int, int], runs: int, tests: int, order: int) ->
         "nodes": len(scene.mesh.nodes),
         "tetrahedra": len(scene.mesh.elements),
         "runs": runs,
+        "tests": tests,
         "series_s": seconds(expanded),
         "campaign_s": seconds(elapsed[-1]),
         "compile_fem_s": seconds(court.compile_s),
