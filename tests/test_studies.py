@@ -135,6 +135,22 @@ def test_error_bar(tmp_path):
     assert (tmp_path / "effectivity.png").stat().st_size > 10_000
 
 
+def test_few_runs(tmp_path):
+    small = ("--mesh", 4, 8, 1, "--runs", 1, 5, "--tests", 3, "--order", 1)
+    results = run("few_runs", "--parts", "left_ventricle", *small, "--out", tmp_path)
+    errors = {(c["method"], c["runs"]): c["err_u_mm"]["median"] for c in results["cases"]}
+    ratio = results["summary"]["left_ventricle"]["residual over the series / POD + GP"]["5"]
+    assert ratio == errors["residual over the series", 5] / errors["POD + GP", 5] < 1.0 / 3.0
+    assert 0.0 < errors["Taylor series", 1] < 0.2
+    for figure in ("runs.png", "time.png"):
+        assert (tmp_path / figure).stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_few_runs_in_full(tmp_path):
+    run("few_runs", "--out", tmp_path)  # asserts its own claims
+
+
 @pytest.mark.slow
 def test_error_bar_in_full(tmp_path):
     run("error_bar", "--out", tmp_path)  # asserts its own claims
