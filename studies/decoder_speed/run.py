@@ -38,6 +38,11 @@ def summary(cases: list[dict[str, Any]]) -> dict[str, float]:
     }
 
 
+def _wrapped(name: str) -> str:
+    """A method's name on two lines."""
+    return name.replace(", ", ",\n").replace(" + 1 ", " +\n1 ")
+
+
 def draw(cases: list[dict[str, Any]], path: Path) -> None:
     """Left, each method's value and gradient on the ventricle; right, time against mesh size."""
     plt = pyplot()
@@ -51,7 +56,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
         known = [(k, 1e3 * case[key]) for k, case in enumerate(methods) if case[key] is not None]
         bars.plot(*zip(*known, strict=True), "o", color=colour, ms=8, label=label)
     bars.axhline(0.2, color="0.6", lw=1, ls="--", label="0.2 ms")
-    bars.set_xticks(range(len(methods)), [case["name"].replace(", ", ",\n") for case in methods])
+    bars.set_xticks(range(len(methods)), [_wrapped(case["name"]) for case in methods])
     bars.set(yscale="log", ylabel="value and gradient, a theta (ms)", xlim=(-0.5, 3.5))
     bars.set_title("left ventricle, 24 landmarks and cavity volume")
     sizes = [case for case in cases if "landmarks_loop_s" in case]
