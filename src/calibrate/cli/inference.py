@@ -24,7 +24,9 @@ _FORWARDS = ("emulator", "corrected", "reduced", "fem")
 
 def register(commands: Any) -> None:
     """Add the commands."""
-    parser = commands.add_parser("demo", help="the whole job on a built-in beam in under a minute, or on a ventricle")
+    parser = commands.add_parser(
+        "demo", help="the whole job on a built-in beam in under a minute, or on a ventricle"
+    )
     parser.add_argument(
         "--scene",
         choices=_DEMOS,

@@ -43,6 +43,7 @@ def run_campaign(
     slopes: bool = False,
     expansion: Expansion | None = None,
     deadline: float = np.inf,
+    at_least: int = 1,
     progress: bool = False,
 ) -> Runs:
     """Solve at every theta (c, p).
@@ -55,7 +56,7 @@ def run_campaign(
     ----------
     slopes : find the derivatives in theta too, from each run's own factor: a tenth of its time on
         a ventricle with five parameters.
-    deadline : of the performance counter, after which no run but the first is begun.
+    deadline : of the performance counter, after which no run but the first ``at_least`` is begun.
 
     Raises
     ------
@@ -69,7 +70,7 @@ def run_campaign(
     derivatives: list[jax.Array] = []
     best = _chooser(simulator)
     for k, theta in enumerate(tqdm(thetas, "FEM", disable=not progress, unit="run")):
-        if fields and time.perf_counter() > deadline:
+        if k >= at_least and time.perf_counter() > deadline:
             break
         starts = _starts(positions[: k + 1], fields, derivatives, expansion)
         start = best(jnp.stack(starts), theta) if len(starts) > 1 else next(iter(starts), None)

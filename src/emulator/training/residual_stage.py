@@ -17,7 +17,7 @@ from emulator.network.emulator import BASES, Base, Emulator
 from emulator.residual import Residual, fit_residual
 
 _HELD_OUT = 5  # one run in so many judges what the residual is fitted on top of
-_FEWEST = 10  # runs; with fewer, all are needed for fitting
+FEWEST = 10  # runs; with fewer, all are needed for fitting
 _OBSERVATIONS = 4000  # values and slopes a covariance matrix of 128 MB has room for
 
 
@@ -56,7 +56,7 @@ def add_residual(
     bare = replace(emulator, residual=None)
     errors: dict[str, float] = {}
     best: Base = "series"
-    if count >= _FEWEST:
+    if count >= FEWEST:
         test = np.arange(count) % _HELD_OUT == _HELD_OUT - 1
         for base in bases:
             fitted = replace(bare, base=base, residual=_fit(bare, runs.take(~test), base))

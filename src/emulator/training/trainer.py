@@ -28,7 +28,7 @@ from emulator.store import fill_tree, read_arrays, save_tree
 from emulator.training.basis import mechanical_modes
 from emulator.training.objectives import Batch, make_loss
 from emulator.training.plan import Plan
-from emulator.training.residual_stage import add_residual, rounded
+from emulator.training.residual_stage import FEWEST, add_residual, rounded
 from emulator.training.sampling import design, sobol, uniform
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -72,7 +72,8 @@ def prepare(
 
     Parameters
     ----------
-    deadline : of the performance counter, after which no further FEM run is begun.
+    deadline : of the performance counter, after which no FEM run is begun, the fewest that a
+        residual can be judged by excepted.
     """
     simulator = Simulator(scene)
     series = _series(simulator, plan)
@@ -86,6 +87,7 @@ def prepare(
         slopes=plan.residual,
         expansion=series if plan.order else None,
         deadline=deadline,
+        at_least=FEWEST + 1,
         progress=progress,
     )
     scale, spread = _scales(scene, plan, runs)

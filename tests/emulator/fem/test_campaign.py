@@ -111,3 +111,9 @@ def test_slopes_are_those_of_the_solver(simulator, thetas):
         (jnp.array([1.0, -2.0]),),
     )
     np.testing.assert_allclose(runs.slopes[0, 0] - 2.0 * runs.slopes[0, 1], along, atol=1e-10)
+
+
+@pytest.mark.parametrize("at_least", [1, 4])
+def test_after_the_deadline_only_the_fewest_are_begun(simulator, thetas, at_least):
+    runs = run_campaign(simulator, thetas, deadline=0.0, at_least=at_least)
+    assert len(runs.theta) == len(runs.displacement) == len(runs.energy) == at_least
