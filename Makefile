@@ -11,7 +11,7 @@ demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --durations=20
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow

@@ -135,6 +135,7 @@ def test_error_bar(tmp_path):
     assert (tmp_path / "effectivity.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_few_runs(tmp_path):
     small = ("--mesh", 4, 8, 1, "--runs", 1, 5, "--tests", 3, "--order", 1)
     results = run("few_runs", "--parts", "left_ventricle", *small, "--out", tmp_path)
@@ -164,6 +165,7 @@ def test_new_ventricle(tmp_path):
     assert case["err_V"]["median"] < 0.1
 
 
+@pytest.mark.slow
 def test_decoder_speed(tmp_path):
     results = run("decoder_speed", "--quick", "--out", tmp_path)  # asserts equal gradients
     cases = {case["name"]: case for case in results["cases"]}

@@ -55,6 +55,7 @@ from emulator.fem.distance import (
     sound_state,
 )
 from emulator.fem.simulator import Simulator
+from emulator.fem.sparse import REFUSALS
 from emulator.forward import ForwardMap
 from emulator.guard import Guard, guard
 from emulator.scenes.scene import Scene
@@ -140,7 +141,7 @@ class ErrorBar:
         sound, safe_theta = self._prepare(u, theta)
         try:
             step = jax.block_until_ready(self._definite_step(sound, safe_theta))
-        except jax.errors.JaxRuntimeError as error:
+        except REFUSALS as error:
             if "not positive definite" not in str(error):
                 raise
             step = self._guarded(sound, safe_theta)._replace(indefinite=jnp.array(True))

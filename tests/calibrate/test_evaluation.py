@@ -11,6 +11,7 @@ from calibrate.cli import main
 from calibrate.evaluation import Evaluation, run_evaluation
 from calibrate.reference import fem_reference
 from emulator.errors import InputError
+from emulator.fem.expansion import constant
 from emulator.network import load, save_emulator
 from network_support import untrained
 
@@ -19,8 +20,9 @@ from network_support import untrained
 def folder(tmp_path_factory):
     scene = em.scenes.once_clamped_beam(cells=(4, 1, 1))
     centre = np.asarray(em.Simulator(scene)(scene.centre))
+    series = constant(np.full(2, 0.5), centre)
     path = tmp_path_factory.mktemp("emulator")
-    save_emulator(replace(untrained(scene), offset=centre, scale=np.full(3, 0.1)), path)
+    save_emulator(replace(untrained(scene), series=series, scale=np.full(3, 0.1)), path)
     return str(path)
 
 

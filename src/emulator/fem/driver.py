@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from emulator.fem.assembly import System
 from emulator.fem.newton import Newton, NewtonOptions, NewtonState, solution_of
 from emulator.fem.solution import Solution, Status
+from emulator.fem.sparse import REFUSALS
 
 _MOST_PATIENCE = 8
 
@@ -47,7 +48,7 @@ class Driver:
                     state = jax.block_until_ready(self._definite_step(theta, state))
                     patience = 1
                     continue
-                except jax.errors.JaxRuntimeError as error:
+                except REFUSALS as error:
                     if "not positive definite" not in str(error):
                         raise
                 # Where the tangent has been indefinite for long, ask less often.
@@ -71,7 +72,7 @@ class Driver:
         try:
             # The factor is kept by the tangent's values: solving for nothing is not in vain.
             jax.block_until_ready(self._definite_trial(tangent))
-        except jax.errors.JaxRuntimeError as error:
+        except REFUSALS as error:
             if "not positive definite" not in str(error):
                 raise
             return self.general, self._general_tangent(u, theta)

@@ -22,7 +22,7 @@ from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
 from emulator.fem.newton import NewtonOptions, newton
 from emulator.fem.solution import Solution, Status
-from emulator.fem.sparse import Factorisation, quiet_blas
+from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
 from emulator.scenes.scene import Scene
 
 
@@ -76,7 +76,7 @@ class Simulator:
             solution = self._equilibrium(theta, jax.lax.stop_gradient(start))
             if not isinstance(solution.status, jax.core.Tracer):
                 jax.block_until_ready(solution)
-        except jax.errors.JaxRuntimeError as error:
+        except REFUSALS as error:
             if "singular" not in str(error):
                 raise
             return self._singular()

@@ -21,6 +21,11 @@ _LEAST_ROW = 1e-290
 
 Factorisation = Literal["umfpack", "cholmod"]
 
+REFUSALS = (jax.errors.JaxRuntimeError, ValueError)
+"""What a factorisation that refuses its matrix raises. JAX has the one where it learns of it when
+waiting for the result, and the other where the call itself does; which of them is a matter of
+timing. Both say ``sparsax`` and the reason."""
+
 
 # sparsax would keep up to 32 UMFPACK and 8 CHOLMOD factors a pattern, and 64 tokens' worth, against
 # values that return. Ours never do, and a factor of a large mesh is a gigabyte.
