@@ -36,6 +36,7 @@ def test_every_study_is_complete(folder):
         assert figure.name in readme
 
 
+@pytest.mark.slow
 def test_accuracy_vs_time(tmp_path):
     results = run("accuracy_vs_time", "--cases", 4, "--out", tmp_path)
     assert len(results["cases"]) >= 8
@@ -126,6 +127,7 @@ def test_many_solves(tmp_path):
     assert (tmp_path / "many_solves.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_error_bar(tmp_path):
     words = ("--scenes", "once_clamped_beam", "--cases", 3, "--outside", 1, "--out", tmp_path)
     cases = {case["name"]: case for case in run("error_bar", *words)["cases"]}

@@ -185,7 +185,7 @@ def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
     assert chosen["base"] == hybrid.base == min(errors, key=errors.get)
 
 
-@pytest.mark.parametrize("writes", [3, 5])
+@pytest.mark.parametrize("writes", [pytest.param(3, marks=pytest.mark.slow), 5])
 def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatch, hybrid, writes):
     """After its modes are frozen, and in the residual's fit."""
     from emulator.training import trainer
