@@ -18,6 +18,7 @@ from emulator.store import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def pyplot() -> Any:
@@ -49,6 +50,19 @@ def displacement_part(posterior: Posterior) -> NodalDisplacements | Landmarks:
     return part
 
 
+def title_and_save(
+    figure: Figure, posterior: Posterior, certificate: Certificate, path: str | Path
+) -> None:
+    """Say whose posterior it is and what FEM says of it, write the picture, close it."""
+    figure.suptitle(
+        f"{posterior.model.forward.scene.name}: posterior by {posterior.model.forward.kind}, "
+        f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"
+    )
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=140)
+    pyplot().close(figure)
+
+
 def beam_figure(
     posterior: Posterior,
     truth: jax.Array,
@@ -71,13 +85,7 @@ def beam_figure(
     scatter = _draw_side(side, posterior, np.asarray(truth), fields)
     figure.colorbar(scatter, ax=side, label="posterior sd of the position (mm)", shrink=0.85)
     _draw_joint(joint, posterior, theta)
-    figure.suptitle(
-        f"{posterior.model.forward.scene.name}: posterior by {posterior.model.forward.kind}, "
-        f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"
-    )
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=140)
-    plt.close(figure)
+    title_and_save(figure, posterior, certificate, path)
 
 
 def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.ndarray) -> Any:

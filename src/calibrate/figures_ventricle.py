@@ -10,10 +10,14 @@ import jax
 import numpy as np
 
 from calibrate.certify import Certificate
-from calibrate.figures import displacement_draws, displacement_part, pyplot
+from calibrate.figures import (
+    displacement_draws,
+    displacement_part,
+    pyplot,
+    title_and_save,
+)
 from calibrate.posterior import Posterior
 from emulator.geometry.tetrahedra import boundary_facets
-from emulator.store import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,13 +50,7 @@ def ventricle_figure(
         _draw_marginal(panel, posterior, parameter, theta[parameter.name])
     _draw_volume(axes.flat[-1], posterior, np.asarray(truth), prior)
     axes.flat[0].legend(loc="best", frameon=False, fontsize=8)
-    figure.suptitle(
-        f"{posterior.model.forward.scene.name}: posterior by {posterior.model.forward.kind}, "
-        f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"
-    )
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=140)
-    plt.close(figure)
+    title_and_save(figure, posterior, certificate, path)
 
 
 def _prior_thetas(posterior: Posterior, count: int = 400) -> jax.Array:

@@ -137,10 +137,6 @@ class Emulator:
         prepared = jax.jit(lambda: self.prepared(self.weights)[1])()
         return CachedEmulator(self, nnx.merge(graph, state), prepared[:, nodes], nodes)
 
-    def without_residual(self) -> Emulator:
-        """Series and network alone."""
-        return replace(self, residual=None, base="network")
-
 
 def definition(
     architecture: Architecture, graph: AugmentedGraph, parameters: int, fixed: int

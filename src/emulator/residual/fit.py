@@ -16,7 +16,7 @@ does.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -88,10 +88,6 @@ class Residual:
     def __call__(self, position: jax.Array) -> jax.Array:
         """Displacement (k, 3) in mm to add at ``position`` (p,)."""
         return self.offset + jnp.tensordot(self.coefficients(position), self.modes, axes=1)
-
-    def at(self, rows: np.ndarray) -> Residual:
-        """The same over some of its nodes."""
-        return replace(self, offset=self.offset[rows], modes=self.modes[:, rows])
 
 
 def fit_residual(

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs, run_campaign
-from emulator.fem.expansion import Expansion, constant, expand_at
+from emulator.fem.expansion import constant, expand
 from emulator.network.emulator import BASES, Emulator, fresh
 from emulator.network.graph import augment
 from emulator.network.pignn import Architecture
@@ -76,7 +76,8 @@ def prepare(
         residual can be judged by excepted.
     """
     simulator = Simulator(scene)
-    series = _series(simulator, plan)
+    # Rounded to what a file keeps, so that the residual is fitted to what will be loaded.
+    series = rounded(expand(simulator, order=plan.order)) if plan.order else None
     thetas = scene.centre[None]
     if plan.runs:
         draw = design if plan.residual else sobol
@@ -85,14 +86,16 @@ def prepare(
         simulator,
         thetas,
         slopes=plan.residual,
-        expansion=series if plan.order else None,
+        expansion=series,
         deadline=deadline,
         at_least=FEWEST + 1,
         progress=progress,
     )
     scale, spread = _scales(scene, plan, runs)
-    if not plan.centred:
-        series = constant(series.centre, jnp.zeros_like(series.displacement))
+    if series is None:
+        u = runs.displacement[0]
+        centre = np.asarray(scene.to_unit(scene.centre))
+        series = constant(centre, u if plan.centred else jnp.zeros_like(u))
     architecture = architecture or (Architecture() if plan.steps else _NO_NETWORK)
     architecture = replace(architecture, decoder=plan.decoder)
     basis = None
@@ -103,15 +106,6 @@ def prepare(
     loss = make_loss(scene, plan.objective, spread, energy_scale, plan.energy_weight)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
     return Problem(emulator, runs, optimiser, _make_step(emulator, plan, runs, loss, optimiser))
-
-
-def _series(simulator: Simulator, plan: Plan) -> Expansion:
-    """The Taylor series about the centre, its numbers rounded to what a file keeps."""
-    theta = simulator.scene.centre
-    u = simulator.solve(theta).require_converged("the centre of the box").displacement
-    if plan.order:
-        return rounded(expand_at(simulator, u, theta, plan.order))
-    return constant(np.asarray(simulator.scene.to_unit(theta)), u)
 
 
 def _scales(scene: Scene, plan: Plan, runs: Runs) -> tuple[np.ndarray, float]:

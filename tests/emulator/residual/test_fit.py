@@ -65,11 +65,6 @@ def test_better_than_values_alone(beam):
     assert 10.0 * np.median(ours) < np.median(theirs)
 
 
-def test_some_of_its_nodes(fitted):
-    x, rows = jnp.array([0.3, 0.8]), np.array([7, 2])
-    np.testing.assert_array_equal(fitted.at(rows)(x), fitted(x)[rows])
-
-
 def test_the_same_twice_to_the_bit(simulator, runs, series, fitted):
     again = fit_residual(simulator.scene, runs, series)
     for name in ("known", "values", "slopes", "offset", "modes"):
