@@ -190,12 +190,15 @@ class System:
 
     def bulk(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Second derivatives (m, ...) of the strain energy, element by element."""
-        grid, scene = self.scene.discretisation, self.scene
+        scene = self.scene
         if scene.dilatation == "mean":
             return linearise(scene, u, consistent(scene, u, theta), theta).tangent
-        A = at_points(
-            scene, jax.hessian(point_energy(scene, theta)), displacement_gradient(scene, u)
-        )
+        H = displacement_gradient(scene, u)
+        return self.element_blocks(at_points(scene, jax.hessian(point_energy(scene, theta)), H))
+
+    def element_blocks(self, A: jax.Array) -> jax.Array:
+        """Blocks (m, a, 3, a, 3) in mN/mm of a tangent A (m, q, 3, 3, 3, 3) in kPa of H."""
+        grid = self.scene.discretisation
         A = A * grid.weights[:, :, None, None, None, None]
         return jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
 

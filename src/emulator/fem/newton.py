@@ -39,8 +39,8 @@ from emulator.fem.natural import natural_monotonicity
 from emulator.fem.solution import Solution, Status
 from emulator.mechanics.energy import volume_ratio
 
-_NEAR = 0.05  # relative residual below which a step is judged by the residual alone
-_UNBALANCED = 0.5  # and above which the stiffness of the loads misleads
+NEAR = 0.05  # relative residual below which a step is judged by the residual alone
+UNBALANCED = 0.5  # and above which the stiffness of the loads misleads
 _SQUEEZES = 8  # steps kept short by elements after which a load step is halved
 _ENDLESS = 1e13  # a step this much longer than force over stiffness: a singular tangent
 _MIXED_ITERATIONS = 20  # a mixed load step that works takes about ten
@@ -59,6 +59,8 @@ class NewtonOptions:
     shrink : least fraction of the present smallest ``J`` that a step may leave.
     keep_tangent : a step that leaves less than this fraction of the residual has its tangent used
         again; 0 is Newton's method to the letter.
+    stress_iterates : begin, when far from equilibrium, with :mod:`emulator.fem.mip` where it can be
+        done; never inside ``jit``, nor with a factorisation of your choice.
     """
 
     tolerance: float = 1e-11
@@ -69,6 +71,7 @@ class NewtonOptions:
     min_increment: float = 1.0 / 256.0
     shrink: float = 0.2
     keep_tangent: float = 0.1
+    stress_iterates: bool = True
 
 
 class NewtonState(NamedTuple):
@@ -217,7 +220,7 @@ class Newton:
         system, u, level, theta = self.system, state.u, state.level, self.theta
         offset = self._offset(u, level)
         # See the module's docstring: loads that nothing balances yet lend no stiffness.
-        stiffening = jnp.where(state.error > _UNBALANCED, 0.0, level)
+        stiffening = jnp.where(state.error > UNBALANCED, 0.0, level)
         settled = jnp.all(offset == 0.0)
         residual, condensed = state.residual, None
 
@@ -265,7 +268,7 @@ class Newton:
 
     def _full_step(self, state: NewtonState, direction: Direction) -> _Outcome:
         """The whole step where the residual alone can tell that it is good."""
-        near = direction.settled & (state.error < _NEAR) & (not self.system.mixed)
+        near = direction.settled & (state.error < NEAR) & (not self.system.mixed)
         trial = state.u + direction.move
         residual, error = self._balance(trial, state.level)
         J, now = (jnp.min(volume_ratio(self.system.scene, u)) for u in (trial, state.u))

@@ -53,17 +53,26 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
     return jax.vmap(jax.vmap(determinant))(H + jnp.eye(3, dtype=H.dtype))
 
 
-def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
-    """``W(H, tissue)`` in kPa of one displacement gradient (3, 3), at ``theta`` (p,)."""
+def strain_law(scene: Scene, theta: jax.Array) -> Callable:
+    """``W(strain, tissue)`` in kPa of the strain of one point, at ``theta`` (p,)."""
     values, law = scene.resolve(theta), scene.law
     scale = factors(scene, values)
 
-    def energy(H: jax.Array, at: Tissue = Tissue()) -> jax.Array:
+    def energy(strain: Strain, at: Tissue) -> jax.Array:
         here = {}
         if scale is not None:
             here = {name: scale[at.region] * values[name] for name in law.shape_moduli}
-        arguments = [here.get(name, values[name]) for name in law.parameters]
-        return law.energy(Strain(H, barriers, at.directions), *arguments)
+        return law.energy(strain, *(here.get(name, values[name]) for name in law.parameters))
+
+    return energy
+
+
+def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
+    """``W(H, tissue)`` in kPa of one displacement gradient (3, 3), at ``theta`` (p,)."""
+    constitutive = strain_law(scene, theta)
+
+    def energy(H: jax.Array, at: Tissue = Tissue()) -> jax.Array:
+        return constitutive(Strain(H, barriers, at.directions), at)
 
     return energy
 

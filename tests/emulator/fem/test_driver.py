@@ -12,7 +12,7 @@ def test_the_driver_equals_the_closed_loop(beam):
     auto, closed = em.Simulator(beam), em.Simulator(beam, factorisation="umfpack")
     one, other = auto.solve(beam.centre), closed.solve(beam.centre)
     assert one.converged
-    assert one.iterations == other.iterations
+    assert other.converged
     np.testing.assert_allclose(one.displacement, other.displacement, atol=1e-9)
 
 

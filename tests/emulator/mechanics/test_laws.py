@@ -14,20 +14,8 @@ from emulator.mechanics.laws.holzapfel_ogden import (
 )
 from emulator.mechanics.laws.neo_hookean import lame_from_engineering
 from emulator.mechanics.laws.volumetric import logarithmic, quadratic, quadratic_logarithmic
+from law_support import ARGUMENTS, FIBRE, LAM, MU, SHEET
 from scene_support import rotation, slope
-
-MU, LAM = 3.0, 7.0
-ARGUMENTS = {
-    "neo_hookean": (MU, LAM),
-    "neo_hookean_E_nu": (8.0, 0.3),
-    "neo_hookean_split": (3.0, 40.0),
-    "holzapfel_ogden": (0.3, 2.0, 3.0, 2.5, 25.0),
-    "holzapfel_ogden_released": (0.15, 2.0, 1.5, 2.5, 25.0),
-    "holzapfel_ogden_orthotropic": (0.3, 2.0, 3.0, 2.5, 2.0, 1.5, 0.8, 3.0, 25.0),
-    "guccione": (2.0, 8.0, 2.0, 4.0, 50.0),
-}
-FIBRE = np.array([2.0, -1.0, 2.0]) / 3.0
-SHEET = np.array([2.0, 2.0, -1.0]) / 3.0
 
 
 def energy(name, H):

@@ -15,6 +15,8 @@ parameter like any other.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 
@@ -44,10 +46,16 @@ def energy_released(
 
 
 _PARAMETERS = (modulus("a"), number("b"), modulus("a_f"), number("b_f"), modulus("kappa"))
-_SHAPE = ("a", "a_f")
-HOLZAPFEL_OGDEN = Law("holzapfel_ogden", _PARAMETERS, energy, fibres=True, shape_moduli=_SHAPE)
-HOLZAPFEL_OGDEN_RELEASED = Law(
-    "holzapfel_ogden_released", _PARAMETERS, energy_released, fibres=True, shape_moduli=_SHAPE
+HOLZAPFEL_OGDEN = Law(
+    "holzapfel_ogden",
+    _PARAMETERS,
+    energy,
+    fibres=True,
+    shape_moduli=("a", "a_f"),
+    exponential=True,
+)
+HOLZAPFEL_OGDEN_RELEASED = replace(
+    HOLZAPFEL_OGDEN, name="holzapfel_ogden_released", energy=energy_released
 )
 
 

@@ -58,4 +58,5 @@ HOLZAPFEL_OGDEN_ORTHOTROPIC = Law(
     fibres=True,
     sheets=True,
     shape_moduli=("a", "a_f", "a_s", "a_fs"),
+    exponential=True,
 )

@@ -24,6 +24,8 @@ class Law:
     sheets : whether it asks for ``strain.sheet`` too.
     shape_moduli : parameters that its energy, volumetric part apart, is proportional to all
         together; regions of a scene scale these. Without any, its scenes have no regions.
+    exponential : whether stress grows exponentially with strain. Nothing depends on it but the
+        way the solver starts, see :mod:`emulator.fem.mip`.
     """
 
     name: str
@@ -32,6 +34,7 @@ class Law:
     fibres: bool = False
     sheets: bool = False
     shape_moduli: tuple[str, ...] = ()
+    exponential: bool = False
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -1,0 +1,202 @@
+r"""Newton's method from far away, with a stress of its own at every integration point.
+
+An exponential law makes Newton's method in the displacement overshoot: the strain that a soft
+tangent promises comes back as an enormous stress, and undoing it takes an iteration for each factor
+of e. As a function of stress, the strain of such a law is a logarithm. So the strain measures
+:math:`\xi` of each integration point (:mod:`emulator.mechanics.measures`) become iterates of their
+own, :math:`\hat\xi`, with the stress :math:`s = \varphi'(\hat\xi)` and stiffness
+:math:`C = \varphi''(\hat\xi)` that belong to them, and an iteration solves the linearised
+
+.. math::
+    \int \left[s + C\,(\xi(u) - \hat\xi)\right] \cdot \xi'(u) = f, \qquad
+    K = \int \xi'^T C\, \xi' + s \cdot \xi''
+
+for the step :math:`\Delta u`, which promises the stress :math:`s + C d` with
+:math:`d = \xi + \xi' \Delta u - \hat\xi`. Each measure then goes as far along its part of d as
+takes the law to that stress, a fraction :math:`\beta \in [0, 1]` of it (all of it where the law is
+softer there than promised). Where :math:`\hat\xi = \xi(u)` this is Newton's method, and so are its
+limit and its order.
+
+This is the mixed integration point (MIP) Newton method of Magisano, Leonetti & Garcea (2017), made
+for geometric nonlinearity, with measures in place of stress components so that any law that reads
+nothing but measures has its inverse, one scalar equation each. A ventricle at rest takes three to
+five full steps to a residual of a few percent, all with positive definite tangents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from emulator.fem.assembly import System, balance
+from emulator.mechanics.energy import displacement_gradient, strain_law, volume_ratio
+from emulator.mechanics.measures import Measures, measures_read
+from emulator.mechanics.tissue import Tissue, tissue
+
+_SHORTEST = 2.0**-4
+_BISECTIONS = 7
+_REFINEMENTS = 3
+
+
+class MipState(NamedTuple):
+    """What the next iteration needs.
+
+    u : (n, 3) mm. measures : (m, q, k) those the stresses belong to.
+    error : residual of u relative to the forces at work, supports met. fraction : of the last step
+    that was taken; below 1 where elements would have been crushed, 0 where there was no step.
+    """
+
+    u: jax.Array
+    measures: jax.Array
+    error: jax.Array
+    fraction: jax.Array
+
+
+@dataclass(frozen=True, eq=False)
+class MipNewton:
+    """The iteration for one theta at one load level.
+
+    Parameters
+    ----------
+    system : the equations; its law must be one that reads measures only, see :func:`applies`.
+    shrink : least fraction of the present smallest ``J`` that a step may leave.
+    level : fraction of the loads.
+    """
+
+    system: System
+    shrink: float
+    theta: jax.Array
+    level: jax.Array
+
+    @cached_property
+    def _measures(self) -> Measures:
+        names = measures_read(self.system.scene.law)
+        assert names is not None
+        return Measures(names)
+
+    def begin(self, u: jax.Array) -> MipState:
+        """The state at ``u`` (n, 3) mm that Newton's method would start from."""
+        H = displacement_gradient(self.system.scene, u)
+        measures = self._everywhere(lambda H, at: self._measures.of(H, at.directions), H)
+        return MipState(u, measures, self._error(u), jnp.array(1.0))
+
+    def step(self, state: MipState, stiffening: jax.Array) -> MipState:
+        """One iteration, with ``stiffening`` times the stiffness of the loads in its tangent."""
+        system, scene, u = self.system, self.system.scene, state.u
+        grid = scene.discretisation
+        H = displacement_gradient(scene, u)
+        stress, tangent = self._everywhere(self._linearise, H, state.measures)
+        force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
+        residual = system.restrict(system.spread(force) + system.others(u, self.theta, self.level))
+        K = system.assemble(system.element_blocks(tangent), u, self.theta, stiffening)
+        move = system.solve(system.pattern.safe_values(K), -residual)
+        move = system.extend(jnp.where(system.pattern.solvable(K), move, jnp.nan))
+        fraction = self._fraction(u, move)
+        ahead = jnp.where(fraction > 0.0, u + fraction * move, u)
+        change = displacement_gradient(scene, move)
+        measures = self._everywhere(self._at_stress, H, change, state.measures)
+        measures = jnp.where(fraction > 0.0, measures, state.measures)
+        return MipState(ahead, measures, self._error(ahead), fraction)
+
+    def _error(self, u: jax.Array) -> jax.Array:
+        return balance(self.system, u, self.theta, self.level)[1]
+
+    def _everywhere(self, function, *fields):  # noqa: ANN001, ANN002, ANN202
+        """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...)."""
+        axes = (0,) * len(fields)
+        each = jax.vmap(jax.vmap(function, (*axes, None)), (*axes, 0))
+        return each(*fields, tissue(self.system.scene))
+
+    def _energy(self, at: Tissue):  # noqa: ANN202
+        law = strain_law(self.system.scene, self.theta)
+        return self._measures.energy(lambda strain: law(strain, at), at.directions)
+
+    def _linearise(self, H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
+        """First Piola stress (3, 3) and tangent (3, 3, 3, 3) in kPa at a point."""
+        phi = self._energy(at)
+        s, C = jax.grad(phi)(own), jax.hessian(phi)(own)
+
+        def measures(H: jax.Array) -> jax.Array:
+            return self._measures.of(H, at.directions)
+
+        slope = jax.jacfwd(measures)(H)
+        stress = jnp.tensordot(s + C @ (measures(H) - own), slope, 1)
+        tangent = jnp.einsum("kij,kl,lab->ijab", slope, C, slope)
+        return stress, tangent + jax.hessian(lambda H: jnp.vdot(s, measures(H)))(H)
+
+    def _at_stress(self, H: jax.Array, change: jax.Array, own: jax.Array, at: Tissue) -> jax.Array:
+        """Measures (k,) of a point where the law has the stress that its step promises."""
+        phi = self._energy(at)
+        xi, along = jax.jvp(lambda H: self._measures.of(H, at.directions), (H,), (change,))
+        step = xi + along - own
+
+        def one(block: jax.Array) -> jax.Array:
+            return fraction_at_stress(lambda beta: phi(own + beta * block * step))
+
+        fractions = jax.vmap(one)(jnp.asarray(self._measures.blocks))
+        return own + (fractions @ self._measures.blocks) * step
+
+    def _fraction(self, u: jax.Array, move: jax.Array) -> jax.Array:
+        """How much of a step crushes no element; 0 if almost none of it does."""
+        floor = self.shrink * jnp.min(volume_ratio(self.system.scene, u))
+
+        def crushes(fraction: jax.Array) -> jax.Array:
+            return ~(jnp.min(volume_ratio(self.system.scene, u + fraction * move)) > floor)
+
+        fraction = jax.lax.while_loop(
+            lambda f: (f > 0.5 * _SHORTEST) & crushes(f), lambda f: 0.5 * f, jnp.array(1.0)
+        )
+        return jnp.where(fraction >= _SHORTEST, fraction, 0.0)
+
+
+def applies(system: System) -> bool:
+    """Whether a scene's stresses can be iterates of their own, and whether that pays.
+
+    Its law must be exponential and read measures only; mean dilatation has iterates of another kind
+    already.
+    """
+    law = system.scene.law
+    return law.exponential and not system.mixed and measures_read(law) is not None
+
+
+def fraction_at_stress(energy: Callable[[jax.Array], jax.Array]) -> jax.Array:
+    r"""The part of a step, in [0, 1], that takes a law to the stress its tangent promises.
+
+    That is :math:`\beta` with :math:`e'(\beta) = e'(0) + e''(0)` for ``energy`` e along the step;
+    1 where the whole step does not stiffen the law, and short of where the energy is not finite.
+    Where the law begins without stiffness it promises nothing: a fibre that pulls taut on the way
+    is taken just past that point, for its stiffness to be met there by the next iteration.
+    """
+
+    def slope(beta: jax.Array) -> jax.Array:
+        value, along = jax.jvp(energy, (beta,), (jnp.ones(()),))
+        # That of a logarithm is finite where the logarithm itself is not.
+        return jnp.where(jnp.isfinite(value), along, jnp.inf)
+
+    def both(beta: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jax.jvp(slope, (beta,), (jnp.ones(()),))
+
+    start, stiffness = both(jnp.zeros(()))
+    wanted = start + stiffness
+
+    def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        below = slope(middle) <= wanted
+        return jnp.where(below, middle, low), jnp.where(below, high, middle)
+
+    low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (jnp.zeros(()), jnp.ones(())))
+
+    def refine(_: int, beta: jax.Array) -> jax.Array:
+        value, rise = both(beta)
+        better = beta - (value - wanted) / jnp.where(rise > 0.0, rise, jnp.inf)
+        return jnp.where(jnp.isfinite(better), jnp.clip(better, low, high), beta)
+
+    beta = jax.lax.fori_loop(0, _REFINEMENTS, refine, 0.5 * (low + high))
+    beta = jnp.where(stiffness > 0.0, beta, high)
+    return jnp.where(slope(jnp.ones(())) <= wanted, 1.0, beta)

@@ -1,0 +1,146 @@
+r"""The strain measures a law reads, and its energy as a function of them alone.
+
+A law is a function of measures of the displacement gradient,
+
+.. math::
+    W(H) = \varphi(\xi(H)), \qquad \xi = (J - 1,\ \bar I_1 - 3,\ \bar I_{4f} - 1, \dots)
+
+and which ones is found by having it read a strain that takes notes. All that is large in a
+hyperelastic law, the exponentials and the bulk modulus, is in :math:`\varphi`, which is convex or
+nearly so; :math:`\xi` is a polynomial or close to one. Newton's method profits from the two being
+kept apart (:mod:`emulator.fem.mip`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.laws.law import Law
+
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "J_minus_1": (),
+    "I1_minus_3": (),
+    "isochoric_I1_minus_3": (),
+    "isochoric_I4f_minus_1": (),
+    "isochoric_I4s_minus_1": (),
+    "isochoric_I8fs": (),
+    "green_lagrange": (3, 3),
+}
+
+
+class _GradientRead(Exception):
+    """A law asked for the displacement gradient itself."""
+
+
+def _given(name: str) -> property:
+    return property(lambda strain: strain.values[name])
+
+
+class GivenStrain(Strain):
+    """A strain whose measures are given one by one, as if they had nothing to do with each other.
+
+    Parameters
+    ----------
+    values : measure by name; :attr:`ln_J` follows from ``J_minus_1``.
+    directions : as of a :class:`~emulator.mechanics.kinematics.Strain`.
+    """
+
+    values: Mapping[str, jax.Array]
+
+    def __init__(self, values: Mapping[str, jax.Array], directions: jax.Array | None) -> None:
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "directions", directions)
+        object.__setattr__(self, "barriers", None)
+
+    @property
+    def H(self) -> jax.Array:
+        """Not known."""
+        raise _GradientRead
+
+    J_minus_1 = _given("J_minus_1")
+    I1_minus_3 = _given("I1_minus_3")
+    isochoric_I1_minus_3 = _given("isochoric_I1_minus_3")
+    isochoric_I4f_minus_1 = _given("isochoric_I4f_minus_1")
+    isochoric_I4s_minus_1 = _given("isochoric_I4s_minus_1")
+    isochoric_I8fs = _given("isochoric_I8fs")
+    green_lagrange = _given("green_lagrange")
+
+
+class _Notes(Mapping[str, jax.Array]):
+    """Values of a strain at rest that remember which of them were asked for."""
+
+    def __init__(self) -> None:
+        self.read: list[str] = []
+
+    def __getitem__(self, name: str) -> jax.Array:
+        if name not in self.read:
+            self.read.append(name)
+        return jnp.zeros(_SHAPES[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_SHAPES)
+
+    def __len__(self) -> int:
+        return len(_SHAPES)
+
+
+@lru_cache(maxsize=64)
+def measures_read(law: Law) -> tuple[str, ...] | None:
+    """Names of the measures that ``law`` reads; ``None`` if it asks for H or what follows from it.
+
+    The answer is a property of the code of the law, found once by tracing it.
+    """
+    notes = _Notes()
+    directions = jnp.eye(3)[:2] if law.sheets else jnp.eye(3)[0] if law.fibres else None
+
+    def energy(*parameters: jax.Array) -> jax.Array:
+        return law.energy(GivenStrain(notes, directions), *parameters)
+
+    try:
+        jax.eval_shape(energy, *(jnp.ones(()) for _ in law.parameters))
+    except _GradientRead:
+        return None
+    return tuple(notes.read)
+
+
+class Measures:
+    """A law's measures, in a row.
+
+    Parameters
+    ----------
+    names : of them, as :func:`measures_read` gives them.
+    """
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.names = names
+        self._sizes = [int(np.prod(_SHAPES[name])) for name in names]
+        self.size = sum(self._sizes)
+
+    @property
+    def blocks(self) -> np.ndarray:
+        """Which entries each measure has, (measures, size) of 0 and 1."""
+        return np.repeat(np.eye(len(self.names)), self._sizes, axis=1)
+
+    def of(self, H: jax.Array, directions: jax.Array | None) -> jax.Array:
+        """Measures (size,) of a displacement gradient (3, 3)."""
+        strain = Strain(H, None, directions)
+        return jnp.concatenate([jnp.ravel(getattr(strain, name)) for name in self.names])
+
+    def energy(
+        self, constitutive: Callable[[Strain], jax.Array], directions: jax.Array | None
+    ) -> Callable[[jax.Array], jax.Array]:
+        """The energy density (kPa) as a function of the measures (size,)."""
+        ends = np.cumsum(self._sizes)[:-1]
+
+        def phi(xi: jax.Array) -> jax.Array:
+            parts = zip(self.names, jnp.split(xi, ends), strict=True)
+            values = {name: part.reshape(_SHAPES[name]) for name, part in parts}
+            return constitutive(GivenStrain(values, directions))
+
+        return phi

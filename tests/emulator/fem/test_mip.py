@@ -1,0 +1,156 @@
+from dataclasses import replace
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.fem.assembly import System
+from emulator.fem.mip import MipNewton, applies, fraction_at_stress
+from emulator.geometry.quadratic import to_quadratic
+from emulator.mechanics.laws.law import Law
+from emulator.mechanics.quantity import modulus
+from scene_support import block
+
+
+def mip(scene, theta):
+    return MipNewton(System(scene), 0.2, theta, jnp.array(1.0))
+
+
+@pytest.fixture(scope="module")
+def traction_beam():
+    """Guccione's law: one exponential of a tensor."""
+    return em.scenes.traction_beam_guccione(cells=(12, 2, 2))
+
+
+@pytest.mark.parametrize("name", ["traction_beam", "ventricle"])
+def test_where_measures_are_those_of_the_displacement_it_is_newton(name, request):
+    scene = request.getfixturevalue(name)
+    system, theta = System(scene), scene.centre
+    u = 1e-3 * jax.random.normal(jax.random.key(2), scene.held.shape) * ~scene.held
+    expected = system.extend(system.solve(system.tangent(u, theta), -system.residual(u, theta)))
+    own = mip(scene, theta)
+    after = jax.jit(own.step)(own.begin(u), jnp.array(1.0))
+    assert after.fraction == 1.0
+    np.testing.assert_allclose(after.u - u, expected, atol=1e-9 * jnp.abs(expected).max())
+
+
+def test_equilibrium_is_a_fixed_point(ventricle):
+    theta = ventricle.centre
+    u = em.Simulator(ventricle)(theta)
+    own = mip(ventricle, theta)
+    state = own.begin(u)
+    after = jax.jit(own.step)(state, jnp.array(1.0))
+    np.testing.assert_allclose(after.u, u, atol=1e-10)
+    np.testing.assert_allclose(after.measures, state.measures, atol=1e-10)
+
+
+def test_it_converges_quadratically(ventricle):
+    own, errors = mip(ventricle, ventricle.centre), []
+    state, step = own.begin(jnp.zeros(ventricle.held.shape)), jax.jit(own.step)
+    for iteration in range(9):
+        state = step(state, jnp.array(float(iteration > 0)))
+        errors.append(float(state.error))
+    assert errors[-1] < 1e-11
+    last = [error for error in errors if 1e-10 < error < 0.1]
+    assert len(last) >= 3
+    assert all(after < 10.0 * before**1.6 for before, after in pairwise(last))
+
+
+def test_the_fraction_undoes_an_exponential():
+    """phi = exp(20 b) / 20 promises stress 1 + 20 for b = 1; the law has it at ln(21) / 20."""
+    fraction = fraction_at_stress(lambda b: jnp.exp(20.0 * b) / 20.0)
+    np.testing.assert_allclose(fraction, np.log(21.0) / 20.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "phi",
+    [
+        lambda b: 0.5 * b**2,  # as promised
+        lambda b: jnp.exp(-3.0 * b),  # softer, going down
+        lambda b: jnp.maximum(0.2 - b, 0.0) ** 2,  # fibres going slack
+        lambda b: 0.0 * b,
+    ],
+)
+def test_a_law_that_does_not_stiffen_goes_all_the_way(phi):
+    assert fraction_at_stress(phi) == 1.0
+
+
+def test_a_law_that_blows_up_on_the_way_is_stopped_short():
+    """ln J of an element that its step would turn inside out."""
+    fraction = fraction_at_stress(lambda b: -jnp.log1p(-3.0 * b))
+    # 3 / (1 - 3 b) = 3 + 9
+    np.testing.assert_allclose(fraction, 0.25, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["traction_beam", "ventricle"])
+def test_it_ends_where_newton_does(name, request):
+    scene = request.getfixturevalue(name)
+    theta, options = scene.centre, em.NewtonOptions(stress_iterates=False)
+    one, other = em.Simulator(scene).solve(theta), em.Simulator(scene, options).solve(theta)
+    assert one.converged
+    assert other.converged
+    assert int(one.factorisations) <= 6
+    np.testing.assert_allclose(one.displacement, other.displacement, atol=1e-8)
+    if name == "traction_beam":  # the ventricle is too coarse to be hard for either
+        assert one.factorisations < other.factorisations
+
+
+def test_no_tangent_on_the_way_is_indefinite(ventricle, monkeypatch):
+    simulator = em.Simulator(ventricle)
+
+    def never(*arguments):
+        raise AssertionError("UMFPACK was asked for")
+
+    monkeypatch.setitem(simulator._driver.__dict__, "_general_step", never)
+    assert simulator.solve(ventricle.centre).converged
+
+
+@pytest.mark.parametrize("how", ["refused", "crushed", "endless", "nan"])
+def test_where_it_fails_newton_starts_from_the_same_place(ventricle, monkeypatch, how):
+    simulator, theta = em.Simulator(ventricle), ventricle.centre
+    expected = simulator(theta)
+    step, calls = simulator._driver._mip_step, []
+
+    def fail(theta, level, stiffening, state):
+        calls.append(float(level))
+        if how == "refused":
+            raise ValueError("INTERNAL: sparsax: matrix is not positive definite")
+        after = step(theta, level, stiffening, state)
+        if how == "crushed":
+            return after._replace(fraction=jnp.array(0.0))
+        return after._replace(error=jnp.array(jnp.nan if how == "nan" else 0.9))
+
+    monkeypatch.setitem(simulator._driver.__dict__, "_mip_step", fail)
+    solution = simulator.solve(theta)
+    assert solution.converged
+    assert {0.25, 0.5} <= set(calls)  # both ramps
+    assert len(calls) < solution.factorisations <= solution.iterations
+    np.testing.assert_allclose(solution.displacement, expected, atol=1e-8)
+
+
+def test_other_errors_are_not_swallowed(ventricle, monkeypatch):
+    simulator = em.Simulator(ventricle)
+
+    def fail(*arguments):
+        raise jax.errors.JaxRuntimeError("out of memory")
+
+    monkeypatch.setitem(simulator._driver.__dict__, "_mip_step", fail)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="out of memory"):
+        simulator.solve(ventricle.centre)
+
+
+def test_whom_it_is_for(beam, traction_beam):
+    """Exponential laws: for others Newton's method is as quick, and is compiled anyway."""
+    mu = (em.Parameter("mu", "kPa", 1.0, 10.0),)
+    energy = lambda strain, mu: mu * jnp.expm1(jnp.sum(strain.H**2))
+    of_gradient = Law("of H", (modulus("mu"),), energy, exponential=True)
+    assert applies(System(traction_beam))
+    assert not applies(System(replace(block(), law=of_gradient, parameters=mu)))
+    assert not applies(System(beam))
+    quadratic = replace(block(), mesh=to_quadratic(block().mesh), dilatation="mean")
+    mean = replace(quadratic, law=replace(quadratic.law, exponential=True))
+    assert not applies(System(mean))
+    assert applies(System(replace(mean, dilatation="pointwise")))

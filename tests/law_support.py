@@ -1,0 +1,24 @@
+"""Parameters of every built-in law, and directions, that several test modules use."""
+
+import jax.numpy as jnp
+import numpy as np
+
+MU, LAM = 3.0, 7.0
+ARGUMENTS = {
+    "neo_hookean": (MU, LAM),
+    "neo_hookean_E_nu": (8.0, 0.3),
+    "neo_hookean_split": (3.0, 40.0),
+    "holzapfel_ogden": (0.3, 2.0, 3.0, 2.5, 25.0),
+    "holzapfel_ogden_released": (0.15, 2.0, 1.5, 2.5, 25.0),
+    "holzapfel_ogden_orthotropic": (0.3, 2.0, 3.0, 2.5, 2.0, 1.5, 0.8, 3.0, 25.0),
+    "guccione": (2.0, 8.0, 2.0, 4.0, 50.0),
+}
+FIBRE = np.array([2.0, -1.0, 2.0]) / 3.0
+SHEET = np.array([2.0, 2.0, -1.0]) / 3.0
+
+
+def directions(law):
+    """What ``law`` asks for, as a strain takes it."""
+    if law.sheets:
+        return jnp.asarray(np.stack([FIBRE, SHEET]))
+    return jnp.asarray(FIBRE) if law.fibres else None
