@@ -425,8 +425,8 @@ def check(cases: list[dict]) -> None:
 
 def check_times(found: dict[str, float]) -> None:
     """Those about time."""
-    assert found["scikit-fem"] > 3.0
-    assert found.get("FEniCS", 20.0) > 6.0
+    assert found["scikit-fem"] > 10.0
+    assert found.get("FEniCS", 20.0) >= 20.0
 
 
 def main() -> None:
