@@ -28,6 +28,13 @@ def register(commands: Any) -> None:
         "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
     )
     parser.add_argument(
+        "--load-steps",
+        type=int,
+        default=1,
+        metavar="N",
+        help="follow the loading path; a very soft body has several equilibria (default 1)",
+    )
+    parser.add_argument(
         "--out", metavar="FILE.vtu", help="write displacement, stress, strain and fibres"
     )
     add_json(parser)
@@ -81,7 +88,7 @@ def simulate(arguments: argparse.Namespace) -> int:
     """Solve at one theta and say how it went."""
     import numpy as np
 
-    from emulator.fem import Simulator, Status
+    from emulator.fem import NewtonOptions, Simulator, Status
     from emulator.geometry.io import write_solution
     from emulator.mechanics.energy import potential_energy, volume_ratio
     from emulator.mechanics.fields import element_fields
@@ -92,7 +99,7 @@ def simulate(arguments: argparse.Namespace) -> int:
     theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
     if arguments.out:
         check_vtu(arguments.out)
-    solution = Simulator(scene).solve(theta)
+    solution = Simulator(scene, NewtonOptions.load_steps(arguments.load_steps)).solve(theta)
     status = Status(int(solution.status))
     J = np.asarray(volume_ratio(scene, solution.displacement))
     # A pressure that follows an open patch has no potential.

@@ -23,6 +23,7 @@ from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS
 
 _MOST_PATIENCE = 8
+_TENTH = 0.1  # of the load, where the ramps are lost and the loading path is followed
 _CARRIED = 0.9  # relative residual below which a level of load is carried well enough to go up
 
 
@@ -80,11 +81,12 @@ class Driver:
 
     def _far(self, state: NewtonState) -> bool:
         """Whether the way is long, its supports in place, and stresses can be iterates."""
+        wanted = self.options.stress_iterates and self.options.increment == 1.0
         far = NEAR < float(state.error) < float("inf")
-        return far and self.options.stress_iterates and applies(self.definite)
+        return wanted and far and applies(self.definite)
 
     def _brought_near(self, theta: jax.Array, state: NewtonState) -> NewtonState:
-        """``state`` moved close to equilibrium, or where it was; with the steps counted."""
+        """``state`` moved close to equilibrium, or to the foot of its load; steps are counted."""
         spent, found = 0, None
         for ramp in _RAMPS:
             found, steps = self._climbed(ramp, theta, state)
@@ -92,6 +94,9 @@ class Driver:
             if found is not None:
                 state = self._begin(theta, found)
                 break
+        if found is None:
+            # Bodies so soft have several equilibria: take the one that loading leads to.
+            state = state._replace(level=jnp.array(_TENTH), increment=jnp.array(_TENTH))
         return state._replace(iterations=jnp.array(spent), factorisations=jnp.array(spent))
 
     def _climbed(

@@ -32,6 +32,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from emulator.errors import InputError
 from emulator.fem.assembly import System, balance
 from emulator.fem.line_search import Direction, choose_fraction
 from emulator.fem.mixed import Condensed, Volumes, advance, consistent, linearise
@@ -55,12 +56,14 @@ class NewtonOptions:
     absolute : residual in mN that is small enough whatever the forces; 0 asks for the others.
     max_iterations : over all load levels.
     level_iterations : after which a load level is given up and its increment halved.
-    min_increment : smallest load increment, as a fraction of the whole.
+    increment : first and largest load increment, as a fraction of the whole. Small ones follow the
+        loading path, which matters to a body that has several equilibria.
+    min_increment : smallest load increment.
     shrink : least fraction of the present smallest ``J`` that a step may leave.
     keep_tangent : a step that leaves less than this fraction of the residual has its tangent used
         again; 0 is Newton's method to the letter.
     stress_iterates : begin, when far from equilibrium, with :mod:`emulator.fem.mip` where it can be
-        done; never inside ``jit``, nor with a factorisation of your choice.
+        done; never inside ``jit``, with a factorisation of your choice, or in load increments.
     """
 
     tolerance: float = 1e-11
@@ -68,10 +71,24 @@ class NewtonOptions:
     absolute: float = 0.0
     max_iterations: int = 200
     level_iterations: int = 40
+    increment: float = 1.0
     min_increment: float = 1.0 / 256.0
     shrink: float = 0.2
     keep_tangent: float = 0.1
     stress_iterates: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.min_increment <= self.increment <= 1.0:
+            raise InputError(
+                f"load increment {self.increment:g}: give {self.min_increment:g} (the least) to 1"
+            )
+
+    @classmethod
+    def load_steps(cls, steps: int) -> NewtonOptions:
+        """Options that follow the loading path in ``steps`` equal increments, or smaller ones."""
+        if steps < 1:
+            raise InputError(f"{steps} load steps; give 1 or more")
+        return cls(increment=1.0 / steps, max_iterations=max(cls.max_iterations, 20 * steps))
 
 
 class NewtonState(NamedTuple):
@@ -163,10 +180,10 @@ class Newton:
         return NewtonState(
             u=u,
             volumes=consistent(self.system.scene, u, self.theta) if self.system.mixed else None,
-            level=jnp.array(1.0),
+            level=jnp.array(self.options.increment),
             u_reached=jnp.zeros_like(u),
             reached=jnp.array(0.0),
-            increment=jnp.array(1.0),
+            increment=jnp.array(self.options.increment),
             at_level=jnp.array(0),
             iterations=jnp.array(0),
             factorisations=jnp.array(0),
@@ -343,7 +360,8 @@ class Newton:
         spent |= (squeezed >= _SQUEEZES) & (halved >= options.min_increment)
         failed = ~solved & (stuck | spent)
         # Easy levels earn a longer next step, failures a shorter one.
-        increment = jnp.where(solved & (at_level <= 8), 2.0 * state.increment, state.increment)
+        longer = jnp.minimum(2.0 * state.increment, options.increment)
+        increment = jnp.where(solved & (at_level <= 8), longer, state.increment)
         increment = jnp.where(failed, halved, increment)
         reached = jnp.where(solved, state.level, state.reached)
         u_reached = jnp.where(solved, outcome.u, state.u_reached)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.errors import InputError
 from emulator.fem.newton import Newton
 from emulator.fem.sparse import REFUSALS
 
@@ -116,3 +117,29 @@ def test_sensitivities_where_cholesky_is_refused(ventricle):
     for k in range(len(theta)):
         balanced = jax.jvp(lambda v: system.residual(v, soft), (blown,), (columns[k],))[1]
         np.testing.assert_allclose(balanced, -forces[:, k], atol=1e-8 * jnp.abs(forces).max())
+
+
+def test_load_steps_follow_the_loading_path(beam):
+    whole, path = em.Simulator(beam), em.Simulator(beam, em.NewtonOptions.load_steps(5))
+    one, five = whole.solve(beam.centre), path.solve(beam.centre)
+    assert five.converged
+    assert int(five.iterations) >= 10  # two or more a step
+    np.testing.assert_allclose(one.displacement, five.displacement, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_soft_ventricle_ends_where_loading_leads():
+    """Fibres go slack here, and there are several equilibria: 0.3 mL and 3.6 mm apart."""
+    scene = em.scenes.left_ventricle()
+    theta = scene.theta(a=0.316, b=1.0, a_f=3.0, b_f=1.0, pressure=1.333)
+    from_rest = em.Simulator(scene).solve(theta)
+    path = em.Simulator(scene, em.NewtonOptions.load_steps(10)).solve(theta)
+    assert from_rest.converged
+    assert path.converged
+    np.testing.assert_allclose(from_rest.displacement, path.displacement, atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [0, 1000])
+def test_load_steps_out_of_range(steps):
+    with pytest.raises(InputError, match=r"load (steps|increment)"):
+        em.NewtonOptions.load_steps(steps)
