@@ -18,7 +18,8 @@ import jax.numpy as jnp
 
 from emulator.fem.assembly import System
 from emulator.fem.mip import MipNewton, MipState, applies
-from emulator.fem.newton import NEAR, UNBALANCED, Newton, NewtonOptions, NewtonState, solution_of
+from emulator.fem.newton import NEAR, UNBALANCED, Newton, NewtonState, solution_of
+from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS
 

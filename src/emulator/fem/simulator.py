@@ -20,7 +20,8 @@ import jax.numpy as jnp
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
-from emulator.fem.newton import NewtonOptions, newton
+from emulator.fem.newton import newton
+from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
 from emulator.scenes.scene import Scene
