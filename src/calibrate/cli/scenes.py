@@ -99,12 +99,16 @@ def simulate(arguments: argparse.Namespace) -> int:
     theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
     if arguments.out:
         check_vtu(arguments.out)
-    solution = Simulator(scene, NewtonOptions.load_steps(arguments.load_steps)).solve(theta)
+    simulator = Simulator(scene, NewtonOptions.load_steps(arguments.load_steps))
+    solution = simulator.solve(theta)
     status = Status(int(solution.status))
     J = np.asarray(volume_ratio(scene, solution.displacement))
     # A pressure that follows an open patch has no potential.
     open_patch = any(isinstance(load, FollowerPressure) for load in scene.loads)
     energy = None if open_patch else float(potential_energy(scene)(solution.displacement, theta))
+    stable = None
+    if status is Status.CONVERGED and not open_patch:
+        stable = simulator.is_stable(solution.displacement, theta)
     result = {
         "scene": scene.name,
         "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
@@ -113,6 +117,7 @@ def simulate(arguments: argparse.Namespace) -> int:
         "residual": float(solution.residual),
         "load_reached": float(solution.load_reached),
         "energy": energy,
+        "stable": stable,
         "max_displacement": float(np.linalg.norm(solution.displacement, axis=1).max()),
         "J_range": [float(J.min()), float(J.max())],
     }
@@ -127,5 +132,9 @@ def simulate(arguments: argparse.Namespace) -> int:
     lines.append(
         f"J from {J.min():.4f} to {J.max():.4f}, relative residual {result['residual']:.1e}"
     )
+    if stable is False:
+        lines.append(
+            "an unstable equilibrium: it has buckled, and any imperfection leads elsewhere"
+        )
     emit(result, as_json=arguments.json, text="\n".join(lines))
     return DONE if status is Status.CONVERGED else FAILED

@@ -24,6 +24,7 @@ from emulator.fem.newton import newton
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
+from emulator.mechanics.energy import volume_ratio
 from emulator.scenes.scene import Scene
 
 
@@ -98,6 +99,27 @@ class Simulator:
         theta, u = self._checked(theta, u, "displacement")
         system, tangent = self.linearised(u, theta)
         return self._columns[system.factorisation](tangent, u, theta)
+
+    def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
+        """Whether the equilibrium ``u`` (n, 3) mm at ``theta`` (p,) is a minimum of the energy.
+
+        Its tangent is then positive definite. At a saddle, such as a column that stays straight
+        under twice its critical load, forces balance but any disturbance leads away. For numbers,
+        not under ``jit``.
+
+        Raises
+        ------
+        InputError
+            A load without a potential: there is no energy to be least.
+        """
+        theta, u = self._checked(theta, u, "displacement")
+        if self.system.forces:
+            raise InputError(
+                f"scene '{self.scene.name}': a follower pressure has no potential, so stability is "
+                "not a question of its tangent's sign"
+            )
+        sound = jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
+        return bool(sound) and self._driver.linearise(u, theta)[0].factorisation == "cholmod"
 
     def _drives(self, *arguments: jax.Array) -> bool:
         """Whether Python sees the numbers and CHOLMOD could work."""

@@ -67,6 +67,7 @@ def test_simulate(capsys, block, tmp_path):
     code, result = answer(capsys, "simulate", block, "--theta", "mu=7", "--out", out)
     assert code == 0
     assert result["status"] == "converged"
+    assert result["stable"] is True
     assert result["theta"] == {"mu": 7.0}
     written = meshio.read(out)
     field = written.point_data["displacement"]
@@ -78,7 +79,7 @@ def test_simulate(capsys, block, tmp_path):
     }
     assert written.cell_data["J"][0].min() == pytest.approx(result["J_range"][0])
     # Half the stiffness, about twice the sag.
-    _, soft = answer(capsys, "simulate", block, "--theta", "mu=14")
+    _, soft = answer(capsys, "simulate", block, "--theta", "mu=14", "--load-steps", 2)
     assert 1.3 < result["max_displacement"] / soft["max_displacement"] < 2.2
 
 
@@ -90,6 +91,7 @@ def test_simulate_under_a_pressure_without_a_potential(capsys, block):
     code, result = answer(capsys, "simulate", block)
     assert code == 0
     assert result["energy"] is None
+    assert result["stable"] is None
     assert result["max_displacement"] > 0.0
     block.write_text(text.replace("follower", "cavity"))
     said = complaint(capsys, "simulate", block)

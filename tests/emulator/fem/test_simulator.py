@@ -8,6 +8,8 @@ import pytest
 import emulator as em
 from emulator.errors import InputError, SolverError
 from emulator.fem.assembly import relative_residual
+from emulator.geometry.generators import box
+from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.loads import Gravity
 from emulator.scenes import Support
 from scene_support import block, slope
@@ -230,3 +232,30 @@ def test_nothing_to_solve_is_said():
     scene = block(supports=(Support("left"), Support("right")), cells=(1, 1, 1))
     with pytest.raises(InputError, match="every node is held"):
         em.Simulator(scene).solve(scene.centre)
+
+
+@pytest.mark.parametrize(("shortening", "stable"), [(0.0005, True), (0.15, False)])
+def test_a_column_beyond_buckling_is_a_saddle(shortening, stable):
+    """Perfect, so it stays straight; slenderness 20, where Euler's limit is 0.8 %."""
+    scene = replace(
+        block(),
+        mesh=box((20.0, 1.0, 1.0), (16, 2, 2)),
+        supports=(Support("left"), Support("right", (-20.0 * shortening, 0.0, 0.0))),
+    )
+    simulator = em.Simulator(scene)
+    solution = simulator.solve(scene.centre)
+    assert solution.converged
+    assert simulator.is_stable(solution.displacement, scene.centre) is stable
+
+
+def test_what_is_no_equilibrium_is_not_stable(beam):
+    simulator = em.Simulator(beam)
+    inverted = jnp.where(beam.held, 0.0, 100.0 * jax.random.normal(jax.random.key(0), (45, 3)))
+    assert not simulator.is_stable(inverted, beam.centre)
+    assert not simulator.is_stable(inverted * jnp.nan, beam.centre)
+
+
+def test_without_an_energy_there_is_no_least():
+    scene = block(loads=(FollowerPressure("top", 0.5),))
+    with pytest.raises(InputError, match="has no potential"):
+        em.Simulator(scene).is_stable(jnp.zeros(scene.held.shape), scene.centre)
