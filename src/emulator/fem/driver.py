@@ -37,8 +37,8 @@ class _Ramp(NamedTuple):
 
 
 # The first takes ventricles from rest to all but their softest corners, in four to six steps: with
-# the whole load at once one in three is lost. A third ramp has not been worth its price.
-_RAMPS = (_Ramp(0.5, 0.25, 12), _Ramp(0.25, 0.125, 20))
+# the whole load at once one in three is lost. The last is for beams that turn.
+_RAMPS = (_Ramp(0.5, 0.25, 12), _Ramp(0.25, 0.125, 20), _Ramp(0.1, 0.1, 40))
 
 
 @dataclass(frozen=True, eq=False)
