@@ -11,8 +11,8 @@ r"""What a training step minimises, for a batch of theta.
 with :math:`u^*` the FEM solution in mm, :math:`F` the dimensionless deformation gradient in the
 Frobenius norm, :math:`s` and :math:`s_F` the spreads of both over the FEM runs, so that both data
 terms are about 1 at the centre's solution, and :math:`\Pi_0` a fixed scale. ``energy``,
-``simulations`` and ``gradients`` are what the paper calls PI, DD and F-DD. The energies pass through
-the barriers, which are inactive near any solution.
+``simulations`` and ``gradients`` are the paper's PI, DD and F-DD. The energies pass through the
+barriers, which are inactive near any solution.
 """
 
 from __future__ import annotations
