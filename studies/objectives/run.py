@@ -161,15 +161,15 @@ def draw(errors: dict[str, Errors], path: Path, title: str) -> None:
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, help="optimiser steps (default 3000; 60 with --quick)")
-    parser.add_argument("--simulations", type=int, help="FEM runs (default 256; 16 with --quick)")
+    parser.add_argument("--steps", type=int, help="optimiser steps (default 1000; 60 with --quick)")
+    parser.add_argument("--simulations", type=int, help="FEM runs (default 128; 16 with --quick)")
     parser.add_argument("--tests", type=int, help="held-out theta (default 50; 4 with --quick)")
     parser.add_argument("--quick", action="store_true", help="a coarse beam and a small network")
     parser.add_argument("--emulators", type=Path, help="keep the trained here, use those there")
     parser.add_argument("--out", type=Path, default=HERE)
     parser.add_argument("--one", choices=tuple(OBJECTIVES), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    for name, full, quick in (("steps", 3000, 60), ("simulations", 256, 16), ("tests", 50, 4)):
+    for name, full, quick in (("steps", 1000, 60), ("simulations", 128, 16), ("tests", 50, 4)):
         if getattr(arguments, name) is None:
             setattr(arguments, name, quick if arguments.quick else full)
     if arguments.one:
