@@ -158,6 +158,21 @@ def draw(errors: dict[str, Errors], path: Path, title: str) -> None:
     plt.close(figure)
 
 
+def check(cases: list[dict[str, Any]]) -> None:
+    """The claims of the study's README."""
+    medians = {
+        key: {case["name"]: case[key]["median"] for case in cases}
+        for key in ("err_u", "err_F", "err_I1", "err_Pi")
+    }
+    for key in ("err_F", "err_I1", "err_Pi"):
+        assert medians[key]["gradients"] < 0.5 * medians[key]["simulations"], key
+    assert medians["err_u"]["gradients"] < 2.0 * medians["err_u"]["simulations"]
+    assert min(OBJECTIVES, key=medians["err_Pi"].__getitem__) == "both"
+    assert medians["err_u"]["energy"] > 5.0 * medians["err_u"]["simulations"]
+    for key, errors in medians.items():
+        assert errors[SHIPPED] < 1e-3 * min(errors[name] for name in OBJECTIVES), key
+
+
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -181,6 +196,8 @@ def main() -> None:
     write_json(arguments.out / "results.json", {**study_header(HERE, TEST_SEED), "cases": cases})
     title = f"once-clamped beam: {arguments.steps} steps by each objective, against FEM"
     draw(errors, arguments.out / "objectives.png", title)
+    if not arguments.quick:
+        check(cases)
 
 
 if __name__ == "__main__":
