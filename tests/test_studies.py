@@ -180,3 +180,16 @@ def test_decoder_speed(tmp_path):
 @pytest.mark.slow
 def test_decoder_speed_in_full(tmp_path):
     run("decoder_speed", "--out", tmp_path)  # asserts its own claims
+
+
+@pytest.mark.slow
+def test_objectives(tmp_path):
+    cases = {
+        case["name"]: case for case in run("objectives", "--quick", "--out", tmp_path)["cases"]
+    }
+    trained = [cases[name] for name in ("simulations", "gradients", "energy", "both")]
+    assert {case["steps"] for case in trained} == {60}
+    assert [case["fem_runs"] for case in trained] == [17, 17, 1, 17]
+    start = cases["the centre's solution"]
+    assert cases["gradients"]["err_F"]["median"] < start["err_F"]["median"]
+    assert (tmp_path / "objectives.png").stat().st_size > 10_000

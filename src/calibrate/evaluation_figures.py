@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from calibrate.evaluation import Evaluated
 
-_LABELS = {
+LABELS = {
     "err_u": "error in displacement (mm)",
     "err_F": "error in deformation gradient",
     "err_I1": "error in first invariant",
@@ -64,7 +64,7 @@ def _map_name(report: Any) -> str:
 # ---- densities --------------------------------------------------------------------------------
 def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
     """Density of each error on a logarithmic axis, its median and 97.5 % quantile marked."""
-    names = [name for name in _LABELS if name in inside.fields]
+    names = [name for name in LABELS if name in inside.fields]
     columns = 3 if len(names) > 4 else 2
     figure, grid = pyplot().subplots(
         2, columns, figsize=(4.2 * columns, 6.4), layout="constrained", squeeze=False
@@ -73,7 +73,7 @@ def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
         _draw_density(axes, inside.fields[name], _INSIDE, "inside" if outside else "")
         if outside is not None:
             _draw_density(axes, outside.fields[name], _OUTSIDE, "outside")
-        axes.set(xscale="log", xlabel=_LABELS[name], ylim=(0.0, None), yticks=[])
+        axes.set(xscale="log", xlabel=LABELS[name], ylim=(0.0, None), yticks=[])
         if axes.lines:
             axes.legend(
                 frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2
@@ -94,17 +94,25 @@ def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> No
         if found[name] > 0.0:
             line = f"{head}{text} {found[name]:.3g}"
             axes.axvline(found[name], color=colour, ls=style, lw=1.2, label=line)
+    curve = log_density(values)
+    if curve is None:
+        return  # one value: the lines say it all
+    at, density = curve
+    axes.plot(at, density, color=colour, lw=1.5)
+    axes.fill_between(at, density, color=colour, alpha=0.2, lw=0)
+
+
+def log_density(values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Errors (300,) and the density of ``log10(values)`` there; ``None`` where all are alike."""
     positive = values[values > 0.0]  # held nodes have no error, and no logarithm
     logs = np.log10(positive[:: max(1, len(positive) // _MOST)])
     if len(logs) < 2 or np.ptp(logs) < 1e-6:
-        return  # one value: the lines say it all
+        return None
     estimate = gaussian_kde(logs)
     width = 3.0 * float(np.sqrt(estimate.covariance[0, 0]))
     low, high = np.quantile(logs, [0.001, 0.999])
     at = np.linspace(low - width, high + width, 300)
-    density = estimate(at)
-    axes.plot(10.0**at, density, color=colour, lw=1.5)
-    axes.fill_between(10.0**at, density, color=colour, alpha=0.2, lw=0)
+    return 10.0**at, estimate(at)
 
 
 # ---- over the parameters ----------------------------------------------------------------------

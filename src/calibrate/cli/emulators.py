@@ -26,7 +26,12 @@ def register(commands: Any) -> None:
         help="default hybrid: Taylor series, network trained on the energy, residual of FEM runs; "
         "mechanics: the same without the network, in a minute",
     )
-    parser.add_argument("--objective", choices=("energy", "simulations", "both"))
+    parser.add_argument(
+        "--objective",
+        choices=("energy", "simulations", "gradients", "both"),
+        help="what the network is trained on: the energy; FEM displacements; those and their "
+        "deformation gradients; FEM displacements and the energy",
+    )
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
         "--budget", metavar="TIME", help="time for everything, e.g. 10m (default 10m)"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from emulator.errors import InputError
-from emulator.training.objectives import Objective
+from emulator.training.objectives import OBJECTIVES, Objective
 
 
 @dataclass(frozen=True)
@@ -14,8 +14,9 @@ class Plan:
     """How to train.
 
     recipe : the name in :data:`RECIPES` it came from, for the record.
-    objective : of the network: ``energy`` (no FEM run but the centre), ``simulations``, or
-        ``both``.
+    objective : of the network: ``energy`` (no FEM run but the centre), ``simulations``,
+        ``gradients`` (simulations and their deformation gradients), or ``both`` (simulations and
+        energy).
     steps : optimiser steps; 0 with a residual is no network.
     simulations : FEM runs to train the network on (not used by ``energy``) and the residual.
     batch : theta a step.
@@ -50,8 +51,9 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.objective not in ("energy", "simulations", "both"):
-            raise InputError(f"objective '{self.objective}': use energy, simulations or both")
+        if self.objective not in OBJECTIVES:
+            *others, last = OBJECTIVES
+            raise InputError(f"objective '{self.objective}': use {', '.join(others)} or {last}")
         least = {"steps": 0 if self.residual else 1, "batch": 1, "checkpoint_every": 1}
         for name, value in least.items():
             if getattr(self, name) < value:

@@ -26,7 +26,7 @@ from emulator.network.pignn import Architecture
 from emulator.scenes.scene import Scene
 from emulator.store import fill_tree, read_arrays, save_tree
 from emulator.training.basis import mechanical_modes
-from emulator.training.objectives import Batch, make_loss
+from emulator.training.objectives import Batch, Scales, make_loss, mean_square_gradient
 from emulator.training.plan import Plan
 from emulator.training.residual_stage import FEWEST, add_residual, rounded
 from emulator.training.sampling import design, sobol, uniform
@@ -91,7 +91,7 @@ def prepare(
         at_least=FEWEST + 1,
         progress=progress,
     )
-    scale, spread = _scales(scene, plan, runs)
+    scale, scales = _scales(scene, plan, runs)
     if series is None:
         u = runs.displacement[0]
         centre = np.asarray(scene.to_unit(scene.centre))
@@ -102,23 +102,26 @@ def prepare(
     if plan.decoder == "separable":
         basis = (mechanical_modes(simulator, series, plan.modes) / scale).astype(np.float32)
     emulator = fresh(scene, augment(scene), architecture, series, scale, plan.seed, basis)
-    energy_scale = float(jnp.abs(runs.energy[0]))
-    loss = make_loss(scene, plan.objective, spread, energy_scale, plan.energy_weight)
+    loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
     return Problem(emulator, runs, optimiser, _make_step(emulator, plan, runs, loss, optimiser))
 
 
-def _scales(scene: Scene, plan: Plan, runs: Runs) -> tuple[np.ndarray, float]:
-    """Of the network's output by component, (3,) mm, and of the displacements, mm."""
+def _scales(scene: Scene, plan: Plan, runs: Runs) -> tuple[np.ndarray, Scales]:
+    """Of the network's output by component, (3,) mm, and of the loss, from what runs differ by."""
     centre = np.asarray(runs.displacement[0])
     known = len(runs.theta) > 1 and plan.objective != "energy"
     deviation = np.asarray(runs.displacement[1:]) - centre if known else _GUESS * centre[None]
     free = ~scene.held
     component = [float(np.sqrt(np.mean(deviation[:, free[:, k], k] ** 2))) for k in range(3)]
-    spread = float(np.sqrt(np.mean(np.sum(deviation**2, axis=-1))))
+    scales = Scales(
+        displacement=float(np.sqrt(np.mean(np.sum(deviation**2, axis=-1)))),
+        gradient=float(jnp.sqrt(mean_square_gradient(scene, jnp.asarray(deviation)))),
+        energy=float(jnp.abs(runs.energy[0])),
+    )
     if not plan.centred:
-        return np.full(3, np.sqrt(np.mean(centre**2))), spread
-    return np.maximum(component, 1e-3 * max(component)), spread
+        return np.full(3, np.sqrt(np.mean(centre**2))), scales
+    return np.maximum(component, 1e-3 * max(component)), scales
 
 
 def _make_step(

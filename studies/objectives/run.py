@@ -1,0 +1,204 @@
+"""What a network learns from each training objective, in equally many steps, judged by FEM.
+
+    python studies/objectives/run.py [--steps N] [--simulations N] [--tests N]
+    python studies/objectives/run.py --quick --out DIR    # a coarse beam, few steps
+
+Each objective is trained in a process of its own, so that compilation and FEM runs count and no
+factor of another's runs is met again. Seconds on the cores depend less than a clock's on what else
+the machine does; both are kept. Writes results.json and objectives.png beside itself, or under
+--out, and asserts what the README says.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+
+import emulator as em
+from calibrate.evaluation_figures import LABELS, log_density
+from calibrate.figures import pyplot
+from calibrate.provenance import study_header
+from emulator.evaluation import Errors, case_errors, quantiles
+from emulator.network import Architecture, load, save_emulator
+from emulator.scenes import Scene
+from emulator.store import replacing, write_json
+from emulator.training import Plan, recipe, remove_checkpoint, run_campaign, sobol, train
+
+HERE = Path(__file__).parent
+TEST_SEED = 90_210
+# Our name, the paper's, and a colour.
+OBJECTIVES = {
+    "simulations": ("DD", "tab:orange"),
+    "gradients": ("F-DD", "tab:green"),
+    "energy": ("PI", "tab:blue"),
+    "both": ("DD and PI", "tab:red"),
+}
+UNTRAINED, SHIPPED = "the centre's solution", "shipped emulator"
+COARSE = (4, 2, 2)
+SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
+
+
+def beam(quick: bool) -> Scene:
+    """The built-in beam, or a coarse one."""
+    return em.scenes.once_clamped_beam(*([COARSE] if quick else []))
+
+
+def plan_of(objective: str, steps: int, simulations: int, quick: bool) -> Plan:
+    """The recipe ``network`` with another objective: same weights, theta and rates for all."""
+    plan = replace(recipe("network"), steps=steps, simulations=simulations)
+    plan = replace(plan, objective=objective)  # type: ignore[arg-type] - a name of OBJECTIVES
+    return replace(plan, batch=8, learning_rate=3e-3) if quick else plan
+
+
+def train_one(scene: Scene, plan: Plan, folder: Path, quick: bool) -> None:
+    """Train and write the emulator to ``folder``, with this process's seconds on the cores."""
+    trained = train(scene, plan, folder, architecture=SMALL if quick else None)
+    record = {**trained.record, "processor_s": round(time.process_time(), 1)}
+    save_emulator(replace(trained, record=record), folder)
+    remove_checkpoint(folder)
+
+
+def in_its_own_process(objective: str, folder: Path, arguments: argparse.Namespace) -> None:
+    """:func:`train_one`, with nothing compiled or factorised before."""
+    words = ["--one", objective, "--out", str(folder), "--steps", str(arguments.steps)]
+    words += ["--simulations", str(arguments.simulations)]
+    words += ["--quick"] if arguments.quick else []
+    subprocess.run([sys.executable, __file__, *words], check=True)
+
+
+def fem_seconds(scene: Scene, plan: Plan) -> float:
+    """On the cores, of the FEM runs that ``plan`` trains on, compilation included."""
+    thetas = scene.centre[None]
+    if plan.runs:
+        thetas = jnp.concatenate([thetas, sobol(scene, plan.runs, plan.seed)])
+    begin = time.process_time()
+    run_campaign(em.Simulator(scene), thetas)
+    return round(time.process_time() - begin, 1)
+
+
+def row(name: str, errors: Errors, **facts: object) -> dict[str, Any]:
+    """A line of the table: quantiles of the four errors, and what it took."""
+    found = {key: quantiles(errors.fields[key]) for key in LABELS if key in errors.fields}
+    told = "  ".join(f"{key} {value['median']:.2e}" for key, value in found.items())
+    print(f"{name:22s} {told}", flush=True)
+    return {"name": name, "status": "done", **facts, **found}
+
+
+def study(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Errors]]:
+    """Train by every objective and judge all by FEM at theta none of them has seen."""
+    scene = beam(arguments.quick)
+    plans = {
+        objective: plan_of(objective, arguments.steps, arguments.simulations, arguments.quick)
+        for objective in OBJECTIVES
+    }
+    fem = {objective: fem_seconds(scene, plans[objective]) for objective in ("energy", "both")}
+    known = run_campaign(em.Simulator(scene), sobol(scene, arguments.tests, TEST_SEED))
+    cases, errors = [], {}
+    with tempfile.TemporaryDirectory() as temporary:
+        for objective, plan in plans.items():
+            folder = (arguments.emulators or Path(temporary)) / objective
+            if not (folder / "emulator.json").is_file():
+                in_its_own_process(objective, folder, arguments)
+            trained = load(folder, scene)
+            if trained.record["plan"] != asdict(plan):
+                raise SystemExit(f"{folder} was trained otherwise: {trained.record['plan']}")
+            errors[objective] = case_errors(trained.cache(), known.theta, known.displacement)
+            facts = {
+                "paper": OBJECTIVES[objective][0],
+                "steps": plan.steps,
+                "fem_runs": plan.runs + 1,
+                "seconds": trained.record["seconds"],
+                "processor_s": trained.record["processor_s"],
+                "fem_processor_s": fem["both" if plan.runs else "energy"],
+            }
+            cases.append(row(objective, errors[objective], **facts))
+    before = replace(trained, base="series")  # of order 0: the centre's solution, whatever theta
+    errors[UNTRAINED] = case_errors(before.cache(), known.theta, known.displacement)
+    cases.append(row(UNTRAINED, errors[UNTRAINED], fem_runs=1))
+    shipped = load("once_clamped_beam")
+    if shipped.scene.fingerprint == scene.fingerprint:
+        ours = case_errors(shipped.cache(), known.theta, known.displacement)
+        facts = {
+            "fem_runs": shipped.record["plan"]["simulations"] + 1,
+            "seconds": shipped.record["seconds"],
+        }
+        cases.append(row(SHIPPED, ours, **facts))
+    return cases, errors
+
+
+def draw(errors: dict[str, Errors], path: Path, title: str) -> None:
+    """Densities of the four errors, a curve an objective."""
+    plt = pyplot()
+    figure, grid = plt.subplots(2, 2, figsize=(9.5, 6.6), layout="constrained")
+    names = [name for name in LABELS if name in errors[UNTRAINED].fields]
+    for axes, name in zip(grid.flat, names, strict=True):
+        for label, found in errors.items():
+            curve = log_density(found.fields[name])
+            if curve is None:
+                continue
+            if label == UNTRAINED:
+                axes.plot(*curve, color="0.55", lw=1.2, ls="--", label=label)
+                continue
+            paper, colour = OBJECTIVES[label]
+            axes.plot(*curve, color=colour, lw=1.7, label=f"{label} ({paper})")
+            axes.axvline(quantiles(found.fields[name])["median"], color=colour, lw=0.8, ls=":")
+        axes.set(xscale="log", xlabel=LABELS[name], ylim=(0.0, None), yticks=[])
+        axes.spines[["top", "right", "left"]].set_visible(False)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    figure.suptitle(title)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=130)
+    plt.close(figure)
+
+
+def check(cases: list[dict[str, Any]]) -> None:
+    """The claims of the study's README."""
+    medians = {
+        key: {case["name"]: case[key]["median"] for case in cases}
+        for key in ("err_u", "err_F", "err_I1", "err_Pi")
+    }
+    for key in ("err_F", "err_I1", "err_Pi"):
+        assert medians[key]["gradients"] < 0.5 * medians[key]["simulations"], key
+    assert medians["err_u"]["gradients"] < 2.0 * medians["err_u"]["simulations"]
+    assert min(OBJECTIVES, key=medians["err_Pi"].__getitem__) == "both"
+    assert medians["err_u"]["energy"] > 5.0 * medians["err_u"]["simulations"]
+    for key, errors in medians.items():
+        assert errors[SHIPPED] < 1e-3 * min(errors[name] for name in OBJECTIVES), key
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, help="optimiser steps (default 1000; 60 with --quick)")
+    parser.add_argument("--simulations", type=int, help="FEM runs (default 128; 16 with --quick)")
+    parser.add_argument("--tests", type=int, help="held-out theta (default 50; 4 with --quick)")
+    parser.add_argument("--quick", action="store_true", help="a coarse beam and a small network")
+    parser.add_argument("--emulators", type=Path, help="keep the trained here, use those there")
+    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--one", choices=tuple(OBJECTIVES), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    for name, full, quick in (("steps", 1000, 60), ("simulations", 128, 16), ("tests", 50, 4)):
+        if getattr(arguments, name) is None:
+            setattr(arguments, name, quick if arguments.quick else full)
+    if arguments.one:
+        plan = plan_of(arguments.one, arguments.steps, arguments.simulations, arguments.quick)
+        train_one(beam(arguments.quick), plan, arguments.out, arguments.quick)
+        return
+    cases, errors = study(arguments)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    write_json(arguments.out / "results.json", {**study_header(HERE, TEST_SEED), "cases": cases})
+    title = f"once-clamped beam: {arguments.steps} steps by each objective, against FEM"
+    draw(errors, arguments.out / "objectives.png", title)
+    if not arguments.quick:
+        check(cases)
+
+
+if __name__ == "__main__":
+    main()
