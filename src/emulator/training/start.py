@@ -1,7 +1,8 @@
 """Starting a training from the network of another emulator.
 
 Encoders, messages and decoders are shared by all nodes, so their weights fit any mesh (Dalton et
-al. 2023, Appendix E). Series, scale and graph belong to one scene and are never carried over.
+al. 2023, Appendix E). Series, scale and graph belong to one scene and are never carried over; the
+ranges of the parameters may differ, because the network sees positions in the box.
 """
 
 from __future__ import annotations

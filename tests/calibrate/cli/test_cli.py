@@ -271,9 +271,7 @@ def test_a_mesh_with_a_flat_element(capsys, block):
 def test_training_starts_from_another_emulator(capsys, block, tmp_path):
     words = ["--objective", "energy", "--steps", 2, "--batch", 2]
     first, second = tmp_path / "a", tmp_path / "b"
-    code, record = answer(
-        capsys, "train", block, "--recipe", "network", *words, "--out", first
-    )
+    code, record = answer(capsys, "train", block, "--recipe", "network", *words, "--out", first)
     assert code == 0
     assert "start" not in record
     code, record = answer(capsys, "train", block, *words, "--start", first, "--out", second)

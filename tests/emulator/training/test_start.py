@@ -3,12 +3,13 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.network import Architecture, load, save_emulator
+from emulator.network import load, save_emulator
 from emulator.training import Plan, pretrain, recipe, train
 from emulator.training.checkpoint import CHECKPOINT
 from emulator.training.start import with_network_of
@@ -35,6 +36,12 @@ def start(beam):
 
 
 @pytest.fixture(scope="module")
+def own(other):
+    """What training the other beam afresh works on."""
+    return prepare(other, PLAN, SMALL)
+
+
+@pytest.fixture(scope="module")
 def whole(other, start, tmp_path_factory):
     return train(other, PLAN, tmp_path_factory.mktemp("whole"), start=start)
 
@@ -52,12 +59,11 @@ def kill_after(writes, module, monkeypatch):
     monkeypatch.setattr(module, "write_checkpoint", killed)
 
 
-def test_before_any_step_the_network_is_the_other_ones(other, start):
+def test_before_any_step_the_network_is_the_other_ones(other, own, start):
     problem = prepare(other, PLAN, start=start)
-    emulator = problem.emulator
+    emulator, own = problem.emulator, own.emulator
     same(emulator.weights, start.weights)
     assert emulator.architecture == SMALL
-    own = prepare(other, PLAN, SMALL).emulator
     np.testing.assert_array_equal(emulator.scale, own.scale)
     np.testing.assert_array_equal(emulator.series.displacement, own.series.displacement)
     # The prediction by hand: the old network on the new graph, in the new scale, on the new series.
@@ -70,27 +76,26 @@ def test_before_any_step_the_network_is_the_other_ones(other, start):
     assert np.abs(emulator(theta) - own(theta)).max() > 1e-3
 
 
-def test_the_emulator_started_from_is_left_as_it_was(other, start):
-    before = start.fingerprint
-    problem = prepare(other, PLAN, start=start)
-    state = problem.optimiser.init(problem.emulator.weights)
-    problem.step(problem.emulator.weights, state, 0, 12)  # consumes its weights
-    assert untrained(start.scene).fingerprint == before
-    same(start.weights, untrained(start.scene).weights)
+def test_training_leaves_the_emulator_it_started_from(whole, start, beam):
+    # A step consumes the weights it is given; these were a copy.
+    same(start.weights, untrained(beam).weights)
+    assert any(
+        (a != b).any()
+        for a, b in zip(jax.tree.leaves(whole.weights), jax.tree.leaves(start.weights), strict=True)
+    )
 
 
-def test_where_a_training_started_is_recorded(whole, start, other, tmp_path):
+def test_where_a_training_started_is_recorded(whole, start, tmp_path):
     assert whole.record["start"] == {
         "scene": "once_clamped_beam",
         "scene_fingerprint": start.scene.fingerprint,
         "fingerprint": start.fingerprint,
     }
-    assert "start" not in train(other, PLAN, tmp_path, architecture=SMALL).record
     save_emulator(whole, tmp_path / "e")
     assert load(tmp_path / "e").record["start"]["fingerprint"] == start.fingerprint
 
 
-@pytest.mark.parametrize("writes", [1, 2])
+@pytest.mark.parametrize("writes", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_started_run_killed_resumes_without_its_start(
     other, start, whole, tmp_path, monkeypatch, writes
 ):
@@ -134,33 +139,32 @@ def pretrained(beam, other, tmp_path_factory):
     return pretrain([beam, other], FAMILY, folder, architecture=SMALL)
 
 
-def test_a_family_shares_one_network(beam, other, pretrained):
+def test_a_family_shares_one_network(beam, other, own, pretrained):
     same(pretrained[0].weights, pretrained[1].weights)
     assert [e.scene for e in pretrained] == [beam, other]
-    own = prepare(other, FAMILY, SMALL).emulator
-    np.testing.assert_array_equal(pretrained[1].scale, own.scale)
-    same(pretrained[1].graph.edge_features, own.graph.edge_features)
+    np.testing.assert_array_equal(pretrained[1].scale, own.emulator.scale)
+    same(pretrained[1].graph.edge_features, own.emulator.graph.edge_features)
     assert pretrained[0].record["family"] == [beam.fingerprint, other.fingerprint]
 
 
-def test_a_family_takes_its_scenes_in_turn(beam, other, pretrained):
-    problems = [prepare(scene, FAMILY, SMALL) for scene in (beam, other)]
+def test_a_family_takes_its_scenes_in_turn(beam, own, pretrained):
+    problems = [prepare(beam, FAMILY, SMALL), own]
     weights = with_network_of(problems[0].emulator, problems[1].emulator).weights
     state = problems[0].optimiser.init(weights)
     for number in range(FAMILY.steps):
-        weights, state, _ = problems[number % 2].step(weights, state, number, FAMILY.steps)
+        weights, state, _ = problems[number % 2].step(
+            weights, state, jnp.asarray(number), jnp.asarray(FAMILY.steps)
+        )
     same(weights, pretrained[0].weights)
 
 
-@pytest.mark.parametrize("writes", [1, 3])
-def test_a_family_killed_resumes_to_the_same(
-    beam, other, pretrained, tmp_path, monkeypatch, writes
-):
+@pytest.mark.slow
+def test_a_family_killed_resumes_to_the_same(beam, other, pretrained, tmp_path, monkeypatch):
     from emulator.training import family
 
     scenes = [beam, other]
     with monkeypatch.context() as patch:
-        kill_after(writes, family, patch)
+        kill_after(1, family, patch)
         with pytest.raises(KeyboardInterrupt):
             pretrain(scenes, FAMILY, tmp_path, architecture=SMALL)
     resumed = pretrain(scenes, Plan(), tmp_path, resume=True)
@@ -174,10 +178,5 @@ def test_families_that_cannot_be(beam, cube, tmp_path):
         pretrain([], FAMILY, tmp_path)
     with pytest.raises(InputError, match="learns a residual, which belongs to one scene"):
         pretrain([beam], recipe("hybrid"), tmp_path)
-    with pytest.raises(InputError, match="'twisting_cube' has degrees"):
+    with pytest.raises(InputError, match="'twisting_cube' has E, nu"):
         pretrain([beam, cube], FAMILY, tmp_path, architecture=SMALL)
-
-
-def test_the_network_of_a_default_architecture_is_the_default(other, beam, tmp_path):
-    fresh = untrained(beam, architecture=Architecture())
-    assert prepare(other, PLAN, start=fresh).emulator.architecture == Architecture()
