@@ -183,7 +183,7 @@ def test_transfer(tmp_path):
         "--tests",
         2,
     )
-    results = run("transfer", "--quick", *small, "--out", tmp_path)
+    results = run("transfer", "--quick", "--one", *small, "--out", tmp_path)
     cases = {case["name"]: case for case in results["cases"]}
     assert len(cases) == 8
     # Before any step, from scratch is the centre's solution and a transfer is not.
