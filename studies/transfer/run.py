@@ -2,8 +2,8 @@
 
 ``python studies/transfer/run.py [--quick] [--one]``. Trains one network on a family of ventricles,
 then trains on a ventricle of another shape and another mesh, from scratch and from the family, each
-for several numbers of steps. Writes results.json and
-transfer.png beside itself, or under --out, and asserts what the README says.
+for several numbers of steps. Writes results.json and transfer.png beside itself, or under --out,
+and asserts what the README says.
 """
 
 import argparse
