@@ -168,6 +168,31 @@ def test_new_ventricle(tmp_path):
 
 
 @pytest.mark.slow
+def test_transfer(tmp_path):
+    small = (
+        "--family",
+        2,
+        "--pretrain",
+        6,
+        "--steps",
+        3,
+        "--longest",
+        4,
+        "--runs",
+        3,
+        "--tests",
+        2,
+    )
+    results = run("transfer", "--quick", "--one", *small, "--out", tmp_path)
+    cases = {case["name"]: case for case in results["cases"]}
+    assert len(cases) == 8
+    # Before any step, from scratch is the centre's solution and a transfer is not.
+    scratch, family = (cases[f"from {name}, 0 steps"] for name in ("scratch", "the family"))
+    assert scratch["err_u"]["median"] != family["err_u"]["median"]
+    assert (tmp_path / "transfer.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
 def test_decoder_speed(tmp_path):
     results = run("decoder_speed", "--quick", "--out", tmp_path)  # asserts equal gradients
     cases = {case["name"]: case for case in results["cases"]}

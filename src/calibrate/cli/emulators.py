@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +26,12 @@ def register(commands: Any) -> None:
         choices=("hybrid", "mechanics", "network", "paper"),
         help="default hybrid: Taylor series, network trained on the energy, residual of FEM runs; "
         "mechanics: the same without the network, in a minute",
+    )
+    parser.add_argument(
+        "--start",
+        metavar="EMULATOR",
+        help="begin from the network of this emulator (shipped name or folder), whatever its mesh; "
+        "the recipe then is network unless another is given",
     )
     parser.add_argument(
         "--objective",
@@ -52,7 +59,7 @@ def train(arguments: argparse.Namespace) -> int:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
     from emulator.errors import InputError
-    from emulator.network import save_emulator
+    from emulator.network import load, save_emulator
     from emulator.scenes import find_scene
     from emulator.store import check_folder
     from emulator.training import recipe, remove_checkpoint
@@ -63,22 +70,25 @@ def train(arguments: argparse.Namespace) -> int:
     names = ("objective", "steps", "simulations", "batch", "seed")
     given = {name: getattr(arguments, name) for name in names}
     given = {name: value for name, value in given.items() if value is not None}
-    if arguments.resume and (given or arguments.budget or arguments.recipe):
-        option = next(iter(given), "recipe" if arguments.recipe else "budget")
+    others = [name for name in ("recipe", "start", "budget") if getattr(arguments, name)]
+    if arguments.resume and (given or others):
+        option = next(iter([*given, *others]))
         raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
-    plan = recipe(arguments.recipe or "hybrid")
+    start = load(arguments.start) if arguments.start else None
+    plan = recipe(arguments.recipe or ("network" if start else "hybrid"))
     fixed = arguments.resume or "steps" in given
     result = train_emulator(
         scene,
         replace(plan, **given),
         arguments.out,
+        start=start,
         budget=None if fixed else seconds(arguments.budget or "10m"),
         resume=arguments.resume,
         progress=show_progress(arguments),
     )
     record = {
         **result.record,
-        "command": command_line(arguments.scene, result.record["plan"]),
+        "command": command_line(arguments.scene, result.record),
         "budget": arguments.budget,
         "hardware": hardware(),
         "versions": versions(),
@@ -92,8 +102,10 @@ def train(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def command_line(scene: str, plan: dict[str, Any]) -> str:
+def command_line(scene: str, record: Mapping[str, Any]) -> str:
     """The command that repeats a training exactly, whatever interrupted or hurried it."""
     names = ("recipe", "objective", "steps", "simulations", "batch", "seed")
-    options = " ".join(f"--{name} {plan[name]}" for name in names)
-    return f"calibrate train {scene} {options} --out DIR"
+    options = " ".join(f"--{name} {record['plan'][name]}" for name in names)
+    # Which emulator it started from is in the record, by its fingerprint.
+    start = " --start EMULATOR" if "start" in record else ""
+    return f"calibrate train {scene} {options}{start} --out DIR"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from emulator.geometry.ellipsoid import human_ventricle
+from dataclasses import astuple
+
+from emulator.geometry.ellipsoid import HUMAN, EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.pressure import KPA_PER_MMHG, CavityPressure
@@ -33,6 +35,7 @@ def left_ventricle(
     layers: int = 3,
     angles: tuple[float, float] = HELIX,
     kappa: float = 25.0,
+    wall: tuple[float, float, float, float, float] = astuple(HUMAN),
 ) -> Scene:
     """Holzapfel-Ogden ventricle under cavity pressure, its base held.
 
@@ -52,8 +55,9 @@ def left_ventricle(
         :func:`~emulator.geometry.ellipsoid.truncated_ellipsoid`; the default has 1564 nodes.
     angles : helix angle in degrees on the endocardium and on the epicardium.
     kappa : resistance to volume change, kPa.
+    wall : dimensions in mm, those of :class:`~emulator.geometry.ellipsoid.EllipsoidalWall`.
     """
-    mesh = human_ventricle(rings, around, layers)
+    mesh = truncated_ellipsoid(EllipsoidalWall(*wall), rings, around, layers)
     return Scene(
         name="left_ventricle",
         mesh=mesh,
@@ -70,5 +74,7 @@ def left_ventricle(
             "layers": layers,
             "angles": list(angles),
             "kappa": kappa,
+            # Only where it is another, so that files of the default say what they always said.
+            **({} if wall == astuple(HUMAN) else {"wall": list(wall)}),
         },
     )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,14 +23,14 @@ from emulator.network.emulator import BASES, Emulator, fresh
 from emulator.network.graph import augment
 from emulator.network.pignn import Architecture
 from emulator.scenes.scene import Scene
-from emulator.store import fill_tree, read_arrays, save_tree
 from emulator.training.basis import mechanical_modes
+from emulator.training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from emulator.training.objectives import Batch, Scales, make_loss, mean_square_gradient
 from emulator.training.plan import Plan
 from emulator.training.residual_stage import FEWEST, add_residual, rounded
 from emulator.training.sampling import design, sobol, uniform
+from emulator.training.start import architecture_from, start_record, with_network_of
 
-CHECKPOINT = "checkpoint.safetensors"
 WARMUP = 100
 # Without FEM runs the spread of the displacements is unknown; this much of the centre's will do.
 _GUESS = 0.2
@@ -65,6 +64,7 @@ def prepare(
     plan: Plan,
     architecture: Architecture | None = None,
     *,
+    start: Emulator | None = None,
     deadline: float = np.inf,
     progress: bool = False,
 ) -> Problem:
@@ -72,9 +72,13 @@ def prepare(
 
     Parameters
     ----------
+    start : the emulator whose network to begin from, on whatever mesh; its architecture then is
+        the default.
     deadline : of the performance counter, after which no FEM run is begun, the fewest that a
         residual can be judged by excepted.
     """
+    if start is not None:
+        architecture = architecture_from(start, scene, plan, architecture)
     simulator = Simulator(scene)
     # Rounded to what a file keeps, so that the residual is fitted to what will be loaded.
     series = rounded(expand(simulator, order=plan.order)) if plan.order else None
@@ -102,6 +106,8 @@ def prepare(
     if plan.decoder == "separable":
         basis = (mechanical_modes(simulator, series, plan.modes) / scale).astype(np.float32)
     emulator = fresh(scene, augment(scene), architecture, series, scale, plan.seed, basis)
+    if start is not None:
+        emulator = with_network_of(emulator, start)
     loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
     return Problem(emulator, runs, optimiser, _make_step(emulator, plan, runs, loss, optimiser))
@@ -185,6 +191,7 @@ def train(
     folder: str | Path,
     *,
     architecture: Architecture | None = None,
+    start: Emulator | None = None,
     budget: float | None = None,
     progress: bool = False,
     resume: bool = False,
@@ -195,31 +202,34 @@ def train(
     ----------
     folder : where checkpoints go. The finished emulator is returned, not written; remove the last
         checkpoint with :func:`remove_checkpoint` once it is safe.
+    start : begin from the network of this emulator, which may be of another geometry.
     budget : seconds for everything (FEM runs, compilation, training, the residual); replaces
         ``plan.steps`` by as many as fit, aimed again as the machine gets busier or less so, and
         ``plan.simulations`` by as many as were done in its first third. Where a residual follows,
         which soon outdoes the network, neither is made larger.
-    resume : continue from the checkpoint in ``folder``, under the plan it was written with. For a
-        plan in steps the result equals that of a run never interrupted; one on a budget keeps the
-        number of steps it was aiming at.
+    resume : continue from the checkpoint in ``folder``, under the plan it was written with and with
+        the network it had, whatever that started from. For a plan in steps the result equals that
+        of a run never interrupted; one on a budget keeps the number of steps it was aiming at.
     """
     started = time.perf_counter()
     checkpoint = Path(folder) / CHECKPOINT
-    saved = _read_checkpoint(checkpoint, scene) if resume else None
-    plan = saved.plan if saved else plan
+    saved = read_checkpoint(checkpoint, scene.fingerprint, scene.name) if resume else None
+    origin = start_record(start) if start is not None else {}
+    if saved:
+        plan, architecture, origin = saved.plan, saved.architecture or architecture, saved.start
+        start = None  # its network is in the checkpoint
     spent = saved.seconds if saved else 0.0
     timed = budget is not None and not saved and plan.residual
     latest = started + _FEM_SHARE * budget if timed and budget is not None else np.inf
-    problem = prepare(scene, plan, architecture, deadline=latest, progress=progress)
+    problem = prepare(scene, plan, architecture, start=start, deadline=latest, progress=progress)
     weights, first = problem.emulator.weights, 0
     state = problem.optimiser.init(weights)
     if plan.runs:
         plan = replace(plan, simulations=len(problem.runs.theta) - 1)
     deadline, most = None, plan.steps if plan.residual else np.iinfo(np.int64).max
     if saved:
-        tree = fill_tree({"weights": weights, "state": state}, saved.arrays, str(checkpoint))
-        weights, state = jax.tree.map(jnp.asarray, (tree["weights"], tree["state"]))
-        first = int(saved.arrays["['step']"])
+        weights, state = saved.restore(weights, state)
+        first = saved.step
     elif budget is not None and plan.steps:
         share = _NETWORK_SHARE if plan.residual else 0.99
         deadline = started + share * budget
@@ -230,7 +240,8 @@ def train(
 
     def keep(weights: Weights, state: Any, done: int) -> None:
         seconds = spent + time.perf_counter() - started
-        _write_checkpoint(checkpoint, scene, plan, (weights, state, done), seconds, loss)
+        sizes, at = problem.emulator.architecture, (weights, state, done)
+        write_checkpoint(checkpoint, scene.fingerprint, plan, sizes, origin, at, seconds, loss)
 
     if not saved:
         keep(weights, state, 0)
@@ -260,6 +271,8 @@ def train(
     if plan.steps and not np.isfinite(loss):
         raise SolverError("training ended in a loss that is not finite; lower the learning rate")
     record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
+    if origin:
+        record["start"] = origin
     emulator = replace(problem.emulator, weights=weights)
     if plan.residual:
         keep(weights, state, done)
@@ -304,38 +317,3 @@ def _seconds_a_step(problem: Problem, plan: Plan, *kept: jax.Array) -> float:
         value.block_until_ready()
         durations.append(time.perf_counter() - begin)
     return float(np.median(durations[1:]))
-
-
-class _Checkpoint(NamedTuple):
-    plan: Plan
-    seconds: float
-    loss: float
-    arrays: dict[str, np.ndarray]
-
-
-def _write_checkpoint(
-    path: Path,
-    scene: Scene,
-    plan: Plan,
-    progress: tuple[Any, Any, int],
-    seconds: float,
-    loss: float,
-) -> None:
-    weights, state, step = progress
-    metadata = {
-        "plan": json.dumps(asdict(plan)),
-        "fingerprint": scene.fingerprint,
-        "seconds": repr(seconds),
-        "loss": repr(loss),
-    }
-    save_tree(path, {"weights": weights, "state": state, "step": np.asarray(step)}, metadata)
-
-
-def _read_checkpoint(path: Path, scene: Scene) -> _Checkpoint:
-    if not path.is_file():
-        raise InputError(f"nothing to resume: checkpoint {path} does not exist")
-    arrays, metadata = read_arrays(path)
-    if metadata.get("fingerprint") != scene.fingerprint:
-        raise InputError(f"{path} belongs to another scene than '{scene.name}'; train afresh")
-    plan = Plan(**json.loads(metadata["plan"]))
-    return _Checkpoint(plan, float(metadata["seconds"]), float(metadata.get("loss", "nan")), arrays)

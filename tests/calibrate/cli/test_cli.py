@@ -9,7 +9,7 @@ import pytest
 
 from calibrate.cli import main
 from emulator.geometry.generators import box
-from emulator.network.files import SHIPPED
+from emulator.network.files import SHIPPED, load
 
 SCENE = """
 law = "neo_hookean"
@@ -170,6 +170,14 @@ def test_bad_meshes_in_scene_files(capsys, block):
             ["train", "once_clamped_beam", "--resume", "--steps", "9", "--out", "x"],
             "--steps has no effect with --resume",
         ),
+        (
+            ["train", "once_clamped_beam", "--resume", "--start", "liver", "--out", "x"],
+            "--start has no effect with --resume",
+        ),
+        (
+            ["train", "twice_clamped_beam", "--start", "once_clamped_beam", "--out", "x"],
+            "coefficients of mechanical modes mean nothing on another mesh",
+        ),
         (["train", "once_clamped_beam", "--resume", "--out", "x"], "nothing to resume"),
         (["train", "once_clamped_beam", "--steps", "9", "--seed", "-1", "--out", "x"], "seed -1"),
         (["train", "once_clamped_beam", "--steps", "9", "--out", "/dev/null/x"], "cannot write to"),
@@ -261,6 +269,19 @@ def test_a_mesh_with_a_flat_element(capsys, block):
     assert "block.vtu: element 5 has no volume, 1 such of 12" in complaint(
         capsys, "simulate", block
     )
+
+
+def test_training_starts_from_another_emulator(capsys, block, tmp_path):
+    words = ["--objective", "energy", "--steps", 2, "--batch", 2]
+    first, second = tmp_path / "a", tmp_path / "b"
+    code, record = answer(capsys, "train", block, "--recipe", "network", *words, "--out", first)
+    assert code == 0
+    assert "start" not in record
+    code, record = answer(capsys, "train", block, *words, "--start", first, "--out", second)
+    assert code == 0
+    assert record["start"]["fingerprint"] == load(first).fingerprint
+    assert record["plan"]["recipe"] == "network"
+    assert record["command"].endswith("--seed 0 --start EMULATOR --out DIR")
 
 
 def test_train_evaluate_infer_certify(capsys, block, tmp_path):

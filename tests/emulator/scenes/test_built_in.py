@@ -8,7 +8,7 @@ import emulator as em
 from emulator.fem import Status
 from emulator.mechanics.energy import volume_ratio
 from emulator.mechanics.pressure import KPA_PER_MMHG, cavity_volume
-from emulator.scenes import BUILT_IN, find_scene
+from emulator.scenes import BUILT_IN, find_scene, scene_from_recipe
 
 COARSE = {
     "left_ventricle": {"rings": 5, "around": 12, "layers": 1},
@@ -65,6 +65,14 @@ def test_a_ventricle_fills_with_pressure_and_resists_by_its_fibres():
     low, high = (filled(simulator, pressure=p)["endocardium"] for p in (0.6, 1.3))
     assert rest < low < high
     assert filled(simulator, pressure=1.3, a_f=10.0)["endocardium"] < high
+
+
+def test_a_ventricle_of_other_dimensions_is_made_again_by_its_recipe():
+    wall = (18.0, 48.0, 31.0, 57.0, 16.0)
+    scene = em.scenes.left_ventricle(5, 12, 1, wall=wall)
+    assert scene.mesh.nodes[:, 2].max() == pytest.approx(16.0)
+    assert scene_from_recipe(scene.recipe).fingerprint == scene.fingerprint
+    assert "wall" not in em.scenes.left_ventricle(5, 12, 1).recipe
 
 
 def test_each_ventricle_has_its_own_pressure():

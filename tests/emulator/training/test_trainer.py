@@ -10,8 +10,9 @@ from emulator.errors import InputError
 from emulator.evaluation import evaluate
 from emulator.network import Architecture
 from emulator.training import Plan, recipe, run_campaign, sobol, train, uniform
+from emulator.training.checkpoint import CHECKPOINT
 from emulator.training.objectives import OBJECTIVES, Batch, Scales, make_loss
-from emulator.training.trainer import CHECKPOINT, WARMUP, learning_rate
+from emulator.training.trainer import WARMUP, learning_rate
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 SCALES = Scales(displacement=2.0, gradient=0.3, energy=7.0)
@@ -43,7 +44,7 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
 
     from emulator.training import trainer
 
-    write, kept = trainer._write_checkpoint, []
+    write, kept = trainer.write_checkpoint, []
 
     def kill_after_second(*arguments):
         write(*arguments)
@@ -51,10 +52,10 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
         if len(kept) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer, "_write_checkpoint", kill_after_second)
+    monkeypatch.setattr(trainer, "write_checkpoint", kill_after_second)
     with pytest.raises(KeyboardInterrupt):
         train(beam, plan, tmp_path / "killed", architecture=SMALL)
-    monkeypatch.setattr(trainer, "_write_checkpoint", write)
+    monkeypatch.setattr(trainer, "write_checkpoint", write)
     # The plan comes from the checkpoint, not from the call.
     resumed = train(beam, Plan(), tmp_path / "killed", architecture=SMALL, resume=True)
     for a, b in zip(jax.tree.leaves(whole.weights), jax.tree.leaves(resumed.weights), strict=True):
@@ -269,7 +270,7 @@ def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatc
     """After its modes are frozen, and in the residual's fit."""
     from emulator.training import trainer
 
-    write, kept = trainer._write_checkpoint, []
+    write, kept = trainer.write_checkpoint, []
 
     def killed(*arguments):
         write(*arguments)
@@ -277,10 +278,10 @@ def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatc
         if len(kept) == writes:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer, "_write_checkpoint", killed)
+    monkeypatch.setattr(trainer, "write_checkpoint", killed)
     with pytest.raises(KeyboardInterrupt):
         train(beam, HYBRID, tmp_path, architecture=SMALL)
-    monkeypatch.setattr(trainer, "_write_checkpoint", write)
+    monkeypatch.setattr(trainer, "write_checkpoint", write)
     resumed = train(beam, Plan(), tmp_path, architecture=SMALL, resume=True)
     assert resumed.fingerprint == hybrid.fingerprint
     assert resumed.record["plan"] == hybrid.record["plan"]

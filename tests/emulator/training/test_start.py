@@ -1,0 +1,182 @@
+"""Starting from another emulator's network, and pretraining one over a family."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.errors import InputError
+from emulator.network import load, save_emulator
+from emulator.training import Plan, pretrain, recipe, train
+from emulator.training.checkpoint import CHECKPOINT
+from emulator.training.start import with_network_of
+from emulator.training.trainer import prepare
+from network_support import SMALL, untrained
+
+PLAN = Plan(objective="energy", steps=12, batch=2, checkpoint_every=5)
+
+
+def same(a, b):
+    for left, right in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+@pytest.fixture(scope="module")
+def other():
+    """The beam on a mesh of another topology."""
+    return em.scenes.once_clamped_beam(cells=(3, 3, 2))
+
+
+@pytest.fixture(scope="module")
+def start(beam):
+    return untrained(beam)
+
+
+@pytest.fixture(scope="module")
+def own(other):
+    """What training the other beam afresh works on."""
+    return prepare(other, PLAN, SMALL)
+
+
+@pytest.fixture(scope="module")
+def whole(other, start, tmp_path_factory):
+    return train(other, PLAN, tmp_path_factory.mktemp("whole"), start=start)
+
+
+def kill_after(writes, module, monkeypatch):
+    """Stop a training after so many checkpoints."""
+    write, kept = module.write_checkpoint, []
+
+    def killed(*arguments):
+        write(*arguments)
+        kept.append(arguments)
+        if len(kept) == writes:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "write_checkpoint", killed)
+
+
+def test_before_any_step_the_network_is_the_other_ones(other, own, start):
+    problem = prepare(other, PLAN, start=start)
+    emulator, own = problem.emulator, own.emulator
+    same(emulator.weights, start.weights)
+    assert emulator.architecture == SMALL
+    np.testing.assert_array_equal(emulator.scale, own.scale)
+    np.testing.assert_array_equal(emulator.series.displacement, own.series.displacement)
+    # The prediction by hand: the old network on the new graph, in the new scale, on the new series.
+    theta = other.theta(mu=60.0, lam=70.0)
+    decoder, prepared = own.prepared(start.weights)
+    raw = np.asarray(decoder(prepared, own.normalise(theta)), dtype=float)
+    expected = np.asarray(own.series.displacement) + own.scale * raw
+    expected[other.held] = other.held_displacement[other.held]
+    np.testing.assert_allclose(emulator(theta), expected, atol=1e-7)
+    assert np.abs(emulator(theta) - own(theta)).max() > 1e-3
+
+
+def test_training_leaves_the_emulator_it_started_from(whole, start, beam):
+    # A step consumes the weights it is given; these were a copy.
+    same(start.weights, untrained(beam).weights)
+    assert any(
+        (a != b).any()
+        for a, b in zip(jax.tree.leaves(whole.weights), jax.tree.leaves(start.weights), strict=True)
+    )
+
+
+def test_where_a_training_started_is_recorded(whole, start, tmp_path):
+    assert whole.record["start"] == {
+        "scene": "once_clamped_beam",
+        "scene_fingerprint": start.scene.fingerprint,
+        "fingerprint": start.fingerprint,
+    }
+    save_emulator(whole, tmp_path / "e")
+    assert load(tmp_path / "e").record["start"]["fingerprint"] == start.fingerprint
+
+
+@pytest.mark.parametrize("writes", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_started_run_killed_resumes_without_its_start(
+    other, start, whole, tmp_path, monkeypatch, writes
+):
+    from emulator.training import trainer
+
+    with monkeypatch.context() as patch:
+        kill_after(writes, trainer, patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(other, PLAN, tmp_path, start=start)
+    # Neither the start nor its architecture is said again.
+    resumed = train(other, Plan(), tmp_path, resume=True)
+    same(resumed.weights, whole.weights)
+    assert resumed.record["start"] == whole.record["start"]
+
+
+def test_what_cannot_be_started_from(beam, other, cube, start, tmp_path):
+    def refused(scene, plan, message, architecture=None, start=start):
+        with pytest.raises(InputError, match=message) as error:
+            train(scene, plan, tmp_path, architecture=architecture, start=start)
+        assert "\n" not in str(error.value)
+
+    wider = replace(SMALL, latent=9)
+    refused(other, PLAN, r"has a network .*latent=8.*; 'once_clamped_beam' .*latent=9", wider)
+    refused(other, replace(PLAN, decoder="separable"), "decoder='pointwise'.*'separable'")
+    refused(cube, PLAN, "'once_clamped_beam' has parameters mu, lam; 'twisting_cube' has")
+    refused(other, replace(PLAN, decoder="separable", order=2), "modes mean nothing on another")
+    refused(other, PLAN, "modes mean nothing", start=em.load("once_clamped_beam"))
+    refused(other, recipe("mechanics"), "recipe 'mechanics' trains no network")
+    clamped = em.Support("right", np.array([0.0, 0.0, -0.1]))
+    moved = replace(other, supports=(*other.supports, clamped))
+    refused(moved, PLAN, "has 6 features a node, 'once_clamped_beam' has 9")
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
+FAMILY = replace(PLAN, steps=9, checkpoint_every=4)
+
+
+@pytest.fixture(scope="module")
+def pretrained(beam, other, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("family")
+    return pretrain([beam, other], FAMILY, folder, architecture=SMALL)
+
+
+def test_a_family_shares_one_network(beam, other, own, pretrained):
+    same(pretrained[0].weights, pretrained[1].weights)
+    assert [e.scene for e in pretrained] == [beam, other]
+    np.testing.assert_array_equal(pretrained[1].scale, own.emulator.scale)
+    same(pretrained[1].graph.edge_features, own.emulator.graph.edge_features)
+    assert pretrained[0].record["family"] == [beam.fingerprint, other.fingerprint]
+
+
+def test_a_family_takes_its_scenes_in_turn(beam, own, pretrained):
+    problems = [prepare(beam, FAMILY, SMALL), own]
+    weights = with_network_of(problems[0].emulator, problems[1].emulator).weights
+    state = problems[0].optimiser.init(weights)
+    for number in range(FAMILY.steps):
+        weights, state, _ = problems[number % 2].step(
+            weights, state, jnp.asarray(number), jnp.asarray(FAMILY.steps)
+        )
+    same(weights, pretrained[0].weights)
+
+
+@pytest.mark.slow
+def test_a_family_killed_resumes_to_the_same(beam, other, pretrained, tmp_path, monkeypatch):
+    from emulator.training import family
+
+    scenes = [beam, other]
+    with monkeypatch.context() as patch:
+        kill_after(1, family, patch)
+        with pytest.raises(KeyboardInterrupt):
+            pretrain(scenes, FAMILY, tmp_path, architecture=SMALL)
+    resumed = pretrain(scenes, Plan(), tmp_path, resume=True)
+    same(resumed[0].weights, pretrained[0].weights)
+    with pytest.raises(InputError, match="belongs to another scene"):
+        pretrain(scenes[::-1], FAMILY, tmp_path, resume=True)
+
+
+def test_families_that_cannot_be(beam, cube, tmp_path):
+    with pytest.raises(InputError, match="no scene is given"):
+        pretrain([], FAMILY, tmp_path)
+    with pytest.raises(InputError, match="learns a residual, which belongs to one scene"):
+        pretrain([beam], recipe("hybrid"), tmp_path)
+    with pytest.raises(InputError, match="'twisting_cube' has E, nu"):
+        pretrain([beam, cube], FAMILY, tmp_path, architecture=SMALL)
