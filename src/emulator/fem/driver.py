@@ -39,6 +39,7 @@ class _Ramp(NamedTuple):
 # The first takes ventricles from rest to all but their softest corners, in four to six steps: with
 # the whole load at once one in three is lost. The last is for beams that turn.
 _RAMPS = (_Ramp(0.5, 0.25, 12), _Ramp(0.25, 0.125, 20), _Ramp(0.1, 0.1, 40))
+_WHOLE = _Ramp(1.0, 0.0, 8)  # for a start that balances about half of the load or more
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,28 +88,34 @@ class Driver:
         return wanted and far and applies(self.definite)
 
     def _brought_near(self, theta: jax.Array, state: NewtonState) -> NewtonState:
-        """``state`` moved close to equilibrium, or to the foot of its load; steps are counted."""
+        """``state`` moved close to equilibrium, if so; steps are counted.
+
+        If not, a start that loads hardly balance is left at the foot of its load.
+        """
+        from_rest = float(state.error) > UNBALANCED
+        if from_rest and not self.definite.scene.held_displacement.any():
+            state = self._begin(theta, jnp.zeros_like(state.u))  # no worse, and on the loading path
         spent, found = 0, None
-        for ramp in _RAMPS:
-            found, steps = self._climbed(ramp, theta, state)
+        for ramp in _RAMPS if from_rest else (_WHOLE,):
+            found, steps = self._climbed(ramp, theta, state.u, from_rest)
             spent += steps
             if found is not None:
                 state = self._begin(theta, found)
                 break
-        if found is None:
+        if found is None and from_rest:
             # Bodies so soft have several equilibria: take the one that loading leads to.
             state = state._replace(level=jnp.array(_TENTH), increment=jnp.array(_TENTH))
         return state._replace(iterations=jnp.array(spent), factorisations=jnp.array(spent))
 
     def _climbed(
-        self, ramp: _Ramp, theta: jax.Array, start: NewtonState
+        self, ramp: _Ramp, theta: jax.Array, start: jax.Array, from_rest: bool
     ) -> tuple[jax.Array | None, int]:
         """Displacement (n, 3) near equilibrium, if the ``ramp`` leads there; and its steps."""
-        state, level = self._begin_mip(theta, start.u), ramp.first
+        state, level = self._begin_mip(theta, start), ramp.first
         for step in range(ramp.steps):
             # Loads that nothing balances yet lend no stiffness, as in Newton's method.
-            hardly = step == 0 and float(start.error) > UNBALANCED
-            after = _unless_refused(self._mip_step, theta, level, 0.0 if hardly else level, state)
+            stiffening = 0.0 if from_rest and step == 0 else level
+            after = _unless_refused(self._mip_step, theta, level, stiffening, state)
             if after is None or not (float(after.fraction) > 0.0 and jnp.isfinite(after.error)):
                 return None, step + 1
             state = after

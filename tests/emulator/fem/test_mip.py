@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.assembly import System
+from emulator.fem.assembly import System, relative_residual
 from emulator.fem.mip import MipNewton, applies, fraction_at_stress
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws.law import Law
@@ -154,3 +154,22 @@ def test_whom_it_is_for(beam, traction_beam):
     mean = replace(quadratic, law=replace(quadratic.law, exponential=True))
     assert not applies(System(mean))
     assert applies(System(replace(mean, dilatation="pointwise")))
+
+
+def test_a_good_start_keeps_its_load_and_a_poor_one_is_left(ventricle, monkeypatch):
+    simulator, theta = em.Simulator(ventricle), ventricle.centre
+    u = simulator(theta)
+    step, levels = simulator._driver._mip_step, []
+
+    def noting(theta, level, stiffening, state):
+        levels.append(float(level))
+        return step(theta, level, stiffening, state)
+
+    monkeypatch.setitem(simulator._driver.__dict__, "_mip_step", noting)
+    errors = {k: float(relative_residual(simulator.system, k * u, theta)) for k in (0.8, 0.05)}
+    assert 0.05 < errors[0.8] < 0.5 < errors[0.05]
+    good, poor = (simulator.solve(theta, k * u) for k in (0.8, 0.05))
+    assert levels[0] == 1.0
+    assert 0.5 in levels  # from rest
+    for solution in (good, poor):
+        np.testing.assert_allclose(solution.displacement, u, atol=1e-8)
