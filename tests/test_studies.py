@@ -43,6 +43,7 @@ def test_accuracy_vs_time(tmp_path):
     assert (tmp_path / "pareto.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_fem_speed(tmp_path):
     # No dolfin here: compiling its forms alone takes longer than all the rest.
     words = ("--quick", "--fenics-python", tmp_path / "absent", "--out", tmp_path)
@@ -59,6 +60,7 @@ def test_fem_speed_in_full(tmp_path, published):
     run("fem_speed", "--published", published, "--out", tmp_path)  # asserts its own claims
 
 
+@pytest.mark.slow
 def test_stability(tmp_path):
     names = (
         "theta_zero_inside_jit",

@@ -99,6 +99,7 @@ def test_its_folder_is_read_back_and_older_ones_too(folder):
     assert read_posterior(folder)[0] == RUN
 
 
+@pytest.mark.slow
 def test_infer_takes_both_and_infers_a_noise(setting, folder, tmp_path, capsys):
     words = ["infer", "left_ventricle", "--data", str(folder / "data.csv"), "--forward", "reduced"]
     words += ["--fem-runs", "6", "--warmup", "20", "--draws", "20", "--chains", "2", "--no-certify"]

@@ -271,6 +271,7 @@ def test_a_mesh_with_a_flat_element(capsys, block):
     )
 
 
+@pytest.mark.slow
 def test_training_starts_from_another_emulator(capsys, block, tmp_path):
     words = ["--objective", "energy", "--steps", 2, "--batch", 2]
     first, second = tmp_path / "a", tmp_path / "b"

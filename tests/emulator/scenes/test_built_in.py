@@ -75,6 +75,7 @@ def test_a_ventricle_of_other_dimensions_is_made_again_by_its_recipe():
     assert "wall" not in em.scenes.left_ventricle(5, 12, 1).recipe
 
 
+@pytest.mark.slow
 def test_each_ventricle_has_its_own_pressure():
     scene = em.scenes.biventricle(**COARSE["biventricle"])
     fuller = em.scenes.biventricle(**COARSE["biventricle"], right_pressure=0.5)
@@ -93,6 +94,7 @@ def twist(angle: float) -> float:
     return float(u[upper, 1] - u[lower, 1])
 
 
+@pytest.mark.slow
 def test_fibres_at_an_angle_twist_the_beam():
     left, straight, right = (twist(angle) for angle in (-30.0, 0.0, 30.0))
     assert (left - straight) * (right - straight) < 0.0  # the mesh itself twists a little

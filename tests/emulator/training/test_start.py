@@ -139,6 +139,7 @@ def pretrained(beam, other, tmp_path_factory):
     return pretrain([beam, other], FAMILY, folder, architecture=SMALL)
 
 
+@pytest.mark.slow
 def test_a_family_shares_one_network(beam, other, own, pretrained):
     same(pretrained[0].weights, pretrained[1].weights)
     assert [e.scene for e in pretrained] == [beam, other]

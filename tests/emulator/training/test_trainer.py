@@ -92,6 +92,7 @@ def test_a_step_without_a_finite_gradient_is_not_taken(beam):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
 
 
+@pytest.mark.slow
 def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
     emulator = train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=25.0)
     assert emulator.record["plan"]["steps"] > WARMUP
@@ -252,6 +253,7 @@ def hybrid(beam, tmp_path_factory):
     return train(beam, HYBRID, tmp_path_factory.mktemp("hybrid"), architecture=SMALL)
 
 
+@pytest.mark.slow
 def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
     series = replace(hybrid, residual=None, base="series")
     before, after = (
