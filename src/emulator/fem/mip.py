@@ -19,8 +19,8 @@ limit and its order.
 
 This is the mixed integration point (MIP) Newton method of Magisano, Leonetti & Garcea (2017), made
 for geometric nonlinearity, with measures in place of stress components so that any law that reads
-nothing but measures has its inverse, one scalar equation each. A ventricle at rest takes three to
-five full steps to a residual of a few percent, all with positive definite tangents.
+nothing but measures has its inverse, one scalar equation each. A ventricle from rest takes four to
+six full steps to a residual of a few percent, all with positive definite tangents.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from emulator.fem.mip import MipNewton, applies, fraction_at_stress
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import modulus
+from emulator.mechanics.tissue import Tissue
 from scene_support import block
 
 
@@ -35,6 +36,27 @@ def test_where_measures_are_those_of_the_displacement_it_is_newton(name, request
     after = jax.jit(own.step)(own.begin(u), jnp.array(1.0))
     assert after.fraction == 1.0
     np.testing.assert_allclose(after.u - u, expected, atol=1e-9 * jnp.abs(expected).max())
+
+
+def test_stress_and_tangent_of_a_point_whose_measures_are_others(ventricle):
+    """Those of quadratic models of the energy, differentiated as functions of H.
+
+    The stress is that of the model about the point's own measures; the tangent weighs the second
+    derivatives of the measures with its own stress, as does a model about where H is.
+    """
+    own, at = mip(ventricle, ventricle.centre), Tissue(jnp.array([1.0, 2.0, 2.0]) / 3.0)
+    H = 0.1 * jax.random.normal(jax.random.key(1), (3, 3))
+    xi = lambda G: own._measures.of(G, at.directions)
+    others = 0.5 * xi(H) + 0.01
+    phi = own._energy(at)
+    s, C = jax.grad(phi)(others), jax.hessian(phi)(others)
+
+    def model(about):
+        return lambda G: s @ xi(G) + 0.5 * (xi(G) - about) @ C @ (xi(G) - about)
+
+    stress, tangent = own._linearise(H, others, at)
+    np.testing.assert_allclose(stress, jax.grad(model(others))(H), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(tangent, jax.hessian(model(xi(H)))(H), rtol=1e-10, atol=1e-9)
 
 
 def test_equilibrium_is_a_fixed_point(ventricle):
