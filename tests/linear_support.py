@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.forward import Prediction, all_nodes
+from emulator.surrogates.protocol import Prediction, all_nodes
 
 
 @dataclass(frozen=True, eq=False)

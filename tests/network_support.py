@@ -5,9 +5,9 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from emulator.fem.expansion import constant
-from emulator.network import Architecture, augment
-from emulator.network.emulator import Emulator, fresh
+from emulator.surrogates import Architecture, augment
+from emulator.surrogates.additive import Emulator, fresh
+from emulator.surrogates.taylor import constant
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.loads import Gravity
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.loads.dead import Gravity
 
 
 def block(

@@ -5,13 +5,13 @@ its posterior; :func:`certify` checks it against FEM.
 """
 
 import emulator
-from calibrate.certify import Certificate, certify
-from calibrate.model import Model, model
+from calibrate.certificate import Certificate, certify
 from calibrate.noise import GaussianNoise
 from calibrate.observations import CavityVolume, landmarks, nodal_displacements
 from calibrate.posterior import Posterior, sample
 from calibrate.priors import box_prior
 from calibrate.samplers import NUTSOptions
+from calibrate.statistical_model import Model, model
 
 __version__ = emulator.__version__
 

@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from calibrate.figures import beam_figure, pyplot
-from calibrate.figures_ventricle import ventricle_figure
+from calibrate.figures.beam import beam_figure
+from calibrate.figures.drawing import pyplot
+from calibrate.figures.ventricle import ventricle_figure
 from calibrate.identifiability import identifiability
-from calibrate.run import Run, certify_and_keep, infer, report, simulator_of
-from emulator.network import shipped
+from calibrate.workflow import Run, certify_and_keep, infer, report, simulator_of
 from emulator.store import check_folder
+from emulator.surrogates import shipped
 
 # Between the training set's Sobol points, and not the centre the emulator is built around.
 DEMO = Run(

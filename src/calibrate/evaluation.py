@@ -13,15 +13,14 @@ from calibrate.reference import (
     outside_reference,
     published_reference,
 )
-from emulator.correct import corrected
+from emulator.error.comparison import Errors, case_errors
 from emulator.errors import InputError, SolverError
-from emulator.evaluation import Errors, case_errors
-from emulator.fem import Simulator
-from emulator.forward import Extrapolated, ForwardMap
-from emulator.network import load
-from emulator.network.emulator import Emulator
-from emulator.reduced import fit_reduced
-from emulator.training import run_campaign, sobol
+from emulator.fem import Simulator, run_campaign, sobol
+from emulator.surrogates import load
+from emulator.surrogates.additive import Emulator
+from emulator.surrogates.corrected import corrected
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import Extrapolated, ForwardMap
 
 FORWARDS = ("emulator", "corrected", "reduced")
 
@@ -137,7 +136,7 @@ def _outside(
 
 def save(evaluated: Evaluated, folder: str | Path) -> list[Path]:
     """Write evaluation.json and the figures to ``folder``; the files written."""
-    from calibrate.evaluation_figures import draw
+    from calibrate.figures.evaluation import draw
     from emulator.store import write_json
 
     path = Path(folder) / "evaluation.json"

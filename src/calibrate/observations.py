@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.forward import all_nodes, check_nodes
-from emulator.mechanics.cavity import Cavity
+from emulator.geometry.cavity import Cavity
 from emulator.scenes.scene import Scene
+from emulator.surrogates.protocol import all_nodes, check_nodes
 
 # How far outside the body a point may lie, as a fraction of the body's size.
 _SLACK = 1e-3

@@ -16,15 +16,15 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
-from calibrate.model import Data, Model
 from calibrate.observations import Landmarks, NodalDisplacements, Observations
 from calibrate.provenance import versions
 from calibrate.samplers import NUTSOptions, nuts
-from emulator.correct import CorrectedForward
+from calibrate.statistical_model import Data, Model
 from emulator.errors import InputError
-from emulator.forward import ForwardMap
-from emulator.network import CachedEmulator
 from emulator.store import replacing
+from emulator.surrogates import CachedEmulator
+from emulator.surrogates.corrected import CorrectedForward
+from emulator.surrogates.protocol import ForwardMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> d
     """What is needed to know, and to repeat, how a posterior was made; plain JSON values."""
     scene = model.forward.scene
     record: dict[str, Any] = {
-        "scene": dict(scene.recipe),
+        "scene": dict(scene.origin),
         "scene_name": scene.name,
         "scene_fingerprint": scene.fingerprint,
         "forward": model.forward.kind,

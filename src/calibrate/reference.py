@@ -11,11 +11,10 @@ import numpy as np
 from tqdm import tqdm
 
 from emulator.errors import InputError
-from emulator.fem import Simulator
-from emulator.forward import inside_box
-from emulator.scenes.published import published_scene, published_tests
+from emulator.fem import Simulator, run_campaign, sobol
+from emulator.released.scenes import published_scene, published_tests
 from emulator.scenes.scene import Scene
-from emulator.training import run_campaign, sobol
+from emulator.surrogates.protocol import inside_box
 
 SEED = 90_210  # test points of their own: training and reduced models draw with small seeds
 # What the ventricle agrees to: its fibres were stored in float32 (calibrate verify published).

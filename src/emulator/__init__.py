@@ -10,10 +10,12 @@ from emulator import _precision  # noqa: F401, I001 - must come first
 from emulator import scenes
 from emulator.errors import InputError, SolverError
 from emulator.fem import NewtonOptions, Simulator, Solution, Status
-from emulator.forward import FEMForward, ForwardMap, Prediction, fem_forward
-from emulator.mechanics.energy import potential_energy
-from emulator.network import Emulator, load, save_emulator, shipped
-from emulator.scenes import Parameter, Scene, Support, find_scene
+from emulator.surrogates.fem import FEMForward, fem_forward
+from emulator.surrogates.protocol import ForwardMap, Prediction
+from emulator.fem.functional import potential_energy
+from emulator.surrogates import Emulator, load, save_emulator, shipped
+from emulator.catalogue import find_scene
+from emulator.scenes import Parameter, Scene, Support
 
 __version__ = "0.1.0"
 

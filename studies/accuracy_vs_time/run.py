@@ -15,17 +15,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.observations import spread_nodes
 from calibrate.provenance import study_header
 from emulator import Simulator, load
-from emulator.correct import corrected
-from emulator.evaluation import quantiles
-from emulator.forward import ForwardMap, fem_forward
-from emulator.reduced import fit_reduced
+from emulator.error.comparison import quantiles
+from emulator.fem import run_campaign, sobol, uniform
 from emulator.scenes import Scene
 from emulator.store import replacing, write_json
-from emulator.training import run_campaign, sobol, uniform
+from emulator.surrogates.corrected import corrected
+from emulator.surrogates.fem import fem_forward
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import ForwardMap
 
 HERE = Path(__file__).parent
 SEED = 4

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 import calibrate as cal
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.observations import spread_nodes
 from calibrate.provenance import study_header
 from emulator import Simulator, load
-from emulator.scenes.published import published_tests
+from emulator.released.scenes import published_tests
 from emulator.store import write_json
 
 HERE = Path(__file__).parent

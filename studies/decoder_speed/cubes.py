@@ -16,9 +16,9 @@ from timing import Function, batched, loop, milliseconds, per_call, unseen
 
 import emulator as em
 from calibrate.observations import Landmarks, landmarks, spread_landmarks
-from emulator.fem.expansion import expand
-from emulator.network import Architecture, CachedEmulator, augment
-from emulator.network.emulator import Emulator, fresh
+from emulator.surrogates import Architecture, CachedEmulator, augment
+from emulator.surrogates.additive import Emulator, fresh
+from emulator.surrogates.taylor import expand
 from emulator.training.basis import mechanical_modes
 
 LANDMARKS = 24

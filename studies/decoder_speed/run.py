@@ -13,7 +13,7 @@ from typing import Any
 import cubes
 import ventricle
 
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from emulator.store import replacing, write_json
 

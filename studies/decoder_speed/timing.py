@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.fem import uniform
 from emulator.scenes import Scene
-from emulator.training import uniform
 
 Function = Callable[[jax.Array], Any]
 

@@ -9,11 +9,11 @@ from timing import Function, batched, in_loop, milliseconds, per_call, unseen
 
 import emulator as em
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
-from emulator.correct import corrected
-from emulator.forward import ForwardMap
-from emulator.network import CachedEmulator
-from emulator.reduced import fit_reduced
-from emulator.training import run_campaign, sobol
+from emulator.fem import run_campaign, sobol
+from emulator.surrogates import CachedEmulator
+from emulator.surrogates.corrected import corrected
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import ForwardMap
 
 SCENE = "left_ventricle"
 LANDMARKS = 24

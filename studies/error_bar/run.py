@@ -18,15 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import emulator as em
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from emulator.correct import newton_step
-from emulator.error_bar import error_bar
-from emulator.forward import ForwardMap
-from emulator.reduced import fit_reduced
+from emulator.error.estimate import error_bar
+from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.store import replacing, write_json
-from emulator.training import run_campaign, sobol
+from emulator.surrogates.corrected import newton_step
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import ForwardMap
 
 HERE = Path(__file__).parent
 SEED = 4

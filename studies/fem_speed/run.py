@@ -25,17 +25,16 @@ from compiling import Compiling
 from plain_skfem import Body
 
 import emulator as em
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from emulator.fem import Status
-from emulator.geometry.generators import box
+from emulator.fem import Status, uniform
+from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.pressure import KPA_PER_MMHG, CavityPressure, cavity_volume
-from emulator.scenes.parameters import Parameter
-from emulator.scenes.published import published_scene
+from emulator.released.scenes import published_scene
+from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure, cavity_volume
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene, Support
 from emulator.store import replacing, write_json
-from emulator.training import uniform
 
 HERE = Path(__file__).parent
 SEED = 7

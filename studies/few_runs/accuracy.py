@@ -18,12 +18,13 @@ from methods import (
 )
 
 import emulator as em
-from emulator.evaluation import quantiles
-from emulator.fem.expansion import Expansion
-from emulator.mechanics.cavity import Cavity
-from emulator.residual import fit_residual
-from emulator.scenes import Scene, scene_from_recipe
-from emulator.training import Runs, sobol
+from emulator.catalogue import scene_from_origin
+from emulator.error.comparison import quantiles
+from emulator.fem import Runs, sobol
+from emulator.geometry.cavity import Cavity
+from emulator.scenes import Scene
+from emulator.surrogates.discrepancy import fit_residual
+from emulator.surrogates.taylor import Expansion
 
 SEED = 0
 TEST_SEED = 90_210
@@ -43,7 +44,7 @@ def scene_of(name: str, shape: tuple[int, int, int] | None = None) -> Scene:
     if shape is None:
         return scene
     sizes = dict(zip(("rings", "around", "layers"), shape, strict=True))
-    return scene_from_recipe({**scene.recipe, **sizes})
+    return scene_from_origin({**scene.origin, **sizes})
 
 
 def design(scene: Scene, count: int) -> jax.Array:

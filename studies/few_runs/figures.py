@@ -5,7 +5,7 @@ from pathlib import Path
 from accuracy import OVER, PLAIN, POSITIONS, RIVAL, SERIES, VALUES
 from tables import WANTED, median, mesh_totals, rows, scenes
 
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from emulator.store import replacing
 
 STYLES = {

@@ -6,7 +6,7 @@ import numpy as np
 from accuracy import Court, design, scene_of, seconds
 from methods import clock, fit_rival, our_campaign
 
-from emulator.residual import fit_residual
+from emulator.surrogates.discrepancy import fit_residual
 
 
 def mesh_case(shape: tuple[int, int, int], runs: int, tests: int, order: int) -> dict[str, Any]:

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator import Simulator
-from emulator.fem.expansion import Expansion, expand
-from emulator.reduced import ReducedForward, fit_reduced
-from emulator.residual import Residual, fit, fit_residual
-from emulator.residual.fit import Warp
-from emulator.residual.kernel import Features, fit_lengths, fit_weights, fold
+from emulator.fem import Runs, run_campaign
 from emulator.scenes import Scene
-from emulator.training import Runs, run_campaign
+from emulator.surrogates.discrepancy import Residual, fit, fit_residual
+from emulator.surrogates.discrepancy.fit import Warp
+from emulator.surrogates.discrepancy.kernel import Features, fit_lengths, fit_weights, fold
+from emulator.surrogates.pod_gp import ReducedForward, fit_reduced
+from emulator.surrogates.taylor import Expansion, expand
 
 RIVAL_MODES = 40  # more cost scikit-learn time and, by the row with twice as many, gain nothing
 RIVAL_STAGES = (30, 60, 120)  # runs after which its own fit starts the next ones
@@ -63,7 +63,7 @@ def our_campaign(
     series = expand(simulator, order=order)
     jax.block_until_ready((series.displacement, series.derivatives))
     expanded = clock() - begin
-    runs = run_campaign(simulator, thetas, slopes=True, expansion=series)
+    runs = run_campaign(simulator, thetas, slopes=True, predictor=series)
     elapsed = simulator.elapsed(thetas, begin)
     elapsed[0] = expanded
     return series, runs, expanded, elapsed
@@ -77,7 +77,7 @@ def rival_campaign(scene: Scene, thetas: jax.Array) -> tuple[Runs, np.ndarray]:
     start = None
     ends = [0, *(n for n in RIVAL_STAGES if n < len(thetas)), len(thetas)]
     for first, last in pairwise(ends):
-        parts.append(run_campaign(simulator, thetas[first:last], expansion=start))
+        parts.append(run_campaign(simulator, thetas[first:last], predictor=start))
         so_far = Runs(*(jnp.concatenate(p) for p in zip(*(q[:3] for q in parts), strict=True)))
         if last < len(thetas):
             reduced = fit_rival(scene, so_far)

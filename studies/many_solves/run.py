@@ -15,13 +15,13 @@ import jax
 import numpy as np
 
 import emulator as em
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from emulator.mechanics.pressure import CavityPressure
+from emulator.fem import uniform
+from emulator.released.scenes import published_scene
 from emulator.scenes import Parameter, Scene
-from emulator.scenes.published import published_scene
+from emulator.scenes.loads.pressure import CavityPressure
 from emulator.store import replacing, write_json
-from emulator.training import uniform
 
 HERE = Path(__file__).parent
 SEED = 11

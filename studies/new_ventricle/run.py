@@ -16,14 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import emulator as em
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from emulator.evaluation import evaluate
-from emulator.geometry.ellipsoid import EllipsoidalWall, truncated_ellipsoid
+from emulator.error.comparison import evaluate
+from emulator.fem import run_campaign, sobol
+from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.scenes import Scene
 from emulator.store import replacing, write_json
-from emulator.training import recipe, run_campaign, sobol, train
+from emulator.training import recipe, train
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
@@ -41,7 +42,7 @@ def ventricle(name: str) -> Scene:
     wall, mesh_size, angles = VENTRICLES[name]
     mesh = truncated_ellipsoid(wall, *mesh_size)
     fibres = rule_based_fibres(mesh, angles=angles)
-    return replace(em.scenes.left_ventricle(), name=name, mesh=mesh, fibres=fibres, recipe={})
+    return replace(em.scenes.left_ventricle(), name=name, mesh=mesh, fibres=fibres, origin={})
 
 
 def one(name: str, began: float, runs: int, tests: int) -> dict[str, Any]:

@@ -21,14 +21,15 @@ from typing import Any
 import jax.numpy as jnp
 
 import emulator as em
-from calibrate.evaluation_figures import LABELS, log_density
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
+from calibrate.figures.evaluation import LABELS, log_density
 from calibrate.provenance import study_header
-from emulator.evaluation import Errors, case_errors, quantiles
-from emulator.network import Architecture, load, save_emulator
+from emulator.error.comparison import Errors, case_errors, quantiles
+from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.store import replacing, write_json
-from emulator.training import Plan, recipe, remove_checkpoint, run_campaign, sobol, train
+from emulator.surrogates import Architecture, load, save_emulator
+from emulator.training import Plan, recipe, remove_checkpoint, train
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210

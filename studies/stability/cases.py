@@ -13,20 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator import NewtonOptions, Parameter, Scene, Simulator, Support
-from emulator.geometry.ellipsoid import EllipsoidalWall, land_ventricle, truncated_ellipsoid
+from emulator.geometry.bodies.box import box
+from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, land_ventricle, truncated_ellipsoid
+from emulator.geometry.bodies.slab import cooks_membrane
+from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.geometry.fibres import rule_based_fibres
-from emulator.geometry.generators import box
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
-from emulator.geometry.slab import cooks_membrane
-from emulator.geometry.sphere import sphere_octant
 from emulator.geometry.tetrahedra import signed_volumes
-from emulator.mechanics.elastic_support import ElasticSupport
-from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.loads import Gravity, Traction
-from emulator.mechanics.pressure import KPA_PER_MMHG, CavityPressure
 from emulator.scenes import BUILT_IN
+from emulator.scenes.loads.dead import Gravity, Traction
+from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure
+from emulator.scenes.supports.elastic import ElasticSupport
 from emulator.scenes.twisting_cube import twist
 
 SEED = 7

@@ -20,11 +20,11 @@ import numpy as np
 import sparsax
 
 from emulator import Scene, Simulator, potential_energy
-from emulator.mechanics.elastic_support import ElasticSupport
-from emulator.mechanics.energy import strain_energy
-from emulator.mechanics.follower import FollowerPressure
-from emulator.mechanics.loads import Gravity, Traction
-from emulator.mechanics.pressure import CavityPressure
+from emulator.fem.functional import strain_energy
+from emulator.scenes.loads.dead import Gravity, Traction
+from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.supports.elastic import ElasticSupport
 
 TOLERANCE = 1e-6
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))

@@ -19,7 +19,7 @@ import numpy as np
 from cases import CASES, SEED, Case, solve
 from judge import TOLERANCE, is_stable, judge
 
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from emulator import Status
 from emulator.errors import InputError

@@ -19,14 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import emulator as em
-from calibrate.figures import pyplot
+from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from emulator.evaluation import evaluate, field_errors, quantiles
-from emulator.mechanics.cavity import Cavity, cavity_sets
-from emulator.network import Architecture, Emulator
+from emulator.error.comparison import evaluate, field_errors, quantiles
+from emulator.fem import Runs, run_campaign, sobol
+from emulator.geometry.cavity import Cavity, cavity_sets
 from emulator.scenes import Scene
 from emulator.store import replacing, write_json
-from emulator.training import Plan, Runs, pretrain, recipe, run_campaign, sobol, train
+from emulator.surrogates import Architecture, Emulator
+from emulator.training import Plan, pretrain, recipe, train
 from emulator.training.start import with_network_of
 from emulator.training.trainer import Problem, prepare
 

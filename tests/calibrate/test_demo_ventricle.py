@@ -11,12 +11,12 @@ import pytest
 import emulator as em
 from calibrate import demo as demos
 from calibrate.cli import main
-from calibrate.cli.inference import _DEMOS
+from calibrate.cli.commands.demo import _DEMOS
 from calibrate.data import read_data
 from calibrate.posterior import read_tree
-from calibrate.run import read_posterior, simulator_of
-from emulator.mechanics.pressure import cavity_volume
+from calibrate.workflow import read_posterior, simulator_of
 from emulator.scenes import registry
+from emulator.scenes.loads.pressure import cavity_volume
 
 # One scene for the whole module, so that its simulator is compiled once.
 COARSE = cache(partial(em.scenes.left_ventricle, rings=4, around=8, layers=1))

@@ -11,8 +11,8 @@ from calibrate.cli import main
 from calibrate.evaluation import Evaluation, run_evaluation
 from calibrate.reference import fem_reference
 from emulator.errors import InputError
-from emulator.fem.expansion import constant
-from emulator.network import load, save_emulator
+from emulator.surrogates import load, save_emulator
+from emulator.surrogates.taylor import constant
 from network_support import untrained
 
 

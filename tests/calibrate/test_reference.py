@@ -11,11 +11,11 @@ from calibrate.reference import outside_reference, published_reference, sample_o
 from emulator.errors import InputError
 from emulator.fem.assembly import relative_residual
 from emulator.fem.solution import Status
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.loads import Gravity
+from emulator.released.scenes import published_scene
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.published import published_scene
+from emulator.scenes.loads.dead import Gravity
 
 MU, LAM = Parameter("mu", "kPa", 3.5, 10.0, "log"), Parameter("lam", "kPa", 3.5, 10.0, "log")
 

@@ -5,10 +5,12 @@ Exit codes: 0 done, 1 ran but failed its check, 2 bad input with one clear line.
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import sys
 from collections.abc import Sequence
 
-from calibrate.cli import emulators, evaluation, inference, prediction, scenes, verification
+from calibrate.cli import commands
 from calibrate.cli.common import BAD_INPUT, FAILED, Parser
 from emulator.errors import InputError, SolverError
 
@@ -16,11 +18,11 @@ from emulator.errors import InputError, SolverError
 def build_parser() -> Parser:
     """The parser with every command."""
     parser = Parser(prog="calibrate", description="Bayesian calibration of soft-tissue models.")
-    commands = parser.add_subparsers(
+    chosen = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND", parser_class=Parser
     )
-    for group in (inference, scenes, emulators, evaluation, prediction, verification):
-        group.register(commands)
+    for module in pkgutil.iter_modules(commands.__path__):
+        importlib.import_module(f"{commands.__name__}.{module.name}").register(chosen)
     return parser
 
 

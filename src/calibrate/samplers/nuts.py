@@ -22,8 +22,8 @@ from numpyro.infer.hmc import hmc
 from numpyro.infer.util import initialize_model
 from tqdm import tqdm
 
-from calibrate.model import Data, Model
 from calibrate.samplers import shear
+from calibrate.statistical_model import Data, Model
 from emulator.errors import InputError, SolverError
 
 _CHUNK = 50  # iterations between two updates of the progress bar

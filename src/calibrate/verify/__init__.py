@@ -1,7 +1,7 @@
 """Verification: measured, reference, tolerance, source."""
 
 from calibrate.verify.cases import CASES
-from calibrate.verify.published import verify_published
+from calibrate.verify.released import verify_published
 from calibrate.verify.row import Row
 
 __all__ = ["CASES", "Row", "verify_published"]

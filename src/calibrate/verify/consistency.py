@@ -12,16 +12,16 @@ import numpy as np
 from calibrate.verify.homogeneous import PARAMETERS
 from calibrate.verify.row import Row
 from emulator.fem import Simulator
-from emulator.geometry.generators import box
+from emulator.fem.functional import strain_energy
+from emulator.geometry.bodies.box import box
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.barriers import Barriers
-from emulator.mechanics.energy import strain_energy
-from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.loads import Gravity
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads.follower import FollowerPressure
 
 _FACES = ("left", "right", "front", "back", "bottom", "top")
 _EXACT = "holds exactly; the tolerance is round-off"

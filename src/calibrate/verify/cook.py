@@ -10,13 +10,13 @@ import numpy as np
 
 from calibrate.verify.row import Row
 from emulator.fem import Simulator
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
+from emulator.geometry.bodies.slab import cooks_membrane
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.slab import cooks_membrane
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
-from emulator.mechanics.loads import Traction
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.loads.dead import Traction
 
 MU, TRACTION = 422.5, 62.5  # kPa
 POINT = (48.0, 52.0)  # mm, middle of the loaded edge

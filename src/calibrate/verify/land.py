@@ -11,14 +11,14 @@ import numpy as np
 
 from calibrate.verify.row import Row
 from emulator.fem import Simulator
-from emulator.geometry.ellipsoid import land_ventricle
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
+from emulator.geometry.bodies.ellipsoid import land_ventricle
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
-from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.pressure import CavityPressure
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads.pressure import CavityPressure
 
 _BEAM = "Land et al. (2015), problem 1: 4.17 in the reproduction by fenicsx-pulse"
 _VENTRICLE = (

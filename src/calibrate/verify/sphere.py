@@ -20,11 +20,11 @@ import numpy as np
 
 from calibrate.verify.row import Row
 from emulator.fem import Simulator
-from emulator.geometry.sphere import sphere_octant
+from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
-from emulator.mechanics.pressure import CavityPressure, PublishedPressure
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.loads.pressure import CavityPressure, PublishedPressure
 
 INNER, OUTER, MU = 10.0, 15.0, 10.0
 NU = 0.4999

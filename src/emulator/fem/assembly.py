@@ -21,9 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.fem.mixed import Condensed, consistent, linearise
-from emulator.fem.sparse import Factorisation, Pattern, block_pattern
-from emulator.mechanics.energy import (
+from emulator.fem.functional import (
     at_points,
     displacement_gradient,
     local_forces,
@@ -33,7 +31,9 @@ from emulator.mechanics.energy import (
     spring_terms,
     strain_energy,
 )
-from emulator.mechanics.local import LocalForce, LocalTerm
+from emulator.fem.mixed import Condensed, consistent, linearise
+from emulator.fem.sparse import Factorisation, Pattern, block_pattern
+from emulator.scenes.local_terms import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -11,10 +12,12 @@ import numpy as np
 from tqdm import tqdm
 
 from emulator.fem.assembly import relative_residual
-from emulator.fem.expansion import Expansion
+from emulator.fem.functional import potential_energy, volume_ratio
 from emulator.fem.simulator import Simulator
-from emulator.mechanics.energy import potential_energy, volume_ratio
 from emulator.scenes.scene import Scene
+
+Predictor = Callable[[jax.Array], jax.Array]
+"""Position in the parameter box (p,) to a displacement (n, 3) mm to start Newton from."""
 
 
 class Runs(NamedTuple):
@@ -41,7 +44,7 @@ def run_campaign(
     thetas: jax.Array,
     *,
     slopes: bool = False,
-    expansion: Expansion | None = None,
+    predictor: Predictor | None = None,
     deadline: float = np.inf,
     at_least: int = 1,
     progress: bool = False,
@@ -49,7 +52,7 @@ def run_campaign(
     """Solve at every theta (c, p).
 
     Each run starts from the nearest one done, from the same moved along its slopes, or from
-    ``expansion``: of those there are, the one with the least force out of balance. Where that start
+    ``predictor``: of those there are, the one with the least force out of balance. Where that start
     fails, from rest.
 
     Parameters
@@ -72,7 +75,7 @@ def run_campaign(
     for k, theta in enumerate(tqdm(thetas, "FEM", disable=not progress, unit="run")):
         if k >= at_least and time.perf_counter() > deadline:
             break
-        starts = _starts(positions[: k + 1], fields, derivatives, expansion)
+        starts = _starts(positions[: k + 1], fields, derivatives, predictor)
         start = best(jnp.stack(starts), theta) if len(starts) > 1 else next(iter(starts), None)
         solution = simulator.solve(theta, start)
         if not solution.converged and starts:
@@ -91,7 +94,7 @@ def _starts(
     positions: np.ndarray,
     fields: list[jax.Array],
     derivatives: list[jax.Array],
-    expansion: Expansion | None,
+    predictor: Predictor | None,
 ) -> list[jax.Array]:
     """Displacements (n, 3) to start from at the last of ``positions`` (k + 1, p)."""
     starts = []
@@ -101,8 +104,8 @@ def _starts(
         starts.append(fields[near])
         if derivatives:
             starts.append(fields[near] + jnp.tensordot(steps[near], derivatives[near], axes=1))
-    if expansion is not None:
-        starts.append(expansion(jnp.asarray(positions[-1])))
+    if predictor is not None:
+        starts.append(predictor(jnp.asarray(positions[-1])))
     return starts
 
 

@@ -34,9 +34,9 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
-from emulator.mechanics.energy import displacement_gradient, strain_law, volume_ratio
+from emulator.fem.functional import displacement_gradient, strain_law, volume_ratio
 from emulator.mechanics.measures import Measures, measures_read
-from emulator.mechanics.tissue import Tissue, tissue
+from emulator.scenes.regions import Tissue, tissue
 
 _SHORTEST = 2.0**-4
 _BISECTIONS = 7

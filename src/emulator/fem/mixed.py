@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.mechanics.energy import at_volume, mean_volume_change
-from emulator.mechanics.tissue import tissue
+from emulator.fem.functional import at_volume, mean_volume_change
+from emulator.scenes.regions import tissue
 from emulator.scenes.scene import Scene
 
 

@@ -33,12 +33,12 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
+from emulator.fem.functional import volume_ratio
 from emulator.fem.line_search import Direction, choose_fraction
 from emulator.fem.mixed import Condensed, Volumes, advance, consistent, linearise
 from emulator.fem.natural import natural_monotonicity
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
-from emulator.mechanics.energy import volume_ratio
 
 NEAR = 0.05  # relative residual below which a step is judged by the residual alone
 UNBALANCED = 0.5  # and above which the stiffness of the loads misleads

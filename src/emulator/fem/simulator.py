@@ -20,11 +20,11 @@ import jax.numpy as jnp
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
+from emulator.fem.functional import volume_ratio
 from emulator.fem.newton import newton
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
-from emulator.mechanics.energy import volume_ratio
 from emulator.scenes.scene import Scene
 
 

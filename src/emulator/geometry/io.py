@@ -132,7 +132,7 @@ def write_solution(
     mesh : the reference body, mm.
     displacement : (n, 3) mm.
     fields : cell data (m,), (m, 3) or (m, 3, 3), the last written as nine components, row by row;
-        :func:`emulator.mechanics.fields.element_fields` has those of a solution.
+        :func:`emulator.fem.fields.element_fields` has those of a solution.
     """
     cells = {}
     for name, values in fields.items():

@@ -6,10 +6,10 @@ from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.left_ventricle_neo_hookean import left_ventricle_neo_hookean
 from emulator.scenes.left_ventricle_segments import left_ventricle_segments
 from emulator.scenes.liver import liver
-from emulator.scenes.parameters import Parameter
-from emulator.scenes.registry import BUILT_IN, find_scene, scene_from_recipe
+from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.registry import BUILT_IN
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
 from emulator.scenes.traction_beams import traction_beam_guccione, traction_beam_holzapfel_ogden
 from emulator.scenes.twisting_cube import twisting_cube
 
@@ -19,13 +19,11 @@ __all__ = [
     "Scene",
     "Support",
     "biventricle",
-    "find_scene",
     "left_ventricle",
     "left_ventricle_neo_hookean",
     "left_ventricle_segments",
     "liver",
     "once_clamped_beam",
-    "scene_from_recipe",
     "traction_beam_guccione",
     "traction_beam_holzapfel_ogden",
     "twice_clamped_beam",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.loads import Gravity
-from emulator.scenes.parameters import Parameter
+from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
 
 
 def _beam(name: str, cells: tuple[int, int, int], clamped: tuple[str, ...]) -> Scene:
@@ -21,7 +21,7 @@ def _beam(name: str, cells: tuple[int, int, int], clamped: tuple[str, ...]) -> S
         ),
         loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80),),
         supports=tuple(Support(face) for face in clamped),
-        recipe={"scene": name, "cells": list(cells)},
+        origin={"scene": name, "cells": list(cells)},
     )
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from emulator.geometry import biventricle as geometry
+from emulator.geometry.bodies import biventricle as geometry
 from emulator.geometry.fibres import biventricular_directions
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.pressure import KPA_PER_MMHG, CavityPressure
 from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE
+from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
 
 
 def biventricle(
@@ -28,7 +28,8 @@ def biventricle(
 
     Parameters
     ----------
-    rings, around, layers : of the mesh, as in :func:`~emulator.geometry.biventricle.biventricle`.
+    rings, around, layers : of the mesh, as in
+        :func:`~emulator.geometry.bodies.biventricle.biventricle`.
     angles : helix angle in degrees on the endocardia and on the epicardium.
     kappa : resistance to volume change, kPa.
     right_pressure : in the right ventricle, kPa.
@@ -46,7 +47,7 @@ def biventricle(
         supports=(Support("base"),),
         constants={"kappa": kappa, "right_pressure": right_pressure},
         fibres=biventricular_directions(mesh, angles).fibres,
-        recipe={
+        origin={
             "scene": "biventricle",
             "rings": rings,
             "around": around,

@@ -104,14 +104,14 @@ from emulator.geometry.fibres import (
 from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
-from emulator.mechanics.elastic_support import ElasticSupport
-from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.laws import Law, find_law
-from emulator.mechanics.loads import Gravity, Load, Traction
-from emulator.mechanics.pressure import CavityPressure
-from emulator.scenes.parameters import Parameter
+from emulator.scenes.loads.dead import Gravity, Load, Traction
+from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports.elastic import ElasticSupport
 from emulator.scenes.tables import Table
 
 Parts = tuple[Mesh, np.ndarray | None, np.ndarray | None]
@@ -174,8 +174,8 @@ def _scene(path: Path, file: Table) -> Scene:
         "constants": file.table("constants").entries(),
         "dilatation": cast(Literal["pointwise", "mean"], dilatation),
     }
-    recipe = {"scene": "file", "path": str(path.resolve())}
-    return Scene(name=path.stem, mesh=mesh, law=law, recipe=recipe, **parts)
+    origin = {"scene": "file", "path": str(path.resolve())}
+    return Scene(name=path.stem, mesh=mesh, law=law, origin=origin, **parts)
 
 
 # ---- geometry ------------------------------------------------------------------------------------

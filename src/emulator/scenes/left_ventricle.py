@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import astuple
 
-from emulator.geometry.ellipsoid import HUMAN, EllipsoidalWall, truncated_ellipsoid
+from emulator.geometry.bodies.ellipsoid import HUMAN, EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.pressure import KPA_PER_MMHG, CavityPressure
-from emulator.scenes.parameters import Parameter
+from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
 
 PRESSURE = Parameter("pressure", "kPa", 4.0 * KPA_PER_MMHG, 10.0 * KPA_PER_MMHG)
 """4 to 10 mmHg at the end of diastole, as in the paper."""
@@ -52,10 +52,10 @@ def left_ventricle(
     Parameters
     ----------
     rings, around, layers : of the mesh, as in
-        :func:`~emulator.geometry.ellipsoid.truncated_ellipsoid`; the default has 1564 nodes.
+        :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`; the default has 1564 nodes.
     angles : helix angle in degrees on the endocardium and on the epicardium.
     kappa : resistance to volume change, kPa.
-    wall : dimensions in mm, those of :class:`~emulator.geometry.ellipsoid.EllipsoidalWall`.
+    wall : dimensions in mm, those of :class:`~emulator.geometry.bodies.ellipsoid.EllipsoidalWall`.
     """
     mesh = truncated_ellipsoid(EllipsoidalWall(*wall), rings, around, layers)
     return Scene(
@@ -67,7 +67,7 @@ def left_ventricle(
         supports=(Support("base"),),
         constants={"kappa": kappa},
         fibres=rule_based_fibres(mesh, angles=angles),
-        recipe={
+        origin={
             "scene": "left_ventricle",
             "rings": rings,
             "around": around,

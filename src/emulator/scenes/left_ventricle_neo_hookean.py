@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from emulator.geometry.ellipsoid import human_ventricle
+from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.pressure import CavityPressure
 from emulator.scenes.left_ventricle import PRESSURE
-from emulator.scenes.parameters import Parameter
+from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
 
 
 def left_ventricle_neo_hookean(rings: int = 15, around: int = 30, layers: int = 3) -> Scene:
@@ -21,7 +21,7 @@ def left_ventricle_neo_hookean(rings: int = 15, around: int = 30, layers: int = 
     Parameters
     ----------
     rings, around, layers : of the mesh, as in
-        :func:`~emulator.geometry.ellipsoid.truncated_ellipsoid`; the default has 1564 nodes.
+        :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`; the default has 1564 nodes.
     """
     return Scene(
         name="left_ventricle_neo_hookean",
@@ -34,7 +34,7 @@ def left_ventricle_neo_hookean(rings: int = 15, around: int = 30, layers: int = 
         ),
         loads=(CavityPressure("endocardium"),),
         supports=(Support("base"),),
-        recipe={
+        origin={
             "scene": "left_ventricle_neo_hookean",
             "rings": rings,
             "around": around,

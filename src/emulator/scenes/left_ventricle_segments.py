@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from emulator.geometry.segments import SEGMENTS, aha_segments
 from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE, left_ventricle
-from emulator.scenes.parameters import Parameter
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 
 STIFFNESSES = tuple(
@@ -41,5 +41,5 @@ def left_ventricle_segments(
         parameters=(*STIFFNESSES, PRESSURE),
         constants={**plain.constants, **centre},
         regions=aha_segments(plain.mesh),
-        recipe={**plain.recipe, "scene": "left_ventricle_segments"},
+        origin={**plain.origin, "scene": "left_ventricle_segments"},
     )

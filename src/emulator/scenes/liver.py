@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from emulator.geometry.organ import organ
+from emulator.geometry.bodies.organ import organ
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.loads import Gravity
-from emulator.scenes.parameters import Parameter
+from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
 
 
 def liver(shells: int = 6) -> Scene:
@@ -18,7 +18,7 @@ def liver(shells: int = 6) -> Scene:
 
     Parameters
     ----------
-    shells : of the mesh, as in :func:`~emulator.geometry.organ.organ`; 6 give 923 nodes.
+    shells : of the mesh, as in :func:`~emulator.geometry.bodies.organ.organ`; 6 give 923 nodes.
     """
     return Scene(
         name="liver",
@@ -30,5 +30,5 @@ def liver(shells: int = 6) -> Scene:
         ),
         loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80),),
         supports=(Support("ligament"),),
-        recipe={"scene": "liver", "shells": shells},
+        origin={"scene": "liver", "shells": shells},
     )

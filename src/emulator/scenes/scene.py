@@ -17,14 +17,14 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation, discretise
 from emulator.geometry.mesh import Mesh, frozen_array
-from emulator.mechanics.elastic_support import ElasticSupport
 from emulator.mechanics.laws import Law
-from emulator.mechanics.loads import Gravity, Load
-from emulator.mechanics.pressure import CavityPressure, require_held_rim
 from emulator.mechanics.quantity import Quantity
-from emulator.mechanics.tissue import checked_regions, region_quantities
-from emulator.scenes.parameters import Parameter
-from emulator.scenes.supports import Support, free_motions, prescribe
+from emulator.scenes.loads.dead import Gravity, Load
+from emulator.scenes.loads.pressure import CavityPressure, require_held_rim
+from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.regions import checked_regions, region_quantities
+from emulator.scenes.supports.dirichlet import Support, free_motions, prescribe
+from emulator.scenes.supports.elastic import ElasticSupport
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +43,14 @@ class Scene:
     supports : where the displacement is known, and where springs resist it.
     constants : parameters of the law and the loads that do not vary.
     fibres : (m, 3) unit fibre direction of each element, for laws that ask for it.
-    recipe : how a built-in scene was made, so that a file can make it again.
+    origin : how a built-in scene was made, so that a file can make it again.
     dilatation : ``pointwise``, or ``mean`` to take the volume change of each element as one, which
         keeps quadratic elements from locking when the material is nearly incompressible.
     sheets : (m, 3) unit sheet direction of each element, across its fibre, for laws that ask for
         it.
     regions : (m,) whole number of the region each element lies in. Region 3 takes a parameter or a
         constant ``stiffness_3``, by which the law's energy there is multiplied, its volumetric part
-        excepted; see :mod:`emulator.mechanics.tissue`.
+        excepted; see :mod:`emulator.scenes.regions`.
     """
 
     name: str
@@ -61,14 +61,14 @@ class Scene:
     supports: tuple[Support | ElasticSupport, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
     fibres: np.ndarray | None = None
-    recipe: Mapping[str, Any] = field(default_factory=dict)
+    origin: Mapping[str, Any] = field(default_factory=dict)
     dilatation: Literal["pointwise", "mean"] = "pointwise"
     sheets: np.ndarray | None = None
     regions: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
-        object.__setattr__(self, "recipe", MappingProxyType(dict(self.recipe)))
+        object.__setattr__(self, "origin", MappingProxyType(dict(self.origin)))
         self._check_regions()
         self._check_names()
         self._check_quantities()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.loads import Traction
 from emulator.scenes.left_ventricle import MYOCARDIUM
-from emulator.scenes.parameters import Parameter
+from emulator.scenes.loads.dead import Traction
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
 
 
 def _beam(
@@ -33,7 +33,7 @@ def _beam(
         supports=(Support("left"),),
         constants={"kappa": kappa},
         fibres=np.tile([np.cos(angle), np.sin(angle), 0.0], (len(mesh.elements), 1)),
-        recipe={
+        origin={
             "scene": name,
             "cells": list(cells),
             "traction": traction,

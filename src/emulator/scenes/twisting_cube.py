@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.scenes.parameters import Parameter
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
+from emulator.scenes.supports.dirichlet import Support
 
 
 def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
@@ -45,5 +45,5 @@ def twisting_cube(cells: int = 6, edge: float = 10.0, degrees: float = 60.0) -> 
             Parameter("nu", "", 0.1, 0.4, "log"),
         ),
         supports=(Support("left"), Support("right", displacement)),
-        recipe={"scene": "twisting_cube", "cells": cells, "edge": edge, "degrees": degrees},
+        origin={"scene": "twisting_cube", "cells": cells, "edge": edge, "degrees": degrees},
     )

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem import Simulator
-from emulator.fem.expansion import Expansion
+from emulator.surrogates.taylor import Expansion
 
 _SAMPLES = 400
 _TRUNCATION = 1e-12  # of the largest energy

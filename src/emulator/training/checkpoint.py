@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.network.pignn import Architecture
 from emulator.store import fill_tree, read_arrays, save_tree
+from emulator.surrogates.network.pignn import Architecture
 from emulator.training.plan import Plan
 
 CHECKPOINT = "checkpoint.safetensors"

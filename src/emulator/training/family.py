@@ -18,9 +18,9 @@ import numpy as np
 from tqdm import tqdm
 
 from emulator.errors import InputError, SolverError
-from emulator.network.emulator import Emulator
-from emulator.network.pignn import Architecture
 from emulator.scenes.scene import Scene
+from emulator.surrogates.additive import Emulator
+from emulator.surrogates.network.pignn import Architecture
 from emulator.training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from emulator.training.plan import Plan
 from emulator.training.trainer import prepare

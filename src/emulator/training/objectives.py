@@ -23,8 +23,8 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 
+from emulator.fem.functional import displacement_gradient, potential_energy
 from emulator.mechanics.barriers import Barriers
-from emulator.mechanics.energy import displacement_gradient, potential_energy
 from emulator.scenes.scene import Scene
 
 Objective = Literal["energy", "simulations", "gradients", "both"]

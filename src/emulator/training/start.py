@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 
 from emulator.errors import InputError
-from emulator.network.emulator import Emulator
-from emulator.network.graph import node_inputs
-from emulator.network.pignn import Architecture
 from emulator.scenes.scene import Scene
+from emulator.surrogates.additive import Emulator
+from emulator.surrogates.network.graph import node_inputs
+from emulator.surrogates.network.pignn import Architecture
 from emulator.training.plan import Plan
 
 

@@ -18,17 +18,17 @@ from tqdm import tqdm
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs, run_campaign
-from emulator.fem.expansion import constant, expand
-from emulator.network.emulator import BASES, Emulator, fresh
-from emulator.network.graph import augment
-from emulator.network.pignn import Architecture
+from emulator.fem.designs import design, sobol, uniform
 from emulator.scenes.scene import Scene
+from emulator.surrogates.additive import BASES, Emulator, fresh
+from emulator.surrogates.network.graph import augment
+from emulator.surrogates.network.pignn import Architecture
+from emulator.surrogates.taylor import constant, expand
 from emulator.training.basis import mechanical_modes
 from emulator.training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
+from emulator.training.discrepancy_stage import FEWEST, add_residual, rounded
 from emulator.training.objectives import Batch, Scales, make_loss, mean_square_gradient
 from emulator.training.plan import Plan
-from emulator.training.residual_stage import FEWEST, add_residual, rounded
-from emulator.training.sampling import design, sobol, uniform
 from emulator.training.start import architecture_from, start_record, with_network_of
 
 WARMUP = 100
@@ -90,7 +90,7 @@ def prepare(
         simulator,
         thetas,
         slopes=plan.residual,
-        expansion=series,
+        predictor=series,
         deadline=deadline,
         at_least=FEWEST + 1,
         progress=progress,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
-from emulator.geometry.generators import box
-from emulator.network.files import SHIPPED, load
+from emulator.geometry.bodies.box import box
+from emulator.surrogates.files import SHIPPED, load
 
 SCENE = """
 law = "neo_hookean"
@@ -248,7 +248,7 @@ def test_a_scene_without_a_shipped_emulator_says_so(capsys, block, tmp_path):
 
 def test_a_posterior_of_another_emulator_is_not_certified(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    from emulator.network import load, save_emulator
+    from emulator.surrogates import load, save_emulator
 
     emulator = load("once_clamped_beam")
     save_emulator(emulator, "mine")

@@ -7,11 +7,11 @@ import pytest
 
 import calibrate as cal
 from calibrate.samplers import shear
-from emulator.correct import corrected
 from emulator.errors import InputError
-from emulator.forward import fem_forward
-from emulator.reduced import fit_reduced
-from emulator.training import run_campaign, sobol
+from emulator.fem import run_campaign, sobol
+from emulator.surrogates.corrected import corrected
+from emulator.surrogates.fem import fem_forward
+from emulator.surrogates.pod_gp import fit_reduced
 from linear_support import closed_form, linear_forward
 
 PRIOR_MEAN, PRIOR_SD = np.array([70.0, 75.0]), np.array([5.0, 8.0])

@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import quad
 
 import emulator as em
-from calibrate.cli.verification import CASE_NAMES
+from calibrate.cli.commands.verify import CASE_NAMES
 from calibrate.verify import CASES, Row
 from calibrate.verify.consistency import verify_barriers, verify_invariance, verify_patch
 from calibrate.verify.cook import deflection, membrane

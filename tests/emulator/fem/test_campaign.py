@@ -7,10 +7,10 @@ import pytest
 
 import emulator as em
 from emulator.errors import SolverError
-from emulator.fem.expansion import constant, expand
+from emulator.fem import run_campaign, sobol
 from emulator.fem.solution import Status
-from emulator.mechanics.loads import Gravity
-from emulator.training import run_campaign, sobol
+from emulator.scenes.loads.dead import Gravity
+from emulator.surrogates.taylor import constant, expand
 from scene_support import block
 
 
@@ -61,7 +61,7 @@ def test_better_starts_save_iterations_and_change_nothing(simulator, thetas, sol
 
     plain, nearest = iterations()
     moved, along = iterations(slopes=True)
-    expanded, series = iterations(expansion=expand(simulator, order=2))
+    expanded, series = iterations(predictor=expand(simulator, order=2))
     assert along < nearest
     assert series < nearest
     for runs in (moved, expanded):
@@ -75,7 +75,7 @@ def test_better_starts_save_iterations_and_change_nothing(simulator, thetas, sol
 def test_an_expansion_that_crushes_elements_is_not_chosen(simulator, thetas, solves):
     """All its nodes in one point; the neighbour, however far, is the better start."""
     crushed = constant(np.full(2, 0.5), -jnp.asarray(simulator.scene.mesh.nodes))
-    runs = run_campaign(simulator, thetas[:2], expansion=crushed)
+    runs = run_campaign(simulator, thetas[:2], predictor=crushed)
     assert len(runs.theta) == 2
     start, solution = solves[-1]
     np.testing.assert_array_equal(start, runs.displacement[0])

@@ -12,7 +12,7 @@ from emulator.fem.mip import MipNewton, applies, fraction_at_stress
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import modulus
-from emulator.mechanics.tissue import Tissue
+from emulator.scenes.regions import Tissue
 from scene_support import block
 
 

@@ -8,9 +8,9 @@ import pytest
 import emulator as em
 from calibrate.verify.consistency import block
 from emulator.errors import InputError
+from emulator.fem.functional import strain_energy
 from emulator.fem.mixed import advance, consistent, linearise
-from emulator.geometry.generators import box
-from emulator.mechanics.energy import strain_energy
+from emulator.geometry.bodies.box import box
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_mean_dilatation_on_linear_elements_is_refused():
 
 def test_the_network_wants_linear_elements():
     from emulator.geometry.quadratic import to_quadratic
-    from emulator.network.graph import augment
+    from emulator.surrogates.network.graph import augment
 
     quadratic = replace(block("P1"), mesh=to_quadratic(box((2.0, 3.0, 4.0), (1, 1, 1))))
     with pytest.raises(InputError, match="linear tetrahedra"):

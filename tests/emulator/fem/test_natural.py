@@ -7,13 +7,13 @@ import pytest
 
 import emulator as em
 from emulator.fem.mixed import Volumes, advance, carried, consistent, linearise
-from emulator.geometry.ellipsoid import land_ventricle
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
+from emulator.geometry.bodies.ellipsoid import land_ventricle
 from emulator.geometry.quadratic import to_quadratic
-from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.pressure import CavityPressure
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads.pressure import CavityPressure
 
 
 def guccione(mesh, load, held, exponents) -> Scene:

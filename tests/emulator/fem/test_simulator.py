@@ -8,10 +8,10 @@ import pytest
 import emulator as em
 from emulator.errors import InputError, SolverError
 from emulator.fem.assembly import relative_residual
-from emulator.geometry.generators import box
-from emulator.mechanics.follower import FollowerPressure
-from emulator.mechanics.loads import Gravity
+from emulator.geometry.bodies.box import box
 from emulator.scenes import Support
+from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads.follower import FollowerPressure
 from scene_support import block, slope
 
 

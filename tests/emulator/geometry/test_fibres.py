@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
-from emulator.geometry.biventricle import biventricle
-from emulator.geometry.ellipsoid import HUMAN, human_ventricle, land_ventricle
+from emulator.geometry.bodies.biventricle import biventricle
+from emulator.geometry.bodies.box import box
+from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle, land_ventricle
+from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.geometry.fibres import (
     Depth,
     biventricular_directions,
@@ -14,8 +16,6 @@ from emulator.geometry.fibres import (
     rule_based_fibres,
     turned,
 )
-from emulator.geometry.generators import box
-from emulator.geometry.sphere import sphere_octant
 from geometry_support import order_of
 
 

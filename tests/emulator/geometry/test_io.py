@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
 from emulator.geometry.io import (
     read_body,
     read_fibres,

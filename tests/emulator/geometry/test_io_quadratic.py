@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
-from emulator.geometry.generators import box
+from emulator.geometry.bodies.box import box
 from emulator.geometry.io import read_body, read_mesh, write_mesh, write_solution
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic

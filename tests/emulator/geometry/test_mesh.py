@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
+from emulator.geometry.bodies.box import box
 from emulator.geometry.discretisation import discretise
-from emulator.geometry.generators import box
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import orient, signed_volumes
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
-from emulator.geometry.biventricle import biventricle
-from emulator.geometry.ellipsoid import HUMAN, human_ventricle
+from emulator.geometry.bodies.biventricle import biventricle
+from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.segments import aha_segments
 from emulator.geometry.tetrahedra import signed_volumes
 from scene_support import rotation

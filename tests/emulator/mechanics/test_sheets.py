@@ -8,11 +8,11 @@ import pytest
 import emulator as em
 from emulator.errors import InputError
 from emulator.fem import Status
-from emulator.geometry.ellipsoid import human_ventricle
+from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import rule_based_directions
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.pressure import CavityPressure
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.loads.pressure import CavityPressure
 
 # Shear of pig myocardium, Holzapfel & Ogden (2009), Table 1.
 PIG = {

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.catalogue import find_scene, scene_from_origin
 from emulator.fem import Status
-from emulator.mechanics.energy import volume_ratio
-from emulator.mechanics.pressure import KPA_PER_MMHG, cavity_volume
-from emulator.scenes import BUILT_IN, find_scene, scene_from_recipe
+from emulator.fem.functional import volume_ratio
+from emulator.scenes import BUILT_IN
+from emulator.scenes.loads.pressure import KPA_PER_MMHG, cavity_volume
 
 COARSE = {
     "left_ventricle": {"rings": 5, "around": 12, "layers": 1},
@@ -71,8 +72,8 @@ def test_a_ventricle_of_other_dimensions_is_made_again_by_its_recipe():
     wall = (18.0, 48.0, 31.0, 57.0, 16.0)
     scene = em.scenes.left_ventricle(5, 12, 1, wall=wall)
     assert scene.mesh.nodes[:, 2].max() == pytest.approx(16.0)
-    assert scene_from_recipe(scene.recipe).fingerprint == scene.fingerprint
-    assert "wall" not in em.scenes.left_ventricle(5, 12, 1).recipe
+    assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
+    assert "wall" not in em.scenes.left_ventricle(5, 12, 1).origin
 
 
 @pytest.mark.slow

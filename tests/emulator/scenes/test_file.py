@@ -5,21 +5,22 @@ import meshio
 import numpy as np
 import pytest
 
+from emulator.catalogue import find_scene, scene_from_origin
 from emulator.errors import InputError
-from emulator.geometry.biventricle import biventricle
-from emulator.geometry.ellipsoid import human_ventricle
+from emulator.geometry.bodies.biventricle import biventricle
+from emulator.geometry.bodies.box import box
+from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import (
     biventricular_directions,
     rule_based_directions,
     rule_based_fibres,
 )
-from emulator.geometry.generators import box
 from emulator.geometry.io import write_mesh
 from emulator.geometry.quadratic import to_quadratic
-from emulator.mechanics.elastic_support import ElasticSupport
-from emulator.mechanics.follower import FollowerPressure
-from emulator.mechanics.loads import Gravity, Traction
-from emulator.scenes import Parameter, file, find_scene, scene_from_recipe
+from emulator.scenes import Parameter, file
+from emulator.scenes.loads.dead import Gravity, Traction
+from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.supports.elastic import ElasticSupport
 from emulator.scenes.tables import Table
 
 SCENE = """
@@ -85,7 +86,7 @@ def test_a_scene_from_a_file(folder):
     np.testing.assert_array_equal(
         np.flatnonzero(scene.held.all(axis=1)), scene.mesh.node_set("left")
     )
-    assert scene_from_recipe(scene.recipe).fingerprint == scene.fingerprint
+    assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
 
 
 @pytest.mark.parametrize(
@@ -222,7 +223,7 @@ def test_the_examples_of_the_documentation(folder):
     assert scene.elastic_supports == (ElasticSupport("epicardium", 0.2, "normal"),)
     pressure = FollowerPressure("endocardium", 0.8)
     assert scene.loads == (pressure, Traction("base", (0.0, 0.1, 0.0)))
-    assert scene_from_recipe(scene.recipe).fingerprint == scene.fingerprint
+    assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
 
 
 def test_pressures_as_parameters_and_other_rules_for_fibres(folder):
@@ -350,5 +351,5 @@ def test_unknown_names(tmp_path):
         find_scene(str(tmp_path / "none.toml"))
     with pytest.raises(InputError, match="with --root DIR"):
         find_scene("published:OnceClampedBeam")
-    with pytest.raises(InputError, match="recipe names scene 'None'"):
-        scene_from_recipe({})
+    with pytest.raises(InputError, match="origin names scene 'None'"):
+        scene_from_origin({})

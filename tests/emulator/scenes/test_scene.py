@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.catalogue import find_scene, scene_from_origin
 from emulator.errors import InputError
-from emulator.mechanics.follower import FollowerPressure
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.loads import Gravity
-from emulator.scenes import BUILT_IN, Parameter, Support, find_scene, scene_from_recipe
+from emulator.scenes import BUILT_IN, Parameter, Support
+from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads.follower import FollowerPressure
 from scene_support import block
 
 
@@ -17,7 +18,7 @@ from scene_support import block
 def test_built_in_scenes_are_made_again_by_their_recipe(name):
     scene = find_scene(name)
     assert scene.name == name
-    assert scene_from_recipe(scene.recipe).fingerprint == scene.fingerprint
+    assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
 
 
 def test_any_resolution():

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.expansion import constant, expand
+from emulator.surrogates.taylor import constant, expand
 from emulator.training.basis import mechanical_modes
 
 

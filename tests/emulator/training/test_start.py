@@ -9,7 +9,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.network import load, save_emulator
+from emulator.surrogates import load, save_emulator
 from emulator.training import Plan, pretrain, recipe, train
 from emulator.training.checkpoint import CHECKPOINT
 from emulator.training.start import with_network_of

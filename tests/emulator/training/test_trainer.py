@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.error.comparison import evaluate
 from emulator.errors import InputError
-from emulator.evaluation import evaluate
-from emulator.network import Architecture
-from emulator.training import Plan, recipe, run_campaign, sobol, train, uniform
+from emulator.fem import run_campaign, sobol, uniform
+from emulator.surrogates import Architecture
+from emulator.training import Plan, recipe, train
 from emulator.training.checkpoint import CHECKPOINT
 from emulator.training.objectives import OBJECTIVES, Batch, Scales, make_loss
 from emulator.training.trainer import WARMUP, learning_rate
@@ -173,7 +174,7 @@ def test_gradients_by_an_independent_evaluation(tests):
     bent = em.scenes.once_clamped_beam(cells=(4, 2, 2))
     nodes = bent.mesh.nodes.copy()
     nodes[:, 0] = 100.0 * (nodes[:, 0] / 100.0) ** 2
-    graded = replace(bent, mesh=replace(bent.mesh, nodes=nodes), recipe={})
+    graded = replace(bent, mesh=replace(bent.mesh, nodes=nodes), origin={})
     u = rough(tests)
     misfits = []
     for found, exact in zip(u, np.asarray(tests.displacement), strict=True):

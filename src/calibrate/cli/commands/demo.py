@@ -1,0 +1,52 @@
+"""``calibrate demo``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress
+from calibrate.cli.posterior_table import summary
+
+# Named here too, so that --help needs no imports; a test compares them with calibrate.demo.DEMOS.
+_DEMOS = ("once_clamped_beam", "left_ventricle")
+
+
+def register(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "demo", help="the whole job on a built-in beam in under a minute, or on a ventricle"
+    )
+    parser.add_argument(
+        "--scene",
+        choices=_DEMOS,
+        default=_DEMOS[0],
+        help="the beam (default), or the left ventricle from a volume and 24 landmarks, in minutes",
+    )
+    parser.add_argument("--out", default="demo-output", metavar="DIR")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the demo and show what came out."""
+    import time
+
+    started = time.perf_counter()
+    from calibrate.demo import demo as run_demo
+
+    report = run_demo(arguments.out, arguments.scene, progress=show_progress(arguments))
+    report["seconds"] = round(time.perf_counter() - started, 1)
+    report["files"] = [
+        f"{arguments.out}/{name}"
+        for name in ("posterior.nc", "certificate.json", report.pop("picture"))
+    ]
+    lines = [summary(report)]
+    if "identifiability" in report:
+        from calibrate.identifiability import in_words
+
+        lines.append(in_words(report["identifiability"]))
+    lines.append(f"written: {', '.join(report['files'])} ({report['seconds']:.0f} s)")
+    text = "\n".join(lines)
+    emit(report, as_json=arguments.json, text=text)
+    return DONE if report["verdict"] == "accepted" else FAILED

@@ -1,0 +1,85 @@
+"""``calibrate simulate``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments, check_vtu, emit
+
+
+def register(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser("simulate", help="solve a scene by finite elements")
+    add_scene(parser)
+    parser.add_argument(
+        "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
+    )
+    parser.add_argument(
+        "--load-steps",
+        type=int,
+        default=1,
+        metavar="N",
+        help="follow the loading path; a very soft body has several equilibria (default 1)",
+    )
+    parser.add_argument(
+        "--out", metavar="FILE.vtu", help="write displacement, stress, strain and fibres"
+    )
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Solve at one theta and say how it went."""
+    import numpy as np
+
+    from emulator.catalogue import find_scene
+    from emulator.fem import NewtonOptions, Simulator, Status
+    from emulator.fem.fields import element_fields
+    from emulator.fem.functional import potential_energy, volume_ratio
+    from emulator.geometry.io import write_solution
+    from emulator.scenes.loads.follower import FollowerPressure
+
+    scene = find_scene(arguments.scene, arguments.root)
+    theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
+    if arguments.out:
+        check_vtu(arguments.out)
+    simulator = Simulator(scene, NewtonOptions.load_steps(arguments.load_steps))
+    solution = simulator.solve(theta)
+    status = Status(int(solution.status))
+    J = np.asarray(volume_ratio(scene, solution.displacement))
+    # A pressure that follows an open patch has no potential.
+    open_patch = any(isinstance(load, FollowerPressure) for load in scene.loads)
+    energy = None if open_patch else float(potential_energy(scene)(solution.displacement, theta))
+    stable = None
+    if status is Status.CONVERGED and not open_patch:
+        stable = simulator.is_stable(solution.displacement, theta)
+    result = {
+        "scene": scene.name,
+        "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
+        "status": status.name.lower(),
+        "iterations": int(solution.iterations),
+        "residual": float(solution.residual),
+        "load_reached": float(solution.load_reached),
+        "energy": energy,
+        "stable": stable,
+        "max_displacement": float(np.linalg.norm(solution.displacement, axis=1).max()),
+        "J_range": [float(J.min()), float(J.max())],
+    }
+    if arguments.out and status is Status.CONVERGED:
+        u = np.asarray(solution.displacement)
+        fields = element_fields(scene, solution.displacement, theta)
+        write_solution(arguments.out, scene.mesh, u, fields)
+        result["out"] = arguments.out
+    lines = [f"{scene.name}: {status.text}, {result['iterations']} Newton iterations"]
+    told = "no potential energy" if energy is None else f"energy {energy:.8g} mN mm"
+    lines.append(f"largest displacement {result['max_displacement']:.6g} mm, {told}")
+    lines.append(
+        f"J from {J.min():.4f} to {J.max():.4f}, relative residual {result['residual']:.1e}"
+    )
+    if stable is False:
+        lines.append(
+            "an unstable equilibrium: it has buckled, and any imperfection leads elsewhere"
+        )
+    emit(result, as_json=arguments.json, text="\n".join(lines))
+    return DONE if status is Status.CONVERGED else FAILED

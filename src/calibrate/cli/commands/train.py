@@ -1,0 +1,111 @@
+"""``calibrate train``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from calibrate.cli.common import (
+    DONE,
+    add_json,
+    add_scene,
+    emit,
+    seconds,
+    show_progress,
+)
+
+
+def register(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser("train", help="train an emulator")
+    add_scene(parser)
+    parser.add_argument(
+        "--recipe",
+        choices=("hybrid", "mechanics", "network", "paper"),
+        help="default hybrid: Taylor series, network trained on the energy, residual of FEM runs; "
+        "mechanics: the same without the network, in a minute",
+    )
+    parser.add_argument(
+        "--start",
+        metavar="EMULATOR",
+        help="begin from the network of this emulator (shipped name or folder), whatever its mesh; "
+        "the recipe then is network unless another is given",
+    )
+    parser.add_argument(
+        "--objective",
+        choices=("energy", "simulations", "gradients", "both"),
+        help="what the network is trained on: the energy; FEM displacements; those and their "
+        "deformation gradients; FEM displacements and the energy",
+    )
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument(
+        "--budget", metavar="TIME", help="time for everything, e.g. 10m (default 10m)"
+    )
+    length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
+    parser.add_argument("--simulations", type=int, help="FEM runs to train on")
+    parser.add_argument("--batch", type=int, help="theta a step")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument(
+        "--resume", action="store_true", help="continue from the checkpoint in --out"
+    )
+    parser.add_argument("--out", required=True, metavar="DIR")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train and write an emulator."""
+    from calibrate.provenance import hardware, versions
+    from emulator.catalogue import find_scene
+    from emulator.errors import InputError
+    from emulator.store import check_folder
+    from emulator.surrogates import load, save_emulator
+    from emulator.training import recipe, remove_checkpoint
+    from emulator.training import train as train_emulator
+
+    scene = find_scene(arguments.scene, arguments.root)
+    check_folder(arguments.out)
+    names = ("objective", "steps", "simulations", "batch", "seed")
+    given = {name: getattr(arguments, name) for name in names}
+    given = {name: value for name, value in given.items() if value is not None}
+    others = [name for name in ("recipe", "start", "budget") if getattr(arguments, name)]
+    if arguments.resume and (given or others):
+        option = next(iter([*given, *others]))
+        raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
+    start = load(arguments.start) if arguments.start else None
+    plan = recipe(arguments.recipe or ("network" if start else "hybrid"))
+    fixed = arguments.resume or "steps" in given
+    result = train_emulator(
+        scene,
+        replace(plan, **given),
+        arguments.out,
+        start=start,
+        budget=None if fixed else seconds(arguments.budget or "10m"),
+        resume=arguments.resume,
+        progress=show_progress(arguments),
+    )
+    record = {
+        **result.record,
+        "command": command_line(arguments.scene, result.record),
+        "budget": arguments.budget,
+        "hardware": hardware(),
+        "versions": versions(),
+    }
+    result = replace(result, record=record)
+    save_emulator(result, arguments.out)
+    remove_checkpoint(arguments.out)
+    steps = record["plan"]["steps"]
+    text = f"trained {scene.name}: {steps} steps, {record['seconds']:.0f} s, in {arguments.out}"
+    emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
+    return DONE
+
+
+def command_line(scene: str, record: Mapping[str, Any]) -> str:
+    """The command that repeats a training exactly, whatever interrupted or hurried it."""
+    names = ("recipe", "objective", "steps", "simulations", "batch", "seed")
+    options = " ".join(f"--{name} {record['plan'][name]}" for name in names)
+    # Which emulator it started from is in the record, by its fingerprint.
+    start = " --start EMULATOR" if "start" in record else ""
+    return f"calibrate train {scene} {options}{start} --out DIR"

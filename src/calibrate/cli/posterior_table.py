@@ -1,0 +1,36 @@
+"""A posterior's parameter table and verdict, for people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from calibrate.cli.common import table
+
+
+def summary(report: dict[str, Any]) -> str:
+    """The parameter table and the verdict for people."""
+    parameters = report["parameters"]
+    columns = ["mean", "sd", "low", "high", "r_hat", "ess_bulk"]
+    titles = ["mean", "sd", "5 %", "95 %", "R-hat", "ESS"]
+    if any("truth" in row for row in parameters.values()):
+        columns, titles = ["truth", *columns], ["truth", *titles]
+    shift = report.get("certificate", {}).get("shift")
+    rows = []
+    for name, row in parameters.items():
+        cells: list[object] = [row.get(column) for column in columns]
+        rows.append((name, *cells, *([shift[name]] if shift else [])))
+    lines = [table(("parameter", *titles, *(["FEM shift / sd"] if shift else [])), rows)]
+    lines.append(
+        f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
+        f", forward map: {report['forward']}"
+    )
+    if "certificate" not in report:
+        lines.append("not checked against FEM yet: calibrate certify")
+    else:
+        c = report["certificate"]
+        lines.append(
+            f"verdict: {report['verdict']} (Pareto k {c['k_hat']:.2f}, "
+            f"at most {c['k_threshold']:.2f}; {c['draws']} FEM runs, {c['failed']} failed): "
+            f"{c['reason']}"
+        )
+    return "\n".join(lines)

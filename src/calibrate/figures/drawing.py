@@ -1,0 +1,60 @@
+"""What all pictures of posteriors share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from calibrate.certificate import Certificate
+from calibrate.observations import Landmarks, NodalDisplacements
+from calibrate.posterior import Posterior
+from emulator.errors import InputError
+from emulator.store import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def pyplot() -> Any:
+    """matplotlib.pyplot drawing to files; :class:`InputError` when it is not installed."""
+    try:
+        import matplotlib as mpl
+    except ImportError as error:
+        raise InputError(
+            "figures need matplotlib: pip install 'soft-tissue-calibrate[plot]'"
+        ) from error
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
+
+
+def displacement_draws(posterior: Posterior, count: int = 200) -> np.ndarray:
+    """Full displacement fields (count, n, 3) mm at evenly spaced draws, from the forward map."""
+    thetas = posterior.thetas()
+    rows = np.linspace(0, len(thetas) - 1, count).astype(int)
+    return np.asarray(jax.jit(lambda t: jax.lax.map(posterior.model.full, t))(thetas[rows]))
+
+
+def displacement_part(posterior: Posterior) -> NodalDisplacements | Landmarks:
+    """The observation of displacements; :class:`InputError` when there is none."""
+    part = posterior.model.observe.parts.get("displacement")
+    if not isinstance(part, NodalDisplacements | Landmarks):
+        raise InputError("figure: the posterior observes no displacements")
+    return part
+
+
+def title_and_save(
+    figure: Figure, posterior: Posterior, certificate: Certificate, path: str | Path
+) -> None:
+    """Say whose posterior it is and what FEM says of it, write the picture, close it."""
+    figure.suptitle(
+        f"{posterior.model.forward.scene.name}: posterior by {posterior.model.forward.kind}, "
+        f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"
+    )
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=140)
+    pyplot().close(figure)

@@ -1,0 +1,258 @@
+"""Pictures of a forward map's errors, after Figs. 5 to 13 of Dalton et al. (2023)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import gaussian_kde
+
+from calibrate.figures.drawing import pyplot
+from emulator.error.comparison import UNITS, Errors, quantiles
+from emulator.geometry.mesh import Mesh
+from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.scene import Scene
+from emulator.store import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from calibrate.evaluation import Evaluated
+
+LABELS = {
+    "err_u": "error in displacement (mm)",
+    "err_F": "error in deformation gradient",
+    "err_I1": "error in first invariant",
+    "err_Pi": "error in energy (%)",
+    "err_V": "error in cavity volume (%)",
+}
+_INSIDE, _OUTSIDE = "tab:blue", "tab:orange"
+_MOST = 20_000  # values a density is estimated from; more change nothing one can see
+# Each quadratic facet (corners, then middles of edges 01, 12, 20) as four flat ones.
+_QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+
+
+def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
+    """Draw all figures into ``folder``; the files written."""
+    scene, folder = evaluated.forward.scene, Path(folder)
+    title = f"{scene.name}: {_map_name(evaluated.report)} against {evaluated.report['reference']}"
+    figures = {
+        "error_densities.png": density_figure(evaluated.inside, evaluated.outside, title),
+        "error_over_parameters.png": parameter_figure(
+            scene, evaluated.inside, evaluated.outside, title
+        ),
+        "error_on_surface.png": surface_figure(
+            scene, evaluated.inside.fields["err_u"].mean(axis=0), title
+        ),
+    }
+    plt = pyplot()
+    for name, figure in figures.items():
+        with replacing(folder / name) as temporary:
+            figure.savefig(temporary, dpi=140)
+        plt.close(figure)
+    return [folder / name for name in figures]
+
+
+def _map_name(report: Any) -> str:
+    kind = report["forward"]
+    if kind == "corrected":
+        return f"emulator + {report['steps']} Newton step{'s' if report['steps'] > 1 else ''}"
+    return f"POD + GP of {report['fem_runs']} FEM runs" if kind == "reduced" else kind
+
+
+# ---- densities --------------------------------------------------------------------------------
+def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
+    """Density of each error on a logarithmic axis, its median and 97.5 % quantile marked."""
+    names = [name for name in LABELS if name in inside.fields]
+    columns = 3 if len(names) > 4 else 2
+    figure, grid = pyplot().subplots(
+        2, columns, figsize=(4.2 * columns, 6.4), layout="constrained", squeeze=False
+    )
+    for axes, name in zip(grid.flat, names, strict=False):
+        _draw_density(axes, inside.fields[name], _INSIDE, "inside" if outside else "")
+        if outside is not None:
+            _draw_density(axes, outside.fields[name], _OUTSIDE, "outside")
+        axes.set(xscale="log", xlabel=LABELS[name], ylim=(0.0, None), yticks=[])
+        if axes.lines:
+            axes.legend(
+                frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2
+            )
+        else:
+            axes.text(0.5, 0.5, "no error", transform=axes.transAxes, ha="center")
+        axes.spines[["top", "right", "left"]].set_visible(False)
+    for axes in grid.flat[len(names) :]:
+        axes.set_axis_off()
+    figure.suptitle(title)
+    return figure
+
+
+def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> None:
+    found = quantiles(values)
+    head = f"{label}: " if label else ""
+    for name, style, text in (("median", "-", "median"), ("q97_5", "--", "97.5 %")):
+        if found[name] > 0.0:
+            line = f"{head}{text} {found[name]:.3g}"
+            axes.axvline(found[name], color=colour, ls=style, lw=1.2, label=line)
+    curve = log_density(values)
+    if curve is None:
+        return  # one value: the lines say it all
+    at, density = curve
+    axes.plot(at, density, color=colour, lw=1.5)
+    axes.fill_between(at, density, color=colour, alpha=0.2, lw=0)
+
+
+def log_density(values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Errors (300,) and the density of ``log10(values)`` there; ``None`` where all are alike."""
+    positive = values[values > 0.0]  # held nodes have no error, and no logarithm
+    logs = np.log10(positive[:: max(1, len(positive) // _MOST)])
+    if len(logs) < 2 or np.ptp(logs) < 1e-6:
+        return None
+    estimate = gaussian_kde(logs)
+    width = 3.0 * float(np.sqrt(estimate.covariance[0, 0]))
+    low, high = np.quantile(logs, [0.001, 0.999])
+    at = np.linspace(low - width, high + width, 300)
+    return 10.0**at, estimate(at)
+
+
+# ---- over the parameters ----------------------------------------------------------------------
+def parameter_figure(scene: Scene, inside: Errors, outside: Errors | None, title: str) -> Any:
+    """Median err_u of each case over parameter space: a map of two, or one panel a parameter."""
+    groups = [(inside, "o", "inside the box")]
+    if outside is not None:
+        groups.append((outside, "D", "outside"))
+    cases = [
+        (errors.thetas, np.maximum(np.median(errors.fields["err_u"], axis=1), 1e-17), marker, label)
+        for errors, marker, label in groups
+    ]
+    two = len(scene.parameters) == 2
+    figure = _draw_map(scene, cases) if two else _draw_panels(scene, cases)
+    figure.suptitle(title)
+    return figure
+
+
+def _draw_map(scene: Scene, cases: list[Any]) -> Any:
+    """Cases in the plane of two parameters, coloured by their error."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.patches import Rectangle
+
+    plt = pyplot()
+    figure, axes = plt.subplots(figsize=(6.8, 5.4), layout="constrained")
+    everything = np.concatenate([errors for _, errors, _, _ in cases])
+    low, high = everything.min(), everything.max()
+    norm = LogNorm(low, max(high, 1.01 * low))
+    scatter = None
+    for thetas, errors, marker, label in cases:
+        scatter = axes.scatter(
+            *thetas.T, c=errors, norm=norm, marker=marker, s=42, ec="k", lw=0.4, label=label
+        )
+    figure.colorbar(scatter, ax=axes, label="median error in displacement of a case (mm)")
+    x, y = scene.parameters
+    size = (x.high - x.low, y.high - y.low)
+    axes.add_patch(Rectangle((x.low, y.low), *size, fill=False, ls="--", lw=1.0))
+    if len(cases) > 1:
+        figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    axes.set(xlabel=_name(x), ylabel=_name(y))
+    _scale(axes.set_xscale, axes.xaxis, x)
+    _scale(axes.set_yscale, axes.yaxis, y)
+    return figure
+
+
+def _draw_panels(scene: Scene, cases: list[Any]) -> Any:
+    """Error of the cases over each parameter in turn."""
+    count = len(scene.parameters)
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure, grid = pyplot().subplots(
+        rows,
+        columns,
+        figsize=(3.8 * columns + 0.6, 3.2 * rows + 0.6),
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )
+    for k, (axes, parameter) in enumerate(zip(grid.flat, scene.parameters, strict=False)):
+        for (thetas, errors, marker, label), colour in zip(
+            cases, (_INSIDE, _OUTSIDE), strict=False
+        ):
+            axes.scatter(
+                thetas[:, k], errors, marker=marker, color=colour, s=22, alpha=0.75, lw=0,
+                label=label,
+            )  # fmt: skip
+        axes.axvspan(parameter.low, parameter.high, color="0.93", zorder=0)
+        axes.set(xlabel=_name(parameter), yscale="log")
+        _scale(axes.set_xscale, axes.xaxis, parameter)
+    for axes in grid.flat[count:]:
+        axes.set_axis_off()
+    _plain(grid[0, 0].yaxis, (1.0, 2.0, 5.0))  # shared
+    for axes in grid[:, 0]:
+        axes.set_ylabel("median err_u of a case (mm)")
+    if len(cases) > 1:
+        figure.legend(
+            *grid[0, 0].get_legend_handles_labels(),
+            loc="outside lower center", ncols=2, frameon=False,
+        )  # fmt: skip
+    return figure
+
+
+def _name(parameter: Parameter) -> str:
+    return f"{parameter.name} ({parameter.unit})" if parameter.unit else parameter.name
+
+
+def _scale(set_scale: Any, axis: Any, parameter: Parameter) -> None:
+    """The parameter's own scale, with plain numbers at its ticks."""
+    if parameter.scale == "log":
+        set_scale("log")
+        _plain(axis, (1.0, 2.0, 3.0, 5.0, 7.0))
+
+
+def _plain(axis: Any, digits: tuple[float, ...]) -> None:
+    """Ticks of a logarithmic axis at these leading digits, as plain numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    axis.set_major_locator(LogLocator(subs=digits))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+# ---- on the body ------------------------------------------------------------------------------
+def surface_triangles(mesh: Mesh) -> np.ndarray:
+    """The surface as flat triangles (k, 3), four for each quadratic facet."""
+    facets = mesh.surface
+    return facets if facets.shape[1] == 3 else facets[:, _QUARTERS].reshape(-1, 3)
+
+
+def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
+    """The undeformed body's surface coloured by ``error`` (n,) mm at its nodes, from two sides."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.ticker import MaxNLocator, NullFormatter
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    plt = pyplot()
+    nodes, triangles = scene.mesh.nodes, surface_triangles(scene.mesh)
+    values = error[triangles].mean(axis=1)
+    colour = ScalarMappable(Normalize(0.0, max(float(values.max()), 1e-17)), "viridis")
+    extent = np.ptp(nodes, axis=0)
+    figure = plt.figure(figsize=(11.0, 5.2), layout="constrained")
+    panels = []
+    for column, (azimuth, elevation) in enumerate(((-60.0, 15.0), (120.0, 40.0)), 1):
+        axes = figure.add_subplot(1, 2, column, projection="3d", azim=azimuth, elev=elevation)
+        axes.add_collection3d(
+            Poly3DCollection(nodes[triangles], facecolors=colour.to_rgba(values), lw=0.0)
+        )
+        thin = extent < 0.25 * extent.max()
+        for k, name in enumerate("xyz"):
+            axis = (axes.xaxis, axes.yaxis, axes.zaxis)[k]
+            getattr(axes, f"set_{name}lim")(nodes[:, k].min(), nodes[:, k].max())
+            axis.set_major_locator(MaxNLocator(4))
+            if thin[k]:  # its numbers would lie on top of one another
+                axis.set_major_formatter(NullFormatter())
+            else:
+                getattr(axes, f"set_{name}label")(f"{name} (mm)", labelpad=14 if thin.any() else 4)
+        axes.set_box_aspect(extent, zoom=0.88)
+        panels.append(axes)
+    label = f"mean err_u of the cases ({UNITS['err_u']})"
+    figure.colorbar(colour, ax=panels, label=label, shrink=0.75)
+    figure.suptitle(title)
+    return figure

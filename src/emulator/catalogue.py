@@ -1,0 +1,58 @@
+"""From a name, a scene file or a scene's origin to the scene: built in, TOML or released."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from emulator.errors import InputError
+from emulator.released.scenes import published_scene
+from emulator.scenes.file import read_scene
+from emulator.scenes.registry import BUILT_IN
+from emulator.scenes.scene import Scene
+
+_RELEASED = "published:"
+
+
+def find_scene(name: str, root: str | Path | None = None) -> Scene:
+    """The scene called ``name``.
+
+    Parameters
+    ----------
+    name : a built-in scene, a ``.toml`` file, or ``published:<Model>``.
+    root : folder of the published data, for the last of these.
+
+    Raises
+    ------
+    InputError
+        No such scene or file.
+    """
+    if name.startswith(_RELEASED):
+        if root is None:
+            raise InputError(f"scene '{name}': say where the published data is with --root DIR")
+        return published_scene(name.removeprefix(_RELEASED), root)
+    if name.endswith(".toml"):
+        return read_scene(name)
+    if name not in BUILT_IN:
+        raise InputError(
+            f"scene '{name}' is unknown; built in: {', '.join(sorted(BUILT_IN))}; "
+            "or give a .toml file, or published:<Model> with --root DIR"
+        )
+    return BUILT_IN[name]()
+
+
+def scene_from_origin(origin: Mapping[str, Any]) -> Scene:
+    """The scene that ``origin``, plain JSON, says how to make: see :class:`Scene`."""
+    options = dict(origin)
+    name = options.pop("scene", None)
+    if name == "file":
+        return read_scene(options["path"])
+    if isinstance(name, str) and name.startswith(_RELEASED):
+        return find_scene(name, options["root"])
+    if name not in BUILT_IN:
+        raise InputError(f"origin names scene '{name}'; built in: {', '.join(sorted(BUILT_IN))}")
+    # JSON has lists where the generators take tuples.
+    return BUILT_IN[name](
+        **{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()}
+    )

@@ -1,0 +1,146 @@
+"""Errors of a forward map against reference solutions (Dalton et al. 2023, Eqs. 26-28)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.errors import InputError, SolverError
+from emulator.fem.functional import displacement_gradient, potential_energy
+from emulator.geometry.cavity import Cavity, cavity_sets
+from emulator.scenes.scene import Scene
+from emulator.surrogates.protocol import ForwardMap
+
+UNITS = {
+    "err_u": "mm",
+    "err_F": "1",
+    "err_I1": "1",
+    "err_Pi": "%",
+    "err_V": "%",
+    "max_u": "mm",
+    "mean_u": "mm",
+}
+
+
+def quantiles(errors: jax.Array | np.ndarray) -> dict[str, float]:
+    """Median, mean, 97.5 % quantile and maximum over all entries."""
+    values = np.asarray(errors).ravel()
+    return {
+        "median": float(np.median(values)),
+        "mean": float(np.mean(values)),
+        "q97_5": float(np.quantile(values, 0.975)),
+        "max": float(np.max(values)),
+    }
+
+
+def field_errors(
+    scene: Scene,
+    theta: jax.Array,
+    u: jax.Array,
+    reference: jax.Array,
+    cavities: Sequence[Cavity] = (),
+) -> dict[str, jax.Array]:
+    """Errors of one field ``u`` (n, 3) against ``reference`` (n, 3).
+
+    err_u : (n,) distance in mm at each node.
+    err_F : (m, q) Frobenius norm of the error in the deformation gradient.
+    err_I1 : (m, q) error in the first invariant.
+    err_Pi : () error in the potential energy, percent.
+    err_V : (v,) error in the volume of each of the ``cavities``, percent; absent without any.
+    """
+    Pi = potential_energy(scene)
+    H, H_reference = displacement_gradient(scene, u), displacement_gradient(scene, reference)
+    I1, I1_reference = (
+        2.0 * jnp.trace(h, axis1=-2, axis2=-1) + jnp.sum(h * h, (-2, -1)) for h in (H, H_reference)
+    )
+    errors = {
+        "err_u": jnp.sqrt(jnp.sum((u - reference) ** 2, axis=-1)),
+        "err_F": jnp.sqrt(jnp.sum((H - H_reference) ** 2, axis=(-2, -1))),
+        "err_I1": jnp.abs(I1 - I1_reference),
+        "err_Pi": _percent(Pi(u, theta), Pi(reference, theta)),
+    }
+    if cavities:
+        volumes = [_percent(V(u[V.nodes]), V(reference[V.nodes])) for V in cavities]
+        errors["err_V"] = jnp.stack(volumes)
+    return errors
+
+
+def _percent(value: jax.Array, exact: jax.Array) -> jax.Array:
+    return 100.0 * jnp.abs((value - exact) / exact)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors of each test case for which the forward map has an answer.
+
+    thetas : (c, p). fields : name -> (c, ...), those of :func:`field_errors`, and ``max_u`` and
+    ``mean_u`` (c,), the size of the reference. invalid : cases without an answer, left out.
+    """
+
+    thetas: np.ndarray
+    fields: Mapping[str, np.ndarray]
+    invalid: int
+
+    def report(self) -> dict[str, Any]:
+        """Quantiles of every field, ``units``, ``cases`` and ``invalid``, as plain JSON."""
+        summary = {name: quantiles(values) for name, values in self.fields.items()}
+        units = {name: unit for name, unit in UNITS.items() if name in self.fields}
+        return {**summary, "units": units, "cases": len(self.thetas), "invalid": self.invalid}
+
+
+def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) -> Errors:
+    """Errors of ``forward`` in each of the test cases ``thetas`` (c, p), ``reference`` (c, n, 3).
+
+    Raises
+    ------
+    InputError
+        The map does not return all nodes.
+    SolverError
+        It has no valid answer for any case.
+    """
+    scene = forward.scene
+    if len(forward.nodes) != len(scene.mesh.nodes):
+        raise InputError("evaluation needs a forward map over all nodes")
+    cavities = [Cavity(scene, name) for name in cavity_sets(scene)]
+
+    @jax.jit
+    def one(theta: jax.Array, exact: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        prediction = forward.evaluate(theta)
+        errors = field_errors(scene, theta, prediction.displacement, exact, cavities)
+        size = jnp.sqrt(jnp.sum(exact**2, axis=-1))
+        errors |= {"max_u": jnp.max(size), "mean_u": jnp.mean(size)}
+        finite = jnp.array([jnp.all(jnp.isfinite(value)) for value in errors.values()])
+        return errors, prediction.valid & jnp.all(finite)
+
+    found = [one(theta, u) for theta, u in zip(thetas, reference, strict=True)]
+    valid = np.array([bool(sound) for _, sound in found])
+    if not valid.any():
+        raise SolverError(
+            f"the {forward.kind} map has no valid answer for any of {len(found)} test cases"
+        )
+    kept = [errors for errors, sound in found if sound]
+    fields = {name: np.stack([errors[name] for errors in kept]) for name in kept[0]}
+    return Errors(np.asarray(thetas)[valid], fields, int((~valid).sum()))
+
+
+def evaluate(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) -> dict[str, Any]:
+    """Error quantiles of ``forward`` over test cases.
+
+    Parameters
+    ----------
+    forward : a map over all nodes of its scene.
+    thetas : (c, p).
+    reference : (c, n, 3) mm.
+
+    Returns
+    -------
+    dict with err_u, err_F, err_I1, err_Pi and, where the scene has a cavity, err_V (quantiles; over
+    nodes, points or cavities and cases together), max_u and mean_u (of |u| over the nodes of each
+    case), units, cases, and how many more were invalid.
+    """
+    return case_errors(forward, thetas, reference).report()

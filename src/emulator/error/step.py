@@ -1,0 +1,163 @@
+r"""How far a displacement is from the equilibrium near it, found in three ways.
+
+One Newton step and a check of it; FEM's own guarded iteration, where that says too little; and
+conjugate gradients with a tangent factorised elsewhere. :mod:`emulator.error.estimate` has the
+theory.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.fem.assembly import System
+from emulator.fem.functional import volume_ratio
+from emulator.fem.newton import Newton, NewtonState
+from emulator.fem.simulator import Simulator
+from emulator.fem.solution import Status
+from emulator.scenes.scene import Scene
+
+ENDLESS = 1e100  # mm; beyond this, squares overflow
+_CONTRACTION = 0.25  # above which one step says too little; see emulator.error.estimate
+_SHRINK = 0.2  # least fraction of the smallest J that a step may leave
+_ROUND_OFF = 1e-9  # an error this small beside the displacement is round-off, and does not contract
+_GOOD_STEP = 0.1  # of the residual is the most that a step to be believed leaves
+_MOST_ITERATIONS = 30
+_FRACTIONS = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of the way from the centre to a prediction
+
+
+class Distance(NamedTuple):
+    """How far a field is from equilibrium, as one way of finding out has it.
+
+    move : (n, 3) mm, the field less the equilibrium.
+    gap : () mN mm, its potential energy less that of the equilibrium.
+    contraction : () about how wrong ``move`` is, relative to itself.
+    iterations : () of FEM's iteration that were taken.
+    indefinite : () whether the tangent is known to be indefinite.
+    settled : () whether the rest is to be believed.
+    """
+
+    move: jax.Array
+    gap: jax.Array
+    contraction: jax.Array
+    iterations: jax.Array
+    indefinite: jax.Array
+    settled: jax.Array
+
+
+def _least_J(scene: Scene, u: jax.Array) -> jax.Array:
+    return jnp.min(volume_ratio(scene, u))
+
+
+def _norm(field: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(field**2))
+
+
+def sound_state(
+    scene: Scene, centre: jax.Array, u: jax.Array, theta: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """``u`` (n, 3) on its supports if no element is inverted, else what is sound on the way back.
+
+    With it a theta that is finite.
+    """
+    fine = jnp.all(jnp.abs(u) < ENDLESS)
+    placed = jnp.where(scene.held, scene.held_displacement, jnp.where(fine, u, centre))
+    fractions = jnp.array(_FRACTIONS)[:, None, None]
+    states = jnp.where(fractions == 1.0, placed, centre + fractions * (placed - centre))
+    J = jax.vmap(partial(_least_J, scene))(states)
+    # The prediction need only be sound; what it is replaced by should be well clear.
+    sound = (_SHRINK * J[-1] < J).at[0].set(J[0] > 0.0)
+    return states[jnp.argmax(sound)], jnp.where(jnp.isfinite(theta), theta, scene.centre)
+
+
+def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
+    """Newton's step turned round, and whether it is to be believed."""
+    residual, tangent = system.residual(u, theta), system.tangent(u, theta)
+    values = system.pattern.safe_values(tangent)
+    move = system.extend(system.solve(values, residual))
+    after = u - move
+    open_ = _least_J(system.scene, after) > _SHRINK * _least_J(system.scene, u)
+    left = system.residual(jnp.where(open_, after, u), theta)
+    length = _norm(move)
+    again = _norm(system.solve(values, left)) / jnp.where(length > 0.0, length, 1.0)
+    gap = 0.5 * jnp.vdot(residual, system.restrict(move))
+    sound = system.pattern.solvable(tangent) & jnp.isfinite(length) & open_ & (gap >= 0.0)
+    exact = length <= _ROUND_OFF * _norm(u)
+    return Distance(
+        move=move,
+        gap=gap,
+        contraction=jnp.where(exact, jnp.minimum(again, 1.0), again),
+        iterations=jnp.array(0),
+        indefinite=gap < 0.0,
+        settled=sound & (exact | (again <= _CONTRACTION)),
+    )
+
+
+def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Distance:
+    """The way FEM's own iteration goes from ``u`` until what is left is short beside it."""
+    system = simulator.system
+    newton = Newton(system, simulator.options, theta)
+
+    def advance(carry: tuple[NewtonState, jax.Array, jax.Array]):  # noqa: ANN202
+        state, _, _ = carry
+        after = newton.step(state)
+        way, step = _norm(after.u - u), _norm(after.u - state.u)
+        # A step cut short is short too, but leaves its residual.
+        good = (after.error <= _GOOD_STEP * state.error) & (step <= _CONTRACTION * way)
+        good &= after.level >= 1.0
+        return after, good | (after.status == Status.CONVERGED), step / jnp.where(way > 0, way, 1.0)
+
+    def unfinished(carry: tuple[NewtonState, jax.Array, jax.Array]) -> jax.Array:
+        state, near, _ = carry
+        going = (state.status == Status.RUNNING) & (state.level >= 1.0)
+        return going & ~near & (state.iterations < _MOST_ITERATIONS)
+
+    begun = newton.begin(u)
+    at_once = begun.status == Status.CONVERGED
+    state, near, ratio = jax.lax.while_loop(unfinished, advance, (begun, at_once, jnp.array(0.0)))
+    follower = system.follower_force(u, theta)
+    gap = system.potential(u, theta, 1.0, follower)[0]
+    gap = gap - system.potential(state.u, theta, 1.0, follower)[0]
+    return Distance(u - state.u, gap, ratio, state.iterations, jnp.array(False), near)
+
+
+def gradients_distance(
+    system: System, tangent: np.ndarray, iterations: int, u: jax.Array, theta: jax.Array
+) -> Distance:
+    """Conjugate gradients on ``K(u) e = r``, preconditioned by the centre's ``tangent`` (nnz,)."""
+    values = jnp.asarray(tangent)
+
+    def stiffness(v: jax.Array) -> jax.Array:
+        along = (system.extend(v),)
+        return jax.jvp(lambda w: system.residual(w, theta), (u,), along)[1]
+
+    force = left = system.residual(u, theta)
+    move = direction = jnp.zeros_like(force)
+    first = before = jnp.array(0.0)
+    convex = jnp.array(True)
+    for k in range(iterations):
+        nearer = system.solve(values, left)
+        size = jnp.vdot(left, nearer)
+        first = size if k == 0 else first
+        direction = nearer + (0.0 if k == 0 else size / jnp.where(before > 0, before, 1.0)) * (
+            direction
+        )
+        pull = stiffness(direction)
+        curvature = jnp.vdot(direction, pull)
+        convex &= (curvature > 0.0) | (size == 0.0)
+        length = jnp.where(convex & (size > 0.0), size / jnp.where(convex, curvature, 1.0), 0.0)
+        length = jnp.where(jnp.isfinite(length), length, 0.0)
+        move, left, before = move + length * direction, left - length * pull, size
+    last = jnp.vdot(left, system.solve(values, left))
+    return Distance(
+        move=system.extend(move),
+        gap=0.5 * jnp.vdot(force, move),
+        contraction=jnp.sqrt(jnp.abs(last) / jnp.where(first > 0.0, first, 1.0)),
+        iterations=jnp.array(0),
+        indefinite=~convex,
+        settled=convex & jnp.all(jnp.isfinite(move)),
+    )

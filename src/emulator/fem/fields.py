@@ -1,0 +1,82 @@
+r"""What a solution says of each element, for pictures and tables.
+
+.. math::
+    P = \partial W / \partial F, \quad \sigma = P F^T / J, \quad E = (F^T F - I)/2
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.fem.functional import (
+    at_points,
+    displacement_gradient,
+    point_energy,
+    with_mean_dilatation,
+)
+from emulator.mechanics.kinematics import determinant
+
+if TYPE_CHECKING:
+    from emulator.scenes.scene import Scene
+
+
+def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np.ndarray]:
+    """Means over each element, weighted by reference volume.
+
+    Parameters
+    ----------
+    scene : what was simulated.
+    u : (n, 3) displacement, mm.
+    theta : (p,) parameters.
+
+    Returns
+    -------
+    ``J`` (m,), ``cauchy_stress`` (m, 3, 3) in kPa, ``green_lagrange`` (m, 3, 3); and where the
+    scene has fibres ``fibres`` (m, 3), ``deformed_fibres`` (m, 3), unit length both, and
+    ``fibre_stretch`` (m,); and where it has regions their ``regions`` (m,).
+    """
+    H = displacement_gradient(scene, jnp.asarray(u))
+    F = H + jnp.eye(3, dtype=H.dtype)
+    J = jax.vmap(jax.vmap(determinant))(F)
+    P = _first_piola(scene, H, theta)
+    # sigma is symmetric up to round-off, which eigenvalue routines trip over.
+    sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]
+    E = _symmetric(H + 0.5 * jnp.swapaxes(H, -1, -2) @ H)
+    weights = scene.discretisation.weights
+    weights = weights / weights.sum(axis=1, keepdims=True)
+
+    def mean(field: jax.Array) -> np.ndarray:
+        return np.asarray(jnp.einsum("mq,mq...->m...", weights, field))
+
+    fields = {"J": mean(J), "cauchy_stress": mean(sigma), "green_lagrange": mean(E)}
+    if scene.fibres is not None:
+        fibres = np.asarray(scene.fibres)
+        along = jnp.einsum("mqij,mj->mqi", F, fibres)
+        direction = mean(along)
+        fields["fibres"] = fibres
+        fields["deformed_fibres"] = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        fields["fibre_stretch"] = mean(jnp.linalg.norm(along, axis=-1))
+    if scene.regions is not None:
+        fields["regions"] = scene.regions
+    return fields
+
+
+def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
+    """Stress (m, q, 3, 3) in kPa that does the strain energy's work on ``H``."""
+    if scene.dilatation == "pointwise":
+        return at_points(scene, jax.grad(point_energy(scene, theta)), H)
+    weights = jnp.asarray(scene.discretisation.weights)
+
+    def energy(H: jax.Array) -> jax.Array:
+        evened = jax.vmap(with_mean_dilatation)(H, weights)
+        return jnp.sum(weights * at_points(scene, point_energy(scene, theta), evened))
+
+    return jax.grad(energy)(H) / weights[..., None, None]
+
+
+def _symmetric(A: jax.Array) -> jax.Array:
+    return 0.5 * (A + jnp.swapaxes(A, -1, -2))

@@ -1,0 +1,196 @@
+r"""Total potential energy of a scene, built of only the terms the scene has.
+
+.. math::
+    \Pi(u, \theta) = \int_\Omega W(\nabla u; \theta)\, dX + \text{springs}
+        - \sum_\text{loads} \text{work}
+
+in mN mm (= micro J; kPa mm3), Dalton et al. (2023), Eq. 20. The displacement ``u`` is the full
+nodal field, (n, 3) in mm, supports included.
+
+With mean dilatation the volume change of an element is that of its mean,
+
+.. math::
+    \hat F = \left(\bar J / J\right)^{1/3} F, \qquad
+    \bar J = \frac{\int_e J\, dX}{\int_e dX},
+
+and W is evaluated at :math:`\hat F`: one volume constraint an element, which quadratic tetrahedra
+can meet without locking (Simo, Taylor & Pister 1985).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.mechanics.barriers import Barriers
+from emulator.mechanics.kinematics import Strain, determinant
+from emulator.scenes.loads.dead import DeadLoad
+from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads.pressure import PotentialPressure
+from emulator.scenes.local_terms import LocalForce, LocalTerm
+from emulator.scenes.regions import Tissue, factors, tissue
+
+if TYPE_CHECKING:  # a scene is made of mechanics, so mechanics only names its type
+    from emulator.scenes.scene import Scene
+
+Energy = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
+    """``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
+    local = u[scene.discretisation.connectivity]
+    return jnp.einsum("mai,mqaj->mqij", local, scene.discretisation.gradients)
+
+
+def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
+    """``J = det F`` at every quadrature point, (m, q); not above 0 means an inverted element."""
+    H = displacement_gradient(scene, u)
+    return jax.vmap(jax.vmap(determinant))(H + jnp.eye(3, dtype=H.dtype))
+
+
+def strain_law(scene: Scene, theta: jax.Array) -> Callable:
+    """``W(strain, tissue)`` in kPa of the strain of one point, at ``theta`` (p,)."""
+    values, law = scene.resolve(theta), scene.law
+    scale = factors(scene, values)
+
+    def energy(strain: Strain, at: Tissue) -> jax.Array:
+        here = {}
+        if scale is not None:
+            here = {name: scale[at.region] * values[name] for name in law.shape_moduli}
+        return law.energy(strain, *(here.get(name, values[name]) for name in law.parameters))
+
+    return energy
+
+
+def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
+    """``W(H, tissue)`` in kPa of one displacement gradient (3, 3), at ``theta`` (p,)."""
+    constitutive = strain_law(scene, theta)
+
+    def energy(H: jax.Array, at: Tissue = Tissue()) -> jax.Array:
+        return constitutive(Strain(H, barriers, at.directions), at)
+
+    return energy
+
+
+def at_points(scene: Scene, function: Callable, H: jax.Array) -> jax.Array:
+    """``function(H, tissue)`` at every point of ``H`` (m, q, 3, 3), with its element's tissue."""
+    return jax.vmap(jax.vmap(function, (0, None)))(H, tissue(scene))
+
+
+def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -> jax.Array:
+    """Mean of ``J - 1`` over an element with ``u`` (a, 3), ``gradients`` (q, a, 3), ``weights``."""
+    H = jnp.einsum("ai,qaj->qij", u, gradients)
+    return jnp.vdot(weights, jax.vmap(lambda h: Strain(h).J_minus_1)(H)) / jnp.sum(weights)
+
+
+def with_volume_change(
+    H: jax.Array, change: jax.Array, barriers: Barriers | None = None
+) -> jax.Array:
+    """Displacement gradients ``H`` (q, 3, 3) stretched evenly to ``J - 1 = change``."""
+    ln_J = jax.vmap(lambda h: Strain(h, barriers).ln_J)(H)
+    stretch = jnp.expm1((jnp.log1p(change) - ln_J) / 3.0)[:, None, None]
+    return H + stretch * (H + jnp.eye(3, dtype=H.dtype))
+
+
+def with_mean_dilatation(
+    H: jax.Array, weights: jax.Array, barriers: Barriers | None = None
+) -> jax.Array:
+    """Displacement gradients (q, 3, 3) of one element, each point's J replaced by their mean."""
+    J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
+    return with_volume_change(H, jnp.vdot(weights, J_minus_1) / jnp.sum(weights), barriers)
+
+
+def at_volume(scene: Scene, theta: jax.Array) -> Callable:
+    """``(change, u, gradients, weights, tissue) -> ()``: strain energy of an element, mN mm.
+
+    Its volume ratio less 1 is ``change`` throughout, whatever ``u`` (a, 3) in mm says;
+    ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3.
+    """
+    at_point = point_energy(scene, theta)
+
+    def energy(
+        change: jax.Array,
+        u: jax.Array,
+        gradients: jax.Array,
+        weights: jax.Array,
+        at: Tissue,
+    ) -> jax.Array:
+        H = with_volume_change(jnp.einsum("ai,qaj->qij", u, gradients), change)
+        return jnp.vdot(weights, jax.vmap(lambda h: at_point(h, at))(H))
+
+    return energy
+
+
+def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
+    """``(u, theta) -> int W dX`` in mN mm."""
+
+    def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
+        weights = scene.discretisation.weights
+        H = displacement_gradient(scene, u)
+        if scene.dilatation == "mean":
+            H = jax.vmap(lambda h, w: with_mean_dilatation(h, w, barriers))(H, weights)
+        return jnp.sum(weights * at_points(scene, point_energy(scene, theta, barriers), H))
+
+    return energy
+
+
+def spring_terms(scene: Scene) -> list[LocalTerm]:
+    """Potentials of the elastic supports."""
+    return [support.term(scene) for support in scene.elastic_supports]
+
+
+def local_terms(scene: Scene) -> list[LocalTerm]:
+    """Potentials of the loads that follow the deformation."""
+    return [load.term(scene) for load in scene.loads if isinstance(load, PotentialPressure)]
+
+
+def local_forces(scene: Scene) -> list[LocalForce]:
+    """Loads that follow the deformation and have no potential."""
+    return [load.forces(scene) for load in scene.loads if isinstance(load, FollowerPressure)]
+
+
+def nodal_dead_force(scene: Scene) -> np.ndarray | None:
+    """Nodal forces of the dead loads, (n, 3) in mN; ``None`` when there are none."""
+    dead = [load.nodal_force(scene) for load in scene.loads if isinstance(load, DeadLoad)]
+    return np.sum(dead, axis=0) if dead else None
+
+
+def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
+    """Total potential energy ``Pi(u, theta)`` in mN mm.
+
+    Parameters
+    ----------
+    scene : what is simulated.
+    barriers : limits on the invariants for training; ``None`` gives the exact energy, which is
+        NaN wherever an element is inverted.
+
+    Raises
+    ------
+    InputError
+        A load of the scene has no potential.
+    """
+    for load in scene.loads:
+        if isinstance(load, FollowerPressure):
+            raise InputError(
+                f"scene '{scene.name}': the follower pressure on '{load.facet_set}' has no "
+                "potential, so the scene has no energy; hold the rim and use CavityPressure, or "
+                "work with FEM displacements"
+            )
+    internal, springs = strain_energy(scene, barriers), spring_terms(scene)
+    force, terms = nodal_dead_force(scene), local_terms(scene)
+
+    def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
+        total = internal(u, theta)
+        if force is not None:
+            total = total - jnp.vdot(force, u)
+        if springs or terms:
+            values = scene.resolve(theta)
+            total = total + sum(term.total(u, values) for term in springs + terms)
+        return total
+
+    return energy

@@ -1,0 +1,1 @@
+"""Bodies that the scenes are made of."""

@@ -1,0 +1,1 @@
+"""Data released with Dalton et al. (2023)."""

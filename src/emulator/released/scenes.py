@@ -1,0 +1,101 @@
+"""Scenes on the released meshes of Dalton et al. (2023), in mm and kPa."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from emulator.errors import InputError
+from emulator.mechanics.laws import find_law
+from emulator.released.files import (
+    PRESSURE_SURFACE,
+    PublishedTests,
+    read_geometry,
+    read_tests,
+    units,
+)
+from emulator.scenes.loads.dead import Gravity, Load
+from emulator.scenes.loads.pressure import PublishedPressure
+from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.scene import Scene
+from emulator.scenes.supports.dirichlet import Support
+
+_GRAVITY = Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80)
+
+
+class _Model(NamedTuple):
+    """Law, parameters in the order of the stored theta, loads, constants."""
+
+    law: str
+    parameters: tuple[Parameter, ...]
+    loads: tuple[Load, ...] = ()
+    constants: Mapping[str, float] = MappingProxyType({})
+
+
+_MODELS = {
+    "OnceClampedBeam": _Model(
+        "neo_hookean",
+        (Parameter("mu", "kPa", 50.0, 100.0, "log"), Parameter("lam", "kPa", 50.0, 100.0, "log")),
+        (_GRAVITY,),
+    ),
+    "TwistingBeam": _Model(
+        "neo_hookean_E_nu",
+        (Parameter("E", "kPa", 1.0, 25.0, "log"), Parameter("nu", "", 0.1, 0.4, "log")),
+    ),
+    "Liver": _Model(
+        "neo_hookean",
+        (Parameter("lam", "kPa", 3.5, 10.0, "log"), Parameter("mu", "kPa", 3.5, 10.0, "log")),
+        (_GRAVITY,),
+    ),
+    "LeftVentricle": _Model(
+        "holzapfel_ogden_released",
+        (
+            Parameter("a", "kPa", 0.1, 0.26, "log"),
+            Parameter("b", "", 1.0, 4.2, "log"),
+            Parameter("a_f", "kPa", 1.5, 5.18, "log"),
+            Parameter("b_f", "", 1.0, 4.46, "log"),
+        ),
+        (PublishedPressure(PRESSURE_SURFACE, pressure=1.06658),),  # 8 mmHg
+        MappingProxyType({"kappa": 25.0}),
+    ),
+}
+MODELS = tuple(_MODELS)
+
+
+def published_scene(model: str, root: str | Path) -> Scene:
+    """The scene of a released model, read from ``root``."""
+    found = _find(model)
+    geometry = read_geometry(root, model)
+    return Scene(
+        name=f"published:{model}",
+        mesh=geometry.mesh,
+        law=find_law(found.law),
+        parameters=found.parameters,
+        loads=found.loads,
+        supports=(Support("held", geometry.displacement),),
+        constants=found.constants,
+        fibres=geometry.fibres,
+        origin={"scene": f"published:{model}", "root": str(Path(root).resolve())},
+    )
+
+
+def _find(model: str) -> _Model:
+    if model not in _MODELS:
+        raise InputError(f"published model '{model}' is unknown; known: {', '.join(MODELS)}")
+    return _MODELS[model]
+
+
+def published_tests(model: str, root: str | Path) -> tuple[jax.Array, PublishedTests]:
+    """Theta (c, p) in the scene's units, and the stored solutions they belong to."""
+    parameters = _find(model).parameters
+    tests = read_tests(root, model)
+    if tests.theta.shape[1] != len(parameters):
+        raise InputError(f"published model '{model}': theta has shape {tests.theta.shape}")
+    stress = units(model).stress
+    scale = jnp.array([stress if parameter.unit == "kPa" else 1.0 for parameter in parameters])
+    return jnp.asarray(tests.theta) * scale, tests

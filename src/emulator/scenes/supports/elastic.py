@@ -1,0 +1,85 @@
+r"""Elastic (Robin) supports: springs spread over a surface.
+
+.. math:: \Pi_s = \frac{k}{2} \int |u|^2\, dA \quad\text{or}\quad
+          \frac{k}{2} \int (u \cdot N)^2\, dA
+
+over the reference surface, with the stiffness ``k`` in kPa/mm and the outward normal ``N``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.discretisation import facet_rule
+from emulator.scenes.local_terms import LocalTerm, Values
+
+if TYPE_CHECKING:
+    from emulator.scenes.scene import Scene
+
+
+@dataclass(frozen=True)
+class ElasticSupport:
+    """Springs on a facet set.
+
+    Parameters
+    ----------
+    facet_set : where they are.
+    stiffness : k in kPa/mm, above 0.
+    direction : ``all``, or ``normal`` to let the surface slide along itself.
+    """
+
+    facet_set: str
+    stiffness: float
+    direction: Literal["all", "normal"] = "all"
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.stiffness < np.inf:
+            raise InputError(
+                f"elastic support on '{self.facet_set}': stiffness is {self.stiffness} kPa/mm; "
+                "it must be above 0"
+            )
+        if self.direction not in ("all", "normal"):
+            raise InputError(
+                f"elastic support on '{self.facet_set}': direction '{self.direction}'; "
+                "use all or normal"
+            )
+
+    def describe(self) -> list[object]:
+        """What tells this support from another."""
+        return ["elastic", self.facet_set, float(self.stiffness), self.direction]
+
+    def term(self, scene: Scene) -> LocalTerm:
+        """The springs' energy, facet by facet."""
+        facets = scene.mesh.facet_set(self.facet_set)
+        rule = facet_rule(scene.mesh.order, 2 * scene.mesh.order)  # u squared
+        corners = scene.mesh.nodes[facets]
+        slopes = np.einsum("qad,kai->kqdi", rule.slopes, corners)
+        normals = np.cross(slopes[:, :, 0], slopes[:, :, 1])  # (k, q, 3), as long as the area
+        areas = np.linalg.norm(normals, axis=-1)
+        data = (rule.weights * areas, normals / areas[..., None])
+
+        def energy(u: jax.Array, data: Any, _: Values) -> jax.Array:
+            weights, normal = data
+            at_points = rule.values @ u
+            if self.direction == "normal":
+                squared = jnp.sum(at_points * normal, axis=1) ** 2
+            else:
+                squared = jnp.sum(at_points**2, axis=1)
+            return 0.5 * self.stiffness * jnp.sum(weights * squared)
+
+        return LocalTerm(facets, data, energy)
+
+    def resisted(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        """Points (k, 3) in mm and the directions (k, 3) in which springs hold them."""
+        points = scene.mesh.nodes[scene.mesh.facet_set(self.facet_set)][:, :3]
+        normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+        if self.direction == "normal":
+            return points.reshape(-1, 3), np.repeat(normal, 3, axis=0)
+        every = points.reshape(-1, 3)
+        return np.repeat(every, 3, axis=0), np.tile(np.eye(3), (len(every), 1))

@@ -1,0 +1,18 @@
+"""Maps from theta to displacement: the protocol, and every map there is."""
+
+from emulator.surrogates.additive import CachedEmulator, Emulator
+from emulator.surrogates.files import load, save_emulator, shipped
+from emulator.surrogates.network.graph import AugmentedGraph, GraphOptions, augment
+from emulator.surrogates.network.pignn import Architecture
+
+__all__ = [
+    "Architecture",
+    "AugmentedGraph",
+    "CachedEmulator",
+    "Emulator",
+    "GraphOptions",
+    "augment",
+    "load",
+    "save_emulator",
+    "shipped",
+]

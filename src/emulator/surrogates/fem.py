@@ -1,0 +1,48 @@
+"""Finite elements as a forward map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import numpy as np
+
+from emulator.fem.simulator import Simulator
+from emulator.scenes.scene import Scene
+from emulator.surrogates.protocol import ForwardMap, Prediction, all_nodes, check_nodes
+
+
+@dataclass(frozen=True, eq=False)
+class FEMForward:
+    """The simulator as a forward map, started at ``start`` each time (``None``: at rest)."""
+
+    simulator: Simulator
+    nodes: np.ndarray
+    start: ForwardMap | None = None
+
+    kind = "fem"
+
+    @cached_property
+    def scene(self) -> Scene:
+        """What is simulated."""
+        return self.simulator.scene
+
+    def evaluate(self, theta: jax.Array) -> Prediction:
+        """Displacement (k, 3) in mm and whether the solve converged."""
+        start = None if self.start is None else self.start(theta)
+        solution = self.simulator.solve(theta, start)
+        return Prediction(solution.displacement[self.nodes], solution.converged)
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Displacement (k, 3) in mm."""
+        return self.evaluate(theta).displacement
+
+    def at(self, nodes: np.ndarray) -> FEMForward:
+        """The same simulator, returning only ``nodes``."""
+        return FEMForward(self.simulator, check_nodes(self.scene, nodes), self.start)
+
+
+def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMForward:
+    """The simulator as a forward map over all nodes; ``start`` predicts where Newton begins."""
+    return FEMForward(simulator, all_nodes(simulator.scene), start)

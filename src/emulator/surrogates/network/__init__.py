@@ -1,0 +1,1 @@
+"""The physics-informed graph network: graph, layers, Algorithm 1."""

@@ -1,0 +1,105 @@
+r"""POD and Gaussian processes: the peer every emulator must beat.
+
+FEM displacements are projected on their leading principal modes,
+:math:`u(\theta) \approx \bar u + \sum_k c_k(\theta)\, \phi_k`, and each coefficient is a Gaussian
+process of theta's position in its box. scikit-learn fits the processes; the mean they predict,
+:math:`c_k = k_k(x, X)\, \alpha_k`, is written in JAX so that it differentiates.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+from emulator.errors import InputError
+from emulator.fem.campaign import Runs
+from emulator.scenes.scene import Scene
+from emulator.surrogates.protocol import Prediction, all_nodes, inside_only, rows_of
+
+_JITTER = 1e-10  # of unit-variance coefficients; FEM has no noise
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedForward:
+    """A fitted reduced model.
+
+    mean : (k, 3) mm. modes : (r, k, 3) mm, scaled by their coefficients' spread.
+    inputs : (c, p) positions of the FEM runs. lengths : (r, p). weights : (r, c), the alpha of
+    each process times its amplitude.
+    """
+
+    scene: Scene
+    nodes: np.ndarray
+    mean: jax.Array
+    modes: jax.Array
+    inputs: jax.Array
+    lengths: jax.Array
+    weights: jax.Array
+
+    kind = "reduced"
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Displacement (k, 3) in mm at ``theta`` (p,)."""
+        gap = (self.scene.to_unit(theta) - self.inputs)[None] / self.lengths[:, None]
+        coefficients = jnp.sum(self.weights * jnp.exp(-0.5 * jnp.sum(gap**2, axis=-1)), axis=-1)
+        return self.mean + jnp.tensordot(coefficients, self.modes, axes=1)
+
+    def evaluate(self, theta: jax.Array) -> Prediction:
+        """Displacement and whether ``theta`` is inside the box of the FEM runs."""
+        return inside_only(self, theta)
+
+    def at(self, nodes: np.ndarray) -> ReducedForward:
+        """The same map, returning only ``nodes``; all must be among the present ones."""
+        rows = rows_of(self, nodes)
+        return replace(
+            self, nodes=self.nodes[rows], mean=self.mean[rows], modes=self.modes[:, rows]
+        )
+
+
+def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> ReducedForward:
+    """Fit the reduced model to FEM runs.
+
+    Parameters
+    ----------
+    truncation : modes whose singular value is below this fraction of the largest are left out.
+    """
+    if len(runs.theta) < 3:
+        raise InputError(f"a reduced model needs 3 FEM runs or more; there are {len(runs.theta)}")
+    snapshots = np.asarray(runs.displacement)
+    mean = snapshots.mean(axis=0)
+    left, size, right = np.linalg.svd(
+        (snapshots - mean).reshape(len(snapshots), -1), full_matrices=False
+    )
+    kept = size > truncation * size[0]
+    inputs = np.asarray(scene.to_unit(runs.theta))
+    fits = [_fit_one(inputs, column) for column in (left[:, kept] * np.sqrt(len(snapshots))).T]
+    modes = right[kept] * size[kept, None] / np.sqrt(len(snapshots))
+    return ReducedForward(
+        scene=scene,
+        nodes=all_nodes(scene),
+        mean=jnp.asarray(mean),
+        modes=jnp.asarray(modes.reshape(-1, *mean.shape)),
+        inputs=jnp.asarray(inputs),
+        lengths=jnp.asarray([lengths for lengths, _ in fits]),
+        weights=jnp.asarray([weights for _, weights in fits]),
+    )
+
+
+def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Length scales (p,) and prediction weights (c,) of one coefficient (c,) of unit variance."""
+    kernel = ConstantKernel(10.0, (1e-2, 1e8)) * RBF(np.ones(inputs.shape[1]), (5e-2, 1e2))
+    process = GaussianProcessRegressor(
+        kernel, alpha=_JITTER, n_restarts_optimizer=1, random_state=0
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a bound reached is no failure here
+        process.fit(inputs, values)
+    fitted = process.kernel_
+    return np.atleast_1d(fitted.k2.length_scale), fitted.k1.constant_value * process.alpha_

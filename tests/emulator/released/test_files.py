@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.errors import InputError
+from emulator.released.files import read_geometry, read_tests
+from emulator.released.scenes import published_scene, published_tests
+
+
+def test_the_built_in_beam_is_the_released_one(published):
+    ours, theirs = em.scenes.once_clamped_beam(), published_scene("OnceClampedBeam", published)
+    np.testing.assert_allclose(ours.mesh.nodes, theirs.mesh.nodes, atol=1e-6)
+    np.testing.assert_array_equal(ours.held, theirs.held)
+    as_set = lambda scene: np.unique(np.sort(scene.mesh.elements, axis=1), axis=0)
+    np.testing.assert_array_equal(as_set(ours), as_set(theirs))
+
+
+def test_the_built_in_cube_is_twisted_like_the_released_one(published):
+    ours, theirs = em.scenes.twisting_cube(edge=1.0), published_scene("TwistingBeam", published)
+    np.testing.assert_allclose(ours.held_displacement, theirs.held_displacement, atol=1e-12)
+
+
+def test_units(published):
+    mesh = read_geometry(published, "OnceClampedBeam").mesh
+    np.testing.assert_allclose(np.ptp(mesh.nodes, axis=0), [100.0, 10.0, 10.0])
+    thetas, tests = published_tests("OnceClampedBeam", published)
+    assert thetas.min() >= 50.0
+    assert thetas.max() <= 100.0
+    # 1 dyn cm = 1e-7 J = 0.1 microjoule = 0.1 mN mm
+    raw = np.load(published / "OnceClampedBeam/simulationData/test/pe-values.npy")
+    np.testing.assert_allclose(tests.energy, 0.1 * raw)
+
+
+def test_missing_and_damaged_files_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"reference-coords.npy is missing"):
+        read_geometry(tmp_path, "OnceClampedBeam")
+    with pytest.raises(InputError, match="published model 'Heart' is unknown"):
+        read_geometry(tmp_path, "Heart")
+    geometry = tmp_path / "OnceClampedBeam" / "geometryData"
+    geometry.mkdir(parents=True)
+    np.save(geometry / "reference-coords.npy", np.eye(4, 3))
+    np.save(geometry / "elements.npy", np.array([[0, 1, 2, 9]]))
+    with pytest.raises(InputError, match="name nodes there are none of"):
+        read_geometry(tmp_path, "OnceClampedBeam")
+    np.save(geometry / "elements.npy", np.array([[0, 1, 2]]))
+    with pytest.raises(InputError, match=r"has shape \(1, 3\); expected \('any', 4\)"):
+        read_geometry(tmp_path, "OnceClampedBeam")
+    np.save(geometry / "reference-coords.npy", np.full((4, 3), np.nan))
+    with pytest.raises(InputError, match="has values that are not finite"):
+        read_geometry(tmp_path, "OnceClampedBeam")
+    folder = tmp_path / "OnceClampedBeam" / "simulationData" / "test"
+    folder.mkdir(parents=True)
+    (folder / "theta.npy").write_bytes(b"\x93NUMPY\x01\x00")
+    with pytest.raises(InputError, match=r"theta.npy is not a readable .npy array"):
+        read_tests(tmp_path, "OnceClampedBeam")

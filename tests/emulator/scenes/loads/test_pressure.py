@@ -1,0 +1,147 @@
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.errors import InputError
+from emulator.mechanics.kinematics import cofactor
+from emulator.scenes import Parameter, Support
+from emulator.scenes.loads.pressure import CavityPressure, PublishedPressure, cavity_volume, rim
+from scene_support import block
+
+VOLUME = 24.0  # of the block, mm3
+
+
+def closed():
+    """The block, its whole surface one facet set: a body in a pressurised bath."""
+    scene = block(cells=(3, 2, 2))
+    surface = np.concatenate(list(scene.mesh.facet_sets.values()))
+    return replace(scene, mesh=replace(scene.mesh, facet_sets={"surface": surface}))
+
+
+def membrane(load):
+    """The block with a pressure on its right face, whose rim is held."""
+    scene = block(cells=(2, 4, 4))
+    edge = np.unique(rim(scene.mesh.facet_set("right")))
+    mesh = replace(scene.mesh, node_sets={**scene.mesh.node_sets, "rim": edge})
+    return replace(scene, mesh=mesh, loads=(load,), supports=(Support("left"), Support("rim")))
+
+
+def test_cofactor():
+    F = np.eye(3) + 0.3 * np.random.default_rng(0).normal(size=(3, 3))
+    np.testing.assert_allclose(
+        cofactor(jnp.asarray(F)), np.linalg.det(F) * np.linalg.inv(F).T, atol=1e-13
+    )
+
+
+def test_volume_of_a_closed_surface():
+    scene = closed()
+    V = cavity_volume(scene, "surface")
+    # The cavity lies outside the tissue: the body's own volume counts negative. 1 mL = 1000 mm3.
+    assert V(jnp.zeros(scene.held.shape)) == pytest.approx(-VOLUME / 1000.0)
+    H = 0.2 * np.random.default_rng(0).normal(size=(3, 3))
+    moved = jnp.asarray(scene.mesh.nodes @ H.T + [7.0, -2.0, 1.0])
+    expected = -VOLUME / 1000.0 * np.linalg.det(np.eye(3) + H)
+    assert V(moved) == pytest.approx(expected, rel=1e-12)
+
+
+def test_pressure_on_a_closed_surface_has_no_net_force_or_moment():
+    scene = closed()
+    term = CavityPressure("surface", 2.0).term(scene)
+    u = jnp.asarray(0.1 * np.random.default_rng(1).normal(size=scene.held.shape))
+    force = -jax.grad(lambda v: term.total(v, {}))(u)
+    np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.cross(scene.mesh.nodes + u, force).sum(axis=0), 0.0, atol=1e-11)
+    # In a bath the body is squeezed: work is pressure times the volume given up.
+    squeezed = jnp.asarray(-0.1 * scene.mesh.nodes)
+    assert term.total(squeezed, {}) == pytest.approx(2.0 * VOLUME * (0.9**3 - 1.0))
+
+
+def test_the_energy_is_minus_p_times_the_change_in_volume():
+    scene = membrane(CavityPressure("right", 0.7))
+    term, V = scene.loads[0].term(scene), cavity_volume(scene, "right")
+    u = jnp.where(scene.held, 0.0, 0.1)
+    change = 1000.0 * (V(u) - V(jnp.zeros_like(u)))
+    assert term.total(u, {}) == pytest.approx(-0.7 * float(change), rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", [CavityPressure, PublishedPressure])
+def test_a_pressed_face_gives_way_and_the_tangent_is_right(kind):
+    scene = membrane(kind("right", 0.5))
+    simulator = em.Simulator(scene)
+    solution = simulator.solve(scene.centre)
+    assert solution.converged
+    V = cavity_volume(scene, "right")
+    assert V(solution.displacement) > V(jnp.zeros(scene.held.shape))  # the cavity grows
+    system, theta, u = simulator.system, scene.centre, solution.displacement
+    direction = jnp.asarray(np.random.default_rng(1).normal(size=len(system.free)))
+    K = np.zeros((system.pattern.size,) * 2)
+    K[system.pattern.rows, system.pattern.columns] = system.tangent(u, theta)
+    product = jax.jvp(lambda v: system.residual(v, theta), (u,), (system.extend(direction),))[1]
+    np.testing.assert_allclose(K @ direction, product, rtol=1e-9, atol=1e-9)
+
+
+def test_pressure_as_a_parameter():
+    scene = membrane(CavityPressure("right", 0.5))
+    free = replace(
+        scene,
+        loads=(CavityPressure("right"),),
+        parameters=(*scene.parameters, Parameter("pressure", "kPa", 0.1, 1.0)),
+    )
+    theta = free.theta(mu=3.0, lam=5.0, pressure=0.5)
+    simulator = em.Simulator(free)
+    np.testing.assert_allclose(simulator(theta), em.Simulator(scene)(theta[:2]), atol=1e-9)
+    V = cavity_volume(free, "right")
+    f = lambda t: V(simulator.solve(t).displacement)
+    h = 1e-4
+    central = (f(theta.at[2].add(h)) - f(theta.at[2].add(-h))) / (2 * h)
+    assert jax.grad(f)(theta)[2] == pytest.approx(float(central), rel=1e-6)
+    with pytest.raises(InputError, match="load CavityPressure needs 'pressure'"):
+        replace(free, parameters=scene.parameters)
+
+
+def test_a_cavity_whose_rim_is_loose_is_refused():
+    with pytest.raises(InputError, match=r"cavity 'right': rim node \d+ .* hold the rim or use"):
+        replace(block(), loads=(CavityPressure("right", 1.0),))
+
+
+def test_a_scene_without_pressure_computes_no_facets():
+    def operations(scene):
+        jaxpr = jax.make_jaxpr(em.potential_energy(scene))(
+            jnp.zeros(scene.held.shape), scene.centre
+        )
+        return len(jaxpr.jaxpr.eqns)
+
+    with_pressure = membrane(CavityPressure("right", 0.5))
+    without = replace(with_pressure, loads=())
+    assert operations(without) == operations(block())
+    assert operations(with_pressure) > operations(without)
+
+
+def test_fibres_are_asked_for_only_by_laws_that_use_them():
+    from emulator.mechanics.laws import find_law
+
+    scene = block()
+    count = len(scene.mesh.elements)
+    fibres = np.tile([1.0, 0.0, 0.0], (count, 1))
+    with pytest.raises(InputError, match="law 'neo_hookean' takes no fibres"):
+        replace(scene, fibres=fibres)
+    law = find_law("guccione")
+    parameters = tuple(Parameter(q.name, q.unit, 1.0, 2.0) for q in law.quantities)
+    other = {"law": law, "parameters": parameters}
+    with pytest.raises(InputError, match="law 'guccione' needs fibres"):
+        replace(scene, **other)
+    with pytest.raises(InputError, match=r"fibres have shape \(1, 3\)"):
+        replace(scene, **other, fibres=fibres[:1])
+    with pytest.raises(InputError, match="fibres are not unit vectors"):
+        replace(scene, **other, fibres=2.0 * fibres)
+    a = replace(scene, **other, fibres=fibres)
+    b = replace(scene, **other, fibres=np.roll(fibres, 1, axis=1))
+    assert a.fingerprint != b.fingerprint
+    # Stiffer along the fibres: the same stretch costs more.
+    u = jnp.asarray(scene.mesh.nodes * [0.1, 0.0, 0.0])
+    theta = jnp.array([1.0, 2.0, 1.0, 1.0, 1.0])
+    assert em.potential_energy(a)(u, theta) > em.potential_energy(b)(u, theta)

@@ -1,0 +1,72 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from emulator.errors import InputError
+from emulator.fem import run_campaign, sobol
+from emulator.surrogates.corrected import corrected
+from emulator.surrogates.fem import fem_forward
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import Prediction, all_nodes
+
+
+class Off:
+    """FEM with a smooth error of a known size."""
+
+    kind = "off"
+
+    def __init__(self, simulator, size):
+        self.simulator, self.scene, self.size = simulator, simulator.scene, size
+        self.nodes = all_nodes(self.scene)
+        x = self.scene.mesh.nodes / self.scene.mesh.size
+        self.error = np.where(self.scene.held, 0.0, np.sin(3 * x) * x[:, :1])
+
+    def __call__(self, theta):
+        return self.simulator.solve(theta).displacement + self.size * self.error
+
+    def evaluate(self, theta):
+        return Prediction(self(theta), jnp.array(True))
+
+    def at(self, nodes):
+        raise AssertionError("the corrector needs every node")
+
+
+def test_each_step_about_squares_the_error(beam, simulator):
+    exact = simulator(beam.centre)
+    largest = lambda u: float(jnp.max(jnp.abs(u - exact)))
+    errors = {}
+    for size in (0.2, 0.1):
+        base = Off(simulator, size)
+        errors[size] = [largest(corrected(base, simulator, k)(beam.centre)) for k in (1, 2)]
+        assert errors[size][0] < 0.3 * largest(base(beam.centre))
+        assert errors[size][1] < 0.01 * errors[size][0]
+    # Half the error before the step, a quarter after it.
+    assert errors[0.2][0] / errors[0.1][0] == pytest.approx(4.0, rel=0.2)
+
+
+def test_the_derivative_is_that_of_the_equilibrium(beam, simulator):
+    polished = corrected(Off(simulator, 0.1), simulator, 2)
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=beam.held.shape))
+    f = jax.grad(lambda t: jnp.vdot(weights, polished(t)))(beam.centre)
+    g = jax.grad(lambda t: jnp.vdot(weights, simulator.solve(t).displacement))(beam.centre)
+    np.testing.assert_allclose(f, g, rtol=1e-5)
+
+
+def test_validity_and_nodes(beam, simulator):
+    polished = corrected(Off(simulator, 0.1), simulator)
+    nodes = np.array([7, 2])
+    np.testing.assert_allclose(polished.at(nodes)(beam.centre), polished(beam.centre)[nodes])
+    assert polished.evaluate(beam.centre).valid
+    wild = corrected(Off(simulator, 1e4), simulator).evaluate(beam.centre)
+    assert not wild.valid
+    assert np.isfinite(wild.displacement).all()
+
+
+def test_bad_corrections(beam, simulator):
+    with pytest.raises(InputError, match="0 Newton steps"):
+        corrected(Off(simulator, 0.1), simulator, 0)
+    runs = run_campaign(simulator, sobol(beam, 4, 0))
+    with pytest.raises(InputError, match="over all nodes"):
+        corrected(fit_reduced(beam, runs).at(np.array([1])), simulator)
+    assert fem_forward(simulator).evaluate(beam.centre).valid

@@ -1,0 +1,86 @@
+import json
+
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.errors import InputError
+from emulator.surrogates import load, save_emulator, shipped
+from network_support import untrained
+
+
+@pytest.fixture(scope="module")
+def emulator(beam):
+    return untrained(beam)
+
+
+@pytest.fixture
+def folder(emulator, tmp_path):
+    save_emulator(emulator, tmp_path / "e")
+    return tmp_path / "e"
+
+
+def test_a_saved_emulator_is_the_same(emulator, folder, beam):
+    back = load(folder)
+    assert back.fingerprint == emulator.fingerprint
+    assert back.scene.fingerprint == beam.fingerprint
+    np.testing.assert_array_equal(back(beam.centre), emulator(beam.centre))
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "emulator.json",
+        "weights.safetensors",
+    ]
+
+
+def test_a_truncated_weights_file(folder):
+    path = folder / "weights.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"weights.safetensors is truncated or not a safetensors"):
+        load(folder)
+
+
+def test_weights_of_another_emulator(folder, emulator, beam, tmp_path):
+    save_emulator(untrained(beam, seed=1), tmp_path / "other")
+    (tmp_path / "other" / "weights.safetensors").replace(folder / "weights.safetensors")
+    with pytest.raises(InputError, match="is not the file emulator.json was written with"):
+        load(folder)
+
+
+def test_a_scene_that_does_not_match(folder):
+    with pytest.raises(InputError, match="was trained for a scene with fingerprint"):
+        load(folder, em.scenes.twisting_cube(cells=2))
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda d: d.pop("architecture"), "lacks or garbles 'architecture'"),
+        (lambda d: d.update(format=99), "has format 99"),
+        (lambda d: d["scene"].update(scene="heart"), "origin names scene 'heart'"),
+        (lambda d: d["architecture"].update(latent=9), "has shape .* expected"),
+    ],
+)
+def test_damaged_descriptions(folder, edit, message):
+    path = folder / "emulator.json"
+    description = json.loads(path.read_text())
+    edit(description)
+    path.write_text(json.dumps(description))
+    with pytest.raises(InputError, match=message):
+        load(folder)
+
+
+def test_missing_ones_are_named(tmp_path):
+    with pytest.raises(
+        InputError, match="neither shipped nor a folder with emulator.json; shipped: left_v"
+    ):
+        load("no_such_emulator")
+    (tmp_path / "emulator.json").write_text("{")
+    with pytest.raises(InputError, match="is not valid JSON"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_shipped_emulators_say_how_they_were_made(name):
+    record = load(name).record
+    assert record["command"].startswith(f"calibrate train {name} ")
+    assert record["seconds"] > 0
+    assert record["hardware"]["cores"]
