@@ -5,7 +5,7 @@ import numpy as np
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads import Gravity
 
 
 def block(

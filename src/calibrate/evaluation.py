@@ -7,15 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calibrate.reference import (
-    Reference,
-    fem_reference,
-    outside_reference,
-    published_reference,
-)
 from emulator.error.comparison import Errors, case_errors
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator, run_campaign, sobol
+from emulator.fem.reference import Reference, fem_reference, outside_reference
+from emulator.released.reference import published_reference
 from emulator.surrogates import load
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.corrected import corrected

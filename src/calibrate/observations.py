@@ -17,6 +17,7 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.cavity import Cavity
+from emulator.scenes.cavities import find_cavity
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import all_nodes, check_nodes
 
@@ -139,7 +140,7 @@ class CavityVolume:
     @cached_property
     def cavity(self) -> Cavity:
         """The volume as a function of its wall's displacement."""
-        return Cavity(self.scene, self.facet_set)
+        return find_cavity(self.scene, self.facet_set)
 
     @property
     def nodes(self) -> np.ndarray:

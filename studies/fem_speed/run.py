@@ -31,7 +31,7 @@ from emulator.fem import Status, uniform
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.released.scenes import published_scene
-from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure, cavity_volume
+from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, cavity_volume
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene, Support
 from emulator.store import replacing, write_json

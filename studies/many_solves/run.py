@@ -20,7 +20,7 @@ from calibrate.provenance import study_header
 from emulator.fem import uniform
 from emulator.released.scenes import published_scene
 from emulator.scenes import Parameter, Scene
-from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.loads import CavityPressure
 from emulator.store import replacing, write_json
 
 HERE = Path(__file__).parent

@@ -23,10 +23,8 @@ from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.tetrahedra import signed_volumes
 from emulator.mechanics.laws import find_law
 from emulator.scenes import BUILT_IN
-from emulator.scenes.loads.dead import Gravity, Traction
-from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure
-from emulator.scenes.supports.elastic import ElasticSupport
+from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, FollowerPressure, Gravity, Traction
+from emulator.scenes.supports import ElasticSupport
 from emulator.scenes.twisting_cube import twist
 
 SEED = 7

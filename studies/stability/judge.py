@@ -21,10 +21,8 @@ import sparsax
 
 from emulator import Scene, Simulator, potential_energy
 from emulator.fem.functional import strain_energy
-from emulator.scenes.loads.dead import Gravity, Traction
-from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.loads.pressure import CavityPressure
-from emulator.scenes.supports.elastic import ElasticSupport
+from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Traction
+from emulator.scenes.supports import ElasticSupport
 
 TOLERANCE = 1e-6
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))

@@ -15,8 +15,8 @@ from calibrate.cli.commands.demo import _DEMOS
 from calibrate.data import read_data
 from calibrate.posterior import read_tree
 from calibrate.workflow import read_posterior, simulator_of
+from emulator.geometry.cavity import Cavity
 from emulator.scenes import registry
-from emulator.scenes.loads.pressure import cavity_volume
 
 # One scene for the whole module, so that its simulator is compiled once.
 COARSE = cache(partial(em.scenes.left_ventricle, rings=4, around=8, layers=1))
@@ -78,7 +78,8 @@ def test_its_files_hold_both_observations(folder):
     np.testing.assert_array_equal(data["volume"], tree["observed_data"]["volume"])
     # The data is FEM at the truth, within the noise.
     u = simulator_of(scene)(scene.theta(**RUN.truth))
-    V = float(cavity_volume(scene, "endocardium")(u))
+    cavity = Cavity(scene.mesh, "endocardium")
+    V = float(cavity(u[cavity.nodes]))
     assert data["volume"] == pytest.approx(V, abs=4.0)
     gap = data["displacement"] - observe.parts["displacement"](
         jnp.asarray(u[observe.parts["displacement"].nodes])

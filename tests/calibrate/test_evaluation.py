@@ -9,8 +9,8 @@ import pytest
 import emulator as em
 from calibrate.cli import main
 from calibrate.evaluation import Evaluation, run_evaluation
-from calibrate.reference import fem_reference
 from emulator.errors import InputError
+from emulator.fem.reference import fem_reference
 from emulator.surrogates import load, save_emulator
 from emulator.surrogates.taylor import constant
 from network_support import untrained

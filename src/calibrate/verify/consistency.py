@@ -14,14 +14,14 @@ from calibrate.verify.row import Row
 from emulator.fem import Simulator
 from emulator.fem.functional import strain_energy
 from emulator.geometry.bodies.box import box
+from emulator.geometry.discretisation import discretise
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads.dead import Gravity
-from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads import FollowerPressure, Gravity
 
 _FACES = ("left", "right", "front", "back", "bottom", "top")
 _EXACT = "holds exactly; the tolerance is round-off"
@@ -111,7 +111,7 @@ def _closed_surfaces() -> list[Row]:
         scene = block(form)
         mesh = scene.mesh
         around = Mesh(mesh.nodes, mesh.elements, mesh.node_sets, {"all": mesh.surface})
-        forces = FollowerPressure("all", 1.0).forces(replace(scene, mesh=around))
+        forces = FollowerPressure("all", 1.0).force(discretise(around))
         u = 0.2 * np.random.default_rng(1).normal(size=mesh.nodes.shape)
         force = np.asarray(forces.total(jnp.asarray(u), {}))
         net = float(np.linalg.norm(force.sum(axis=0)) / np.abs(force).sum())

@@ -16,7 +16,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads.dead import Traction
+from emulator.scenes.loads import Traction
 
 MU, TRACTION = 422.5, 62.5  # kPa
 POINT = (48.0, 52.0)  # mm, middle of the loaded edge

@@ -17,8 +17,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.loads import CavityPressure, FollowerPressure
 
 _BEAM = "Land et al. (2015), problem 1: 4.17 in the reproduction by fenicsx-pulse"
 _VENTRICLE = (

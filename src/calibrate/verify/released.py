@@ -12,7 +12,7 @@ from emulator.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign
 from emulator.fem.assembly import relative_residual
 from emulator.fem.functional import potential_energy
-from emulator.released.files import units
+from emulator.released.files import models_in, units
 from emulator.released.scenes import MODELS, published_scene, published_tests
 from emulator.scenes.scene import Scene
 
@@ -27,7 +27,7 @@ BALANCE_TOLERANCE = 1e-6  # what FEniCS' stopping rule leaves; ours leaves 1e-11
 
 
 def verify_published(root: str | Path, *, most: int | None = None) -> list[Row]:
-    """Largest relative errors over all test cases of every released model that we build.
+    """Largest relative errors over all test cases of every released model in ``root``.
 
     The released solutions end where FEniCS stopped, some with a visible force out of balance. The
     comparison therefore stops by the same rule, :func:`fenics_tolerance`; how far from balance the
@@ -35,12 +35,21 @@ def verify_published(root: str | Path, *, most: int | None = None) -> list[Row]:
 
     Parameters
     ----------
-    root : folder of the release's data, ``<root>/<model>/geometryData`` and so on.
+    root : folder of the release's data, ``<root>/<model>/geometryData`` and so on; models that
+        are not there are left out.
     most : cases of each model to look at; all by default.
+
+    Raises
+    ------
+    InputError
+        No such folder, none of the models in it, or a model that lacks a file.
     """
     if not Path(root).is_dir():
         raise InputError(f"published data: folder {root} does not exist")
-    return [row for model in MODELS for row in _verify_model(root, model, most)]
+    models = models_in(root)
+    if not models:
+        raise InputError(f"published data: {root} holds none of the models {', '.join(MODELS)}")
+    return [row for model in models for row in _verify_model(root, model, most)]
 
 
 def fenics_tolerance(scene: Scene, model: str) -> float:

@@ -24,7 +24,7 @@ from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads.pressure import CavityPressure, PublishedPressure
+from emulator.scenes.loads import CavityPressure, PublishedPressure
 
 INNER, OUTER, MU = 10.0, 15.0, 10.0
 NU = 0.4999
@@ -96,7 +96,7 @@ def verify_pressure_work() -> list[Row]:
 
 def _work_ratio(load: CavityPressure | PublishedPressure, stretch: float) -> float:
     scene = replace(sphere_scene((4, 2), 1.0, order=1), loads=(load,))
-    term = load.term(scene)
+    term = load.term(scene.discretisation)
     X = jnp.asarray(scene.mesh.nodes)
     slope = jax.grad(lambda value: term.total((value - 1.0) * X, {}))
     facets = scene.mesh.nodes[scene.mesh.facet_set("inner")]

@@ -12,7 +12,8 @@ import numpy as np
 
 from emulator.errors import InputError, SolverError
 from emulator.fem.functional import displacement_gradient, potential_energy
-from emulator.geometry.cavity import Cavity, cavity_sets
+from emulator.geometry.cavity import Cavity
+from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 
@@ -106,7 +107,7 @@ def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) ->
     scene = forward.scene
     if len(forward.nodes) != len(scene.mesh.nodes):
         raise InputError("evaluation needs a forward map over all nodes")
-    cavities = [Cavity(scene, name) for name in cavity_sets(scene)]
+    cavities = [Cavity(scene.mesh, name) for name in cavity_sets(scene)]
 
     @jax.jit
     def one(theta: jax.Array, exact: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:

@@ -18,7 +18,6 @@ from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
-from emulator.surrogates.protocol import inside_box
 
 
 class Guard(NamedTuple):
@@ -95,10 +94,10 @@ def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
 def outside_box(scene: Scene, theta: jax.Array) -> jax.Array:
     """Which entries of ``theta`` (p,) lie outside their range, (p,) bool; NaN does.
 
-    The others are put in the middle of theirs, so that this is :func:`inside_box`, entry by entry.
+    The others are put in the middle of theirs, so that one entry decides for itself.
     """
     each = jnp.where(jnp.eye(len(scene.parameters), dtype=bool), theta[None, :], scene.centre)
-    return ~inside_box(scene, each)
+    return ~scene.space.contains(each)
 
 
 def invariants(scene: Scene, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -20,7 +20,6 @@ can meet without locking (Simo, Taylor & Pister 1985).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -29,14 +28,9 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain, determinant
-from emulator.scenes.loads.dead import DeadLoad
-from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.loads.pressure import PotentialPressure
 from emulator.scenes.local_terms import LocalForce, LocalTerm
-from emulator.scenes.regions import Tissue, factors, tissue
-
-if TYPE_CHECKING:  # a scene is made of mechanics, so mechanics only names its type
-    from emulator.scenes.scene import Scene
+from emulator.scenes.regions import Tissue, factors
+from emulator.scenes.scene import Scene
 
 Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -56,7 +50,7 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
 def strain_law(scene: Scene, theta: jax.Array) -> Callable:
     """``W(strain, tissue)`` in kPa of the strain of one point, at ``theta`` (p,)."""
     values, law = scene.resolve(theta), scene.law
-    scale = factors(scene, values)
+    scale = factors(scene.regions, values)
 
     def energy(strain: Strain, at: Tissue) -> jax.Array:
         here = {}
@@ -79,7 +73,7 @@ def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = Non
 
 def at_points(scene: Scene, function: Callable, H: jax.Array) -> jax.Array:
     """``function(H, tissue)`` at every point of ``H`` (m, q, 3, 3), with its element's tissue."""
-    return jax.vmap(jax.vmap(function, (0, None)))(H, tissue(scene))
+    return jax.vmap(jax.vmap(function, (0, None)))(H, scene.tissue)
 
 
 def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -> jax.Array:
@@ -141,22 +135,26 @@ def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
 
 def spring_terms(scene: Scene) -> list[LocalTerm]:
     """Potentials of the elastic supports."""
-    return [support.term(scene) for support in scene.elastic_supports]
+    terms = (support.term(scene.discretisation) for support in scene.supports)
+    return [term for term in terms if term is not None]
 
 
 def local_terms(scene: Scene) -> list[LocalTerm]:
     """Potentials of the loads that follow the deformation."""
-    return [load.term(scene) for load in scene.loads if isinstance(load, PotentialPressure)]
+    terms = (load.term(scene.discretisation) for load in scene.loads)
+    return [term for term in terms if term is not None]
 
 
 def local_forces(scene: Scene) -> list[LocalForce]:
     """Loads that follow the deformation and have no potential."""
-    return [load.forces(scene) for load in scene.loads if isinstance(load, FollowerPressure)]
+    forces = (load.force(scene.discretisation) for load in scene.loads)
+    return [force for force in forces if force is not None]
 
 
 def nodal_dead_force(scene: Scene) -> np.ndarray | None:
     """Nodal forces of the dead loads, (n, 3) in mN; ``None`` when there are none."""
-    dead = [load.nodal_force(scene) for load in scene.loads if isinstance(load, DeadLoad)]
+    forces = [load.nodal_force(scene.discretisation) for load in scene.loads]
+    dead = [force for force in forces if force is not None]
     return np.sum(dead, axis=0) if dead else None
 
 
@@ -175,11 +173,11 @@ def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
         A load of the scene has no potential.
     """
     for load in scene.loads:
-        if isinstance(load, FollowerPressure):
+        if not load.has_potential:
             raise InputError(
-                f"scene '{scene.name}': the follower pressure on '{load.facet_set}' has no "
-                "potential, so the scene has no energy; hold the rim and use CavityPressure, or "
-                "work with FEM displacements"
+                f"scene '{scene.name}': the {load.kind.replace('_', ' ')} on "
+                f"'{', '.join(load.facet_sets)}' has no potential, so the scene has no energy; "
+                "hold the rim and use CavityPressure, or work with FEM displacements"
             )
     internal, springs = strain_energy(scene, barriers), spring_terms(scene)
     force, terms = nodal_dead_force(scene), local_terms(scene)

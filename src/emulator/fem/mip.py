@@ -36,7 +36,7 @@ import jax.numpy as jnp
 from emulator.fem.assembly import System, balance
 from emulator.fem.functional import displacement_gradient, strain_law, volume_ratio
 from emulator.mechanics.measures import Measures, measures_read
-from emulator.scenes.regions import Tissue, tissue
+from emulator.scenes.regions import Tissue
 
 _SHORTEST = 2.0**-4
 _BISECTIONS = 7
@@ -110,7 +110,7 @@ class MipNewton:
         """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...)."""
         axes = (0,) * len(fields)
         each = jax.vmap(jax.vmap(function, (*axes, None)), (*axes, 0))
-        return each(*fields, tissue(self.system.scene))
+        return each(*fields, self.system.scene.tissue)
 
     def _energy(self, at: Tissue):  # noqa: ANN202
         law = strain_law(self.system.scene, self.theta)

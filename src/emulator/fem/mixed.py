@@ -29,7 +29,6 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.functional import at_volume, mean_volume_change
-from emulator.scenes.regions import tissue
 from emulator.scenes.scene import Scene
 
 
@@ -60,7 +59,7 @@ def _arguments(scene: Scene, u: jax.Array) -> tuple:
     """Displacements, gradients, weights and tissue of every element, to map over."""
     grid = scene.discretisation
     local = (u[grid.connectivity], jnp.asarray(grid.gradients), jnp.asarray(grid.weights))
-    return (*local, tissue(scene))
+    return (*local, scene.tissue)
 
 
 def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:

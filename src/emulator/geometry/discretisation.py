@@ -15,14 +15,16 @@ from emulator.geometry.mesh import Mesh, frozen_array
 
 @dataclass(frozen=True, eq=False)
 class Discretisation:
-    """Arrays an energy needs; ``m`` elements, ``q`` quadrature points, ``a`` local nodes.
+    """A mesh with its shape functions; ``m`` elements, ``q`` quadrature points, ``a`` local nodes.
 
+    mesh : what is discretised.
     connectivity : (m, a) node of each local shape function.
     gradients : (m, q, a, 3) reference gradients of the shape functions, 1/mm.
     values : (q, a) shape functions at the quadrature points.
     weights : (m, q) quadrature weights times volume, mm3.
     """
 
+    mesh: Mesh
     connectivity: np.ndarray
     gradients: np.ndarray
     values: np.ndarray
@@ -62,6 +64,7 @@ def discretise(mesh: Mesh) -> Discretisation:
         folded = int(np.flatnonzero(~(determinant > 0.0).all(axis=1))[0])
         raise InputError(f"mesh: element {folded} is curved so much that it folds over itself")
     return Discretisation(
+        mesh=mesh,
         connectivity=mesh.elements,
         gradients=frozen_array(np.einsum("qaj,mqji->mqai", slopes, np.linalg.inv(jacobian))),
         values=frozen_array(values),

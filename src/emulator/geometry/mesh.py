@@ -37,7 +37,8 @@ class Mesh:
         VTK's order (01, 12, 02, 03, 13, 23).
     node_sets : name -> (k,) node indices.
     facet_sets : name -> (k, 3) corner indices of surface triangles; (k, 6) on a quadratic mesh,
-        with the nodes on edges 01, 12 and 20.
+        with the nodes on edges 01, 12 and 20. They are turned to face out of the tissue, whichever
+        way they are listed.
 
     Raises
     ------
@@ -103,16 +104,25 @@ class Mesh:
     def _check_facets(self) -> None:
         if not self.facet_sets:
             return
-        surface = {tuple(row) for row in np.sort(self.surface, axis=1).tolist()}
+        # By corners and midpoints alike, each facet as the surface lists it: facing out.
+        surface = dict(
+            zip(map(tuple, np.sort(self.surface, axis=1).tolist()), self.surface, strict=True)
+        )
         width = 3 if self.order == 1 else 6
+        outward = {}
         for name, facets in self.facet_sets.items():
             if facets.ndim != 2 or facets.shape[1:] != (width,) or not len(facets):
                 raise InputError(
                     f"mesh: facet set '{name}' has shape {facets.shape}; not (k, {width})"
                 )
-            for row in np.sort(facets, axis=1).tolist():
-                if tuple(row) not in surface:
-                    raise InputError(f"mesh: facet {row} of set '{name}' is not on the surface")
+            rows = list(map(tuple, np.sort(facets, axis=1).tolist()))
+            for row in rows:
+                if row not in surface:
+                    raise InputError(
+                        f"mesh: facet {list(row)} of set '{name}' is not on the surface"
+                    )
+            outward[name] = frozen_array([surface[row] for row in rows], np.int64)
+        object.__setattr__(self, "facet_sets", MappingProxyType(outward))
 
     @property
     def order(self) -> int:

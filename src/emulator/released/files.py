@@ -1,8 +1,8 @@
 """Reader of the data released with Dalton et al. (2023): geometry and FEniCS test solutions.
 
 The folder layout is the release's own, ``<model>/geometryData`` and
-``<model>/simulationData/test``, so a user's clone works as it is. Lengths become mm,
-stresses kPa, energies mN mm.
+``<model>/simulationData/test``, so a user's clone, or its folder ``data``, works as it is. Lengths
+become mm, stresses kPa, energies mN mm.
 """
 
 from __future__ import annotations
@@ -31,9 +31,11 @@ class PublishedUnits:
 
 
 PRESSURE_SURFACE = "endocardium"
+_POINTER = b"version https://git-lfs"  # how a large file that was not fetched begins
 _CGS = PublishedUnits(length=10.0, stress=1e-4)
 UNITS = {
     "OnceClampedBeam": _CGS,
+    "TwiceClampedBeam": _CGS,
     "TwistingBeam": PublishedUnits(length=1.0, stress=1.0),  # dimensionless
     "Liver": _CGS,
     "LeftVentricle": PublishedUnits(length=10.0, stress=1.0),
@@ -72,13 +74,16 @@ Shape = tuple[int | None, ...]
 
 def _array(root: str | Path, model: str, part: str, shape: Shape | None = None) -> np.ndarray:
     """A finite array of the given shape, ``None`` standing for any length."""
-    path = Path(root) / model / part
+    path = _folder(root, model) / part
     if not path.is_file():
-        raise InputError(f"published data: {path} is missing; give the folder that holds {model}/")
+        raise InputError(f"published data: {path} is missing; {_remedy(root, model)}")
     try:
         array = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        raise InputError(f"published data: {path} is not a readable .npy array") from error
+        what = "is not a readable .npy array"
+        if path.read_bytes()[: len(_POINTER)] == _POINTER:
+            what = "is a pointer to a large file that the clone has not fetched; run git lfs pull"
+        raise InputError(f"published data: {path} {what}") from error
     if shape is not None and (
         array.ndim != len(shape)
         or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True))
@@ -91,7 +96,24 @@ def _array(root: str | Path, model: str, part: str, shape: Shape | None = None) 
 
 
 def _array_if_there(root: str | Path, model: str, part: str, shape: Shape) -> np.ndarray | None:
-    return _array(root, model, part, shape) if (Path(root) / model / part).is_file() else None
+    return _array(root, model, part, shape) if (_folder(root, model) / part).is_file() else None
+
+
+def _folder(root: str | Path, model: str) -> Path:
+    """Folder of ``model`` in the release's folder ``data`` or in a clone of the whole release."""
+    inside = Path(root) / "data" / model
+    return inside if inside.is_dir() else Path(root) / model
+
+
+def _remedy(root: str | Path, model: str) -> str:
+    if _folder(root, model).is_dir():
+        return "the clone lacks it, perhaps for its size: fetch that file"
+    return f"give the folder that holds {model}/"
+
+
+def models_in(root: str | Path) -> tuple[str, ...]:
+    """Released models whose folder is in ``root``."""
+    return tuple(model for model in UNITS if _folder(root, model).is_dir())
 
 
 def units(model: str) -> PublishedUnits:

@@ -19,11 +19,10 @@ from emulator.released.files import (
     read_tests,
     units,
 )
-from emulator.scenes.loads.dead import Gravity, Load
-from emulator.scenes.loads.pressure import PublishedPressure
+from emulator.scenes.loads import Gravity, Load, PublishedPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports import Support
 
 _GRAVITY = Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80)
 
@@ -37,12 +36,14 @@ class _Model(NamedTuple):
     constants: Mapping[str, float] = MappingProxyType({})
 
 
+_BEAM = _Model(
+    "neo_hookean",
+    (Parameter("mu", "kPa", 50.0, 100.0, "log"), Parameter("lam", "kPa", 50.0, 100.0, "log")),
+    (_GRAVITY,),
+)
 _MODELS = {
-    "OnceClampedBeam": _Model(
-        "neo_hookean",
-        (Parameter("mu", "kPa", 50.0, 100.0, "log"), Parameter("lam", "kPa", 50.0, 100.0, "log")),
-        (_GRAVITY,),
-    ),
+    "OnceClampedBeam": _BEAM,
+    "TwiceClampedBeam": _BEAM,
     "TwistingBeam": _Model(
         "neo_hookean_E_nu",
         (Parameter("E", "kPa", 1.0, 25.0, "log"), Parameter("nu", "", 0.1, 0.4, "log")),

@@ -9,7 +9,7 @@ from emulator.scenes.liver import liver
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.registry import BUILT_IN
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports import Support
 from emulator.scenes.traction_beams import traction_beam_guccione, traction_beam_holzapfel_ogden
 from emulator.scenes.twisting_cube import twisting_cube
 

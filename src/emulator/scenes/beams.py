@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads import Gravity
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports import Support
 
 
 def _beam(name: str, cells: tuple[int, int, int], clamped: tuple[str, ...]) -> Scene:

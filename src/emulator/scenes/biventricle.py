@@ -6,9 +6,9 @@ from emulator.geometry.bodies import biventricle as geometry
 from emulator.geometry.fibres import biventricular_directions
 from emulator.mechanics.laws import find_law
 from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE
-from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure
+from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports import Support
 
 
 def biventricle(

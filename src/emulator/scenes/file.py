@@ -105,13 +105,10 @@ from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws import Law, find_law
-from emulator.scenes.loads.dead import Gravity, Load, Traction
-from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load, Traction
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
-from emulator.scenes.supports.elastic import ElasticSupport
+from emulator.scenes.supports import ElasticSupport, Support
 from emulator.scenes.tables import Table
 
 Parts = tuple[Mesh, np.ndarray | None, np.ndarray | None]

@@ -7,10 +7,10 @@ from dataclasses import astuple
 from emulator.geometry.bodies.ellipsoid import HUMAN, EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.mechanics.laws import find_law
-from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure
+from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports import Support
 
 PRESSURE = Parameter("pressure", "kPa", 4.0 * KPA_PER_MMHG, 10.0 * KPA_PER_MMHG)
 """4 to 10 mmHg at the end of diastole, as in the paper."""

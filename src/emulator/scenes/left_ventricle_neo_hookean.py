@@ -5,10 +5,10 @@ from __future__ import annotations
 from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.mechanics.laws import find_law
 from emulator.scenes.left_ventricle import PRESSURE
-from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.loads import CavityPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports import Support
 
 
 def left_ventricle_neo_hookean(rings: int = 15, around: int = 30, layers: int = 3) -> Scene:

@@ -1,13 +1,25 @@
-"""Parameters of a scene: what may vary, between which bounds, on which scale."""
+r"""Parameters of a scene: which quantities vary, between which bounds, on which scale.
+
+A position :math:`x \in [0, 1]^p` in the box belongs to each theta,
+
+.. math::
+    x = \frac{\theta - \theta_\text{low}}{\theta_\text{high} - \theta_\text{low}}
+    \quad\text{(uniform)}, \qquad
+    x = \frac{\ln(\theta / \theta_\text{low})}{\ln(\theta_\text{high} / \theta_\text{low})}
+    \quad\text{(log)}.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from emulator.errors import InputError
 
@@ -51,3 +63,89 @@ class Parameter:
         if self.scale == "log":
             return self.low * (self.high / self.low) ** position
         return self.low + (self.high - self.low) * position
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON, the constructor's arguments."""
+        return asdict(self)
+
+
+_SLACK = 1e-9  # of a range: values that round-off puts outside it are inside
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """The box that theta lies in, one side a parameter.
+
+    Parameters
+    ----------
+    parameters : entries of theta, in order.
+    """
+
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries of theta, in order."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @cached_property
+    def centre(self) -> jax.Array:
+        """Theta in the middle of the box, on each parameter's scale, shape (p,)."""
+        with jax.ensure_compile_time_eval():  # kept, so it must not belong to a trace
+            return self.from_unit(jnp.full(len(self.parameters), 0.5))
+
+    def to_unit(self, theta: jax.Array) -> jax.Array:
+        """Position (..., p) in the box of ``theta`` (..., p), 0 to 1 inside."""
+        columns = [p.to_unit(theta[..., k]) for k, p in enumerate(self.parameters)]
+        return jnp.stack(columns, axis=-1)
+
+    def from_unit(self, position: jax.Array) -> jax.Array:
+        """Inverse of :meth:`to_unit`."""
+        columns = [p.from_unit(position[..., k]) for k, p in enumerate(self.parameters)]
+        return jnp.stack(columns, axis=-1)
+
+    def contains(self, theta: jax.Array) -> jax.Array:
+        """Whether ``theta`` (..., p) lies in the box, (...) bool; NaN does not."""
+        position = self.to_unit(theta)
+        return jnp.all((position >= -_SLACK) & (position <= 1.0 + _SLACK), axis=-1)
+
+    def theta(self, values: Mapping[str, float], owner: str) -> jax.Array:
+        """Theta (p,) from named values in the parameters' units.
+
+        Raises
+        ------
+        InputError
+            Unknown, missing or out-of-range value; ``owner`` is named.
+        """
+        for name in values:
+            if name not in self.names:
+                raise InputError(
+                    f"{owner} has no parameter '{name}'; it has {', '.join(self.names)}"
+                )
+        missing = [name for name in self.names if name not in values]
+        if missing:
+            raise InputError(f"{owner}: no value for parameter '{missing[0]}'")
+        theta = jnp.array([float(values[name]) for name in self.names])
+        self.check(theta, owner)
+        return theta
+
+    def check(self, theta: jax.Array, owner: str) -> None:
+        """Raise :class:`InputError` unless every row of ``theta`` (..., p) is inside the box."""
+        rows = np.atleast_2d(np.asarray(theta))
+        if rows.shape[-1] != len(self.parameters):
+            raise InputError(
+                f"{owner}: theta has {rows.shape[-1]} values; "
+                f"expected {len(self.parameters)}: {', '.join(self.names)}"
+            )
+        for k, parameter in enumerate(self.parameters):
+            slack = _SLACK * (parameter.high - parameter.low)
+            inside = (rows[:, k] >= parameter.low - slack) & (rows[:, k] <= parameter.high + slack)
+            if not inside.all():
+                value = rows[np.flatnonzero(~inside)[0], k]
+                raise InputError(
+                    f"parameter '{parameter.name}' is {value:g} {parameter.unit}; {owner} covers "
+                    f"{parameter.low:g} to {parameter.high:g}"
+                )

@@ -1,4 +1,4 @@
-r"""What the law may know of each element: its directions, and the region it lies in.
+r"""What differs between elements: directions of the tissue, and regions of other stiffness.
 
 In region k of a scene that has regions, the law's energy is multiplied by a factor of its own,
 
@@ -12,7 +12,7 @@ proportional to their ``shape_moduli``, so it is these that the factor multiplie
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,34 +23,23 @@ from emulator.geometry.mesh import frozen_array
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import Quantity, number
 
-if TYPE_CHECKING:
-    from emulator.scenes.scene import Scene
-
 
 class Tissue(NamedTuple):
-    """Of one element, or of all with a leading axis m; what a scene does not have is ``None``.
+    """What the law may know of an element; arrays have a leading axis m for all elements.
 
-    directions : as in a ``Strain``, (3,) or (2, 3).
-    region : place of its region in the factors, ().
+    directions : fibre (3,), or fibre and sheet (2, 3); None without fibres.
+    region : index of the element's region among the factors, (); None without regions.
     """
 
     directions: jax.Array | None = None
     region: jax.Array | None = None
 
 
-def tissue(scene: Scene) -> Tissue:
-    """That of every element of a scene."""
-    directions = None if scene.directions is None else jnp.asarray(scene.directions)
-    if scene.regions is None:
-        return Tissue(directions)
-    return Tissue(directions, jnp.asarray(np.unique(scene.regions, return_inverse=True)[1]))
-
-
-def factors(scene: Scene, values: Mapping[str, Any]) -> jax.Array | None:
-    """Stiffness factor (k,) of each region, by ascending label; ``None`` without regions."""
-    if scene.regions is None:
+def factors(regions: np.ndarray | None, values: Mapping[str, Any]) -> jax.Array | None:
+    """Stiffness factor (k,) of each region, by ascending label; None without regions."""
+    if regions is None:
         return None
-    return jnp.stack([jnp.asarray(values[q.name]) for q in region_quantities(scene.regions)])
+    return jnp.stack([jnp.asarray(values[q.name]) for q in region_quantities(regions)])
 
 
 def region_quantities(regions: np.ndarray) -> tuple[Quantity, ...]:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
@@ -19,12 +16,12 @@ from emulator.geometry.discretisation import Discretisation, discretise
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws import Law
 from emulator.mechanics.quantity import Quantity
-from emulator.scenes.loads.dead import Gravity, Load
-from emulator.scenes.loads.pressure import CavityPressure, require_held_rim
-from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.regions import checked_regions, region_quantities
-from emulator.scenes.supports.dirichlet import Support, free_motions, prescribe
-from emulator.scenes.supports.elastic import ElasticSupport
+from emulator.scenes.identity import Identity, fingerprint, identity_of
+from emulator.scenes.loads.load import Load
+from emulator.scenes.parameter_space import Parameter, ParameterSpace
+from emulator.scenes.regions import Tissue, checked_regions, region_quantities
+from emulator.scenes.supports.boundary_condition import BoundaryCondition
+from emulator.scenes.supports.dirichlet import free_motions, prescribe
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +55,7 @@ class Scene:
     law: Law
     parameters: tuple[Parameter, ...]
     loads: tuple[Load, ...] = ()
-    supports: tuple[Support | ElasticSupport, ...] = ()
+    supports: tuple[BoundaryCondition, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
     fibres: np.ndarray | None = None
     origin: Mapping[str, Any] = field(default_factory=dict)
@@ -152,10 +149,9 @@ class Scene:
     def _check_supports(self) -> None:
         if not self.supports:
             raise InputError(f"scene '{self.name}': no support, the body could move freely")
-        nodes, axes = np.nonzero(self.held)
-        springs = [support.resisted(self) for support in self.elastic_supports]
-        points = np.concatenate([self.mesh.nodes[nodes], *(place for place, _ in springs)])
-        directions = np.concatenate([np.eye(3)[axes], *(along for _, along in springs)])
+        resisted = [support.resisted(self.mesh) for support in self.supports]
+        points = np.concatenate([each.points for each in resisted])
+        directions = np.concatenate([each.directions for each in resisted])
         free = free_motions(points, directions)
         if free:
             raise InputError(
@@ -164,15 +160,25 @@ class Scene:
             )
 
     def _check_loads(self) -> None:
+        for part in self.parts:
+            for name in part.facet_sets:
+                self.mesh.facet_set(name)
         for load in self.loads:
-            if not isinstance(load, Gravity):
-                self.mesh.facet_set(load.facet_set)
-            if isinstance(load, CavityPressure):
-                require_held_rim(self, load.facet_set)
+            load.check(self.mesh, self.held, self.held_displacement)
+
+    @property
+    def parts(self) -> tuple[Load | BoundaryCondition, ...]:
+        """Loads and supports."""
+        return (*self.loads, *self.supports)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Every parameter that law, loads and regions take, by name."""
+        return {name: quantity for name, (quantity, _) in self._takers.items()}
 
     @property
     def _takers(self) -> dict[str, tuple[Quantity, str]]:
-        """Every parameter law, loads and regions take, by name, with who takes it."""
+        """Quantity of every parameter, by name, and a name for what takes it."""
         takers = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
         if self.regions is not None:
             takers |= {q.name: (q, "a region") for q in region_quantities(self.regions)}
@@ -182,15 +188,20 @@ class Scene:
         return takers
 
     # ---- parameters -------------------------------------------------------------------------
+    @cached_property
+    def space(self) -> ParameterSpace:
+        """The box that theta lies in."""
+        return ParameterSpace(self.parameters)
+
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the entries of theta, in order."""
-        return tuple(parameter.name for parameter in self.parameters)
+        return self.space.names
 
     @property
     def centre(self) -> jax.Array:
         """Theta in the middle of its box, on each parameter's scale, shape (p,)."""
-        return self.from_unit(jnp.full(len(self.parameters), 0.5))
+        return self.space.centre
 
     def theta(self, **values: float) -> jax.Array:
         """Theta from named values in the parameters' units, shape (p,).
@@ -200,46 +211,19 @@ class Scene:
         InputError
             Unknown, missing or out-of-range value.
         """
-        for name in values:
-            if name not in self.parameter_names:
-                raise InputError(
-                    f"scene '{self.name}' has no parameter '{name}'; "
-                    f"it has {', '.join(self.parameter_names)}"
-                )
-        missing = [name for name in self.parameter_names if name not in values]
-        if missing:
-            raise InputError(f"scene '{self.name}': no value for parameter '{missing[0]}'")
-        theta = jnp.array([float(values[name]) for name in self.parameter_names])
-        self.check_theta(theta)
-        return theta
+        return self.space.theta(values, f"scene '{self.name}'")
 
     def check_theta(self, theta: jax.Array) -> None:
         """Raise :class:`InputError` unless every row of ``theta`` (..., p) is inside the box."""
-        rows = np.atleast_2d(np.asarray(theta))
-        if rows.shape[-1] != len(self.parameters):
-            raise InputError(
-                f"scene '{self.name}': theta has {rows.shape[-1]} values; "
-                f"expected {len(self.parameters)}: {', '.join(self.parameter_names)}"
-            )
-        for k, parameter in enumerate(self.parameters):
-            slack = 1e-9 * (parameter.high - parameter.low)
-            inside = (rows[:, k] >= parameter.low - slack) & (rows[:, k] <= parameter.high + slack)
-            if not inside.all():
-                value = rows[np.flatnonzero(~inside)[0], k]
-                raise InputError(
-                    f"parameter '{parameter.name}' is {value:g} {parameter.unit}; scene "
-                    f"'{self.name}' covers {parameter.low:g} to {parameter.high:g}"
-                )
+        self.space.check(theta, f"scene '{self.name}'")
 
     def to_unit(self, theta: jax.Array) -> jax.Array:
         """Theta (..., p) as positions in its box, 0 to 1 inside."""
-        columns = [p.to_unit(theta[..., k]) for k, p in enumerate(self.parameters)]
-        return jnp.stack(columns, axis=-1)
+        return self.space.to_unit(theta)
 
     def from_unit(self, position: jax.Array) -> jax.Array:
         """Inverse of :meth:`to_unit`."""
-        columns = [p.from_unit(position[..., k]) for k, p in enumerate(self.parameters)]
-        return jnp.stack(columns, axis=-1)
+        return self.space.from_unit(position)
 
     def resolve(self, theta: jax.Array) -> dict[str, jax.Array]:
         """Every parameter of law, loads and regions by name, from theta (p,) and the constants."""
@@ -260,15 +244,19 @@ class Scene:
             return self.fibres
         return frozen_array(np.stack([self.fibres, self.sheets], axis=1))
 
-    @property
-    def elastic_supports(self) -> tuple[ElasticSupport, ...]:
-        """Those of the supports that are springs."""
-        return tuple(s for s in self.supports if isinstance(s, ElasticSupport))
+    @cached_property
+    def tissue(self) -> Tissue:
+        """What the law may know of every element, arrays of leading axis m."""
+        region = None
+        if self.regions is not None:
+            region = np.unique(self.regions, return_inverse=True)[1]
+        # NumPy's arrays: made under a trace, JAX's would belong to it.
+        return Tissue(cast(Any, self.directions), cast(Any, region))
 
     @cached_property
     def prescribed(self) -> tuple[np.ndarray, np.ndarray]:
         """``(held, values)``: where the displacement is known, (n, 3) bool, and it, (n, 3) mm."""
-        return prescribe(self.mesh, [s for s in self.supports if isinstance(s, Support)])
+        return prescribe(self.mesh, self.supports)
 
     @property
     def held(self) -> np.ndarray:
@@ -282,32 +270,11 @@ class Scene:
 
     # ---- identity ------------------------------------------------------------------------------
     @cached_property
+    def identity(self) -> Identity:
+        """All that the solutions depend on; equal for scenes with the same solutions."""
+        return identity_of(self)
+
+    @cached_property
     def fingerprint(self) -> str:
-        """Short hash of all that shapes the solution; equal scenes have equal fingerprints."""
-        digest = hashlib.sha256()
-        # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
-        digest.update((np.round(self.mesh.nodes, 9) + 0.0).tobytes())
-        digest.update(np.sort(self.mesh.elements, axis=1).tobytes())
-        digest.update(self.held.tobytes())
-        digest.update((np.round(self.held_displacement, 9) + 0.0).tobytes())
-        if self.fibres is not None:
-            digest.update((np.round(self.fibres, 6) + 0.0).tobytes())
-        if self.sheets is not None:
-            digest.update((np.round(self.sheets, 6) + 0.0).tobytes())
-        if self.regions is not None:
-            digest.update(self.regions.astype(np.int64).tobytes())
-        surfaces = {getattr(part, "facet_set", "") for part in (*self.loads, *self.supports)}
-        for name in sorted(surfaces - {""}):
-            digest.update(np.sort(np.sort(self.mesh.facet_set(name), axis=1), axis=0).tobytes())
-        description: dict[str, Any] = {
-            "law": self.law.name,
-            "constants": {name: float(self.constants[name]) for name in sorted(self.constants)},
-            "parameters": [[p.name, float(p.low), float(p.high), p.scale] for p in self.parameters],
-            "loads": [load.describe() for load in self.loads],
-        }
-        if self.elastic_supports:
-            description["springs"] = [support.describe() for support in self.elastic_supports]
-        if self.dilatation != "pointwise":
-            description["dilatation"] = self.dilatation
-        digest.update(json.dumps(description, sort_keys=True).encode())
-        return digest.hexdigest()[:16]
+        """Short hash of the identity, and of theta's order and box."""
+        return fingerprint(self)

@@ -7,10 +7,10 @@ import numpy as np
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.left_ventricle import MYOCARDIUM
-from emulator.scenes.loads.dead import Traction
+from emulator.scenes.loads import Traction
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports import Support
 
 
 def _beam(

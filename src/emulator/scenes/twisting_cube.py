@@ -8,7 +8,7 @@ from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.supports import Support
 
 
 def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:

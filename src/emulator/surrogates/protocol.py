@@ -75,19 +75,13 @@ def check_nodes(scene: Scene, nodes: np.ndarray) -> np.ndarray:
     return nodes
 
 
-def inside_box(scene: Scene, theta: jax.Array) -> jax.Array:
-    """Whether ``theta`` (..., p) lies in the scene's parameter box, (...) bool."""
-    position = scene.to_unit(theta)
-    return jnp.all((position >= -1e-9) & (position <= 1.0 + 1e-9), axis=-1)
-
-
 def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
     """``forward(theta)``, valid inside the box; outside it the value at the box's centre.
 
     A map fitted inside the box means nothing outside, and may not even be finite there: its
     gradient would reach a sampler through the branch not taken.
     """
-    inside = inside_box(forward.scene, theta)
+    inside = forward.scene.space.contains(theta)
     safe = jnp.where(inside[..., None], theta, forward.scene.centre)
     return Prediction(forward(safe), inside)
 

@@ -9,7 +9,7 @@ import pytest
 import emulator as em
 from calibrate.cli import main
 from calibrate.cli.commands.predict import cavities, told
-from emulator.scenes.loads.pressure import cavity_volume
+from emulator.geometry.cavity import Cavity
 
 CENTRE = ("mu=75", "lam=60")
 
@@ -74,7 +74,8 @@ def test_bad_input(capsys, words, message):
 def test_cavities():
     scene = em.scenes.left_ventricle(rings=2, around=6, layers=1)
     u = jnp.zeros(scene.held.shape)
-    volume = float(cavity_volume(scene, "endocardium")(u))
+    cavity = Cavity(scene.mesh, "endocardium")
+    volume = float(cavity(u[cavity.nodes]))
     assert cavities(scene, u, None) == {
         "endocardium": {"volume_ml": pytest.approx(volume), "error_ml": None}
     }

@@ -9,7 +9,7 @@ import emulator as em
 from emulator.errors import SolverError
 from emulator.fem import run_campaign, sobol
 from emulator.fem.solution import Status
-from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads import Gravity
 from emulator.surrogates.taylor import constant, expand
 from scene_support import block
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from emulator.fem.functional import nodal_dead_force, potential_energy, strain_energy
-from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads import Gravity
 from scene_support import block, rotation
 
 VOLUME = 2.0 * 3.0 * 4.0

@@ -12,8 +12,7 @@ from emulator.geometry.bodies.ellipsoid import land_ventricle
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.loads import CavityPressure, FollowerPressure
 
 
 def guccione(mesh, load, held, exponents) -> Scene:

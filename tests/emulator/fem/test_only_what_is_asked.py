@@ -14,8 +14,7 @@ from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.laws.volumetric import logarithmic, quadratic
 from emulator.mechanics.quantity import modulus
-from emulator.scenes.loads.dead import Gravity, Traction
-from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.loads import CavityPressure, Gravity, Traction
 from scene_support import block
 
 SHAPE = Law("shape only", (modulus("mu"),), lambda strain, mu: 0.5 * mu * strain.I1_minus_3)

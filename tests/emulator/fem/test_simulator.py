@@ -10,8 +10,7 @@ from emulator.errors import InputError, SolverError
 from emulator.fem.assembly import relative_residual
 from emulator.geometry.bodies.box import box
 from emulator.scenes import Support
-from emulator.scenes.loads.dead import Gravity
-from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads import FollowerPressure, Gravity
 from scene_support import block, slope
 
 

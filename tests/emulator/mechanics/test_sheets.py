@@ -12,7 +12,7 @@ from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import rule_based_directions
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads.pressure import CavityPressure
+from emulator.scenes.loads import CavityPressure
 
 # Shear of pig myocardium, Holzapfel & Ogden (2009), Table 1.
 PIG = {

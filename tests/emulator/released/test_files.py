@@ -3,7 +3,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.released.files import read_geometry, read_tests
+from emulator.released.files import models_in, read_geometry, read_tests
 from emulator.released.scenes import published_scene, published_tests
 
 
@@ -53,3 +53,40 @@ def test_missing_and_damaged_files_are_named(tmp_path):
     (folder / "theta.npy").write_bytes(b"\x93NUMPY\x01\x00")
     with pytest.raises(InputError, match=r"theta.npy is not a readable .npy array"):
         read_tests(tmp_path, "OnceClampedBeam")
+
+
+@pytest.fixture
+def twice_clamped(published, tmp_path):
+    """A clone whose data folder holds a beam held at both ends, as the release has it."""
+    folder = tmp_path / "data" / "TwiceClampedBeam" / "geometryData"
+    folder.mkdir(parents=True)
+    source = published / "OnceClampedBeam" / "geometryData"
+    nodes = np.load(source / "reference-coords.npy")
+    np.save(folder / "reference-coords.npy", nodes)
+    np.save(folder / "elements.npy", np.load(source / "elements.npy"))
+    x = nodes[:, 0]
+    inner = (x > x.min() + 1e-6) & (x < x.max() - 1e-6)
+    np.save(folder / "interior-points.npy", inner[:, None])
+    return tmp_path
+
+
+def test_the_twice_clamped_beam_is_read_from_a_clone(twice_clamped):
+    assert models_in(twice_clamped) == ("TwiceClampedBeam",)
+    scene = em.find_scene("published:TwiceClampedBeam", twice_clamped)
+    assert scene.parameter_names == ("mu", "lam")
+    ours = em.scenes.twice_clamped_beam()
+    assert ours.identity.agrees(scene.identity)
+
+
+def test_what_a_clone_lacks_is_named(twice_clamped):
+    folder = twice_clamped / "data" / "TwiceClampedBeam"
+    with pytest.raises(InputError, match=r"TwiceClampedBeam/simulationData/test/theta.npy is miss"):
+        read_tests(twice_clamped, "TwiceClampedBeam")
+    (folder / "geometryData" / "elements.npy").write_text(
+        "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 46208\n"
+    )
+    with pytest.raises(InputError, match=r"elements.npy is a pointer to a large file .* git lfs"):
+        read_geometry(twice_clamped, "TwiceClampedBeam")
+    (folder / "geometryData" / "elements.npy").unlink()
+    with pytest.raises(InputError, match=r"elements.npy is missing; the clone lacks it"):
+        read_geometry(twice_clamped, "TwiceClampedBeam")

@@ -18,9 +18,8 @@ from emulator.geometry.fibres import (
 from emulator.geometry.io import write_mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes import Parameter, file
-from emulator.scenes.loads.dead import Gravity, Traction
-from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.supports.elastic import ElasticSupport
+from emulator.scenes.loads import FollowerPressure, Gravity, Traction
+from emulator.scenes.supports import ElasticSupport
 from emulator.scenes.tables import Table
 
 SCENE = """
@@ -220,7 +219,7 @@ def test_the_examples_of_the_documentation(folder):
     base = scene.mesh.node_set("base")
     assert scene.held[base].tolist() == [[False, False, True]] * len(base)
     np.testing.assert_array_equal(scene.held_displacement[base], [[0.0, 0.0, 0.5]] * len(base))
-    assert scene.elastic_supports == (ElasticSupport("epicardium", 0.2, "normal"),)
+    assert scene.supports[1] == ElasticSupport("epicardium", 0.2, "normal")
     pressure = FollowerPressure("endocardium", 0.8)
     assert scene.loads == (pressure, Traction("base", (0.0, 0.1, 0.0)))
     assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
@@ -271,7 +270,7 @@ def test_facet_sets_on_a_plane_and_quadratic_elements(folder):
     (folder / "scene.toml").write_text(text)
     scene = find_scene(str(folder / "scene.toml"))
     assert scene.mesh.facet_set("end").shape == (2, 6)
-    force = scene.loads[1].nodal_force(scene)
+    force = scene.loads[1].nodal_force(scene.discretisation)
     np.testing.assert_allclose(force.sum(axis=0), [0.0, 0.0, 1.0], atol=1e-12)  # 1 mm2 of 1 kPa
     on_plane = np.flatnonzero(scene.mesh.nodes[:, 0] == 0.0)
     np.testing.assert_array_equal(scene.mesh.node_set("left"), on_plane)

@@ -14,7 +14,7 @@ from emulator.fem.functional import strain_energy
 from emulator.fem.mixed import consistent, linearise
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter
-from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads import Gravity
 from scene_support import block, slope
 
 COARSE = {"rings": 5, "around": 12, "layers": 1}

@@ -9,8 +9,7 @@ from emulator.catalogue import find_scene, scene_from_origin
 from emulator.errors import InputError
 from emulator.mechanics.laws import find_law
 from emulator.scenes import BUILT_IN, Parameter, Support
-from emulator.scenes.loads.dead import Gravity
-from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads import FollowerPressure, Gravity
 from scene_support import block
 
 

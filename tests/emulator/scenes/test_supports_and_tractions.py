@@ -11,8 +11,8 @@ import emulator as em
 from emulator.errors import InputError
 from emulator.fem.functional import nodal_dead_force, spring_terms, strain_energy
 from emulator.geometry.quadratic import to_quadratic
-from emulator.scenes.loads.dead import Traction
-from emulator.scenes.supports.elastic import ElasticSupport
+from emulator.scenes.loads import Traction
+from emulator.scenes.supports import ElasticSupport
 from scene_support import block
 
 

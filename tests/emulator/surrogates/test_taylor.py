@@ -10,8 +10,7 @@ import emulator as em
 from calibrate.verify.consistency import block as heavy_block
 from emulator.errors import InputError, SolverError
 from emulator.scenes import Parameter
-from emulator.scenes.loads.dead import Gravity
-from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads import FollowerPressure, Gravity
 from emulator.surrogates import taylor
 from emulator.surrogates.taylor import Expansion, constant, expand, expand_at, monomials
 from scene_support import block, slope

@@ -99,12 +99,17 @@ def anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
 def cavities(
     scene: Scene, u: jax.Array, estimate: ErrorEstimate | None
 ) -> dict[str, dict[str, float | None]]:
-    """Volume in mL of each cavity under pressure, and its estimated error if there is one."""
-    from emulator.scenes.loads.pressure import CavityPressure, cavity_volume
+    """Volume in mL of each cavity, and its estimated error if there is one."""
+    from emulator.geometry.cavity import Cavity
+    from emulator.scenes.cavities import cavity_sets
 
     found: dict[str, dict[str, float | None]] = {}
-    for name in (load.facet_set for load in scene.loads if isinstance(load, CavityPressure)):
-        volume = cavity_volume(scene, name)
+    for name in cavity_sets(scene):
+        cavity = Cavity(scene.mesh, name)
+
+        def volume(u: jax.Array, cavity: Cavity = cavity) -> jax.Array:
+            return cavity(u[cavity.nodes])
+
         error = None if estimate is None or not estimate.valid else float(estimate.of(volume))
         found[name] = {"volume_ml": float(volume(u)), "error_ml": error}
     return found

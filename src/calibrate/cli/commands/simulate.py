@@ -38,7 +38,6 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.fem.fields import element_fields
     from emulator.fem.functional import potential_energy, volume_ratio
     from emulator.geometry.io import write_solution
-    from emulator.scenes.loads.follower import FollowerPressure
 
     scene = find_scene(arguments.scene, arguments.root)
     theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
@@ -49,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     status = Status(int(solution.status))
     J = np.asarray(volume_ratio(scene, solution.displacement))
     # A pressure that follows an open patch has no potential.
-    open_patch = any(isinstance(load, FollowerPressure) for load in scene.loads)
+    open_patch = not all(load.has_potential for load in scene.loads)
     energy = None if open_patch else float(potential_energy(scene)(solution.displacement, theta))
     stable = None
     if status is Status.CONVERGED and not open_patch:

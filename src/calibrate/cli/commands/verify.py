@@ -59,8 +59,14 @@ def _rows(names: list[str]) -> list[Row]:
         if len(names) != 2:
             raise InputError("verify published: give the folder of the released data, and only it")
         from calibrate.verify import verify_published
+        from emulator.released.files import models_in
+        from emulator.released.scenes import MODELS
 
-        return verify_published(names[1])
+        rows = verify_published(names[1])
+        absent = sorted(set(MODELS) - set(models_in(names[1])))
+        if absent:
+            print(f"not in {names[1]}: {', '.join(absent)}", file=sys.stderr, flush=True)
+        return rows
     for name in names:
         if name not in CASE_NAMES:
             raise InputError(

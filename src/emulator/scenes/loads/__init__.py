@@ -1,1 +1,28 @@
-"""Loads."""
+"""External loads, one kind a file; ``LOADS`` is their registry.
+
+A new kind is a frozen dataclass derived from :class:`Load` in a file of its own, named here.
+"""
+
+from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads.gravity import Gravity
+from emulator.scenes.loads.load import Load
+from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure, SurfacePressure
+from emulator.scenes.loads.published_pressure import PublishedPressure
+from emulator.scenes.loads.traction import Traction
+
+LOADS: dict[str, type[Load]] = {
+    load.kind: load
+    for load in (Gravity, Traction, CavityPressure, FollowerPressure, PublishedPressure)
+}
+
+__all__ = [
+    "KPA_PER_MMHG",
+    "LOADS",
+    "CavityPressure",
+    "FollowerPressure",
+    "Gravity",
+    "Load",
+    "PublishedPressure",
+    "SurfacePressure",
+    "Traction",
+]

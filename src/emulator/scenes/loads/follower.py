@@ -12,29 +12,34 @@ is not symmetric, and a scene with one can be simulated but has no energy to tra
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from emulator.geometry.discretisation import facet_rule
+from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import area_vectors
 from emulator.scenes.loads.pressure import SurfacePressure
 from emulator.scenes.local_terms import LocalForce, Values
-
-if TYPE_CHECKING:
-    from emulator.scenes.scene import Scene
 
 
 @dataclass(frozen=True)
 class FollowerPressure(SurfacePressure):
     """Pressure on a patch whose rim may move; positive pushes into the tissue."""
 
-    def forces(self, scene: Scene) -> LocalForce:
+    kind: ClassVar[str] = "follower_pressure"
+
+    @property
+    def has_potential(self) -> bool:
+        """No: the tangent of the force is not symmetric."""
+        return False
+
+    def force(self, grid: Discretisation) -> LocalForce:
         """The nodal forces, facet by facet."""
-        facets = scene.mesh.facet_set(self.facet_set)
+        mesh = grid.mesh
+        facets = mesh.facet_set(self.facet_set)
         # N_a times the area vector: degree 1 on linear facets, 4 on quadratic ones.
-        rule = facet_rule(scene.mesh.order, 1 if scene.mesh.order == 1 else 4)
+        rule = facet_rule(mesh.order, 1 if mesh.order == 1 else 4)
 
         def force(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
             normals = area_vectors(corners + u, rule)
@@ -42,4 +47,4 @@ class FollowerPressure(SurfacePressure):
                 "q,qa,qi->ai", rule.weights, rule.values, normals
             )
 
-        return LocalForce(facets, scene.mesh.nodes[facets], force)
+        return LocalForce(facets, mesh.nodes[facets], force)

@@ -1,19 +1,22 @@
-"""Supports that prescribe displacements, and whether a body is held at all."""
+"""Prescribed displacements, and whether a body is held at all."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.mesh import Mesh, frozen_array
+from emulator.scenes.supports.boundary_condition import BoundaryCondition, Held, Resisted
 
 _AXES = "xyz"
 
 
 @dataclass(frozen=True, eq=False)
-class Support:
+class Support(BoundaryCondition):
     """Displacement of a node set held at a value, in all its components or in some.
 
     Parameters
@@ -22,6 +25,8 @@ class Support:
     displacement : (3,) or (k, 3) in mm, one row a node of the set; zero clamps it.
     components : which of ``xyz`` are held; the others stay free, whatever their ``displacement``.
     """
+
+    kind: ClassVar[str] = "held"
 
     node_set: str
     displacement: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -35,8 +40,8 @@ class Support:
                 "name some of x, y and z"
             )
 
-    def values(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray, list[int]]:
-        """``(nodes, displacement, axes)``: what is held (k,), at what (k, 3), in which axes."""
+    def held(self, mesh: Mesh) -> Held:
+        """The nodes of the set, their displacements, and the axes that are held."""
         nodes = mesh.node_set(self.node_set)
         if not np.isfinite(self.displacement).all():
             raise InputError(f"support on '{self.node_set}': displacement is not finite")
@@ -46,10 +51,16 @@ class Support:
                 f"{self.displacement.shape}; expected (3,) or ({len(nodes)}, 3)"
             )
         axes = [k for k, axis in enumerate(_AXES) if axis in self.components]
-        return nodes, np.broadcast_to(self.displacement, (len(nodes), 3)), axes
+        return Held(self.node_set, nodes, np.broadcast_to(self.displacement, (len(nodes), 3)), axes)
+
+    def resisted(self, mesh: Mesh) -> Resisted:
+        """Every node of the set along each axis that is held."""
+        _, nodes, _, axes = self.held(mesh)
+        points = np.repeat(mesh.nodes[nodes], len(axes), axis=0)
+        return Resisted(points, np.tile(np.eye(3)[axes], (len(nodes), 1)))
 
 
-def prescribe(mesh: Mesh, supports: list[Support]) -> tuple[np.ndarray, np.ndarray]:
+def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> tuple[np.ndarray, np.ndarray]:
     """``(held, values)``: where the displacement is known, (n, 3) bool, and it, (n, 3) mm.
 
     Raises
@@ -60,13 +71,15 @@ def prescribe(mesh: Mesh, supports: list[Support]) -> tuple[np.ndarray, np.ndarr
     held = np.zeros(mesh.nodes.shape, dtype=bool)
     values = np.zeros(mesh.nodes.shape)
     for support in supports:
-        nodes, wanted, axes = support.values(mesh)
+        if (prescribed := support.held(mesh)) is None:
+            continue
+        where, nodes, wanted, axes = prescribed
         for axis in axes:
             clash = held[nodes, axis] & (values[nodes, axis] != wanted[:, axis])
             if clash.any():
                 node = nodes[np.flatnonzero(clash)[0]]
                 raise InputError(
-                    f"support on '{support.node_set}' contradicts another one at node {node}: "
+                    f"support on '{where}' contradicts another one at node {node}: "
                     f"{_AXES[axis]} is {values[node, axis]:g} mm there, "
                     f"not {wanted[np.flatnonzero(clash)[0], axis]:g}"
                 )

@@ -9,22 +9,21 @@ over the reference surface, with the stiffness ``k`` in kPa/mm and the outward n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.discretisation import facet_rule
+from emulator.geometry.discretisation import Discretisation, facet_rule
+from emulator.geometry.mesh import Mesh
 from emulator.scenes.local_terms import LocalTerm, Values
-
-if TYPE_CHECKING:
-    from emulator.scenes.scene import Scene
+from emulator.scenes.supports.boundary_condition import BoundaryCondition, Resisted
 
 
 @dataclass(frozen=True)
-class ElasticSupport:
+class ElasticSupport(BoundaryCondition):
     """Springs on a facet set.
 
     Parameters
@@ -33,6 +32,8 @@ class ElasticSupport:
     stiffness : k in kPa/mm, above 0.
     direction : ``all``, or ``normal`` to let the surface slide along itself.
     """
+
+    kind: ClassVar[str] = "elastic"
 
     facet_set: str
     stiffness: float
@@ -50,15 +51,21 @@ class ElasticSupport:
                 "use all or normal"
             )
 
-    def describe(self) -> list[object]:
-        """What tells this support from another."""
-        return ["elastic", self.facet_set, float(self.stiffness), self.direction]
+    @property
+    def facet_sets(self) -> tuple[str, ...]:
+        """Where it acts."""
+        return (self.facet_set,)
 
-    def term(self, scene: Scene) -> LocalTerm:
-        """The springs' energy, facet by facet."""
-        facets = scene.mesh.facet_set(self.facet_set)
-        rule = facet_rule(scene.mesh.order, 2 * scene.mesh.order)  # u squared
-        corners = scene.mesh.nodes[facets]
+    def to_json(self) -> list[Any]:
+        """Kind, facet set, stiffness and direction."""
+        return [self.kind, self.facet_set, float(self.stiffness), self.direction]
+
+    def term(self, grid: Discretisation) -> LocalTerm:
+        """Energy of the springs, facet by facet."""
+        mesh = grid.mesh
+        facets = mesh.facet_set(self.facet_set)
+        rule = facet_rule(mesh.order, 2 * mesh.order)  # u squared
+        corners = mesh.nodes[facets]
         slopes = np.einsum("qad,kai->kqdi", rule.slopes, corners)
         normals = np.cross(slopes[:, :, 0], slopes[:, :, 1])  # (k, q, 3), as long as the area
         areas = np.linalg.norm(normals, axis=-1)
@@ -75,11 +82,11 @@ class ElasticSupport:
 
         return LocalTerm(facets, data, energy)
 
-    def resisted(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-        """Points (k, 3) in mm and the directions (k, 3) in which springs hold them."""
-        points = scene.mesh.nodes[scene.mesh.facet_set(self.facet_set)][:, :3]
+    def resisted(self, mesh: Mesh) -> Resisted:
+        """The corners of every facet, along all axes or along its normal."""
+        points = mesh.nodes[mesh.facet_set(self.facet_set)][:, :3]
         normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
         if self.direction == "normal":
-            return points.reshape(-1, 3), np.repeat(normal, 3, axis=0)
+            return Resisted(points.reshape(-1, 3), np.repeat(normal, 3, axis=0))
         every = points.reshape(-1, 3)
-        return np.repeat(every, 3, axis=0), np.tile(np.eye(3), (len(every), 1))
+        return Resisted(np.repeat(every, 3, axis=0), np.tile(np.eye(3), (len(every), 1)))

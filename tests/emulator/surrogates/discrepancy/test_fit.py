@@ -8,7 +8,7 @@ import pytest
 import emulator as em
 from emulator.errors import InputError
 from emulator.fem import run_campaign, sobol
-from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads import Gravity
 from emulator.surrogates.discrepancy import fit_residual
 from emulator.surrogates.discrepancy.fit import _spread
 from emulator.surrogates.pod_gp import fit_reduced

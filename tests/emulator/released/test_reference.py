@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate import reference
-from calibrate.reference import outside_reference, published_reference, sample_outside
 from emulator.errors import InputError
 from emulator.fem.assembly import relative_residual
-from emulator.fem.solution import Status
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
+from emulator.released import reference
+from emulator.released.reference import published_reference
 from emulator.released.scenes import published_scene
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads import Gravity
 
 MU, LAM = Parameter("mu", "kPa", 3.5, 10.0, "log"), Parameter("lam", "kPa", 3.5, 10.0, "log")
 
@@ -100,53 +99,8 @@ def test_another_scene_is_refused(hanging, released):
         published_reference(stiff, released)
 
 
-def test_what_makes_two_scenes_the_same(published):
-    ours = published_scene("LeftVentricle", published)
-    turned = np.random.default_rng(0).permutation(len(ours.fibres))
-    elements, fibres = ours.mesh.elements[turned], ours.fibres[turned]
-    listed = replace(ours, mesh=replace(ours.mesh, elements=elements), fibres=fibres)
-    assert reference._same(ours, listed)
-    assert not reference._same(ours, replace(listed, fibres=ours.fibres))
-    assert not reference._same(ours, replace(ours, constants={"kappa": 30.0}))
-
-
 @pytest.mark.slow
 def test_released_models_without_fields(published):
     for model, cases in (("Liver", 241), ("LeftVentricle", 75)):
         found = published_reference(published_scene(model, published), published / model)
         assert len(found.displacement) == cases
-
-
-def test_outside_the_box(hanging):
-    thetas = np.asarray(sample_outside(hanging, 40, 0.25))
-    position = np.asarray(hanging.to_unit(jnp.asarray(thetas)))
-    assert thetas.shape == (40, 2)
-    assert ((position < 0.0) | (position > 1.0)).any(axis=1).all()
-    assert position.min() >= -0.25
-    assert position.max() <= 1.25
-    assert (position.min() < -0.15) & (position.max() > 1.15)
-    # A uniform range widened past zero, and a Poisson ratio past a half, hold values to leave out.
-    near = replace(hanging, parameters=(Parameter("mu", "kPa", 1.0, 3.0), LAM))
-    assert np.asarray(sample_outside(near, 40, 1.0))[:, 0].min() > 0.0
-    nu = np.asarray(sample_outside(em.scenes.twisting_cube(cells=1), 40, 0.5))[:, 1]
-    assert 0.45 < nu.max() < 0.5
-    with pytest.raises(InputError, match="outside is -1"):
-        sample_outside(hanging, 4, -1.0)
-
-
-def test_solves_that_fail_outside_are_counted(hanging, simulator, out_of_balance):
-    class Brittle(em.Simulator):
-        def solve(self, theta, start=None):
-            solution = super().solve(theta, start)
-            soft = jnp.where(theta[0] < MU.low, Status.LOAD_LIMIT, solution.status)
-            return solution._replace(status=soft)
-
-    brittle = Brittle(hanging)
-    vars(brittle).update(_driver=simulator._driver)  # compiled already
-    found = outside_reference(brittle, 8, 0.25, reference.fem_reference(brittle, 2))
-    soft = int((np.asarray(sample_outside(hanging, 8, 0.25))[:, 0] < MU.low).sum())
-    assert 0 < soft < 8
-    assert found.failed == soft
-    assert len(found.thetas) == len(found.displacement) == 8 - soft
-    assert found.thetas[:, 0].min() >= MU.low
-    assert out_of_balance(found.displacement[0], found.thetas[0]) < 1e-8

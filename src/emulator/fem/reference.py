@@ -1,0 +1,93 @@
+"""Reference solutions that forward maps are judged by, inside the box and outside."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from emulator.errors import InputError
+from emulator.fem.campaign import run_campaign
+from emulator.fem.designs import sobol
+from emulator.fem.simulator import Simulator
+from emulator.scenes.scene import Scene
+
+SEED = 90_210  # test points of their own: training and reduced models draw with small seeds
+
+
+class Reference(NamedTuple):
+    """Theta (c, p), displacement (c, n, 3) mm, where it is from, and how many solves failed."""
+
+    thetas: jax.Array
+    displacement: jax.Array
+    source: str
+    failed: int = 0
+
+
+def fem_reference(simulator: Simulator, cases: int, *, progress: bool = False) -> Reference:
+    """Our FEM at ``cases`` theta over the box; :class:`SolverError` when one fails."""
+    runs = run_campaign(simulator, sobol(simulator.scene, cases, SEED), progress=progress)
+    return Reference(runs.theta, runs.displacement, "our FEM")
+
+
+def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
+    """Theta (cases, p) outside the box, in the box widened by ``fraction`` of each side, both ways.
+
+    Widened on each parameter's scale; values that law and loads do not take are left out.
+    """
+    if not 0.0 < fraction < np.inf:
+        raise InputError(f"outside is {fraction}; give a fraction above 0, e.g. 0.25")
+    count = 2 * cases
+    for _ in range(12):
+        position = scene.to_unit(sobol(scene, count, SEED + 1))
+        thetas = scene.from_unit(position * (1.0 + 2.0 * fraction) - fraction)
+        outside = ~np.asarray(scene.space.contains(thetas))
+        admitted = outside & _admissible(scene, np.asarray(thetas))
+        if admitted.sum() >= cases:
+            return thetas[np.flatnonzero(admitted)[:cases]]
+        count *= 2
+    raise InputError(f"outside {fraction:g}: next to nothing there is a value the scene takes")
+
+
+def _admissible(scene: Scene, thetas: np.ndarray) -> np.ndarray:
+    """Whether law, loads and regions take every entry of each theta (c, p), (c,) bool."""
+    quantities = [scene.quantities[name] for name in scene.parameter_names]
+    return np.array(
+        [
+            all(q.value_fault(float(v)) is None for q, v in zip(quantities, theta, strict=True))
+            for theta in thetas
+        ]
+    )
+
+
+def outside_reference(
+    simulator: Simulator,
+    cases: int,
+    fraction: float,
+    inside: Reference,
+    *,
+    progress: bool = False,
+) -> Reference:
+    """Our FEM outside the box, each from the nearest solution there is, else from rest.
+
+    What does not converge is left out and counted.
+    """
+    scene = simulator.scene
+    thetas = sample_outside(scene, cases, fraction)
+    positions = list(np.asarray(scene.to_unit(inside.thetas)))
+    fields, solved = list(inside.displacement), []
+    for k, theta in enumerate(tqdm(thetas, "FEM outside", disable=not progress, unit="run")):
+        position = np.asarray(scene.to_unit(theta))
+        nearest = int(np.argmin(np.sum((np.array(positions) - position) ** 2, axis=1)))
+        solution = simulator.solve(theta, fields[nearest])
+        if not solution.converged:
+            solution = simulator.solve(theta)
+        if solution.converged:
+            solved.append(k)
+            positions.append(position)
+            fields.append(solution.displacement)
+    displacement = jnp.stack(fields[len(inside.thetas) :]) if solved else jnp.zeros((0, 0, 3))
+    return Reference(thetas[np.array(solved, int)], displacement, "our FEM", cases - len(solved))

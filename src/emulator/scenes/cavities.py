@@ -1,0 +1,39 @@
+"""The cavities of a scene."""
+
+from __future__ import annotations
+
+from emulator.errors import InputError
+from emulator.geometry.cavity import Cavity, encloses
+from emulator.scenes.scene import Scene
+
+ENDOCARDIUM = "endocardium"
+
+
+def cavity_sets(scene: Scene) -> tuple[str, ...]:
+    """Facet sets of the scene's cavities: those under pressure, and one called ``endocardium``.
+
+    A patch that encloses no volume, such as a plane one, is no cavity.
+    """
+    pressed = [load.pressed for load in scene.loads if load.pressed is not None]
+    named = [ENDOCARDIUM] if ENDOCARDIUM in scene.mesh.facet_sets else []
+    names = dict.fromkeys([*pressed, *named])
+    return tuple(name for name in names if encloses(scene.mesh, name))
+
+
+def find_cavity(scene: Scene, facet_set: str | None = None) -> Cavity:
+    """The cavity whose wall is ``facet_set``; by default the only one the scene has.
+
+    Raises
+    ------
+    InputError
+        The set is missing or encloses no volume; several cavities, or none, and no name.
+    """
+    if facet_set is not None:
+        return Cavity(scene.mesh, facet_set)
+    names = cavity_sets(scene)
+    if len(names) != 1:
+        found = ", ".join(names or sorted(scene.mesh.facet_sets)) or "none"
+        raise InputError(
+            f"scene '{scene.name}' has {len(names)} cavities; name a facet set: {found}"
+        )
+    return Cavity(scene.mesh, names[0])

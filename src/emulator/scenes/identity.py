@@ -1,0 +1,119 @@
+"""The identity of a scene: all that its solutions depend on, in one form.
+
+The form does not depend on how tetrahedra and facets are listed, nor on the order of theta or its
+ranges. Two scenes have the same solutions where their identities agree; a scene's *fingerprint*
+hashes its identity together with theta's order and box. Emulators and posteriors carry the
+fingerprint and refuse a scene with another.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from emulator.mechanics.laws.identity import law_identity
+
+if TYPE_CHECKING:  # the scene knows its identity
+    from emulator.scenes.scene import Scene
+
+_LENGTH_DIGITS = 9  # of mm, in the fingerprint
+_DIRECTION_DIGITS = 6  # of unit vectors, which some files store in single precision
+_TOLERANCE = 1e-6  # of two scenes' lengths, relative to the size of the body, and of directions
+_HASH_LENGTH = 16  # hexadecimal digits
+
+
+@dataclass(frozen=True, eq=False)
+class Identity:
+    """What the solutions of a scene depend on at given values of its parameters.
+
+    lengths : arrays in mm by name: nodes, prescribed displacements.
+    directions : unit vectors by name: fibres, sheets; those that the scene has.
+    indices : arrays of whole numbers by name: tetrahedra, held, regions, facet sets under a load
+        or a support.
+    description : law, constants, loads, springs and the names of the parameters, plain JSON.
+    """
+
+    lengths: Mapping[str, np.ndarray]
+    directions: Mapping[str, np.ndarray]
+    indices: Mapping[str, np.ndarray]
+    description: Mapping[str, Any]
+
+    def agrees(self, other: Identity) -> bool:
+        """Whether both have the same solutions, nodes in the same order."""
+        size = float(np.linalg.norm(np.ptp(self.lengths["nodes"], axis=0)))
+        return (
+            _close(self.lengths, other.lengths, _TOLERANCE * size)
+            and _close(self.directions, other.directions, _TOLERANCE)
+            and _close(self.indices, other.indices, 0.0)
+            and self.description == other.description
+        )
+
+    def parts(self) -> list[bytes]:
+        """The identity as bytes to hash, lengths and directions rounded."""
+        found = [_text(dict(self.description))]
+        rounded = {name: np.round(v, _LENGTH_DIGITS) for name, v in self.lengths.items()}
+        rounded |= {name: np.round(v, _DIRECTION_DIGITS) for name, v in self.directions.items()}
+        for name, values in sorted(rounded.items()):
+            # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
+            found += [name.encode(), (values + 0.0).tobytes()]
+        for name, values in sorted(self.indices.items()):
+            found += [name.encode(), values.astype(np.int64).tobytes()]
+        return found
+
+
+def identity_of(scene: Scene) -> Identity:
+    """The identity of ``scene``."""
+    elements = np.sort(scene.mesh.elements, axis=1)
+    order = np.lexsort(elements.T)
+    vectors = {"fibres": scene.fibres, "sheets": scene.sheets}
+    named = {name for part in scene.parts for name in part.facet_sets}
+    indices = {"elements": elements[order], "held": scene.held}
+    indices |= {f"facets {name}": _as_set(scene.mesh.facet_set(name)) for name in named}
+    if scene.regions is not None:
+        indices["regions"] = scene.regions[order]
+    springs = [support.to_json() for support in scene.supports]
+    return Identity(
+        lengths={"nodes": scene.mesh.nodes, "displacement": scene.held_displacement},
+        directions={name: v[order] for name, v in vectors.items() if v is not None},
+        indices=indices,
+        description={
+            "law": law_identity(scene.law),
+            "constants": {name: float(value) for name, value in scene.constants.items()},
+            "parameters": sorted(scene.parameter_names),
+            "loads": sorted(json.dumps(load.to_json()) for load in scene.loads),
+            "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
+            "dilatation": scene.dilatation,
+        },
+    )
+
+
+def fingerprint(scene: Scene) -> str:
+    """Short hash of the identity of ``scene`` and of theta's order and box."""
+    box = [[p.name, float(p.low), float(p.high), p.scale] for p in scene.parameters]
+    digest = hashlib.sha256()
+    for part in [*scene.identity.parts(), _text(box)]:
+        # The length keeps the end of one part from passing for the beginning of the next.
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()[:_HASH_LENGTH]
+
+
+def _close(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray], tolerance: float) -> bool:
+    return a.keys() == b.keys() and all(
+        a[name].shape == b[name].shape and np.allclose(a[name], b[name], rtol=0.0, atol=tolerance)
+        for name in a
+    )
+
+
+def _as_set(facets: np.ndarray) -> np.ndarray:
+    """Facets (k, 3 or 6) without regard to order: nodes sorted in each, then whole rows."""
+    return np.unique(np.sort(facets, axis=1), axis=0)
+
+
+def _text(content: Any) -> bytes:
+    return json.dumps(content, sort_keys=True).encode()

@@ -1,0 +1,74 @@
+"""What a load is to the rest of the project."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+
+from emulator.geometry.discretisation import Discretisation
+from emulator.geometry.mesh import Mesh
+from emulator.mechanics.quantity import Quantity
+from emulator.scenes.local_terms import LocalForce, LocalTerm
+
+
+class Load(ABC):
+    """An external load; a concrete one is a frozen dataclass whose fields a scene file can give.
+
+    A load contributes in one of three ways, and overrides the method for it: a dead nodal force, a
+    potential, or a force that has no potential.
+
+    kind : name in scene files and in :data:`~emulator.scenes.loads.LOADS`.
+    """
+
+    kind: ClassVar[str]
+
+    @property
+    def facet_sets(self) -> tuple[str, ...]:
+        """Facet sets the load acts on; they must be in the mesh."""
+        return ()
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Parameters the load takes from theta or from the scene's constants."""
+        return ()
+
+    @property
+    def pressed(self) -> str | None:
+        """Facet set the load presses on, the wall of a cavity if it encloses one."""
+        return None
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether the load's work is a potential of the displacement."""
+        return True
+
+    def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
+        """Raise :class:`~emulator.errors.InputError` if the load cannot act on this body.
+
+        Parameters
+        ----------
+        held, displacement : (n, 3) where the displacement is prescribed, and its value in mm.
+        """
+
+    def nodal_force(self, grid: Discretisation) -> np.ndarray | None:
+        """Dead nodal force (n, 3) in mN, or None."""
+        return None
+
+    def term(self, grid: Discretisation) -> LocalTerm | None:
+        """Potential of a load that follows the deformation, or None."""
+        return None
+
+    def force(self, grid: Discretisation) -> LocalForce | None:
+        """Force of a load that follows the deformation and has no potential, or None."""
+        return None
+
+    @abstractmethod
+    def to_json(self) -> list[Any]:
+        """Plain JSON that tells this load from any other with another effect."""
+
+
+def nodal_sums(mesh: Mesh, nodes: np.ndarray, amounts: np.ndarray) -> np.ndarray:
+    """Sum of ``amounts`` (k, a) at each of their ``nodes`` (k, a), shape (n,)."""
+    return np.bincount(nodes.ravel(), amounts.ravel(), minlength=len(mesh.nodes))

@@ -1,0 +1,52 @@
+"""Dead traction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.discretisation import Discretisation, facet_rule
+from emulator.geometry.facets import nodal_areas
+from emulator.scenes.loads.load import Load, nodal_sums
+
+
+@dataclass(frozen=True)
+class Traction(Load):
+    r"""Dead traction, potential :math:`-\int t \cdot u\, dA` over the reference surface.
+
+    Parameters
+    ----------
+    facet_set : where it acts.
+    traction : force per reference area in kPa, three components; it keeps its direction.
+    """
+
+    kind: ClassVar[str] = "traction"
+
+    facet_set: str
+    traction: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if len(self.traction) != 3 or not np.isfinite(self.traction).all():
+            raise InputError(
+                f"traction on '{self.facet_set}' is {self.traction}; give 3 finite numbers in kPa"
+            )
+
+    @property
+    def facet_sets(self) -> tuple[str, ...]:
+        """Where it acts."""
+        return (self.facet_set,)
+
+    def to_json(self) -> list[Any]:
+        """Kind, facet set and traction."""
+        return [self.kind, self.facet_set, *(float(x) + 0.0 for x in self.traction)]
+
+    def nodal_force(self, grid: Discretisation) -> np.ndarray:
+        """Consistent nodal forces, (n, 3) in mN."""
+        mesh = grid.mesh
+        facets = mesh.facet_set(self.facet_set)
+        rule = facet_rule(mesh.order, 4)
+        area = nodal_areas(mesh.nodes[facets], rule)
+        return nodal_sums(mesh, facets, area)[:, None] * np.asarray(self.traction, dtype=float)

@@ -1,0 +1,61 @@
+"""What a support is to the rest of the project."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from emulator.geometry.discretisation import Discretisation
+from emulator.geometry.mesh import Mesh
+from emulator.scenes.local_terms import LocalTerm
+
+
+class Held(NamedTuple):
+    """Prescribed displacements.
+
+    where : for people. nodes : (k,). displacement : (k, 3) mm. axes : those that are held.
+    """
+
+    where: str
+    nodes: np.ndarray
+    displacement: np.ndarray
+    axes: list[int]
+
+
+class Resisted(NamedTuple):
+    """``points`` (k, 3) in mm and the ``directions`` (k, 3) in which they cannot move freely."""
+
+    points: np.ndarray
+    directions: np.ndarray
+
+
+class BoundaryCondition(ABC):
+    """A support: it prescribes displacements, or resists them by a potential.
+
+    kind : name in scene files and in :data:`~emulator.scenes.supports.SUPPORTS`.
+    """
+
+    kind: ClassVar[str]
+
+    @property
+    def facet_sets(self) -> tuple[str, ...]:
+        """Facet sets the support acts on; they must be in the mesh."""
+        return ()
+
+    def held(self, mesh: Mesh) -> Held | None:
+        """Displacements it prescribes, or None."""
+        return None
+
+    def term(self, grid: Discretisation) -> LocalTerm | None:
+        """Potential of its springs, or None."""
+        return None
+
+    @abstractmethod
+    def resisted(self, mesh: Mesh) -> Resisted:
+        """Where, and in which directions, it stops or resists a rigid motion of the body."""
+
+    def to_json(self) -> list[Any] | None:
+        """Plain JSON that tells springs apart; None where :meth:`held` says it all."""
+        return None

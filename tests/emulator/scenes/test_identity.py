@@ -1,0 +1,114 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.mechanics.laws import LAWS
+from emulator.mechanics.laws.identity import law_identity, probed
+from emulator.scenes import Parameter, Support
+from emulator.scenes.identity import _as_set
+from emulator.scenes.loads import Gravity, Traction
+from emulator.scenes.supports import ElasticSupport
+from scene_support import block
+
+
+def test_facet_sets_are_sets_of_facets_not_columns_of_nodes():
+    one, other = np.array([[1, 2, 9], [3, 4, 5]]), np.array([[1, 2, 5], [3, 4, 9]])
+    np.testing.assert_array_equal(np.sort(one, axis=0), np.sort(other, axis=0))
+    assert not np.array_equal(_as_set(one), _as_set(other))
+    np.testing.assert_array_equal(_as_set(one), _as_set(one[::-1][:, [2, 0, 1]]))
+
+
+def test_a_load_on_other_facets_is_another_scene():
+    scene = block(cells=(2, 2, 2))
+    right = scene.mesh.facet_set("right")
+
+    def loaded(facets):
+        mesh = replace(scene.mesh, facet_sets={"loaded": facets})
+        return replace(scene, mesh=mesh, loads=(Traction("loaded", (0.0, 0.0, 1.0)),))
+
+    one, other = loaded(right[:4]), loaded(right[[0, 1, 2, 5]])
+    assert one.fingerprint != other.fingerprint
+    assert not one.identity.agrees(other.identity)
+    again = loaded(right[[3, 1, 0, 2]][:, [2, 0, 1]])
+    assert again.fingerprint == one.fingerprint
+    assert again.identity.agrees(one.identity)
+
+
+def test_an_edited_law_is_another_law(beam):
+    law = beam.law
+    doubled = replace(law, energy=lambda strain, mu, lam: law.energy(strain, 2.0 * mu, lam))
+    assert doubled.name == law.name
+    edited = replace(beam, law=doubled)
+    assert edited.fingerprint != beam.fingerprint
+    assert not edited.identity.agrees(beam.identity)
+    same = replace(law, energy=lambda strain, mu, lam: law.energy(strain, mu, lam))
+    assert replace(beam, law=same).fingerprint == beam.fingerprint
+
+
+@pytest.mark.parametrize("name", sorted(LAWS))
+def test_probes_see_every_parameter_and_stay_where_the_law_is_defined(name):
+    law = LAWS[name]
+    energies = probed(law)
+    assert np.isfinite(energies).all()
+    for k in range(len(law.parameters)):
+
+        def less(strain, *values, k=k):
+            return law.energy(strain, *values[:k], 0.99 * values[k], *values[k + 1 :])
+
+        assert law_identity(replace(law, energy=less)) != law_identity(law)
+
+
+def test_springs_regions_sheets_and_dilatation_count(ventricle):
+    scene = replace(ventricle, supports=(Support("base"), ElasticSupport("epicardium", 0.2)))
+    assert scene.fingerprint != ventricle.fingerprint
+    stiffer = replace(scene, supports=(Support("base"), ElasticSupport("epicardium", 0.3)))
+    assert not stiffer.identity.agrees(scene.identity)
+    labels = np.arange(len(ventricle.mesh.elements)) % 2 + 1
+    ones = {"stiffness_1": 1.0, "stiffness_2": 1.0}
+    regions = replace(ventricle, regions=labels, constants={**ventricle.constants, **ones})
+    swapped = replace(regions, regions=3 - labels)
+    assert not regions.identity.agrees(swapped.identity)
+    assert not regions.identity.agrees(ventricle.identity)
+    assert regions.fingerprint != swapped.fingerprint
+
+
+def test_listing_elements_in_another_order_changes_nothing(ventricle):
+    order = np.random.default_rng(0).permutation(len(ventricle.mesh.elements))
+    even = order[:, None] % 2 == 0
+    elements = ventricle.mesh.elements[order]
+    elements = np.where(even, elements[:, [1, 2, 0, 3]], elements)  # turned, as large as before
+    listed = replace(
+        ventricle, mesh=replace(ventricle.mesh, elements=elements), fibres=ventricle.fibres[order]
+    )
+    assert listed.fingerprint == ventricle.fingerprint
+    assert listed.identity.agrees(ventricle.identity)
+    mixed = replace(listed, fibres=ventricle.fibres)
+    assert not mixed.identity.agrees(ventricle.identity)
+
+
+def test_the_box_and_the_order_of_theta_are_in_the_fingerprint_only(beam):
+    mu, lam = beam.parameters
+    turned = replace(beam, parameters=(lam, mu))
+    wider = replace(beam, parameters=(Parameter("mu", "kPa", 40.0, 100.0, "log"), lam))
+    for other in (turned, wider):
+        assert other.fingerprint != beam.fingerprint
+        assert other.identity.agrees(beam.identity)
+    heavier = replace(beam, loads=(Gravity(density=1.1, acceleration=9.80),))
+    assert not heavier.identity.agrees(beam.identity)
+
+
+def test_lengths_may_differ_by_what_single_precision_loses(beam):
+    stored = beam.mesh.nodes.astype(np.float32).astype(float)
+    assert replace(beam, mesh=replace(beam.mesh, nodes=stored)).identity.agrees(beam.identity)
+    moved = beam.mesh.nodes + [0.0, 0.0, 0.01]
+    assert not replace(beam, mesh=replace(beam.mesh, nodes=moved)).identity.agrees(beam.identity)
+
+
+def test_the_released_models_are_told_from_ours(published):
+    from emulator.released.scenes import published_scene
+
+    ours = em.scenes.once_clamped_beam()
+    assert ours.identity.agrees(published_scene("OnceClampedBeam", published).identity)
+    assert not ours.identity.agrees(em.scenes.twice_clamped_beam().identity)
