@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from emulator.mechanics.laws.identity import law_identity
-
-if TYPE_CHECKING:  # the scene knows its identity
-    from emulator.scenes.scene import Scene
+from emulator.geometry.mesh import Mesh
+from emulator.scenes.parameter_space import ParameterSpace
 
 _LENGTH_DIGITS = 9  # of mm, in the fingerprint
 _DIRECTION_DIGITS = 6  # of unit vectors, which some files store in single precision
@@ -66,37 +64,43 @@ class Identity:
         return found
 
 
-def identity_of(scene: Scene) -> Identity:
-    """The identity of ``scene``."""
-    elements = np.sort(scene.mesh.elements, axis=1)
+def identity_of(
+    mesh: Mesh,
+    prescribed: tuple[np.ndarray, np.ndarray],
+    directions: Mapping[str, np.ndarray | None],
+    regions: np.ndarray | None,
+    facet_sets: Collection[str],
+    description: Mapping[str, Any],
+) -> Identity:
+    """The identity of a scene made of these parts, elements put in a fixed order.
+
+    Parameters
+    ----------
+    prescribed : where the displacement is known (n, 3) bool, and its value (n, 3) mm.
+    directions : (m, 3) unit vectors by name, or None.
+    regions : (m,) labels, or None.
+    facet_sets : names of the sets under a load or a support.
+    """
+    held, displacement = prescribed
+    elements = np.sort(mesh.elements, axis=1)
     order = np.lexsort(elements.T)
-    vectors = {"fibres": scene.fibres, "sheets": scene.sheets}
-    named = {name for part in scene.parts for name in part.facet_sets}
-    indices = {"elements": elements[order], "held": scene.held}
-    indices |= {f"facets {name}": _as_set(scene.mesh.facet_set(name)) for name in named}
-    if scene.regions is not None:
-        indices["regions"] = scene.regions[order]
-    springs = [support.to_json() for support in scene.supports]
+    indices = {"elements": elements[order], "held": held}
+    indices |= {f"facets {name}": _as_set(mesh.facet_set(name)) for name in facet_sets}
+    if regions is not None:
+        indices["regions"] = regions[order]
     return Identity(
-        lengths={"nodes": scene.mesh.nodes, "displacement": scene.held_displacement},
-        directions={name: v[order] for name, v in vectors.items() if v is not None},
+        lengths={"nodes": mesh.nodes, "displacement": displacement},
+        directions={name: v[order] for name, v in directions.items() if v is not None},
         indices=indices,
-        description={
-            "law": law_identity(scene.law),
-            "constants": {name: float(value) for name, value in scene.constants.items()},
-            "parameters": sorted(scene.parameter_names),
-            "loads": sorted(json.dumps(load.to_json()) for load in scene.loads),
-            "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
-            "dilatation": scene.dilatation,
-        },
+        description=description,
     )
 
 
-def fingerprint(scene: Scene) -> str:
-    """Short hash of the identity of ``scene`` and of theta's order and box."""
-    box = [[p.name, float(p.low), float(p.high), p.scale] for p in scene.parameters]
+def fingerprint(identity: Identity, space: ParameterSpace) -> str:
+    """Short hash of an identity and of theta's order and box."""
+    box = [[p.name, float(p.low), float(p.high), p.scale] for p in space.parameters]
     digest = hashlib.sha256()
-    for part in [*scene.identity.parts(), _text(box)]:
+    for part in [*identity.parts(), _text(box)]:
         # The length keeps the end of one part from passing for the beginning of the next.
         digest.update(len(part).to_bytes(8, "little"))
         digest.update(part)

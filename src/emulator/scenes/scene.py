@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,6 +16,7 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation, discretise
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws import Law
+from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
@@ -272,9 +274,25 @@ class Scene:
     @cached_property
     def identity(self) -> Identity:
         """All that the solutions depend on; equal for scenes with the same solutions."""
-        return identity_of(self)
+        springs = [support.to_json() for support in self.supports]
+        description = {
+            "law": law_identity(self.law),
+            "constants": {name: float(value) for name, value in self.constants.items()},
+            "parameters": sorted(self.parameter_names),
+            "loads": sorted(json.dumps(load.to_json()) for load in self.loads),
+            "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
+            "dilatation": self.dilatation,
+        }
+        return identity_of(
+            self.mesh,
+            self.prescribed,
+            {"fibres": self.fibres, "sheets": self.sheets},
+            self.regions,
+            sorted({name for part in self.parts for name in part.facet_sets}),
+            description,
+        )
 
     @cached_property
     def fingerprint(self) -> str:
         """Short hash of the identity, and of theta's order and box."""
-        return fingerprint(self)
+        return fingerprint(self.identity, self.space)

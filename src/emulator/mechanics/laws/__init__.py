@@ -1,34 +1,22 @@
 """Hyperelastic laws, one a file.
 
 To add one, write a file with its energy, a function of a ``Strain`` (see
-:mod:`emulator.mechanics.kinematics`) and the law's parameters; wrap it in a :class:`Law` and add
-that to ``LAWS``. Stress and tangent follow. The tests in ``tests/emulator/mechanics/test_laws.py``
-take it up from the registry once their ``ARGUMENTS`` have values for it. ``docs/adding_a_law.md``
-does it step by step.
+:mod:`emulator.mechanics.kinematics`) and the law's parameters; wrap it in a :class:`Law` and name
+it in the file's ``LAWS``. Every file of this package is looked through, so that is all; stress and
+tangent follow. The tests in ``tests/emulator/mechanics/test_laws.py`` take the law up once
+``tests/law_support.py`` has values for it. ``docs/extending.md`` does it step by step.
 """
 
+import pkgutil
+from importlib import import_module
+
 from emulator.errors import InputError
-from emulator.mechanics.laws.guccione import GUCCIONE
-from emulator.mechanics.laws.holzapfel_ogden import HOLZAPFEL_OGDEN, HOLZAPFEL_OGDEN_RELEASED
-from emulator.mechanics.laws.holzapfel_ogden_orthotropic import HOLZAPFEL_OGDEN_ORTHOTROPIC
 from emulator.mechanics.laws.law import Law
-from emulator.mechanics.laws.neo_hookean import (
-    NEO_HOOKEAN,
-    NEO_HOOKEAN_E_NU,
-    NEO_HOOKEAN_SPLIT,
-)
 
 LAWS: dict[str, Law] = {
     law.name: law
-    for law in (
-        NEO_HOOKEAN,
-        NEO_HOOKEAN_E_NU,
-        NEO_HOOKEAN_SPLIT,
-        HOLZAPFEL_OGDEN,
-        HOLZAPFEL_OGDEN_RELEASED,
-        HOLZAPFEL_OGDEN_ORTHOTROPIC,
-        GUCCIONE,
-    )
+    for file in sorted(module.name for module in pkgutil.iter_modules(__path__))
+    for law in getattr(import_module(f"{__name__}.{file}"), "LAWS", ())
 }
 
 

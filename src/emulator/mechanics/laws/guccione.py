@@ -45,3 +45,4 @@ def energy(
 
 _PARAMETERS = (modulus("C"), number("b_f"), number("b_t"), number("b_fs"), modulus("kappa"))
 GUCCIONE = Law("guccione", _PARAMETERS, energy, fibres=True, shape_moduli=("C",), exponential=True)
+LAWS = (GUCCIONE,)

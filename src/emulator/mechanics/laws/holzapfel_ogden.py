@@ -57,6 +57,7 @@ HOLZAPFEL_OGDEN = Law(
 HOLZAPFEL_OGDEN_RELEASED = replace(
     HOLZAPFEL_OGDEN, name="holzapfel_ogden_released", energy=energy_released
 )
+LAWS = (HOLZAPFEL_OGDEN, HOLZAPFEL_OGDEN_RELEASED)
 
 
 def textbook_from_released(a: float, a_f: float) -> tuple[float, float]:

@@ -60,3 +60,4 @@ HOLZAPFEL_OGDEN_ORTHOTROPIC = Law(
     shape_moduli=("a", "a_f", "a_s", "a_fs"),
     exponential=True,
 )
+LAWS = (HOLZAPFEL_OGDEN_ORTHOTROPIC,)

@@ -59,3 +59,4 @@ NEO_HOOKEAN_E_NU = Law(
 NEO_HOOKEAN_SPLIT = Law(
     "neo_hookean_split", (modulus("mu"), modulus("kappa")), energy_split, shape_moduli=("mu",)
 )
+LAWS = (NEO_HOOKEAN, NEO_HOOKEAN_E_NU, NEO_HOOKEAN_SPLIT)

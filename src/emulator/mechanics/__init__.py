@@ -1,0 +1,1 @@
+"""Mechanics of one material point: strain measures, laws, units. No mesh here."""
