@@ -72,7 +72,8 @@ class Table(BaseModel):
                 raise _mistake(key=key, problem=f"unknown key '{key}'; known: {known}{close}")
         for key, info in cls.model_fields.items():
             if info.is_required() and key not in data:
-                expected = expectation(info.annotation) or "a table"
+                several = get_origin(info.annotation) is tuple
+                expected = expectation(info.annotation) or ("tables" if several else "a table")
                 raise _mistake(problem=f"key '{key}' is missing; expected {expected}")
         return data
 
@@ -201,7 +202,8 @@ def read_json_as[Kind](kind: type[Kind], path: str | FilePath) -> Kind:
     try:
         return _builder(kind)(table)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        first_word = str(error).split(" ", 1)[0]  # often the field
+        raise Source(str(path), data, lines).error(str(error), (first_word,)) from error
 
 
 def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:

@@ -74,7 +74,7 @@ def test_a_dataclass_from_json(tmp_path):
         ({"scene": "b", "draws": "5"}, 'line 3: draws = "5"; expected a whole number'),
         ({"scene": "b", "draws": True}, "line 3: draws = true; expected a whole number"),
         ({"scene": "b", "draws": 5.5}, "line 3: draws = 5.5; expected a whole number"),
-        ({"scene": "b", "draws": 0}, "draws is 0; it must be 1 or more"),
+        ({"scene": "b", "draws": 0}, "line 3: draws is 0; it must be 1 or more"),
         ({"scene": "b", "noise": True}, "line 3: noise = true; expected a number"),
         ({"scene": "b", "noise": float("inf")}, "line 3: noise = Infinity; expected a number"),
         ({"scene": "b", "verbose": 1}, "line 3: verbose = 1; expected true or false"),

@@ -95,7 +95,10 @@ def test_a_scene_from_a_file(folder):
     ("old", "new", "message"),
     [
         ('law = "neo_hookean"', 'law = "hooke"', "law 'hooke' is unknown"),
-        ('law = "neo_hookean"', "", "key 'law' is missing"),
+        ('law = "neo_hookean"', "", "key 'law' is missing; expected a string"),
+        ('[[supports]]\nnode_set = "left"', "", "key 'supports' is missing; expected tables"),
+        ("[[loads]]", "[loads]", r"loads = .*; expected tables \[\[loads\]\]"),
+        ('kind = "gravity"', "", r"number 1: key 'kind' is missing; expected \"gravity\" or"),
         ('law = "neo_hookean"', 'laws = "neo_hookean"', "unknown key 'laws'"),
         ("block.vtu", "missing.vtu", "missing.vtu does not exist"),
         ("at = 0.0", "at = 0.5", "no node at x = 0.5 mm"),
