@@ -1,0 +1,298 @@
+"""Plain data from TOML and JSON files, read into dataclasses and pydantic models.
+
+A mistake is one :class:`~emulator.errors.InputError` that names file, line and key, what was found
+and what would be right. Numbers are finite, and neither strings nor booleans.
+"""
+
+from __future__ import annotations
+
+import json
+import types
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import MISSING, dataclass, field, fields
+from difflib import get_close_matches
+from pathlib import Path as FilePath
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    GetCoreSchemaHandler,
+    Tag,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    create_model,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
+
+from emulator.errors import InputError
+from emulator.line_index import Path, json_lines, line_of
+from emulator.store import read_json
+
+_SCALARS = {float: "number", int: "whole number", str: "string"}
+# What pydantic calls a value of the wrong type, where no field of a table says what is right.
+_EXPECTED = {
+    "float_type": "a number",
+    "finite_number": "a number",
+    "string_type": "a string",
+    "int_type": "a whole number",
+    "tuple_type": "a list",
+}
+
+
+class Table(BaseModel):
+    """A table of a file: no other keys than its fields, no value of another type."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_keys(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            raise _mistake("a table")
+        for key in data:
+            if key not in cls.model_fields:
+                known = ", ".join(sorted(cls.model_fields))
+                close = _closest(key, cls.model_fields)
+                raise _mistake(key=key, problem=f"unknown key '{key}'; known: {known}{close}")
+        for key, info in cls.model_fields.items():
+            if info.is_required() and key not in data:
+                several = get_origin(info.annotation) is tuple
+                expected = expectation(info.annotation) or ("tables" if several else "a table")
+                raise _mistake(problem=f"key '{key}' is missing; expected {expected}")
+        return data
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _check_value(
+        cls, value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+    ) -> Any:
+        annotation = cls.model_fields[str(info.field_name)].annotation
+        if any(get_origin(kind) is tuple for kind in (annotation, *get_args(annotation))):
+            value = _as_tuples(value)  # files have lists only
+        try:
+            return handler(value)
+        except ValidationError:
+            if (expected := expectation(annotation)) is None:
+                raise
+            raise _mistake(expected) from None
+
+
+@dataclass(frozen=True, eq=False)
+class OneOf:
+    """Annotation of a table whose ``key`` names one of several dataclasses.
+
+    Parameters
+    ----------
+    key : e.g. ``kind``.
+    choices : the dataclasses by the value of ``key``; their fields are the table's other keys.
+    default : value of ``key`` in a table without it.
+    """
+
+    key: str
+    choices: Mapping[str, type]
+    default: str | None = None
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        members = tuple(
+            Annotated[
+                table_of(choice, self.key, name),
+                AfterValidator(_builder(choice, self.key)),
+                Tag(name),
+            ]
+            for name, choice in self.choices.items()
+        )
+        tag = Discriminator(
+            self._tag,
+            custom_error_type="choice",
+            custom_error_message="choice",
+            custom_error_context={"key": self.key, "choices": json.dumps(list(self.choices))},
+        )
+        return handler.generate_schema(Annotated[Union[members], tag])  # noqa: UP007
+
+    def _tag(self, data: Any) -> str | None:
+        found = data.get(self.key, self.default) if isinstance(data, dict) else None
+        return found if isinstance(found, str) else None
+
+
+@dataclass(frozen=True)
+class Source:
+    """Data of a file, and what is needed to point at it.
+
+    Parameters
+    ----------
+    name : how messages call the file.
+    data : its content.
+    lines : line of each path, as far as known.
+    toml : whether paths are written as in TOML, ``[parameters.mu]: range``.
+    """
+
+    name: str
+    data: Any
+    lines: Mapping[Path, int] = field(default_factory=dict)
+    toml: bool = True
+
+    def error(self, problem: str, path: Path = (), table: Path = ()) -> InputError:
+        """``problem`` with file, line of ``path``, and name of ``table``."""
+        line = line_of(self.lines, path)
+        where = self.name if line is None else f"{self.name}, line {line}"
+        named = f"{self.written(table)}: " if table else ""
+        return InputError(f"{where}: {named}{problem}")
+
+    @contextmanager
+    def at(self, *path: str | int, table: Path = ()) -> Iterator[None]:
+        """Errors raised inside are about the entry at ``path``."""
+        try:
+            yield
+        except InputError as error:
+            raise self.error(str(error), path, table) from error
+
+    def written(self, path: Path) -> str:
+        """The name of a table as the file's author writes it."""
+        if not self.toml:
+            steps = (f"[{k}]" if isinstance(k, int) else f".{k}" for k in path)
+            return "".join(steps).removeprefix(".")
+        if isinstance(path[-1], int):
+            return f"[[{'.'.join(map(str, path[:-1]))}]] number {path[-1] + 1}"
+        return f"[{'.'.join(map(str, path))}]"
+
+
+def parse[Model: BaseModel](
+    model: type[Model],
+    mapping: Any,
+    where: str,
+    lines: Mapping[Path, int] | None = None,
+    *,
+    toml: bool = True,
+) -> Model:
+    """Plain data of the file ``where`` as a model.
+
+    Raises
+    ------
+    InputError
+        The first mistake: file, line and key, what was found and what would be right.
+    """
+    source = Source(where, mapping, lines or {}, toml)
+    try:
+        return model.model_validate(mapping)
+    except ValidationError as caught:
+        raise _first_mistake(source, caught.errors(include_url=False)[0]) from None
+
+
+def read_json_as[Kind](kind: type[Kind], path: str | FilePath) -> Kind:
+    """The dataclass ``kind`` from a JSON file; mistakes as in :func:`parse`."""
+    data = read_json(path)
+    lines = json_lines(FilePath(path).read_text(encoding="utf-8"))
+    table = parse(table_of(kind), data, str(path), lines, toml=False)
+    try:
+        return _builder(kind)(table)
+    except InputError as error:
+        first_word = str(error).split(" ", 1)[0]  # often the field
+        raise Source(str(path), data, lines).error(str(error), (first_word,)) from error
+
+
+def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:
+    """The model with the fields of a dataclass, and ``key`` whose only value is ``tag``."""
+    hints = get_type_hints(kind)
+    entries: dict[str, Any] = {key: (Literal[tag], tag)} if key else {}
+    for entry in fields(kind):
+        required = entry.default is MISSING and entry.default_factory is MISSING
+        # np.ndarray stands for a vector in a file. Defaults are left to the dataclass.
+        hint = tuple[float, float, float] if hints[entry.name] is np.ndarray else hints[entry.name]
+        entries[entry.name] = (hint, ... if required else None)
+    return create_model(kind.__name__, __base__=Table, **entries)
+
+
+def expectation(annotation: Any) -> str | None:
+    """What a value of this type looks like, in words; None for tables and lists of them."""
+    origin, args = get_origin(annotation), get_args(annotation)
+    if annotation in _SCALARS:
+        return f"a {_SCALARS[annotation]}"
+    if annotation is bool:
+        return "true or false"
+    if origin is Literal:
+        return " or ".join(map(json.dumps, args))
+    if origin in (Union, types.UnionType):
+        words = [expectation(arg) for arg in args if arg is not type(None)]
+        return " or ".join(word for word in words if word) if all(words) else None
+    if origin is tuple and args[0] in _SCALARS:
+        count = "" if args[-1] is Ellipsis else f"{len(args)} "
+        return f"{count}{_SCALARS[args[0]]}s in brackets"
+    return None
+
+
+def _builder(kind: type, key: str = "") -> Any:
+    """From a table to the dataclass whose fields it has."""
+    return lambda table: kind(
+        **{name: getattr(table, name) for name in table.model_fields_set if name != key}
+    )
+
+
+def _mistake(expected: str = "", *, problem: str = "", key: str = "") -> PydanticCustomError:
+    return PydanticCustomError(
+        "mistake", "{problem}", {"expected": expected, "problem": problem, "key": key}
+    )
+
+
+def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
+    """The line about one of pydantic's errors."""
+    path, found = _found(source.data, error["loc"])
+    context: dict[str, Any] = error.get("ctx", {})
+    if error["type"] == "value_error":  # the dataclass refused its values
+        return source.error(str(context["error"]), path, path)
+    if context.get("problem"):
+        key = context["key"]
+        return source.error(context["problem"], (*path, key) if key else path, path)
+    expected = context.get("expected") or _EXPECTED.get(error["type"], "a table")
+    if error["type"] == "choice" and isinstance(found, dict):
+        choices, key = json.loads(context["choices"]), context["key"]
+        expected = " or ".join(map(json.dumps, choices))
+        if key not in found:
+            return source.error(f"key '{key}' is missing; expected {expected}", path, path)
+        path, found = (*path, key), found[key]
+        expected += _closest(found, choices)
+    if source.toml and expected == "a list":
+        expected = f"tables [[{path[-1]}]]"
+    value = _shortened(json.dumps(found, default=str, ensure_ascii=False))
+    if expected == "a table" and path:
+        return source.error(f"{source.written(path)} is {value}; expected a table", path)
+    table, key = path[:-1], path[-1] if path else "content"
+    return source.error(f"{key} = {value}; expected {expected}", path, table)
+
+
+def _found(data: Any, loc: Path) -> tuple[Path, Any]:
+    """Path and value an error is about; ``loc`` also has the names of a union's members."""
+    path: Path = ()
+    for step in loc:
+        inside = isinstance(data, dict) and step in data
+        if inside or (isinstance(data, list) and isinstance(step, int)):
+            path, data = (*path, step), data[step]
+    return path, data
+
+
+def _as_tuples(value: Any) -> Any:
+    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
+
+
+def _closest(word: Any, known: Any) -> str:
+    close = get_close_matches(str(word), list(known), 1)
+    return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= 60 else f"{text[:57]}..."
