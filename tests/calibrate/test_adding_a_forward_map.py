@@ -83,17 +83,13 @@ def answer(capsys, *words):
 
 def test_it_is_evaluated(setting, tmp_path, capsys):
     save_emulator(untrained(setting), tmp_path)
-    words = ["evaluate", tmp_path, "--against", "fem", "--cases", 3, "--forward", "polynomial"]
-    errors = []
-    for order in (0, 1):
-        code, report = answer(capsys, *words, "--order", order, "--outside", 0.1)
-        assert code == 0
-        assert report["forward"] == "polynomial"
-        assert report["forward_options"] == {"order": order}
-        assert report["label"] == f"polynomial of order {order}"
-        assert report["outside"]["invalid"] == 0
-        errors.append(report["err_u"]["median"])
-    assert errors[1] < 0.5 * errors[0]
+    words = ["evaluate", tmp_path, "--against", "fem", "--cases", 3, "--outside", 0.1]
+    code, report = answer(capsys, *words, "--forward", "polynomial", "--order", 1)
+    assert code == 0
+    assert (report["forward"], report["forward_options"]) == ("polynomial", {"order": 1})
+    assert report["label"] == "polynomial of order 1"
+    assert report["outside"]["invalid"] == 0
+    assert report["err_u"]["median"] < 0.2 * report["mean_u"]["median"]
 
 
 def test_it_is_inferred_with_and_certified(tmp_path, capsys):
