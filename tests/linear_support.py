@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.surrogates.protocol import Prediction, all_nodes
+from emulator.surrogates.protocol import Prediction, all_nodes, fingerprint_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +18,11 @@ class LinearForward:
     shift: np.ndarray
     limit: float = np.inf
 
-    kind = "linear"
+    kind = label = "linear"
+
+    @property
+    def fingerprint(self):
+        return fingerprint_of(self.scene.fingerprint, self.nodes, self.matrix, self.shift)
 
     def __call__(self, theta):
         return jnp.tensordot(self.matrix, theta, axes=1) + self.shift

@@ -1,12 +1,12 @@
-r"""Certificates: is a posterior made with a cheap forward map the one FEM would give.
+r"""Certificates: whether a posterior made with a cheap forward map agrees with FEM's.
 
 Draws :math:`\theta_s` are pushed through FEM and reweighted by the ratio of likelihoods
 
 .. math:: \log w_s = \log p_\text{FEM}(y \mid \theta_s) - \log p_\text{cheap}(y \mid \theta_s)
 
 with Pareto-smoothed importance sampling (Vehtari et al. 2024). The shape :math:`\hat k` of the
-ratios' tail says whether the reweighted posterior can be trusted; the shift of its means, in
-posterior standard deviations, says whether reweighting is needed at all.
+ratios' tail decides whether the reweighted posterior can be trusted; the shift of the means, in
+posterior standard deviations, decides whether reweighting is needed.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ from emulator.fem import Simulator
 
 Verdict = Literal["accepted", "reweight", "not certified"]
 
-# Below this spread (in log) all weights are equal to a tenth of a percent and the tail has no
-# shape to fit.
+# Log weights within this range of each other are equal to 0.1 %: their tail has no shape to fit.
 _EQUAL_WEIGHTS = 1e-3
-# When even the largest weight is less than this times their mean, no tail of theirs can do harm,
-# whatever shape a fit to its last few finds; the box is compact, so the ratios are bounded.
+# If the largest weight is below this multiple of the mean weight, a heavy tail fitted to the last
+# few weights does no harm: theta is bounded by its box, so the ratios are bounded too.
 _NO_TAIL = 2.0
-# Beyond this there is no one posterior to certify; for use, look for 1.01.
+# Largest R-hat at which the chains count as draws of one posterior; good results have 1.01.
 LARGEST_R_HAT = 1.05
 
 
@@ -43,11 +42,11 @@ class Certificate:
     """Outcome of a check against FEM.
 
     verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use ``mean_fem``), or
-        ``not certified`` (the FEM posterior is too far away to be reached by reweighting, or the
-        chains do not agree on the cheap one).
-    reason : of the verdict, for people.
-    k_hat, k_threshold : Pareto shape of the weights' tail, and the most it may be unless no weight
-        reaches twice their mean.
+        ``not certified`` (FEM's posterior is too far away for reweighting, or the chains have not
+        converged).
+    reason : why this verdict, for people.
+    k_hat, k_threshold : Pareto shape of the weights' tail, and the largest one allowed unless every
+        weight is below twice the mean weight.
     ess : effective number of reweighted draws.
     shift : per parameter, mean under FEM less mean under the cheap map, in posterior sd.
     mean_fem : per parameter, the reweighted mean.
@@ -82,7 +81,7 @@ def judge(
     largest_failure_rate: float = 0.02,
     r_hat: float = 1.0,
 ) -> Certificate:
-    """The certificate from log likelihood ratios (s,) and the draws (s,) they belong to.
+    """The certificate from log likelihood ratios (s,) and their draws, (s,) of each parameter.
 
     Parameters
     ----------
@@ -90,55 +89,60 @@ def judge(
     largest_shift : of a mean, in posterior sd, for the posterior to stand as it is. At 0.25 a
         90 % interval still covers 88.7 %.
     largest_failure_rate : fraction of FEM runs that may fail.
-    r_hat : largest of the parameters'; above :data:`LARGEST_R_HAT` nothing is certified.
+    r_hat : largest of the parameters'; above :data:`LARGEST_R_HAT`, or NaN, nothing is certified.
     """
     log_ratios = np.asarray(log_ratios, dtype=float)
     fine = np.isfinite(log_ratios)
-    threshold = pareto_threshold(len(log_ratios))
-    failed = int((~fine).sum())
-    if failed == len(log_ratios):
+    count, failed = len(log_ratios), int((~fine).sum())
+    threshold = pareto_threshold(count)
+    if failed == count:
         nothing = dict.fromkeys(draws, float("nan"))
-        reason = "no FEM run converged"
         return Certificate(
-            "not certified", reason, np.inf, threshold, 0.0, nothing, nothing, failed, failed
-        )
-    ratios = log_ratios[fine] - log_ratios[fine].max()
-    if np.ptp(ratios) < _EQUAL_WEIGHTS:
-        log_weights, k_hat = np.full(ratios.shape, -np.log(len(ratios))), 0.0
-    else:
-        # ArviZ takes log likelihoods, whose importance ratios are their inverse.
-        log_weights, k_hat = array_stats.psislw(-ratios)
-    weights = np.exp(np.asarray(log_weights) - np.max(log_weights))
-    weights /= weights.sum()
-    k_hat = float(k_hat)
+            "not certified", "no FEM run converged", np.inf, threshold, 0.0, nothing, nothing,
+            count, failed,
+        )  # fmt: skip
+    weights, k_hat = _weights(log_ratios[fine])
     mean = {name: float(weights @ values[fine]) for name, values in draws.items()}
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shift = _shift(mean, draws)
-    largest = max(abs(value) for value in shift.values())
+    shift = _shift(mean, draws)
+    largest = float(np.max(np.abs(list(shift.values()))))  # NaN if one is
     verdict: Verdict = "not certified"
     # Every comparison is written so that NaN fails it.
-    if not r_hat <= LARGEST_R_HAT:
+    if not np.isfinite(r_hat):
+        reason = "R-hat is not a number: too few draws, or draws that do not vary"
+    elif not r_hat <= LARGEST_R_HAT:
         reason = f"the chains disagree, R-hat {r_hat:.3f}"
-    elif not failed <= largest_failure_rate * len(log_ratios):
+    elif not failed <= largest_failure_rate * count:
         reason = f"{failed} FEM runs failed"
     elif not (k_hat < threshold or weights.max() * len(weights) < _NO_TAIL):
         reason = "the weights' tail is too heavy to reweight"
     elif not np.isfinite(largest):
-        reason = "a parameter has no spread"
+        reason = "the draws of a parameter do not vary"
     elif largest > largest_shift:
         verdict, reason = "reweight", f"a mean moves by {largest:.2f} posterior sd"
     else:
         verdict, reason = "accepted", f"no mean moves by more than {largest_shift} posterior sd"
     ess = float(1.0 / np.sum(weights**2))
-    return Certificate(verdict, reason, k_hat, threshold, ess, shift, mean, len(log_ratios), failed)
+    return Certificate(verdict, reason, k_hat, threshold, ess, shift, mean, count, failed)
+
+
+def _weights(log_ratios: np.ndarray) -> tuple[np.ndarray, float]:
+    """Smoothed weights (s,) that sum to 1, and the Pareto shape of their tail."""
+    log_ratios = log_ratios - log_ratios.max()
+    if np.ptp(log_ratios) < _EQUAL_WEIGHTS:
+        return np.full(log_ratios.shape, 1.0 / len(log_ratios)), 0.0
+    # ArviZ takes log likelihoods, which are the log ratios' negatives.
+    log_weights, k_hat = array_stats.psislw(-log_ratios)
+    weights = np.exp(np.asarray(log_weights) - np.max(log_weights))
+    return weights / weights.sum(), float(k_hat)
 
 
 def _shift(mean: dict[str, float], draws: dict[str, np.ndarray]) -> dict[str, float]:
-    """Reweighted less plain means in sd of the draws; NaN where they have none."""
-    return {
-        name: float(np.float64(mean[name] - values.mean()) / values.std(ddof=1))
-        for name, values in draws.items()
-    }
+    """Reweighted less plain mean, in sd of the draws; NaN where the draws do not vary."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return {
+            name: float(np.float64(mean[name] - values.mean()) / values.std(ddof=1))
+            for name, values in draws.items()
+        }
 
 
 def certify(
@@ -166,20 +170,21 @@ def certify(
     thetas = posterior.thetas()[rows]
     log_ratios = np.full(draws, -np.inf)
     for s in tqdm(range(draws), "FEM check", disable=not progress, unit="run"):
-        # Outside jit, where the solver may use CHOLMOD.
+        # Not under jit: there the solver cannot use CHOLMOD, which is faster.
         solution = simulator.solve(thetas[s], start(thetas[s]))
         if solution.converged:
             sds = model.noise_sds({name: values[s] for name, values in chosen.items()})
             log_ratios[s] = ratio(thetas[s], solution.displacement, sds, data)
-    worst = max(row["r_hat"] for row in posterior.summary().values())
+    # NumPy's maximum is NaN if one of them is; Python's depends on their order.
+    worst = float(np.max([row["r_hat"] for row in posterior.summary().values()]))
     return judge(log_ratios, chosen, r_hat=worst)
 
 
 @lru_cache(maxsize=4)
 def _compiled(model: Model) -> tuple[Callable, Callable]:
-    """The cheap map over all nodes, and the log likelihood ratio of FEM's displacement over it.
+    """Compiled once a model: the cheap map over all nodes, and the log likelihood ratio.
 
-    Compiled once a model.
+    The ratio takes FEM's displacement (n, 3) mm and is FEM's log likelihood less the cheap map's.
     """
 
     @jax.jit

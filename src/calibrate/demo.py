@@ -1,14 +1,13 @@
-"""The main job on what is built in: data, an emulator that ships, a posterior, a check, a picture.
+"""The whole job on a built-in scene: synthetic data, posterior, certificate and picture.
 
-The beam is the quick one. The left ventricle is what the package is for: the passive stiffness of
-the muscle and the pressure that fills it, from one cavity volume and the displacements of 24
-landmarks in the wall.
+The beam takes under a minute. The left ventricle is the intended use: passive stiffness of the
+muscle and filling pressure, from one cavity volume and the displacements of 24 landmarks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,8 @@ from calibrate.figures.ventricle import ventricle_figure
 from calibrate.identifiability import identifiability
 from calibrate.workflow import Run, certify_and_keep, infer, report, simulator_of
 from emulator.store import check_folder
-from emulator.surrogates import shipped
 
-# Between the training set's Sobol points, and not the centre the emulator is built around.
+# Neither a theta of the training runs nor the centre of the Taylor series.
 DEMO = Run(
     scene="once_clamped_beam",
     truth={"mu": 73.0, "lam": 61.0},
@@ -31,8 +29,8 @@ DEMO = Run(
 )
 
 # Off the centre of the box in every parameter; 1 kPa is 7.5 mmHg, a normal end-diastolic pressure.
-# The noise is assumed, that of careful work: observers of one heart differ by several mL in its
-# end-diastolic volume, automatic tracking by millimetres.
+# The noise is optimistic: observers of one heart differ by several mL in its end-diastolic volume,
+# and automatic tracking errs by millimetres.
 VENTRICLE = Run(
     scene="left_ventricle",
     truth={"a": 0.36, "b": 1.8, "a_f": 4.6, "b_f": 2.4, "pressure": 1.0},
@@ -40,7 +38,6 @@ VENTRICLE = Run(
     noise_sd=0.2,
     volume_noise_sd=1.0,
     forward="emulator",
-    fem_runs=120,
     warmup=300,
     draws=500,
     seed=2023,
@@ -49,7 +46,11 @@ VENTRICLE = Run(
 
 @dataclass(frozen=True)
 class Demo:
-    """A run, its picture and what draws it; ``identify`` asks what the data has fixed."""
+    """A run and its picture.
+
+    figure : draws the picture, to a file called ``picture``.
+    identify : whether to report which combinations of parameters the data identifies.
+    """
 
     run: Run
     figure: Callable[..., None]
@@ -63,16 +64,14 @@ DEMOS = {
 }
 
 
-def demo(
+def run_demo(
     folder: str | Path, scene: str = "once_clamped_beam", *, progress: bool = False
 ) -> dict[str, Any]:
-    """Run a demo, leave posterior, certificate and picture in ``folder``; returns the report."""
+    """Run the demo of ``scene``, write its files to ``folder`` and return the report."""
     folder = check_folder(folder)
-    pyplot()  # a missing plotting package is better found out now
+    pyplot()  # a missing plotting package is reported before the sampling
     chosen = DEMOS[scene]
     run = chosen.run
-    if run.forward == "emulator" and scene not in shipped():
-        run = replace(run, forward="reduced")
     posterior = infer(run, folder, progress=progress)
     certificate = certify_and_keep(posterior, folder, progress=progress)
     built = posterior.model.forward.scene

@@ -1,24 +1,20 @@
-"""How far a forward map made from an emulator is from reference solutions."""
+"""Errors of a forward map against reference solutions, inside its box and outside."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 from emulator.error.comparison import Errors, case_errors
 from emulator.errors import InputError, SolverError
-from emulator.fem import Simulator, run_campaign, sobol
+from emulator.fem import Simulator
 from emulator.fem.reference import Reference, fem_reference, outside_reference
 from emulator.released.reference import published_reference
 from emulator.surrogates import load
-from emulator.surrogates.additive import Emulator
-from emulator.surrogates.corrected import corrected
-from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.protocol import Extrapolated, ForwardMap
-
-FORWARDS = ("emulator", "corrected", "reduced")
+from emulator.surrogates.kind import Ingredients
+from emulator.surrogates.protocol import ForwardMap
+from emulator.surrogates.registry import build_forward, full_options
 
 
 @dataclass(frozen=True)
@@ -28,9 +24,10 @@ class Evaluation:
     emulator : shipped name or folder; its scene is the one evaluated.
     against : ``fem``, or a published model's folder.
     cases : FEM runs against ``fem``, inside the box and again outside.
-    outside : how far beyond the box to look too, as a fraction of each side; ``None``: not at all.
-    forward : one of :data:`FORWARDS`. steps : Newton steps of the corrected map.
-    fem_runs : those the reduced model is fitted to.
+    outside : fraction of each side by which the box is widened for the cases outside; ``None``
+        for no such cases.
+    forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
+        options by name, e.g. ``{"steps": 2}``.
     """
 
     emulator: str
@@ -38,19 +35,14 @@ class Evaluation:
     cases: int = 50
     outside: float | None = None
     forward: str = "emulator"
-    steps: int = 1
-    fem_runs: int = 30
+    forward_options: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.forward not in FORWARDS:
-            raise InputError(f"forward map '{self.forward}': use {', '.join(FORWARDS)}")
+        full_options(self.forward, self.forward_options)
         if self.outside is not None and self.against != "fem":
             raise InputError("outside: nothing was released outside the box; use --against fem")
         if self.outside is not None and not 0.0 < self.outside < float("inf"):
             raise InputError(f"outside is {self.outside}; give a fraction above 0, e.g. 0.25")
-        for name in ("steps", "fem_runs"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be 1 or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,36 +55,27 @@ class Evaluated:
     report: Mapping[str, Any]
 
 
-def build(
-    plan: Evaluation, emulator: Emulator, simulator: Simulator, *, progress: bool = False
-) -> ForwardMap:
-    """The forward map to evaluate, over all nodes and also outside the box."""
-    scene = emulator.scene
-    if plan.forward == "reduced":
-        runs = run_campaign(simulator, sobol(scene, plan.fem_runs, 0), progress=progress)
-        return Extrapolated(fit_reduced(scene, runs))
-    base = Extrapolated(emulator.cache())
-    return base if plan.forward == "emulator" else corrected(base, simulator, plan.steps)
-
-
 def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
-    """Solve or read the references, and measure.
+    """Solve or read the reference solutions, and compare the forward map with them.
 
     Raises
     ------
     InputError
-        No such emulator, or references for another scene.
+        The emulator is missing or damaged, or the references are for another scene.
     SolverError
         FEM fails inside the box.
     """
     emulator = load(plan.emulator)
     scene = emulator.scene
-    simulator = Simulator(scene)  # one for all: it compiles once
+    simulator = Simulator(scene)  # shared by references and forward map: it compiles once
     if plan.against == "fem":
         reference = fem_reference(simulator, plan.cases, progress=progress)
     else:
         reference = published_reference(scene, plan.against, progress=progress)
-    forward = build(plan, emulator, simulator, progress=progress)
+    made_of = Ingredients(
+        scene, simulator, plan.emulator, seed=0, extrapolate=True, progress=progress
+    )
+    forward = build_forward(plan.forward, made_of, plan.forward_options)
     inside = case_errors(forward, reference.thetas, reference.displacement)
     report = {
         **inside.report(),
@@ -100,12 +83,10 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
         "scene": scene.name,
         "emulator": plan.emulator,
         "forward": plan.forward,
+        "forward_options": full_options(plan.forward, plan.forward_options),
+        "label": forward.label,
         "training": dict(emulator.record),
     }
-    if plan.forward == "corrected":
-        report["steps"] = plan.steps
-    if plan.forward == "reduced":
-        report["fem_runs"] = plan.fem_runs
     outside = None
     if plan.outside is not None:
         beyond = outside_reference(
@@ -118,23 +99,13 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
 def _outside(
     forward: ForwardMap, beyond: Reference, fraction: float
 ) -> tuple[Errors | None, dict[str, Any]]:
-    """Errors outside the box and their report; without errors where nothing is to compare."""
+    """Errors outside the box and their report; no errors where no case has a valid prediction."""
     found: dict[str, Any] = {"fraction": fraction, "failed": beyond.failed}
     solved = len(beyond.thetas)
     try:
         errors = case_errors(forward, beyond.thetas, beyond.displacement) if solved else None
-    except SolverError:  # the map answers nowhere out there
+    except SolverError:  # the map has no valid prediction at any of them
         errors = None
     if errors is None:
         return None, {"cases": 0, "invalid": solved, **found}
     return errors, {**errors.report(), **found}
-
-
-def save(evaluated: Evaluated, folder: str | Path) -> list[Path]:
-    """Write evaluation.json and the figures to ``folder``; the files written."""
-    from calibrate.figures.evaluation import draw
-    from emulator.store import write_json
-
-    path = Path(folder) / "evaluation.json"
-    write_json(path, evaluated.report)
-    return [path, *draw(evaluated, folder)]

@@ -22,9 +22,6 @@ from calibrate.samplers import NUTSOptions, nuts
 from calibrate.statistical_model import Data, Model
 from emulator.errors import InputError
 from emulator.store import replacing
-from emulator.surrogates import CachedEmulator
-from emulator.surrogates.corrected import CorrectedForward
-from emulator.surrogates.protocol import ForwardMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +92,12 @@ def read_tree(path: str | Path) -> xr.DataTree:
 def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> dict[str, Any]:
     """What is needed to know, and to repeat, how a posterior was made; plain JSON values."""
     scene = model.forward.scene
-    record: dict[str, Any] = {
+    return {
         "scene": dict(scene.origin),
         "scene_name": scene.name,
         "scene_fingerprint": scene.fingerprint,
         "forward": model.forward.kind,
+        "forward_fingerprint": model.full.fingerprint,
         "observe": model.observe.describe(),
         "noise": _describe_noise(model),
         "prior": {name: describe_distribution(d) for name, d in model.prior.items()},
@@ -108,23 +106,12 @@ def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> d
         "seed": seed,
         "versions": versions(),
     }
-    fingerprint = emulator_fingerprint(model.full)
-    if fingerprint is not None:
-        record["emulator_fingerprint"] = fingerprint
-    return record
 
 
 def _describe_noise(model: Model) -> dict[str, Any]:
     """The noise of each observation by name; of a single one just that."""
     described = {name: noise.describe() for name, noise in model.noise.items()}
     return described if len(described) > 1 else next(iter(described.values()))
-
-
-def emulator_fingerprint(forward: ForwardMap) -> str | None:
-    """Fingerprint of the emulator inside a forward map, ``None`` when there is none."""
-    while isinstance(forward, CorrectedForward):
-        forward = forward.base
-    return forward.emulator.fingerprint if isinstance(forward, CachedEmulator) else None
 
 
 def describe_distribution(distribution: dist.Distribution) -> str:

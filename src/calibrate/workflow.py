@@ -16,6 +16,7 @@ import numpy as np
 
 from calibrate.certificate import Certificate, certify
 from calibrate.data import DISPLACEMENT, is_volume, read_data, volume_of, write_data
+from calibrate.kept import check_forward, check_run, run_as_json
 from calibrate.noise import GaussianNoise
 from calibrate.observations import (
     Landmarks,
@@ -28,22 +29,20 @@ from calibrate.observations import (
     spread_landmarks,
     spread_nodes,
 )
-from calibrate.posterior import Posterior, emulator_fingerprint, read_tree, sample
+from calibrate.posterior import Posterior, read_tree, sample
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import Model, model
 from emulator.catalogue import find_scene
 from emulator.errors import InputError
-from emulator.fem import Simulator, run_campaign, sobol
+from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
 from emulator.store import read_json, write_json
-from emulator.surrogates import load
-from emulator.surrogates.corrected import corrected
-from emulator.surrogates.fem import fem_forward
-from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates import registry
+from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.protocol import ForwardMap
 
-FORWARDS = ("emulator", "corrected", "reduced", "fem")
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
+FORWARD = "forward.safetensors"
 
 
 @dataclass(frozen=True)
@@ -57,8 +56,8 @@ class Run:
         ``volume``, ``volume:<facet set>``, or several of these joined by ``+``.
     noise_sd : of displacements, mm; known unless ``noise_scale``, the scale of its prior, asks to
         infer it. volume_noise_sd, volume_noise_scale : the same of volumes, mL.
-    forward : one of :data:`FORWARDS`; ``emulator`` a shipped name or folder; ``fem_runs`` those
-        the reduced model is fitted to.
+    forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
+        options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
     """
 
     scene: str
@@ -72,7 +71,7 @@ class Run:
     volume_noise_scale: float | None = None
     forward: str = "emulator"
     emulator: str | None = None
-    fem_runs: int = 30
+    forward_options: dict[str, Any] = field(default_factory=dict)
     sampler: str = "nuts"
     warmup: int = 500
     draws: int = 1000
@@ -80,7 +79,9 @@ class Run:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("fem_runs", "warmup", "draws", "chains"):
+        registry.full_options(self.forward, self.forward_options)
+        registry.check_emulator(self.forward, self.emulator)
+        for name in ("warmup", "draws", "chains"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be 1 or more")
         if self.seed < 0:
@@ -122,17 +123,21 @@ def simulator_of(scene: Scene) -> Simulator:
     return Simulator(scene)
 
 
+def ingredients_of(run: Run, scene: Scene, *, progress: bool = False) -> Ingredients:
+    """What the forward map of a run is built from."""
+    return Ingredients(scene, simulator_of(scene), run.emulator, run.seed, progress=progress)
+
+
 def build_forward(run: Run, scene: Scene, *, progress: bool = False) -> ForwardMap:
     """The forward map a run asks for, over all nodes."""
-    if run.forward not in FORWARDS:
-        raise InputError(f"forward map '{run.forward}' is unknown; known: {', '.join(FORWARDS)}")
-    if run.forward == "reduced":
-        thetas = sobol(scene, run.fem_runs, run.seed)
-        return fit_reduced(scene, run_campaign(simulator_of(scene), thetas, progress=progress))
-    if run.forward == "fem":
-        return fem_forward(simulator_of(scene))
-    cached = load(run.emulator or scene.name, scene).cache()
-    return cached if run.forward == "emulator" else corrected(cached, simulator_of(scene))
+    made_of = ingredients_of(run, scene, progress=progress)
+    return registry.build_forward(run.forward, made_of, run.forward_options)
+
+
+def restore_forward(run: Run, scene: Scene, folder: Path) -> ForwardMap:
+    """The forward map of the run kept in ``folder``."""
+    made_of = ingredients_of(run, scene)
+    return registry.restore_forward(run.forward, made_of, run.forward_options, folder / FORWARD)
 
 
 def parse_observation(scene: Scene, text: str, seed: int) -> Observations:
@@ -197,35 +202,42 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         folder = Path(folder)
         # An earlier result goes first and the posterior comes last: killed in between, the folder
         # holds no posterior rather than one beside another's certificate.
-        for name in (CERTIFICATE, POSTERIOR):
+        for name in (CERTIFICATE, POSTERIOR, FORWARD):
             (folder / name).unlink(missing_ok=True)
         write_data(folder / DATA, observe, data)
         write_json(folder / RUN, asdict(run))
+        registry.keep_forward(posterior.model.full, folder / FORWARD)
+        posterior.tree.attrs["run"] = run_as_json(run)
         posterior.save(folder / POSTERIOR)
     return posterior
 
 
-def read_posterior(folder: str | Path, *, progress: bool = False) -> tuple[Run, Posterior]:
-    """The run kept in ``folder`` and its posterior, ready to be certified."""
+def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
+    """The run kept in ``folder`` and its posterior, ready to be certified.
+
+    Raises
+    ------
+    InputError
+        A file is missing or damaged, or the posterior was not made with this run, its scene or its
+        forward map.
+    """
     folder = Path(folder)
+    path = folder / POSTERIOR
     text = read_json(folder / RUN)
     try:
         run = Run(**text)
     except TypeError as error:
         raise InputError(f"{folder / RUN} does not describe a run: {error}") from error
     scene = find_scene(run.scene, run.root)
-    tree = read_tree(folder / POSTERIOR)
+    tree = read_tree(path)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
-        raise InputError(f"{folder / POSTERIOR} was made for another scene than '{run.scene}'")
+        raise InputError(f"{path} was made for another scene than '{run.scene}'")
+    check_run(path, tree, run)
+    forward = restore_forward(run, scene, folder)
+    check_forward(path, tree, forward)
     observe = observations_from(scene, json.loads(tree.attrs["observe"]))
-    built: Model = model(build_forward(run, scene, progress=progress), observe, run.noise(observe))
+    built: Model = model(forward, observe, run.noise(observe))
     data = built.check_data({n: np.asarray(tree["observed_data"][n]) for n in observe.parts})
-    made_with = tree.attrs.get("emulator_fingerprint")
-    if made_with != (found := emulator_fingerprint(built.full)):
-        raise InputError(
-            f"{folder / POSTERIOR} was made with emulator {made_with}, but "
-            f"'{run.emulator or scene.name}' is now {found}; infer again"
-        )
     return run, Posterior(tree, built, data)
 
 

@@ -100,8 +100,15 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, str] = {}) -> str:
     """Write a pytree of arrays; returns the SHA-256 of the file."""
-    arrays = {name: np.asarray(leaf, order="C") for name, leaf in _leaves(tree).items()}
-    content = save(arrays, metadata=dict(metadata))
+    return save_arrays(path, _leaves(tree), metadata)
+
+
+def save_arrays(
+    path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, str] = {}
+) -> str:
+    """Write named arrays; returns the SHA-256 of the file."""
+    ordered = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    content = save(ordered, metadata=dict(metadata))
     write_atomically(path, content)
     return hashlib.sha256(content).hexdigest()
 

@@ -60,10 +60,15 @@ def test_failed_fem_runs_count():
 
 def test_a_stuck_sampler_is_not_accepted():
     stuck = judge(np.zeros(100), {"x": np.ones(100)})
-    assert (stuck.verdict, stuck.reason) == ("not certified", "a parameter has no spread")
+    assert (stuck.verdict, stuck.reason) == (
+        "not certified",
+        "the draws of a parameter do not vary",
+    )
     apart = judge(*gaussian_case(0.0, 1.0), r_hat=1.2)
     assert (apart.verdict, apart.reason) == ("not certified", "the chains disagree, R-hat 1.200")
-    assert judge(*gaussian_case(0.0, 1.0), r_hat=float("nan")).verdict == "not certified"
+    unknown = judge(*gaussian_case(0.0, 1.0), r_hat=float("nan"))
+    assert unknown.verdict == "not certified"
+    assert "R-hat is not a number" in unknown.reason
 
 
 def test_threshold():
@@ -100,6 +105,23 @@ def test_certify_sees_the_error_of_the_forward_map(posterior, beam):
     assert cal.certify(posterior, LinearSimulator(near)).verdict == "accepted"
     far = replace(forward, shift=forward.shift + 1.0)  # ten noise sd
     assert cal.certify(posterior, LinearSimulator(far)).verdict == "not certified"
+
+
+@pytest.mark.parametrize("name", ["mu", "lam"])
+def test_one_r_hat_that_is_not_a_number_is_enough(posterior, name, monkeypatch):
+    """Python's max would drop a NaN that does not come first."""
+    table = posterior.summary()
+    table[name]["r_hat"] = float("nan")
+    monkeypatch.setattr(Posterior, "summary", lambda _: table)
+    certificate = cal.certify(posterior, LinearSimulator(posterior.model.full))
+    assert certificate.verdict == "not certified"
+
+
+def test_one_chain_with_a_finite_r_hat_is_certified(posterior, monkeypatch):
+    one = replace(posterior, tree=posterior.tree.isel(chain=slice(1)))
+    table = {name: {**row, "r_hat": 1.01} for name, row in posterior.summary().items()}
+    monkeypatch.setattr(Posterior, "summary", lambda _: table)
+    assert cal.certify(one, LinearSimulator(one.model.full)).verdict == "accepted"
 
 
 def test_certify_with_an_inferred_noise(beam):

@@ -27,7 +27,7 @@ def test_the_demo_ends_accepted(folder, capsys):
     assert report["parameters"]["mu"]["sd"] < 2.0
     assert report["parameters"]["lam"]["sd"] > 5.0
     tree = read_tree(folder / "posterior.nc")
-    assert tree.attrs["emulator_fingerprint"]
+    assert tree.attrs["forward_fingerprint"]
     assert json.loads(tree.attrs["observe"])["kind"] == "nodes"
     assert json.loads(tree.attrs["sampler_options"])["chains"] == 4
     assert json.loads(tree.attrs["prior"])["mu"] == "LogUniform(low=50.0, high=100.0)"

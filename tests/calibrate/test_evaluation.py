@@ -1,6 +1,8 @@
 """The command's work, on a coarse beam with a small network that is off by about 0.1 mm."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -35,13 +37,15 @@ def test_newton_steps_square_the_error(folder, reference, monkeypatch):
     monkeypatch.setattr("calibrate.evaluation.fem_reference", lambda *_, **__: reference)
     base = run_evaluation(Evaluation(folder)).report
     once, thrice = (
-        run_evaluation(Evaluation(folder, forward="corrected", steps=k)).report for k in (1, 3)
+        run_evaluation(Evaluation(folder, forward="corrected", forward_options={"steps": k})).report
+        for k in (1, 3)
     )
     medians = [report["err_u"]["median"] for report in (base, once, thrice)]
     assert medians[0] > 2.0 * medians[1]
     assert medians[2] < 1e-3 * medians[1]
-    assert (once["forward"], once["steps"], once["reference"]) == ("corrected", 1, "our FEM")
-    assert "steps" not in base
+    assert (once["forward"], once["forward_options"]) == ("corrected", {"steps": 1})
+    assert (once["label"], once["reference"]) == ("emulator + 1 Newton step", "our FEM")
+    assert base["forward_options"] == {}
 
 
 def test_outside_comes_separately_with_files_and_figures(folder, tmp_path, capsys):
@@ -52,7 +56,8 @@ def test_outside_comes_separately_with_files_and_figures(folder, tmp_path, capsy
     report = json.loads(capsys.readouterr().out)
     kept = json.loads((out / "evaluation.json").read_text())
     assert kept == {name: value for name, value in report.items() if name != "files"}
-    assert (kept["forward"], kept["fem_runs"]) == ("reduced", 10)
+    assert (kept["forward"], kept["forward_options"]) == ("reduced", {"fem_runs": 10})
+    assert kept["label"] == "POD + GP of 10 FEM runs"
     assert kept["err_u"]["median"] < 1e-3 * kept["mean_u"]["median"]
     outside = kept["outside"]
     assert outside["cases"] + outside["failed"] + outside["invalid"] == 4
@@ -86,6 +91,13 @@ def test_bad_calls(folder, capsys, words, message):
     assert message in capsys.readouterr().err
 
 
-def test_a_map_that_is_none_of_ours():
-    with pytest.raises(InputError, match="forward map 'fem': use emulator, corrected, reduced"):
-        Evaluation("x", forward="fem")
+def test_plans_that_cannot_be_carried_out():
+    with pytest.raises(InputError, match="forward map 'spline' is unknown; known: emulator, corr"):
+        Evaluation("x", forward="spline")
+    with pytest.raises(InputError, match="--steps has no effect without --forward corrected"):
+        Evaluation("x", forward_options={"steps": 2})
+
+
+def test_evaluating_imports_no_figures():
+    code = "import calibrate.evaluation, sys; assert not {'calibrate.figures', 'matplotlib'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

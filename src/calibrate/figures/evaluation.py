@@ -36,7 +36,7 @@ _QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
     """Draw all figures into ``folder``; the files written."""
     scene, folder = evaluated.forward.scene, Path(folder)
-    title = f"{scene.name}: {_map_name(evaluated.report)} against {evaluated.report['reference']}"
+    title = f"{scene.name}: {evaluated.forward.label} against {evaluated.report['reference']}"
     figures = {
         "error_densities.png": density_figure(evaluated.inside, evaluated.outside, title),
         "error_over_parameters.png": parameter_figure(
@@ -52,13 +52,6 @@ def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
             figure.savefig(temporary, dpi=140)
         plt.close(figure)
     return [folder / name for name in figures]
-
-
-def _map_name(report: Any) -> str:
-    kind = report["forward"]
-    if kind == "corrected":
-        return f"emulator + {report['steps']} Newton step{'s' if report['steps'] > 1 else ''}"
-    return f"POD + GP of {report['fem_runs']} FEM runs" if kind == "reduced" else kind
 
 
 # ---- densities --------------------------------------------------------------------------------

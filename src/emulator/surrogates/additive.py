@@ -35,7 +35,14 @@ from emulator.surrogates.network.pignn import (
     SeparableDecoder,
     build,
 )
-from emulator.surrogates.protocol import Prediction, all_nodes, check_nodes, inside_only, rows_of
+from emulator.surrogates.protocol import (
+    Prediction,
+    all_nodes,
+    check_nodes,
+    fingerprint_of,
+    inside_only,
+    rows_of,
+)
 from emulator.surrogates.taylor import Expansion
 
 # Positions in the box are uniform on [0, 1]; this gives them standard deviation 1 (Eq. 25).
@@ -174,11 +181,19 @@ class CachedEmulator:
     nodes: np.ndarray
 
     kind = "emulator"
+    label = "emulator"
 
     @property
     def scene(self) -> Scene:
         """What is emulated."""
         return self.emulator.scene
+
+    @property
+    def fingerprint(self) -> str:
+        """Short hash of scene, emulator and nodes."""
+        return fingerprint_of(
+            self.kind, self.scene.fingerprint, self.emulator.fingerprint, self.nodes
+        )
 
     @cached_property
     def _linear(self) -> tuple[np.ndarray, np.ndarray]:

@@ -1,11 +1,12 @@
-r"""Polish: a forward map's prediction moved by Newton steps on the potential energy.
+r"""Correction: Newton steps on the potential energy, from another forward map's prediction.
 
 .. math:: u \leftarrow u - K(u)^{-1} r(u, \theta), \qquad
           \frac{\partial u}{\partial \theta} = -K(u)^{-1} \frac{\partial r}{\partial \theta}
 
-Each step about squares the error, at the price of one tangent assembly and factorisation. The
-derivative is that of the equilibrium nearby, with the same tangent; differentiating through the
-step itself would need third derivatives of the energy and be no more accurate.
+Each step about squares the error and costs one assembly and factorisation of the tangent K. The
+derivative is the equilibrium's, by the implicit function theorem with K at the corrected
+displacement. Differentiating the step itself would need third derivatives of the energy and be no
+more accurate.
 """
 
 from __future__ import annotations
@@ -22,11 +23,19 @@ from emulator.fem.assembly import System
 from emulator.fem.functional import volume_ratio
 from emulator.fem.simulator import Simulator, displacement_derivative
 from emulator.scenes.scene import Scene
-from emulator.surrogates.protocol import ForwardMap, Prediction, all_nodes, check_nodes
+from emulator.surrogates.files import EMULATOR
+from emulator.surrogates.kind import ForwardKind, Ingredients, Option, Options
+from emulator.surrogates.protocol import (
+    ForwardMap,
+    Prediction,
+    all_nodes,
+    check_nodes,
+    fingerprint_of,
+)
 
 
 def newton_step(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
-    """``u`` (n, 3) mm after one full Newton step, unguarded."""
+    """``u`` (n, 3) mm after one full Newton step, without a line search."""
     tangent = system.pattern.safe_values(system.tangent(u, theta))
     return u - system.extend(system.solve(tangent, system.residual(u, theta)))
 
@@ -43,32 +52,45 @@ class CorrectedForward:
     kind = "corrected"
 
     @property
+    def label(self) -> str:
+        """Label of ``base`` and the number of steps."""
+        return f"{self.base.label} + {self.steps} Newton step{'s' if self.steps > 1 else ''}"
+
+    @property
     def scene(self) -> Scene:
-        """What is mapped."""
+        """The scene whose displacement is predicted."""
         return self.base.scene
 
     @cached_property
-    def _polish(self):  # noqa: ANN202 - a closure with its derivative, private
+    def fingerprint(self) -> str:
+        """Short hash of ``base``, the scene whose equilibrium is sought, steps and nodes."""
+        equilibrium = self.simulator.scene.fingerprint
+        return fingerprint_of(
+            self.kind, self.base.fingerprint, equilibrium, str(self.steps), self.nodes
+        )
+
+    @cached_property
+    def _corrected(self):  # noqa: ANN202 - a closure with its derivative, private
         system = self.simulator.system
 
         @jax.custom_jvp
-        def polish(theta: jax.Array) -> jax.Array:
+        def correct(theta: jax.Array) -> jax.Array:
             u = self.base(theta)
             for _ in range(self.steps):
                 u = newton_step(system, u, theta)
             return u
 
-        @polish.defjvp
+        @correct.defjvp
         def derivative(primals, tangents):  # noqa: ANN001, ANN202
             (theta,), (direction,) = primals, tangents
-            u = polish(theta)
+            u = correct(theta)
             return u, displacement_derivative(system, u, theta, direction)
 
-        return polish
+        return correct
 
     def evaluate(self, theta: jax.Array) -> Prediction:
-        """Displacement, valid where the base is and the polished field inverts no element."""
-        u = self._polish(theta)
+        """Displacement (k, 3) in mm, valid where ``base`` is and no element is inverted."""
+        u = self._corrected(theta)
         sound = jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
         u = jnp.where(sound, u, 0.0)
         return Prediction(u[self.nodes], self.base.evaluate(theta).valid & sound)
@@ -78,14 +100,28 @@ class CorrectedForward:
         return self.evaluate(theta).displacement
 
     def at(self, nodes: np.ndarray) -> CorrectedForward:
-        """The same map, returning only ``nodes``."""
+        """The map restricted to ``nodes``; it still computes them all."""
         return replace(self, nodes=check_nodes(self.scene, nodes))
 
 
 def corrected(base: ForwardMap, simulator: Simulator, steps: int = 1) -> CorrectedForward:
-    """``base``, a map over all nodes, polished by ``steps`` Newton steps."""
+    """``base``, a map over all nodes, corrected by ``steps`` Newton steps."""
     if len(base.nodes) != len(base.scene.mesh.nodes):
         raise InputError("correction needs a forward map over all nodes")
     if steps < 1:
         raise InputError(f"correction: {steps} Newton steps; give 1 or more")
     return CorrectedForward(base, simulator, steps, all_nodes(base.scene))
+
+
+def _build(made_of: Ingredients, options: Options) -> ForwardMap:
+    """The emulator's prediction, corrected."""
+    return corrected(EMULATOR.build(made_of, {}), made_of.simulator, options["steps"])
+
+
+CORRECTED = ForwardKind(
+    "corrected",
+    "an emulator followed by Newton steps",
+    _build,
+    (Option("steps", 1, "Newton steps of the corrected map"),),
+    from_emulator=True,
+)

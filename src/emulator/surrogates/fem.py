@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 
 import jax
@@ -10,23 +10,38 @@ import numpy as np
 
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
-from emulator.surrogates.protocol import ForwardMap, Prediction, all_nodes, check_nodes
+from emulator.store import to_json
+from emulator.surrogates.kind import ForwardKind
+from emulator.surrogates.protocol import (
+    ForwardMap,
+    Prediction,
+    all_nodes,
+    check_nodes,
+    fingerprint_of,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class FEMForward:
-    """The simulator as a forward map, started at ``start`` each time (``None``: at rest)."""
+    """The simulator as a forward map; Newton begins at ``start(theta)``, or at rest if ``None``."""
 
     simulator: Simulator
     nodes: np.ndarray
     start: ForwardMap | None = None
 
     kind = "fem"
+    label = "FEM"
 
     @cached_property
     def scene(self) -> Scene:
-        """What is simulated."""
+        """The scene that is simulated."""
         return self.simulator.scene
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Short hash of scene, solver options and nodes; ``start`` only affects the time taken."""
+        options = to_json(asdict(self.simulator.options))
+        return fingerprint_of(self.kind, self.scene.fingerprint, options, self.nodes)
 
     def evaluate(self, theta: jax.Array) -> Prediction:
         """Displacement (k, 3) in mm and whether the solve converged."""
@@ -46,3 +61,8 @@ class FEMForward:
 def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMForward:
     """The simulator as a forward map over all nodes; ``start`` predicts where Newton begins."""
     return FEMForward(simulator, all_nodes(simulator.scene), start)
+
+
+FEM = ForwardKind(
+    "fem", "finite elements, from rest each time", lambda made_of, _: fem_forward(made_of.simulator)
+)

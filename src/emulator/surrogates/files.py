@@ -19,8 +19,10 @@ from emulator.store import fill_tree, read_arrays, read_json, save_tree, write_j
 from emulator.surrogates.additive import BASES, Emulator
 from emulator.surrogates.discrepancy import Residual
 from emulator.surrogates.discrepancy.fit import Warp
+from emulator.surrogates.kind import ForwardKind, Ingredients, Options
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.pignn import Architecture, build
+from emulator.surrogates.protocol import ForwardMap
 from emulator.surrogates.taylor import Expansion, constant
 
 FORMAT = 2
@@ -175,3 +177,14 @@ def _residual(arrays: dict[str, np.ndarray]) -> Residual | None:
     )
     warp = Warp(centre, indices, jnp.asarray(coefficients), jnp.asarray(lengths))
     return Residual(warp=warp, **parts)
+
+
+def _build(made_of: Ingredients, _: Options) -> ForwardMap:
+    """The emulator named, or the one shipped for the scene."""
+    name = made_of.scene.name if made_of.emulator is None else made_of.emulator
+    return made_of.ranged(load(name, made_of.scene).cache())
+
+
+EMULATOR = ForwardKind(
+    "emulator", "a trained emulator, shipped or in a folder", _build, from_emulator=True
+)

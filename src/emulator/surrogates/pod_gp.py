@@ -1,4 +1,4 @@
-r"""POD and Gaussian processes: the peer every emulator must beat.
+r"""Proper orthogonal decomposition (POD) and Gaussian processes: a reduced model of FEM runs.
 
 FEM displacements are projected on their leading principal modes,
 :math:`u(\theta) \approx \bar u + \sum_k c_k(\theta)\, \phi_k`, and each coefficient is a Gaussian
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -19,20 +20,33 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from emulator.errors import InputError
-from emulator.fem.campaign import Runs
+from emulator.fem.campaign import Runs, run_campaign
+from emulator.fem.designs import sobol
 from emulator.scenes.scene import Scene
-from emulator.surrogates.protocol import Prediction, all_nodes, inside_only, rows_of
+from emulator.surrogates.kind import Arrays, ForwardKind, Ingredients, Option, Options
+from emulator.surrogates.protocol import (
+    ForwardMap,
+    Prediction,
+    all_nodes,
+    fingerprint_of,
+    inside_only,
+    rows_of,
+)
 
-_JITTER = 1e-10  # of unit-variance coefficients; FEM has no noise
+# Variance added to each process, whose coefficients have variance 1: FEM has no noise.
+_JITTER = 1e-10
+# What a reduced model is made of, besides its scene.
+_ARRAYS = ("nodes", "mean", "modes", "inputs", "lengths", "weights")
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedForward:
     """A fitted reduced model.
 
-    mean : (k, 3) mm. modes : (r, k, 3) mm, scaled by their coefficients' spread.
-    inputs : (c, p) positions of the FEM runs. lengths : (r, p). weights : (r, c), the alpha of
-    each process times its amplitude.
+    nodes : (k,). mean : (k, 3) mm. modes : (r, k, 3) mm, each times its coefficient's standard
+        deviation over the runs.
+    inputs : (c, p), theta of the FEM runs as positions in the box.
+    lengths : (r, p), length scales. weights : (r, c), amplitude times alpha of each process.
     """
 
     scene: Scene
@@ -45,6 +59,17 @@ class ReducedForward:
 
     kind = "reduced"
 
+    @property
+    def label(self) -> str:
+        """The method, and the number of FEM runs it was fitted to."""
+        return f"POD + GP of {len(self.inputs)} FEM runs"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Short hash of the scene and of every array."""
+        arrays = (getattr(self, name) for name in _ARRAYS)
+        return fingerprint_of(self.kind, self.scene.fingerprint, *arrays)
+
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (k, 3) in mm at ``theta`` (p,)."""
         gap = (self.scene.to_unit(theta) - self.inputs)[None] / self.lengths[:, None]
@@ -56,7 +81,7 @@ class ReducedForward:
         return inside_only(self, theta)
 
     def at(self, nodes: np.ndarray) -> ReducedForward:
-        """The same map, returning only ``nodes``; all must be among the present ones."""
+        """The map restricted to ``nodes``, all of which must be among its own."""
         rows = rows_of(self, nodes)
         return replace(
             self, nodes=self.nodes[rows], mean=self.mean[rows], modes=self.modes[:, rows]
@@ -69,6 +94,11 @@ def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> Reduce
     Parameters
     ----------
     truncation : modes whose singular value is below this fraction of the largest are left out.
+
+    Raises
+    ------
+    InputError
+        Fewer than 3 runs.
     """
     if len(runs.theta) < 3:
         raise InputError(f"a reduced model needs 3 FEM runs or more; there are {len(runs.theta)}")
@@ -103,3 +133,29 @@ def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
         process.fit(inputs, values)
     fitted = process.kernel_
     return np.atleast_1d(fitted.k2.length_scale), fitted.k1.constant_value * process.alpha_
+
+
+def _build(made_of: Ingredients, options: Options) -> ForwardMap:
+    """A reduced model fitted to FEM runs at a Sobol sequence of theta."""
+    thetas = sobol(made_of.scene, options["fem_runs"], made_of.seed)
+    runs = run_campaign(made_of.simulator, thetas, progress=made_of.progress)
+    return made_of.ranged(fit_reduced(made_of.scene, runs))
+
+
+def _to_arrays(forward: ForwardMap) -> Arrays:
+    return {name: np.asarray(getattr(forward, name)) for name in _ARRAYS}
+
+
+def _from_arrays(scene: Scene, arrays: Arrays) -> ReducedForward:
+    nodes, *rest = (arrays[name] for name in _ARRAYS)
+    return ReducedForward(scene, nodes, *map(jnp.asarray, rest))
+
+
+REDUCED = ForwardKind(
+    "reduced",
+    "POD and Gaussian processes of a few FEM runs",
+    _build,
+    (Option("fem_runs", 30, "FEM runs that the reduced model is fitted to", least=3),),
+    _to_arrays,
+    _from_arrays,
+)

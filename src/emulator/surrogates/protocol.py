@@ -1,7 +1,8 @@
-"""Forward maps: whatever takes theta to displacement. Calibration sees nothing else."""
+"""Forward maps: theta to displacement. Calibration sees nothing else of the mechanics."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -14,33 +15,38 @@ from emulator.scenes.scene import Scene
 
 
 class Prediction(NamedTuple):
-    """Displacement (k, 3) in mm of a forward map's nodes, and whether it may be used, () bool."""
+    """Displacement (k, 3) in mm at a forward map's nodes, and whether it may be used, () bool."""
 
     displacement: jax.Array
     valid: jax.Array
 
 
 class ForwardMap(Protocol):
-    """Theta to displacement, differentiable, usable under ``jit`` and ``vmap``.
-
-    kind : short name, e.g. ``emulator`` or ``fem``.
-    scene : what it maps.
-    nodes : (k,) the nodes it returns, in order.
-    """
+    """Theta to displacement, differentiable, usable under ``jit`` and ``vmap``."""
 
     @property
     def kind(self) -> str:
-        """Short name."""
+        """Name of its kind, e.g. ``emulator`` or ``fem``."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """How pictures and tables call this map, e.g. ``emulator + 2 Newton steps``."""
         ...
 
     @property
     def scene(self) -> Scene:
-        """What is mapped."""
+        """The scene whose displacement it predicts."""
         ...
 
     @property
     def nodes(self) -> np.ndarray:
-        """Nodes returned, (k,)."""
+        """Nodes at which it predicts, (k,), in the order of its rows."""
+        ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Short hash of everything that shapes the prediction (:func:`fingerprint_of`)."""
         ...
 
     def __call__(self, theta: jax.Array) -> jax.Array:
@@ -48,12 +54,24 @@ class ForwardMap(Protocol):
         ...
 
     def evaluate(self, theta: jax.Array) -> Prediction:
-        """The same with its validity, for use inside a density."""
+        """Displacement (k, 3) in mm at ``theta`` (p,) with its validity, for use in a density."""
         ...
 
     def at(self, nodes: np.ndarray) -> ForwardMap:
-        """The same map restricted to ``nodes``; a fast map then computes only those."""
+        """The map restricted to ``nodes``; a fast map then computes only those."""
         ...
+
+
+def fingerprint_of(*parts: str | np.ndarray | jax.Array) -> str:
+    """Short hash of words and arrays; shape and type of an array count as its values do."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, str):
+            digest.update(f"{len(part)}:{part}".encode())
+        else:
+            array = np.ascontiguousarray(part)
+            digest.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def all_nodes(scene: Scene) -> np.ndarray:
@@ -78,8 +96,8 @@ def check_nodes(scene: Scene, nodes: np.ndarray) -> np.ndarray:
 def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
     """``forward(theta)``, valid inside the box; outside it the value at the box's centre.
 
-    A map fitted inside the box means nothing outside, and may not even be finite there: its
-    gradient would reach a sampler through the branch not taken.
+    A map fitted inside the box may be infinite outside it. ``jnp.where`` would still pass the
+    gradient of that infinite branch on, as NaN, so the map is never evaluated there.
     """
     inside = forward.scene.space.contains(theta)
     safe = jnp.where(inside[..., None], theta, forward.scene.centre)
@@ -88,27 +106,37 @@ def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Extrapolated:
-    """``base``, taken at its word outside the box too, wherever it is finite.
+    """``base`` outside the box too: valid wherever its displacement is finite.
 
-    To measure how fast a map gets worse there; never to calibrate with.
+    It measures how the error grows outside the box; a density must not use it.
     """
 
     base: ForwardMap
 
     @property
     def kind(self) -> str:
-        """That of ``base``."""
+        """Kind of ``base``."""
         return self.base.kind
 
     @property
+    def label(self) -> str:
+        """Label of ``base``."""
+        return self.base.label
+
+    @property
     def scene(self) -> Scene:
-        """What is mapped."""
+        """The scene whose displacement ``base`` predicts."""
         return self.base.scene
 
     @property
     def nodes(self) -> np.ndarray:
-        """Nodes returned, (k,)."""
+        """Nodes at which it predicts, (k,)."""
         return self.base.nodes
+
+    @property
+    def fingerprint(self) -> str:
+        """Short hash of ``base`` and of its use outside the box."""
+        return fingerprint_of("extrapolated", self.base.fingerprint)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (k, 3) in mm."""
@@ -120,12 +148,12 @@ class Extrapolated:
         return Prediction(u, jnp.all(jnp.isfinite(u)))
 
     def at(self, nodes: np.ndarray) -> Extrapolated:
-        """The same map restricted to ``nodes``."""
+        """The extrapolated map restricted to ``nodes``."""
         return Extrapolated(self.base.at(nodes))
 
 
 def rows_of(forward: ForwardMap, nodes: np.ndarray) -> np.ndarray:
-    """Positions of ``nodes`` among those of ``forward``; :class:`InputError` when one is not."""
+    """Rows of ``forward`` that belong to ``nodes``; :class:`InputError` for a node it lacks."""
     nodes = check_nodes(forward.scene, nodes)
     position = {int(node): k for k, node in enumerate(forward.nodes)}
     missing = [int(node) for node in nodes if int(node) not in position]

@@ -258,7 +258,9 @@ def test_a_posterior_of_another_emulator_is_not_certified(capsys, monkeypatch, t
     from dataclasses import replace
 
     save_emulator(replace(emulator, scale=1.01 * emulator.scale), "mine")
-    assert "was made with emulator" in complaint(capsys, "certify", "r", "--draws", "30")
+    assert "was made with another emulator map" in complaint(
+        capsys, "certify", "r", "--draws", "30"
+    )
 
 
 def test_a_mesh_with_a_flat_element(capsys, block):
@@ -310,7 +312,7 @@ def test_train_evaluate_infer_certify(capsys, block, tmp_path):
     row = result["parameters"]["mu"]
     assert abs(row["mean"] - 9.0) < 4 * row["sd"]
     names = {path.name for path in (tmp_path / "r").iterdir()}
-    assert names == {"run.json", "data.csv", "posterior.nc"}
+    assert names == {"run.json", "data.csv", "forward.safetensors", "posterior.nc"}
     code, result = answer(capsys, "certify", tmp_path / "r", "--draws", 50)
     assert (code, result["verdict"]) == (0, "accepted")
     assert json.loads((tmp_path / "r" / "certificate.json").read_text())["verdict"] == "accepted"

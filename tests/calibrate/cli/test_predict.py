@@ -8,7 +8,7 @@ import pytest
 
 import emulator as em
 from calibrate.cli import main
-from calibrate.cli.commands.predict import cavities, told
+from calibrate.cli.commands.predict import cavities, summary
 from emulator.geometry.cavity import Cavity
 
 CENTRE = ("mu=75", "lam=60")
@@ -41,7 +41,7 @@ def test_error_bar_against_fem(capsys):
     assert result["error"]["median_mm"] == pytest.approx(np.median(true), rel=0.1)
     assert result["error"]["max_mm"] == pytest.approx(true.max(), rel=0.1)
     assert 0.0 < result["error"]["energy_gap_percent"] < 1.0
-    said = told(result)
+    said = summary(result)
     assert "estimated error: median " in said
     assert "not to be trusted" not in said
 

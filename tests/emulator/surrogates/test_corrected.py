@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import emulator as em
 from emulator.errors import InputError
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates.corrected import corrected
@@ -14,12 +15,13 @@ from emulator.surrogates.protocol import Prediction, all_nodes
 class Off:
     """FEM with a smooth error of a known size."""
 
-    kind = "off"
+    kind = label = "off"
 
     def __init__(self, simulator, size):
         self.simulator, self.scene, self.size = simulator, simulator.scene, size
         self.nodes = all_nodes(self.scene)
         x = self.scene.mesh.nodes / self.scene.mesh.size
+        self.fingerprint = f"off by {size}"
         self.error = np.where(self.scene.held, 0.0, np.sin(3 * x) * x[:, :1])
 
     def __call__(self, theta):
@@ -45,7 +47,7 @@ def test_each_step_about_squares_the_error(beam, simulator):
     assert errors[0.2][0] / errors[0.1][0] == pytest.approx(4.0, rel=0.2)
 
 
-def test_the_derivative_is_that_of_the_equilibrium(beam, simulator):
+def test_the_derivative_is_the_equilibriums(beam, simulator):
     polished = corrected(Off(simulator, 0.1), simulator, 2)
     weights = jnp.asarray(np.random.default_rng(0).normal(size=beam.held.shape))
     f = jax.grad(lambda t: jnp.vdot(weights, polished(t)))(beam.centre)
@@ -61,6 +63,21 @@ def test_validity_and_nodes(beam, simulator):
     wild = corrected(Off(simulator, 1e4), simulator).evaluate(beam.centre)
     assert not wild.valid
     assert np.isfinite(wild.displacement).all()
+
+
+def test_label_and_fingerprint(beam, cube, simulator):
+    base = Off(simulator, 0.1)
+    once = corrected(base, simulator)
+    assert once.label == "off + 1 Newton step"
+    assert corrected(base, simulator, 2).label == "off + 2 Newton steps"
+    assert once.fingerprint == corrected(Off(simulator, 0.1), em.Simulator(beam)).fingerprint
+    others = [
+        corrected(base, simulator, 2),
+        corrected(Off(simulator, 0.2), simulator),
+        corrected(base, em.Simulator(cube)),
+        once.at(np.array([3])),
+    ]
+    assert len({once.fingerprint, *(other.fingerprint for other in others)}) == 5
 
 
 def test_bad_corrections(beam, simulator):

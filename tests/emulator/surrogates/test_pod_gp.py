@@ -1,12 +1,18 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import emulator as em
 from emulator.error.comparison import evaluate
 from emulator.errors import InputError
 from emulator.fem import run_campaign, sobol
-from emulator.surrogates.pod_gp import fit_reduced
+from emulator.store import save_arrays
+from emulator.surrogates.kind import Ingredients
+from emulator.surrogates.pod_gp import REDUCED, fit_reduced
+from emulator.surrogates.registry import keep_forward, restore_forward
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +48,41 @@ def test_gradient_and_nodes(beam, runs):
     with pytest.raises(InputError, match="node 5 is not among the 2 this reduced map returns"):
         reduced.at(nodes).at(np.array([5]))
     assert not reduced.evaluate(2.0 * beam.centre).valid
+
+
+def test_its_arrays_are_the_whole_map(beam, runs, tmp_path):
+    reduced = fit_reduced(beam, runs)
+    path = tmp_path / "map.safetensors"
+    keep_forward(reduced, path)
+    back = restore_forward("reduced", Ingredients(beam, None), {}, path)
+    assert back.fingerprint == reduced.fingerprint
+    np.testing.assert_array_equal(back(beam.centre), reduced(beam.centre))
+    assert reduced.label == "POD + GP of 20 FEM runs"
+    # Every array counts, and so does the scene.
+    arrays = dict(REDUCED.to_arrays(reduced))
+    found = {reduced.fingerprint}
+    for name, array in arrays.items():
+        found.add(REDUCED.from_arrays(beam, {**arrays, name: array + 1}).fingerprint)
+    found.add(replace(reduced, scene=em.scenes.once_clamped_beam(cells=(4, 2, 3))).fingerprint)
+    assert len(found) == 8
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda path: path.unlink(), "the reduced map of the posterior beside it, is missing"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-40]), "truncated"),
+        (lambda path: save_arrays(path, {"mean": 1.0}), "holds no reduced map"),
+        (lambda path: save_arrays(path, {"mean": 1.0}, {"kind": "reduced"}), "'nodes' is missing"),
+    ],
+)
+def test_a_damaged_file_is_named(beam, runs, tmp_path, spoil, message):
+    path = tmp_path / "map.safetensors"
+    keep_forward(fit_reduced(beam, runs.take(slice(3))), path)
+    spoil(path)
+    with pytest.raises(InputError, match=message) as raised:
+        restore_forward("reduced", Ingredients(beam, None), {}, path)
+    assert str(path) in str(raised.value)
 
 
 def test_too_few_runs(beam, runs):

@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     from calibrate.workflow import certify_and_keep, read_posterior, report
 
     progress = show_progress(arguments)
-    plan, posterior = read_posterior(arguments.folder, progress=progress)
+    plan, posterior = read_posterior(arguments.folder)
     certificate = certify_and_keep(
         posterior, arguments.folder, draws=arguments.draws, progress=progress
     )

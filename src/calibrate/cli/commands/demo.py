@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import time
 from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress
 from calibrate.cli.posterior_table import summary
-
-# Named here too, so that --help needs no imports; a test compares them with calibrate.demo.DEMOS.
-_DEMOS = ("once_clamped_beam", "left_ventricle")
+from calibrate.demo import DEMOS, run_demo
 
 
 def register(commands: Any) -> None:
@@ -19,8 +18,8 @@ def register(commands: Any) -> None:
     )
     parser.add_argument(
         "--scene",
-        choices=_DEMOS,
-        default=_DEMOS[0],
+        choices=tuple(DEMOS),
+        default=next(iter(DEMOS)),
         help="the beam (default), or the left ventricle from a volume and 24 landmarks, in minutes",
     )
     parser.add_argument("--out", default="demo-output", metavar="DIR")
@@ -29,12 +28,8 @@ def register(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the demo and show what came out."""
-    import time
-
+    """Run the demo and show the report."""
     started = time.perf_counter()
-    from calibrate.demo import demo as run_demo
-
     report = run_demo(arguments.out, arguments.scene, progress=show_progress(arguments))
     report["seconds"] = round(time.perf_counter() - started, 1)
     report["files"] = [

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import DONE, add_json, emit, show_progress, table
-from emulator.errors import InputError
+from calibrate.cli.forward import add_forward, forward_options
 
-_FORWARDS = ("emulator", "corrected", "reduced")
+if TYPE_CHECKING:
+    from calibrate.evaluation import Evaluated
 
 
 def register(commands: Any) -> None:
@@ -24,15 +26,9 @@ def register(commands: Any) -> None:
         "--outside",
         type=float,
         metavar="FRACTION",
-        help="as many FEM runs again outside the box, each side widened by this much of it",
+        help="evaluate at as many theta again outside the box, each side widened by this fraction",
     )
-    parser.add_argument(
-        "--forward", choices=_FORWARDS, default="emulator", help="made of the emulator or its scene"
-    )
-    parser.add_argument("--steps", type=int, help="Newton steps of the corrected map (default 1)")
-    parser.add_argument(
-        "--fem-runs", type=int, help="that the reduced model is fitted to (default 30)"
-    )
+    add_forward(parser)
     parser.add_argument("--out", metavar="DIR", help="write evaluation.json and figures")
     add_json(parser)
     parser.set_defaults(run=run)
@@ -40,22 +36,19 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare a forward map with stored or fresh FEM solutions."""
-    given = {name: getattr(arguments, name) for name in ("steps", "fem_runs")}
-    given = {name: value for name, value in given.items() if value is not None}
-    for name, kind in (("steps", "corrected"), ("fem_runs", "reduced")):
-        if name in given and arguments.forward != kind:
-            option = name.replace("_", "-")
-            raise InputError(f"--{option} has no effect without --forward {kind}")
-    from calibrate.evaluation import Evaluation, run_evaluation, save
+    from calibrate.evaluation import Evaluation, run_evaluation
 
     names = ("emulator", "against", "cases", "outside", "forward")
-    plan = Evaluation(**{name: getattr(arguments, name) for name in names}, **given)
+    plan = Evaluation(
+        **{name: getattr(arguments, name) for name in names},
+        forward_options=forward_options(arguments),
+    )
     if arguments.out:
         from calibrate.figures.drawing import pyplot
         from emulator.store import check_folder
 
         check_folder(arguments.out)
-        pyplot()  # before minutes are spent on what it is to draw
+        pyplot()  # a missing plotting package is reported before minutes of FEM
     evaluated = run_evaluation(plan, progress=show_progress(arguments))
     files = [str(path) for path in save(evaluated, arguments.out)] if arguments.out else []
     report = {**evaluated.report, **({"files": files} if files else {})}
@@ -64,18 +57,28 @@ def run(arguments: argparse.Namespace) -> int:
     return DONE
 
 
+def save(evaluated: Evaluated, folder: str | Path) -> list[Path]:
+    """Write evaluation.json and the figures to ``folder``; the files written."""
+    from calibrate.figures.evaluation import draw
+    from emulator.store import write_json
+
+    path = Path(folder) / "evaluation.json"
+    write_json(path, evaluated.report)
+    return [path, *draw(evaluated, folder)]
+
+
 def summary(report: Mapping[str, Any]) -> str:
     """The tables for people."""
     lines = [_table(report, f"{report['cases']} cases")]
-    lines.append(f"forward map: {report['forward']}, reference: {report['reference']}")
+    lines.append(f"forward map: {report['label']}, reference: {report['reference']}")
     if report["invalid"]:
-        lines.append(f"{report['invalid']} cases more without a valid answer")
+        lines.append(f"{report['invalid']} further cases without a valid prediction")
     if outside := report.get("outside"):
         title = f"{outside['cases']} cases outside"
         lines += ["", _table({**outside, "units": report["units"]}, title)]
         lines.append(
-            f"box widened by {outside['fraction']:g} of each side; {outside['failed']} more where "
-            f"FEM failed, {outside['invalid']} where the map did"
+            f"box widened by {outside['fraction']:g} of each side; further cases: FEM failed at "
+            f"{outside['failed']}, the map had no valid prediction at {outside['invalid']}"
         )
     return "\n".join(lines)
 

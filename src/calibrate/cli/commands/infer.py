@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments, emit, show_progress
+from calibrate.cli.forward import add_forward, forward_options
 from calibrate.cli.posterior_table import summary
-
-_FORWARDS = ("emulator", "corrected", "reduced", "fem")
 
 
 def register(commands: Any) -> None:
@@ -30,12 +29,9 @@ def register(commands: Any) -> None:
         "volume:FACETSET; several joined by +, as in landmarks:24+volume",
     )
     _add_noise(parser)
-    parser.add_argument("--forward", choices=_FORWARDS, default="emulator")
+    add_forward(parser)
     parser.add_argument(
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
-    )
-    parser.add_argument(
-        "--fem-runs", type=int, default=30, help="that the reduced model is fitted to"
     )
     parser.add_argument("--sampler", choices=("nuts",), default="nuts")
     parser.add_argument("--draws", type=int, default=1000)
@@ -90,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         volume_noise_scale=arguments.volume_noise_scale,
         forward=arguments.forward,
         emulator=_emulator(arguments.emulator),
-        fem_runs=arguments.fem_runs,
+        forward_options=forward_options(arguments),
         sampler=arguments.sampler,
         warmup=arguments.warmup,
         draws=arguments.draws,

@@ -29,7 +29,7 @@ def register(commands: Any) -> None:
         "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
     )
     parser.add_argument(
-        "--error-bar", action="store_true", help="estimate the error from the forces out of balance"
+        "--error-bar", action="store_true", help="estimate the error from the residual forces"
     )
     parser.add_argument("--out", metavar="FILE.vtu", help="write displacement, stress and strain")
     add_json(parser)
@@ -37,7 +37,7 @@ def register(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate once and say what speaks against it."""
+    """Predict at one theta and report the guard's verdict."""
     from functools import partial
 
     import jax
@@ -77,19 +77,20 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out and finite and against.least_J > 0.0:
         write_solution(arguments.out, scene.mesh, np.asarray(u), element_fields(scene, u, theta))
         result["out"] = arguments.out
-    emit(result, as_json=arguments.json, text=told(result))
+    emit(result, as_json=arguments.json, text=summary(result))
     return DONE if result["trusted"] else FAILED
 
 
 def anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
-    """Theta (p,) from named finite values, outside the box too; :class:`InputError` for others."""
+    """Theta (p,) from named finite values, which may lie outside the box."""
     import jax.numpy as jnp
 
     for name, value in values.items():
         if not math.isfinite(value):
             raise InputError(f"parameter '{name}' is {value}; give a finite number")
     box = {p.name: (p.low, p.high) for p in scene.parameters}
-    # What is missing or unknown is refused by the scene, once the rest is inside its box.
+    # The scene refuses missing and unknown names. Values outside the box are allowed here, so they
+    # are clipped for this check.
     scene.theta(
         **{n: min(max(v, box[n][0]), box[n][1]) if n in box else v for n, v in values.items()}
     )
@@ -116,7 +117,7 @@ def cavities(
 
 
 def error_of(estimate: ErrorEstimate) -> dict[str, Any]:
-    """The error bar as plain JSON; no numbers where it is not to be believed."""
+    """The error bar as plain JSON; without numbers where it is not valid."""
     if not estimate.valid:
         return {"valid": False}
     gap, least = float(estimate.energy_gap), float(estimate.least_energy)
@@ -132,7 +133,7 @@ def error_of(estimate: ErrorEstimate) -> dict[str, Any]:
     }
 
 
-def told(result: dict[str, Any]) -> str:
+def summary(result: dict[str, Any]) -> str:
     """The result for people."""
     largest = result["max_displacement"]
     lines = [

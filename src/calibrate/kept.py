@@ -1,0 +1,58 @@
+"""Whether a kept posterior still belongs to the run and the forward map beside it.
+
+``posterior.nc`` carries the run it was sampled for and the fingerprint of its forward map. A
+certificate speaks about that run and that map, so any difference is refused.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from emulator.errors import InputError
+from emulator.surrogates.protocol import ForwardMap
+
+if TYPE_CHECKING:
+    from calibrate.workflow import Run
+
+# Where scene and emulator are found may change when a folder moves; their fingerprints may not.
+_PLACES = ("scene", "root", "emulator")
+
+
+def run_as_json(run: Run) -> str:
+    """The run as the JSON kept in a posterior's attributes."""
+    return json.dumps(asdict(run))
+
+
+def check_run(path: Path, tree: xr.DataTree, run: Run) -> None:
+    """:class:`InputError` names the first entry of ``run`` that the posterior was not made with.
+
+    Parameters
+    ----------
+    path, tree : the posterior's file and its content.
+    """
+    try:
+        sampled: dict[str, Any] = json.loads(tree.attrs["run"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} does not name the run it was sampled for; infer again") from error
+    now = json.loads(run_as_json(run))
+    for name in sorted({*sampled, *now} - set(_PLACES)):
+        if sampled.get(name) != now.get(name):
+            raise InputError(
+                f"{path} was sampled with {name} = {json.dumps(sampled.get(name))}, but run.json "
+                f"says {json.dumps(now.get(name))}; infer again"
+            )
+
+
+def check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
+    """:class:`InputError` unless the posterior was made with ``forward``."""
+    made_with = tree.attrs.get("forward_fingerprint")
+    if made_with != forward.fingerprint:
+        raise InputError(
+            f"{path} was made with another {forward.kind} map (fingerprint {made_with}; it is "
+            f"{forward.fingerprint} now); infer again"
+        )

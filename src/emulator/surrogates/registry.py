@@ -1,0 +1,105 @@
+"""Every kind of forward map by name: the one list of them.
+
+To add one, write its map and its :class:`~emulator.surrogates.kind.ForwardKind` in a file, and add
+it here; command line, calibration and evaluation then know it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from emulator.errors import InputError
+from emulator.store import read_arrays, save_arrays
+from emulator.surrogates.corrected import CORRECTED
+from emulator.surrogates.fem import FEM
+from emulator.surrogates.files import EMULATOR
+from emulator.surrogates.kind import ForwardKind, Ingredients, Option
+from emulator.surrogates.pod_gp import REDUCED
+from emulator.surrogates.protocol import ForwardMap
+
+FORWARD_MAPS: dict[str, ForwardKind] = {
+    kind.name: kind for kind in (EMULATOR, CORRECTED, REDUCED, FEM)
+}
+
+
+def forward_kind(name: str) -> ForwardKind:
+    """The kind called ``name``; :class:`InputError` lists the known ones."""
+    if name not in FORWARD_MAPS:
+        raise InputError(f"forward map '{name}' is unknown; known: {', '.join(FORWARD_MAPS)}")
+    return FORWARD_MAPS[name]
+
+
+def known_options() -> dict[str, tuple[Option, tuple[str, ...]]]:
+    """Every option of every kind by name, with the names of the kinds that take it."""
+    found: dict[str, tuple[Option, tuple[str, ...]]] = {}
+    for kind in FORWARD_MAPS.values():
+        for option in kind.options:
+            first, owners = found.get(option.name, (option, ()))
+            found[option.name] = (first, (*owners, kind.name))
+    return found
+
+
+def full_options(name: str, given: Mapping[str, Any]) -> dict[str, int]:
+    """A value of every option of the kind called ``name``, from ``given`` or by default.
+
+    Raises
+    ------
+    InputError
+        An unknown kind, an option it does not take, or a value out of range.
+    """
+    kind = forward_kind(name)
+    if not isinstance(given, Mapping):
+        raise InputError(f"options of a forward map are {given!r}; give a value by name")
+    known = known_options()
+    for word in given:
+        if word not in known:
+            raise InputError(f"forward map '{name}' has no option '{word}'")
+        option, owners = known[word]
+        if name not in owners:
+            raise InputError(f"{option.flag} has no effect without --forward {' or '.join(owners)}")
+    return {o.name: o.checked(given.get(o.name, o.default)) for o in kind.options}
+
+
+def check_emulator(name: str, emulator: str | None) -> None:
+    """:class:`InputError` if an emulator is given to a kind that is not built from one."""
+    if emulator is not None and not forward_kind(name).from_emulator:
+        owners = " or ".join(kind.name for kind in FORWARD_MAPS.values() if kind.from_emulator)
+        raise InputError(f"--emulator has no effect without --forward {owners}")
+
+
+def build_forward(name: str, ingredients: Ingredients, given: Mapping[str, Any] = {}) -> ForwardMap:
+    """The forward map called ``name`` over all nodes, with the options ``given``."""
+    return forward_kind(name).build(ingredients, full_options(name, given))
+
+
+def keep_forward(forward: ForwardMap, path: str | Path) -> None:
+    """Write the arrays of a map that was fitted while it was built; for other maps, nothing."""
+    kind = FORWARD_MAPS.get(forward.kind)
+    if kind is not None and kind.to_arrays is not None:
+        save_arrays(path, kind.to_arrays(forward), {"kind": kind.name})
+
+
+def restore_forward(
+    name: str, ingredients: Ingredients, given: Mapping[str, Any], path: str | Path
+) -> ForwardMap:
+    """The map :func:`keep_forward` wrote to ``path``, or a new one of a kind that keeps none.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged or of another kind.
+    """
+    kind = forward_kind(name)
+    if kind.from_arrays is None:
+        return build_forward(name, ingredients, given)
+    if not Path(path).is_file():
+        raise InputError(f"{path}, the {name} map of the posterior beside it, is missing")
+    arrays, metadata = read_arrays(path)
+    if metadata.get("kind") != name:
+        raise InputError(f"{path} holds no {name} map; infer again")
+    try:
+        return kind.from_arrays(ingredients.scene, arrays)
+    except KeyError as error:
+        raise InputError(f"{path}: array {error} is missing; infer again") from error
