@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -51,3 +52,26 @@ class Parameter:
         if self.scale == "log":
             return self.low * (self.high / self.low) ** position
         return self.low + (self.high - self.low) * position
+
+
+def unit_sensitivities(
+    parameters: Sequence[Parameter], theta: jax.Array, du_dtheta: jax.Array
+) -> jax.Array:
+    r"""Sensitivities in the unit box, from those in the parameters' own units.
+
+    .. math:: \partial u / \partial x_k
+        = (\partial u / \partial \theta_k)\, \mathrm{d}\theta_k / \mathrm{d}x_k
+
+    Parameters
+    ----------
+    theta : (c, p). du_dtheta : (c, p, n, 3) mm a unit of each parameter.
+
+    Returns
+    -------
+    (c, p, n, 3) mm.
+    """
+    rates = [
+        jax.vmap(jax.grad(parameter.from_unit))(parameter.to_unit(theta[:, k]))
+        for k, parameter in enumerate(parameters)
+    ]
+    return du_dtheta * jnp.stack(rates, axis=1)[:, :, None, None]
