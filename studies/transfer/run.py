@@ -223,6 +223,7 @@ def main() -> None:
     problem = prepare(scene, plan, sizes)
     steps_from(problem, problem.emulator, 1)
     ready = time.perf_counter() - ready
+    network = problem.emulator.network
     starts = {"scratch": problem.emulator, **starts}
     report = judge(problem, known)
     cases += curves(problem, starts, arguments.steps, arguments.longest, report)
@@ -230,9 +231,7 @@ def main() -> None:
     summary = {
         "nodes": {"family": len(groups["family"][0].mesh.nodes), "unseen": len(scene.mesh.nodes)},
         "architecture": asdict(sizes),
-        "weights": int(
-            sum(leaf.size for leaf in jax.tree.leaves(problem.emulator.network.weights))
-        ),
+        "weights": int(sum(leaf.size for leaf in jax.tree.leaves(network.weights))),
         "ms_a_step": round(1e3 * longest["seconds"] / longest["steps"], 2),
         "prepare_and_compile_s": round(ready, 1),
         "pretraining": pretraining,
