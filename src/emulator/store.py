@@ -92,15 +92,19 @@ def read_json(path: str | Path) -> Any:
         raise InputError(f"{path} is not valid JSON: {error}") from error
 
 
-def _leaves(tree: Any) -> dict[str, Any]:
-    return {
-        jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
-    }
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """Leaves of a pytree by their place in it, e.g. ``rounds/0/edge/kernel``."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {"/".join(filter(None, map(_word, path))): leaf for path, leaf in leaves}
 
 
-def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, str] = {}) -> str:
-    """Write a pytree of arrays; returns the SHA-256 of the file."""
-    return save_arrays(path, _leaves(tree), metadata)
+def _word(key: Any) -> str:
+    """One step of a leaf's path: a dictionary's key, a place in a list, or an attribute."""
+    for attribute in ("key", "idx", "name"):
+        if hasattr(key, attribute):
+            word = str(getattr(key, attribute))
+            return "" if word == "value" else word  # flax wraps each weight in a variable
+    raise TypeError(f"a leaf of kind {type(key).__name__} has no name")
 
 
 def save_arrays(
@@ -129,14 +133,23 @@ def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]
 
 
 def fill_tree[Tree](template: Tree, arrays: Mapping[str, np.ndarray], what: str) -> Tree:
-    """``template`` with its leaves replaced by ``arrays``; shapes must agree."""
-    named = _leaves(template)
+    """``template`` with its leaves replaced by ``arrays`` (:func:`named_leaves`), shapes equal.
+
+    what : where the arrays come from, for the error message.
+    """
+    named = named_leaves(template)
     for name, leaf in named.items():
         if name not in arrays:
-            raise InputError(f"{what}: array {name} is missing")
+            raise InputError(f"{what}: array '{name}' is missing")
         if arrays[name].shape != np.shape(leaf):
             raise InputError(
-                f"{what}: array {name} has shape {arrays[name].shape}; expected {np.shape(leaf)}"
+                f"{what}: array '{name}' has shape {arrays[name].shape}; expected {np.shape(leaf)}"
             )
     leaves = [arrays[name] for name in named]
     return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(template), leaves)
+
+
+def inside(arrays: Mapping[str, np.ndarray], folder: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with ``folder/``, by the rest of their names."""
+    start = f"{folder}/"
+    return {name.removeprefix(start): a for name, a in arrays.items() if name.startswith(start)}

@@ -16,8 +16,8 @@ from timing import Function, batched, loop, milliseconds, per_call, unseen
 
 import emulator as em
 from calibrate.observations import Landmarks, landmarks, spread_landmarks
-from emulator.surrogates import Architecture, CachedEmulator, augment
-from emulator.surrogates.additive import Emulator, fresh
+from emulator.surrogates import Architecture, CachedEmulator, Emulator, augment
+from emulator.surrogates.network.part import Network, fresh
 from emulator.surrogates.taylor import expand
 from emulator.training.basis import mechanical_modes
 
@@ -40,12 +40,12 @@ def clocked(function: Any, *arguments: Any) -> tuple[float, Any]:
     return time.perf_counter() - begin, result
 
 
-def drawn(emulator: Emulator, seed: int) -> Emulator:
+def drawn(network: Network, seed: int) -> Network:
     """Weights moved off zero: the compiler must not find that the last layer does nothing."""
     rng = np.random.default_rng(seed)
-    leaves, structure = jax.tree.flatten(emulator.weights)
+    leaves, structure = jax.tree.flatten(network.weights)
     leaves = [leaf + 0.01 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves]
-    return replace(emulator, weights=jax.tree.unflatten(structure, leaves))
+    return replace(network, weights=jax.tree.unflatten(structure, leaves))
 
 
 def cube(cells: int, order: int, points: np.ndarray | None, seed: int) -> Cube:
@@ -56,10 +56,10 @@ def cube(cells: int, order: int, points: np.ndarray | None, seed: int) -> Cube:
     seconds["series"], series = clocked(expand, simulator, None, order)
     basis = mechanical_modes(simulator, series, ARCHITECTURE.modes).astype(np.float32)
     seconds["graph"], graph = clocked(augment, scene)
-    emulator = drawn(fresh(scene, graph, ARCHITECTURE, series, np.ones(3), seed, basis), seed)
+    network = drawn(fresh(scene, graph, ARCHITECTURE, np.ones(3), seed, basis), seed)
+    emulator = Emulator(scene, taylor=series, network=network)
     begin = time.perf_counter()
     cached = emulator.cache()
-    jax.block_until_ready(cached.prepared)
     seconds["cache"] = time.perf_counter() - begin
     if points is None:
         points = spread_landmarks(scene, LANDMARKS, seed)

@@ -104,12 +104,12 @@ def row(name: str, call: float, loop: float | None, batch: float | None, **more:
 def stages(cached: CachedEmulator, misfit: Misfit, calls: int) -> list[dict]:
     """Value and gradient of more and more of the emulator: where its time goes."""
     trained = cached.emulator
-    scene, residual = trained.scene, trained.residual
+    scene, series, discrepancy = trained.scene, trained.taylor, trained.discrepancy
     parts: dict[str, Function] = {"position in the box": scene.to_unit}
-    if trained.base != "nothing":
-        parts["Taylor monomials"] = lambda theta: trained.series.monomials(scene.to_unit(theta))
-    if residual is not None:
-        parts["kernel's features"] = lambda theta: residual.warp(scene.to_unit(theta))
+    if series is not None:
+        parts["Taylor monomials"] = lambda theta: series.monomials(scene.to_unit(theta))
+    if discrepancy is not None:
+        parts["kernel's features"] = lambda theta: discrepancy.warp(scene.to_unit(theta))
     parts["all coefficients"] = cached.coefficients
     parts["displacement of the observed nodes"] = cached
     cases = []

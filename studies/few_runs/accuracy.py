@@ -23,7 +23,7 @@ from emulator.error.comparison import quantiles
 from emulator.fem import Runs, sobol
 from emulator.geometry.cavity import Cavity
 from emulator.scenes import Scene
-from emulator.surrogates.discrepancy import fit_residual
+from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.taylor import Expansion
 
 SEED = 0
@@ -138,9 +138,9 @@ def accuracy(
     )  # fmt: skip
     for count in (n for n in counts if n > 1):
         some, done = ours.take(slice(count)), elapsed[count - 1]
-        fitted, took = _timed(lambda some=some: fit_residual(scene, some, series, series))
+        fitted, took = _timed(lambda some=some: fit_discrepancy(scene, some, series, series))
         note(OVER, count, base + court.predict(fitted), done, took, modes=len(fitted.modes))
-        alone, took = _timed(lambda some=some: fit_residual(scene, some, series))
+        alone, took = _timed(lambda some=some: fit_discrepancy(scene, some, series))
         note(PLAIN, count, court.predict(alone), done, took, modes=len(alone.modes))
         if count >= 3:
             _note_rival(note, court, some, rival_elapsed[count - 1], RIVAL_MODES)

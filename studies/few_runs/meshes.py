@@ -6,7 +6,7 @@ import numpy as np
 from accuracy import Court, design, scene_of, seconds
 from methods import clock, fit_rival, our_campaign
 
-from emulator.surrogates.discrepancy import fit_residual
+from emulator.surrogates.discrepancy import fit_discrepancy
 
 
 def mesh_case(shape: tuple[int, int, int], runs: int, tests: int, order: int) -> dict[str, Any]:
@@ -17,10 +17,10 @@ def mesh_case(shape: tuple[int, int, int], runs: int, tests: int, order: int) ->
     court = Court(scene, tests, series)
     base = court.predict(series)
     begin = clock()
-    fitted = fit_residual(scene, ours, series, series)
+    fitted = fit_discrepancy(scene, ours, series, series)
     fit_s = clock() - begin
     begin = clock()
-    alone = fit_residual(scene, ours, series)
+    alone = fit_discrepancy(scene, ours, series)
     alone_s = clock() - begin
     rival = fit_rival(scene, ours)
     with_slopes = np.median(np.diff(elapsed[1:], axis=0), axis=0)  # the first two compile

@@ -13,8 +13,7 @@ import numpy as np
 from emulator import Simulator
 from emulator.fem import Runs, run_campaign
 from emulator.scenes import Scene
-from emulator.surrogates.discrepancy import Residual, fit, fit_residual
-from emulator.surrogates.discrepancy.fit import Warp
+from emulator.surrogates.discrepancy import Discrepancy, Warp, fit, fit_discrepancy
 from emulator.surrogates.discrepancy.kernel import Features, fit_lengths, fit_weights, fold
 from emulator.surrogates.pod_gp import ReducedForward, fit_reduced
 from emulator.surrogates.taylor import Expansion, expand
@@ -63,7 +62,7 @@ def our_campaign(
     series = expand(simulator, order=order)
     jax.block_until_ready((series.displacement, series.derivatives))
     expanded = clock() - begin
-    runs = run_campaign(simulator, thetas, slopes=True, predictor=series)
+    runs = run_campaign(simulator, thetas, sensitivities=True, predictor=series)
     elapsed = simulator.elapsed(thetas, begin)
     elapsed[0] = expanded
     return series, runs, expanded, elapsed
@@ -93,10 +92,10 @@ def fit_rival(scene: Scene, runs: Runs, modes: int = RIVAL_MODES) -> ReducedForw
     return fit_reduced(scene, runs, truncation=max(1e-9, least))
 
 
-def plain_kernel(scene: Scene, runs: Runs, series: Expansion, mean_map: Map | None) -> Residual:
+def plain_kernel(scene: Scene, runs: Runs, series: Expansion, mean_map: Map | None) -> Discrepancy:
     """Our residual with a kernel that knows positions only."""
     with patch.object(fit, "_FEATURES", 0):
-        return fit_residual(scene, runs, series, mean_map)
+        return fit_discrepancy(scene, runs, series, mean_map)
 
 
 def unscaled(warp: Warp, features: bool = True) -> Warp:
@@ -106,7 +105,7 @@ def unscaled(warp: Warp, features: bool = True) -> Warp:
     return warp._replace(coefficients=coefficients, inverse_lengths=jnp.ones(size))
 
 
-def fit_values(scene: Scene, runs: Runs, warp: Warp, mean_map: Map | None) -> Residual:
+def fit_values(scene: Scene, runs: Runs, warp: Warp, mean_map: Map | None) -> Discrepancy:
     """Our residual without slopes: the same kernel and likelihood on displacements alone.
 
     warp : of lengths one.
@@ -127,7 +126,7 @@ def fit_values(scene: Scene, runs: Runs, warp: Warp, mean_map: Map | None) -> Re
     lengths = jnp.asarray(fit_lengths(features, observations[:, :20]))
     scaled = features.scaled(lengths)
     values, slopes = fold(scaled, fit_weights(scaled, observations))
-    return Residual(
+    return Discrepancy(
         warp._replace(inverse_lengths=lengths),
         scaled.value,
         values,

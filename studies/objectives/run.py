@@ -119,7 +119,7 @@ def study(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str
                 "fem_processor_s": fem["both" if plan.runs else "energy"],
             }
             cases.append(row(objective, errors[objective], **facts))
-    before = replace(trained, base="series")  # of order 0: the centre's solution, whatever theta
+    before = replace(trained, network=None)  # of order 0: the centre's solution, whatever theta
     errors[UNTRAINED] = case_errors(before.cache(), known.theta, known.displacement)
     cases.append(row(UNTRAINED, errors[UNTRAINED], fem_runs=1))
     shipped = load("once_clamped_beam")

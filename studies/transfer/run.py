@@ -28,8 +28,9 @@ from emulator.scenes import Scene
 from emulator.store import replacing, write_json
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import Plan, pretrain, recipe, train
+from emulator.training.problem import Problem, prepare
 from emulator.training.start import with_network_of
-from emulator.training.trainer import Problem, prepare
+from emulator.training.step import predictor
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
@@ -59,10 +60,11 @@ def judge(problem: Problem, known: Runs) -> Callable[[Any], dict[str, Any]]:
     """Weights to err_u in mm and err_V in percent over the ``known`` FEM solutions."""
     scene = problem.emulator.scene
     cavities = [Cavity(scene, name) for name in cavity_sets(scene)]
+    predict = predictor(problem.emulator)
 
     @jax.jit
     def errors(weights: Any) -> dict[str, jax.Array]:
-        u = problem.emulator.predict(weights, known.theta)
+        u = predict(weights, known.theta)
         one = lambda t, v, exact: field_errors(scene, t, v, exact, cavities)  # noqa: E731
         return jax.vmap(one)(known.theta, u, known.displacement)
 
@@ -75,7 +77,7 @@ def judge(problem: Problem, known: Runs) -> Callable[[Any], dict[str, Any]]:
 
 def steps_from(problem: Problem, start: Emulator, total: int) -> tuple[Any, float]:
     """Weights after a whole training of ``total`` steps, and the seconds of one step."""
-    weights = with_network_of(problem.emulator, start).weights
+    weights = with_network_of(problem.emulator, start).network.weights
     state = problem.optimiser.init(weights)
     began = time.perf_counter()
     for number in range(total):
@@ -221,6 +223,7 @@ def main() -> None:
     problem = prepare(scene, plan, sizes)
     steps_from(problem, problem.emulator, 1)
     ready = time.perf_counter() - ready
+    network = problem.emulator.network
     starts = {"scratch": problem.emulator, **starts}
     report = judge(problem, known)
     cases += curves(problem, starts, arguments.steps, arguments.longest, report)
@@ -228,7 +231,7 @@ def main() -> None:
     summary = {
         "nodes": {"family": len(groups["family"][0].mesh.nodes), "unseen": len(scene.mesh.nodes)},
         "architecture": asdict(sizes),
-        "weights": int(sum(leaf.size for leaf in jax.tree.leaves(problem.emulator.weights))),
+        "weights": int(sum(leaf.size for leaf in jax.tree.leaves(network.weights))),
         "ms_a_step": round(1e3 * longest["seconds"] / longest["steps"], 2),
         "prepare_and_compile_s": round(ready, 1),
         "pretraining": pretraining,

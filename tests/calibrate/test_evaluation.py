@@ -13,7 +13,7 @@ from calibrate.cli import main
 from calibrate.evaluation import Evaluation, run_evaluation
 from emulator.errors import InputError
 from emulator.fem.reference import fem_reference
-from emulator.surrogates import load, save_emulator
+from emulator.surrogates import Emulator, load, save_emulator
 from emulator.surrogates.taylor import constant
 from network_support import untrained
 
@@ -24,7 +24,8 @@ def folder(tmp_path_factory):
     centre = np.asarray(em.Simulator(scene)(scene.centre))
     series = constant(np.full(2, 0.5), centre)
     path = tmp_path_factory.mktemp("emulator")
-    save_emulator(replace(untrained(scene), series=series, scale=np.full(3, 0.1)), path)
+    network = replace(untrained(scene).network, scale=np.full(3, 0.1))
+    save_emulator(Emulator(scene, taylor=series, network=network), path)
     return str(path)
 
 

@@ -2,18 +2,28 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
-from emulator.store import fill_tree, read_arrays, replacing, save_tree, write_json
+from emulator.store import (
+    fill_tree,
+    inside,
+    named_leaves,
+    read_arrays,
+    replacing,
+    save_arrays,
+    write_json,
+)
 
 
 def test_a_tree_comes_back(tmp_path):
     tree = {"a": np.arange(3.0), "b": [np.ones((2, 2), np.float32), np.asarray(7)]}
-    save_tree(tmp_path / "t.safetensors", tree, {"note": "x"})
+    save_arrays(tmp_path / "t.safetensors", named_leaves(tree), {"note": "x"})
     arrays, metadata = read_arrays(tmp_path / "t.safetensors")
     assert metadata["note"] == "x"
+    assert sorted(arrays) == ["a", "b/0", "b/1"]
+    assert sorted(inside(arrays, "b")) == ["0", "1"]
     back = fill_tree(tree, arrays, "t")
     np.testing.assert_array_equal(back["b"][0], tree["b"][0])
     assert back["b"][1] == 7
-    with pytest.raises(InputError, match=r"t: array \['c'\] is missing"):
+    with pytest.raises(InputError, match="t: array 'c' is missing"):
         fill_tree({"c": np.ones(1)}, arrays, "t")
     with pytest.raises(InputError, match=r"has shape \(3,\); expected \(4,\)"):
         fill_tree({"a": np.ones(4)}, arrays, "t")

@@ -24,26 +24,26 @@ class Runs(NamedTuple):
     """Converged FEM solutions.
 
     theta : (c, p). displacement : (c, n, 3) mm. energy : (c,) mN mm.
-    slopes : (c, p, n, 3) mm, derivatives of the displacement in theta's position in its box; or
-        None where they were not asked for.
+    sensitivities : (c, p, n, 3), du/dtheta in mm a unit of each parameter; None where they were not
+        asked for.
     """
 
     theta: jax.Array
     displacement: jax.Array
     energy: jax.Array
-    slopes: jax.Array | None = None
+    sensitivities: jax.Array | None = None
 
     def take(self, rows: slice | np.ndarray) -> Runs:
         """Some of the runs."""
-        slopes = None if self.slopes is None else self.slopes[rows]
-        return Runs(self.theta[rows], self.displacement[rows], self.energy[rows], slopes)
+        columns = None if self.sensitivities is None else self.sensitivities[rows]
+        return Runs(self.theta[rows], self.displacement[rows], self.energy[rows], columns)
 
 
 def run_campaign(
     simulator: Simulator,
     thetas: jax.Array,
     *,
-    slopes: bool = False,
+    sensitivities: bool = False,
     predictor: Predictor | None = None,
     deadline: float = np.inf,
     at_least: int = 1,
@@ -51,14 +51,14 @@ def run_campaign(
 ) -> Runs:
     """Solve at every theta (c, p).
 
-    Each run starts from the nearest one done, from the same moved along its slopes, or from
+    Each run starts from the nearest one done, from the same moved along its sensitivities, or from
     ``predictor``: of those there are, the one with the least force out of balance. Where that start
     fails, from rest.
 
     Parameters
     ----------
-    slopes : find the derivatives in theta too, from each run's own factor: a tenth of its time on
-        a ventricle with five parameters.
+    sensitivities : find du/dtheta too, from each run's own factor: a tenth of its time on a
+        ventricle with five parameters.
     deadline : of the performance counter, after which no run but the first ``at_least`` is begun.
 
     Raises
@@ -68,26 +68,26 @@ def run_campaign(
     """
     scene = simulator.scene
     positions = np.asarray(scene.to_unit(thetas))
-    scales = jax.vmap(lambda x: jnp.diagonal(jax.jacfwd(scene.from_unit)(x)))(positions)
     fields: list[jax.Array] = []
-    derivatives: list[jax.Array] = []
+    found: list[jax.Array] = []  # du/dtheta
+    moved: list[jax.Array] = []  # the same in the unit box
     best = _chooser(simulator)
     for k, theta in enumerate(tqdm(thetas, "FEM", disable=not progress, unit="run")):
         if k >= at_least and time.perf_counter() > deadline:
             break
-        starts = _starts(positions[: k + 1], fields, derivatives, predictor)
+        starts = _starts(positions[: k + 1], fields, moved, predictor)
         start = best(jnp.stack(starts), theta) if len(starts) > 1 else next(iter(starts), None)
         solution = simulator.solve(theta, start)
         if not solution.converged and starts:
             solution = simulator.solve(theta)
         fields.append(solution.require_converged(f"FEM run {k}").displacement)
-        if slopes:
-            columns = simulator.sensitivities(fields[-1], theta)
-            derivatives.append(columns * scales[k][:, None, None])
+        if sensitivities:
+            found.append(simulator.sensitivities(fields[-1], theta))
+            moved.append(scene.space.unit_sensitivities(theta[None], found[-1][None])[0])
     thetas = thetas[: len(fields)]
     displacement = jnp.stack(fields)
     energy = jax.jit(jax.vmap(potential_energy(scene)))(displacement, thetas)
-    return Runs(thetas, displacement, energy, jnp.stack(derivatives) if slopes else None)
+    return Runs(thetas, displacement, energy, jnp.stack(found) if sensitivities else None)
 
 
 def _starts(

@@ -107,6 +107,26 @@ class ParameterSpace:
         columns = [p.from_unit(position[..., k]) for k, p in enumerate(self.parameters)]
         return jnp.stack(columns, axis=-1)
 
+    def unit_sensitivities(self, theta: jax.Array, du_dtheta: jax.Array) -> jax.Array:
+        r"""Sensitivities in the unit box, from those in the parameters' own units.
+
+        .. math:: \partial u / \partial x_k
+            = (\partial u / \partial \theta_k)\, \mathrm{d}\theta_k / \mathrm{d}x_k
+
+        Parameters
+        ----------
+        theta : (c, p). du_dtheta : (c, p, n, 3) mm a unit of each parameter.
+
+        Returns
+        -------
+        (c, p, n, 3) mm.
+        """
+        rates = [
+            jax.vmap(jax.grad(parameter.from_unit))(parameter.to_unit(theta[:, k]))
+            for k, parameter in enumerate(self.parameters)
+        ]
+        return du_dtheta * jnp.stack(rates, axis=1)[:, :, None, None]
+
     def contains(self, theta: jax.Array) -> jax.Array:
         """Whether ``theta`` (..., p) lies in the box, (...) bool; NaN does not."""
         position = self.to_unit(theta)

@@ -1,4 +1,4 @@
-"""Maps from theta to displacement: the protocol, and every map there is."""
+"""Maps from theta to displacement: the protocol, and all kinds of maps."""
 
 from emulator.surrogates.additive import CachedEmulator, Emulator
 from emulator.surrogates.files import load, save_emulator, shipped

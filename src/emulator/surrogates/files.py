@@ -3,60 +3,45 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import nnx
 
 from emulator.catalogue import scene_from_origin
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
-from emulator.store import fill_tree, read_arrays, read_json, save_tree, write_json
-from emulator.surrogates.additive import BASES, Emulator
-from emulator.surrogates.discrepancy import Residual
-from emulator.surrogates.discrepancy.fit import Warp
+from emulator.store import inside, read_arrays, read_json, save_arrays, write_json
+from emulator.surrogates.additive import KINDS, Emulator
 from emulator.surrogates.kind import ForwardKind, Ingredients, Options
-from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.pignn import Architecture, build
 from emulator.surrogates.protocol import ForwardMap
-from emulator.surrogates.taylor import Expansion, constant
 
-FORMAT = 2
-_READABLE = (1, 2)  # 1 had an offset where there is a series now, and no residual
+FORMAT = 3
 SHIPPED = Path(__file__).parent.parent / "shipped"
-_GRAPH = ("node_features", "edge_features", "senders", "receivers")
-_SERIES = ("centre", "displacement", "indices", "derivatives")
-_RESIDUAL = ("known", "values", "slopes", "offset", "modes")
 
 
 def save_emulator(emulator: Emulator, folder: str | Path) -> None:
-    """Write ``emulator`` into ``folder``."""
+    """Write ``emulator`` into ``folder``.
+
+    The array ``derivatives`` of the part ``taylor`` is called ``taylor/derivatives``, and so on.
+    """
     folder = Path(folder)
-    arrays: dict[str, Any] = {
-        "weights": nnx.to_pure_dict(emulator.weights),
-        "graph": {name: getattr(emulator.graph, name) for name in _GRAPH},
-        "series": {name: _narrow(getattr(emulator.series, name)) for name in _SERIES},
-        "scale": emulator.scale,
-        "basis": emulator.basis,
+    if not emulator.parts:
+        raise InputError("an emulator without any part has nothing to save")
+    arrays = {
+        f"{name}/{key}": _narrow(array)
+        for name, part in emulator.parts.items()
+        for key, array in part.arrays().items()
     }
-    if emulator.residual is not None:
-        arrays["residual"] = {
-            "warp": emulator.residual.warp._asdict(),
-            **{name: _narrow(getattr(emulator.residual, name)) for name in _RESIDUAL},
-        }
-    digest = save_tree(folder / "weights.safetensors", arrays)
+    digest = save_arrays(folder / "weights.safetensors", arrays)
     write_json(
         folder / "emulator.json",
         {
             "format": FORMAT,
             "scene": dict(emulator.scene.origin),
             "fingerprint": emulator.scene.fingerprint,
-            "architecture": asdict(emulator.architecture),
-            "base": emulator.base,
+            "parts": {name: part.to_json() for name, part in emulator.parts.items()},
             "weights_sha256": digest,
             "record": dict(emulator.record),
         },
@@ -99,29 +84,57 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
         )
     description = read_json(folder / "emulator.json")
     try:
-        if description["format"] not in _READABLE:
-            raise InputError(
-                f"{folder}/emulator.json has format {description['format']}; "
-                f"this version reads {', '.join(map(str, _READABLE))}"
-            )
-        sizes = description["architecture"]
-        architecture = Architecture(**{**sizes, "hidden": tuple(sizes["hidden"])})
-        fingerprint, base = description["fingerprint"], description.get("base", "network")
-        if base not in BASES:
-            raise InputError(f"{folder}/emulator.json: base '{base}'; expected {', '.join(BASES)}")
-        scene = scene_from_origin(description["scene"]) if scene is None else scene
-        if scene.fingerprint != fingerprint:
-            raise InputError(
-                f"emulator '{name}' was trained for a scene with fingerprint {fingerprint}; "
-                f"'{scene.name}' has {scene.fingerprint}: train one for this scene"
-            )
+        _check_description(folder, description)
+        scene = _matching_scene(name, description, scene)
         arrays = _arrays(folder / "weights.safetensors", description["weights_sha256"])
     except (KeyError, TypeError) as error:
         raise InputError(f"{folder}/emulator.json lacks or garbles {error}") from error
+    parts = {
+        part: _restore(folder, part, scene, told, inside(arrays, part))
+        for part, told in description["parts"].items()
+    }
+    return Emulator(scene, **parts, record=description.get("record", {}))
+
+
+def _restore(
+    folder: Path,
+    name: str,
+    scene: Scene,
+    description: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+) -> Any:
+    """The part ``name``; errors name the folder and the part."""
     try:
-        return _assemble(scene, architecture, arrays, base, description.get("record", {}))
-    except KeyError as error:
-        raise InputError(f"{folder}/weights.safetensors: array {error} is missing") from error
+        return KINDS[name].restore(scene, description, arrays)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder}: its part '{name}' lacks or garbles {error}") from error
+    except InputError as error:
+        raise InputError(f"{folder}: its part '{name}': {error}") from error
+
+
+def _check_description(folder: Path, description: Mapping[str, Any]) -> None:
+    if description["format"] != FORMAT:
+        raise InputError(
+            f"{folder}/emulator.json has format {description['format']}; this version reads "
+            f"{FORMAT}: train the emulator again"
+        )
+    unknown = [name for name in description["parts"] if name not in KINDS]
+    if unknown:
+        raise InputError(
+            f"{folder}/emulator.json: part '{unknown[0]}' is unknown; known: {', '.join(KINDS)}"
+        )
+
+
+def _matching_scene(name: str | Path, description: Mapping[str, Any], scene: Scene | None) -> Scene:
+    """``scene``, or the one the emulator was trained for, if its fingerprint is the emulator's."""
+    fingerprint = description["fingerprint"]
+    scene = scene_from_origin(description["scene"]) if scene is None else scene
+    if scene.fingerprint != fingerprint:
+        raise InputError(
+            f"emulator '{name}' was trained for a scene with fingerprint {fingerprint}; "
+            f"'{scene.name}' has {scene.fingerprint}: train one for this scene"
+        )
+    return scene
 
 
 def _arrays(path: Path, digest: str) -> dict[str, np.ndarray]:
@@ -129,54 +142,6 @@ def _arrays(path: Path, digest: str) -> dict[str, np.ndarray]:
     if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
         raise InputError(f"{path} is not the file emulator.json was written with")
     return arrays
-
-
-def _assemble(
-    scene: Scene, architecture: Architecture, arrays: dict[str, np.ndarray], base: Any, record: dict
-) -> Emulator:
-    stored = {name: arrays[f"['graph']['{name}']"] for name in _GRAPH}
-    graph = AugmentedGraph(**stored, real=len(scene.mesh.nodes))
-    basis = arrays.get("['basis']", np.zeros((0, *scene.held.shape), dtype=np.float32))
-    state = nnx.state(
-        nnx.eval_shape(lambda: build(architecture, graph, len(scene.parameters), len(basis), 0))
-    )
-    pure = fill_tree({"weights": nnx.to_pure_dict(state)}, arrays, "weights.safetensors")
-    nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure["weights"]))
-    return Emulator(
-        scene=scene,
-        architecture=architecture,
-        graph=graph,
-        weights=state,
-        series=_series(scene, arrays),
-        scale=arrays["['scale']"],
-        basis=basis,
-        residual=_residual(arrays),
-        base=base,
-        record=record,
-    )
-
-
-def _wide(array: np.ndarray) -> np.ndarray:
-    """Floating point numbers in float64, whatever they were kept in."""
-    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array
-
-
-def _series(scene: Scene, arrays: dict[str, np.ndarray]) -> Expansion:
-    if "['offset']" in arrays:
-        return constant(np.full(len(scene.parameters), 0.5), jnp.asarray(arrays["['offset']"]))
-    centre, u, indices, derivatives = (_wide(arrays[f"['series']['{name}']"]) for name in _SERIES)
-    return Expansion(centre, jnp.asarray(u), indices, jnp.asarray(derivatives))
-
-
-def _residual(arrays: dict[str, np.ndarray]) -> Residual | None:
-    if "['residual']['modes']" not in arrays:
-        return None
-    parts = {name: jnp.asarray(_wide(arrays[f"['residual']['{name}']"])) for name in _RESIDUAL}
-    centre, indices, coefficients, lengths = (
-        _wide(arrays[f"['residual']['warp']['{name}']"]) for name in Warp._fields
-    )
-    warp = Warp(centre, indices, jnp.asarray(coefficients), jnp.asarray(lengths))
-    return Residual(warp=warp, **parts)
 
 
 def _build(made_of: Ingredients, _: Options) -> ForwardMap:

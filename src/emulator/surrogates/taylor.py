@@ -9,18 +9,20 @@ Along :math:`x` (theta's position in its box) the equilibrium satisfies
         r(u_0 + \epsilon_1 u_{,a} + \epsilon_2 u_{,b},\;
           x_0 + \epsilon_1 e_a + \epsilon_2 e_b)\right|_0
 
-and so on with the path's own mixed terms, every order uses the tangent :math:`K` of the first: what
-follows a solve are residuals differentiated along paths and back-substitutions. On a ventricle with
-five parameters, over the whole box, orders 1, 2, 3 and 4 leave a median error of 0.20, 0.047, 0.010
-and 0.003 mm; at the corners, near the series' radius of convergence, the error is much larger.
+and so on with the path's own mixed terms. Every order uses the tangent :math:`K` of the first, so
+beyond one solve a series costs residuals differentiated along paths, and back-substitutions. On a
+ventricle with five parameters, over the whole box, orders 1, 2, 3 and 4 leave a median error of
+0.20, 0.047, 0.010 and 0.003 mm; at the corners, near the series' radius of convergence, the error
+is much larger.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from itertools import combinations, combinations_with_replacement
 from math import comb, factorial, prod
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -29,16 +31,18 @@ import numpy as np
 from emulator.errors import InputError, SolverError
 from emulator.fem.assembly import System
 from emulator.fem.simulator import Simulator
+from emulator.scenes.scene import Scene
+from emulator.surrogates.part import CachedPart, widened
 
-_MOST_TERMS = 200  # of one order; 18 parameters have 171 of the second and 1140 of the third
+_MOST_TERMS = 200  # in one order; 18 parameters have 171 of the second and 1140 of the third
 
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """Taylor series of a scene's equilibrium about one theta.
+    """Taylor series of a scene's equilibrium about one theta, a part of an emulator.
 
-    centre : (p,) position in the box.
-    displacement : (n, 3) mm, the equilibrium there.
+    centre : (p,) position in the unit box about which the series is taken.
+    displacement : (n, 3) mm, the equilibrium at the centre.
     indices : (t, order) parameters each term is differentiated in, -1 for none; sorted by order.
     derivatives : (t, n, 3) mm, with respect to position.
     """
@@ -49,17 +53,51 @@ class Expansion:
     derivatives: jax.Array
 
     def monomials(self, position: jax.Array) -> jax.Array:
-        """What each derivative is multiplied by at ``position`` (..., p), shape (..., t)."""
+        """The factor of each derivative at ``position`` (..., p), shape (..., t)."""
         return monomials(self.indices, position - self.centre)
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (..., n, 3) mm at ``position`` (..., p) in the box."""
+        """Displacement (..., n, 3) mm at ``position`` (..., p) in the unit box."""
         return self.displacement + jnp.tensordot(self.monomials(position), self.derivatives, axes=1)
 
     @property
     def order(self) -> int:
-        """Of the highest derivative there is."""
+        """Order of the highest derivative."""
         return int(np.max(np.sum(self.indices >= 0, axis=1), initial=0))
+
+    def cache(self, nodes: np.ndarray) -> CachedPart:
+        """The series over ``nodes`` (k,): its derivatives are the modes."""
+        offset, modes = np.asarray(self.displacement)[nodes], np.asarray(self.derivatives)[:, nodes]
+        return CachedPart(offset, modes, self.monomials)
+
+    def arrays(self) -> dict[str, Any]:
+        """The four arrays by name."""
+        return vars(self).copy()
+
+    def to_json(self) -> dict[str, Any]:
+        """Nothing: the arrays are all."""
+        return {}
+
+    @classmethod
+    def restore(
+        cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> Self:
+        """The series with these arrays."""
+        del scene, description
+        centre, u, indices, derivatives = (
+            widened(arrays[name]) for name in ("centre", "displacement", "indices", "derivatives")
+        )
+        return cls(centre, jnp.asarray(u), indices, jnp.asarray(derivatives))
+
+    def rounded(self) -> Expansion:
+        """The series in numbers float32 can hold, so that a file of half the size loses nothing."""
+        u, derivatives = (rounded(a) for a in (self.displacement, self.derivatives))
+        return replace(self, displacement=u, derivatives=derivatives)
+
+
+def rounded(array: jax.Array) -> jax.Array:
+    """The array in float64, its numbers rounded to float32."""
+    return array.astype(jnp.float32).astype(jnp.float64)
 
 
 def constant(position: np.ndarray, displacement: jax.Array) -> Expansion:
@@ -107,7 +145,7 @@ def expand(simulator: Simulator, theta: jax.Array | None = None, order: int = 3)
 
 
 def expand_at(simulator: Simulator, u: jax.Array, theta: jax.Array, order: int) -> Expansion:
-    """The same about a known equilibrium ``u`` (n, 3) mm."""
+    """:func:`expand` about a known equilibrium ``u`` (n, 3) mm at ``theta`` (p,)."""
     _check_order(order)
     scene, theta, u = simulator.scene, jnp.asarray(theta, dtype=float), jnp.asarray(u, dtype=float)
     position = scene.to_unit(theta)
@@ -145,10 +183,10 @@ def _forces(
 ) -> jax.Array:
     """Mixed derivative (t, f) of the residual along each term's path, its own term left out.
 
-    The fields on the paths are looked up term by term: side by side they would fill the memory.
+    Term by term (``lax.map``): the paths of all terms at once would not fit into memory.
     """
     degree = len(terms[0])
-    # Every proper part of the multi-index has its term on the path.
+    # The path holds one term for every proper subset of the multi-index.
     parts = [s for size in range(1, degree) for s in _subsets(degree, size)]
     places = {term: k for k, term in enumerate(found)}
     paths = [[places[tuple(term[k] for k in part)] for part in parts] for term in terms]

@@ -1,7 +1,7 @@
-r"""Modes that mechanics gives to a separable decoder.
+r"""Modes for a separable decoder, computed from mechanics.
 
-They span the Taylor series of the equilibrium about the centre, so they know how this body answers
-to these parameters, and they are orthonormal in its tangent there:
+They span the Taylor series of the equilibrium about the centre, and so the body's response to these
+parameters, and they are orthonormal in the tangent there:
 :math:`\phi_j \cdot K_c\, \phi_k = \delta_{jk}`. In their coefficients the potential energy is round
 near the centre, which keeps training on it from leaving the soft modes behind.
 """
@@ -16,26 +16,26 @@ from emulator.fem import Simulator
 from emulator.surrogates.taylor import Expansion
 
 _SAMPLES = 400
-_TRUNCATION = 1e-12  # of the largest energy
-_STEP = 0.1  # a unit of the network's output, as a fraction of a coefficient's spread
+_TRUNCATION = 1e-12  # relative to the largest energy
+_STEP = 0.1  # a unit of the network's output, in root mean squares of a mode's coefficient
 
 
 def mechanical_modes(simulator: Simulator, series: Expansion, most: int) -> np.ndarray:
-    """Modes (f, n, 3) mm, f at most ``most``, each as long as a unit of its coefficient should be.
+    """Modes (f, n, 3) mm, f at most ``most``, scaled so that coefficients of order 1 are typical.
 
-    Empty for a series of order 0.
+    There are none for a series of order 0.
     """
     count, shape = len(series.indices), series.displacement.shape
     if count == 0 or most == 0:
         return np.zeros((0, *shape))
     scene = simulator.scene
     samples = np.random.default_rng(0).random((_SAMPLES, len(scene.parameters)))
-    spread = np.sqrt(np.mean(np.asarray(series.monomials(jnp.asarray(samples))) ** 2, axis=0))
-    fields = np.asarray(series.derivatives) * spread[:, None, None]
+    rms = np.sqrt(np.mean(np.asarray(series.monomials(jnp.asarray(samples))) ** 2, axis=0))
+    fields = np.asarray(series.derivatives) * rms[:, None, None]
     energies, vectors = np.linalg.eigh(_energies(simulator, series, fields))
     order = np.argsort(energies)[::-1][:most]
     order = order[energies[order] > _TRUNCATION * energies.max()]
-    # Each is a unit in K_c times the root of its energy, the spread of its coefficient.
+    # Each is a unit vector in K_c times the root of its energy, the rms of its coefficient.
     return _STEP * np.tensordot(vectors[:, order].T, fields, axes=1)
 
 

@@ -1,4 +1,4 @@
-"""The last stage of training: what the FEM runs still have to teach."""
+"""The last stage of training: a discrepancy model of the FEM runs, and what it stands on."""
 
 from __future__ import annotations
 
@@ -12,36 +12,21 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.fem.campaign import Runs
-from emulator.surrogates.additive import BASES, Base, Emulator
-from emulator.surrogates.discrepancy import Residual, fit_residual
-from emulator.surrogates.taylor import Expansion
+from emulator.surrogates.additive import Emulator
+from emulator.surrogates.discrepancy import fit_discrepancy
+from emulator.surrogates.taylor import constant
 
-_HELD_OUT = 5  # one run in so many judges what the residual is fitted on top of
-FEWEST = 10  # runs; with fewer, all are needed for fitting
-_OBSERVATIONS = 4000  # values and slopes a covariance matrix of 128 MB has room for
-
-
-def rounded(series: Expansion) -> Expansion:
-    """The series in numbers that float32 can hold, so that a file half as long loses nothing."""
-    return replace(
-        series,
-        displacement=_round(series.displacement),
-        derivatives=_round(series.derivatives),
-    )
+_HELD_OUT = 5  # every fifth run is held out
+FEWEST = 10  # runs; of fewer, none is held out
+_OBSERVATIONS = 4000  # values and derivatives; their covariance matrix takes 128 MB
 
 
-def _round(array: jax.Array) -> jax.Array:
-    return array.astype(jnp.float32).astype(jnp.float64)
+def add_discrepancy(emulator: Emulator, runs: Runs) -> tuple[Emulator, dict[str, Any]]:
+    """``emulator`` with a discrepancy model of ``runs``, and a record of how it was chosen.
 
-
-def add_residual(
-    emulator: Emulator, runs: Runs, bases: tuple[Base, ...] = BASES
-) -> tuple[Emulator, dict[str, Any]]:
-    """``emulator`` with the residual of ``runs``, and a record of how it was chosen.
-
-    A network trained for minutes is worth standing on when runs are few, and a rough ground when
-    they are many: which of ``bases`` to add the residual to is judged by runs held out, then fitted
-    to all.
+    The model is fitted on top of nothing, of the Taylor series, and of series and network, and the
+    sum with the least error at held-out runs is taken, then fitted to all runs: a network helps
+    where runs are few and harms where they are many. Parts that are not in that sum are dropped.
 
     Raises
     ------
@@ -52,41 +37,49 @@ def add_residual(
     runs = runs.take(slice(0, most))
     count = len(runs.theta)
     if count < 2:
-        raise InputError("the residual needs FEM runs besides the centre's; give the budget more")
-    bare = replace(emulator, residual=None)
+        raise InputError(
+            "the discrepancy model needs FEM runs besides the centre's; give a larger budget"
+        )
+    series = emulator.taylor or constant(
+        np.full(runs.theta.shape[1], 0.5), jnp.zeros(emulator.scene.held.shape)
+    )
+
+    def fitted(bare: Emulator, some: Runs) -> Emulator:
+        model = fit_discrepancy(bare.scene, some, series, _mean(bare)).rounded()
+        return replace(bare, discrepancy=model)
+
+    sums = _sums(emulator)
     errors: dict[str, float] = {}
-    best: Base = "series"
+    best = "taylor" if "taylor" in sums else "nothing"
     if count >= FEWEST:
         test = np.arange(count) % _HELD_OUT == _HELD_OUT - 1
-        for base in bases:
-            fitted = replace(bare, base=base, residual=_fit(bare, runs.take(~test), base))
-            errors[base] = _error(fitted, runs.take(test))
-        best = min(bases, key=errors.__getitem__)
-    residual = _fit(bare, runs, best)
-    record = {
-        "base": best,
-        "runs": count,
-        "modes": len(residual.modes),
-        "held_out_err_u_mm": errors,
-    }
-    return replace(bare, base=best, residual=residual), record
+        for name, bare in sums.items():
+            errors[name] = _error(fitted(bare, runs.take(~test)), runs.take(test))
+        best = min(errors, key=errors.__getitem__)
+    whole = fitted(sums[best], runs)
+    assert whole.discrepancy is not None, "it was fitted above"
+    modes = len(whole.discrepancy.modes)
+    record = {"on": best, "runs": count, "modes": modes, "held_out_err_u_mm": errors}
+    return whole, record
 
 
-def _fit(emulator: Emulator, runs: Runs, base: Base) -> Residual:
-    residual = fit_residual(emulator.scene, runs, emulator.series, _mean(emulator, base))
-    return replace(residual, offset=_round(residual.offset), modes=_round(residual.modes))
+def _sums(emulator: Emulator) -> dict[str, Emulator]:
+    """The sums of parts a discrepancy model may be added to, by name."""
+    bare = replace(emulator, discrepancy=None)
+    candidates = [replace(bare, taylor=None, network=None), replace(bare, network=None), bare]
+    return {" + ".join(sum_.parts) or "nothing": sum_ for sum_ in candidates}
 
 
-def _mean(emulator: Emulator, base: Base) -> Callable[[jax.Array], jax.Array] | None:
-    """Position in the box to the displacement (n, 3) of what is below the residual."""
-    if base == "nothing":
+def _mean(emulator: Emulator) -> Callable[[jax.Array], jax.Array] | None:
+    """Position in the unit box to the displacement (n, 3) of all parts; None without parts."""
+    if not emulator.parts:
         return None
-    cached = replace(emulator, base=base).cache()
+    cached = emulator.cache()
     return lambda position: cached(emulator.scene.from_unit(position))
 
 
 def _error(emulator: Emulator, runs: Runs) -> float:
-    """Mean err_u in mm of a typical run: one hard corner does not outvote the box."""
+    """Geometric mean of err_u in mm over ``runs``, so that one large error does not decide."""
     predicted = jax.jit(emulator.cache())(runs.theta)
     each = jnp.mean(jnp.linalg.norm(predicted - runs.displacement, axis=-1), axis=-1)
     return float(jnp.exp(jnp.mean(jnp.log(each + 1e-300))))

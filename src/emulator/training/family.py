@@ -1,8 +1,8 @@
 """Pretraining: one network for a family of scenes, to start others from.
 
-One optimiser walks through the scenes in turn. Each keeps its own graph, series and scale; only the
-weights are common. A body the family never saw then starts from these, with
-``train(scene, ..., start=pretrained[0])``.
+One optimiser takes a step on each scene in turn. Each scene keeps its own graph, series and scale;
+only the weights are common. Training on a body outside the family then starts from these weights,
+with ``train(scene, ..., start=pretrained[0])``.
 """
 
 from __future__ import annotations
@@ -12,18 +12,17 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 from tqdm import tqdm
 
-from emulator.errors import InputError, SolverError
+from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
+from emulator.training.checkpoint import CHECKPOINT, State, Writer, read_checkpoint
+from emulator.training.loop import Bar, Keep, Steps, optimise, require_finite
 from emulator.training.plan import Plan
-from emulator.training.trainer import prepare
+from emulator.training.problem import Problem, prepare
+from emulator.training.start import with_weights
 
 
 def pretrain(
@@ -41,53 +40,47 @@ def pretrain(
     ----------
     scenes : of equal parameters; meshes and their topology may differ. The step is compiled once
         for each.
-    plan : with a network and no residual. ``plan.steps`` counts the steps of all scenes together,
-        each of which takes the next scene; FEM runs, if any, are solved on every scene.
+    plan : with a network and no discrepancy model. ``plan.steps`` counts the steps of all scenes
+        together, each of which takes the next scene; FEM runs, if any, are solved on every scene.
     folder : where checkpoints go, as in :func:`~emulator.training.train`.
     resume : continue from the checkpoint in ``folder``, under the plan it was written with.
     """
-    started = time.perf_counter()
-    checkpoint = Path(folder) / CHECKPOINT
+    path, began = Path(folder) / CHECKPOINT, time.perf_counter()
     if not scenes:
         raise InputError("pretraining: no scene is given")
     fingerprint = "+".join(scene.fingerprint for scene in scenes)
     names = ", ".join(scene.name for scene in scenes)
-    saved = read_checkpoint(checkpoint, fingerprint, names) if resume else None
-    if saved:
+    saved = read_checkpoint(path, fingerprint, names) if resume else None
+    if saved is not None:
         plan, architecture = saved.plan, saved.architecture or architecture
-    if plan.residual:
-        raise InputError(
-            f"pretraining: recipe '{plan.recipe}' learns a residual, which belongs to one scene; "
-            "use recipe network or paper"
-        )
-    problems = [prepare(scenes[0], plan, architecture)]
-    for scene in tqdm(scenes[1:], "prepare", disable=not progress):
-        # From the first one's network: as well as the same weights, the same demands on the scene.
-        problems.append(prepare(scene, plan, architecture, start=problems[0].emulator))
-    weights = jax.tree.map(jnp.copy, problems[0].emulator.weights)
-    state = problems[0].optimiser.init(weights)
-    spent, first, value = 0.0, 0, float("nan")
-    if saved:
-        weights, state = saved.restore(weights, state)
-        spent, first, value = saved.seconds, saved.step, saved.loss
-    sizes = problems[0].emulator.architecture
-    bar = tqdm(desc="pretrain", initial=first, total=plan.steps, disable=not progress)
-    for number in range(first, plan.steps):
-        step, done = problems[number % len(problems)].step, number + 1
-        weights, state, loss = step(weights, state, jnp.asarray(number), jnp.asarray(plan.steps))
-        bar.update()
-        if done % plan.checkpoint_every == 0 or done == plan.steps:
-            value = float(loss)
-            seconds = spent + time.perf_counter() - started
-            at = (weights, state, done)
-            write_checkpoint(checkpoint, fingerprint, plan, sizes, {}, at, seconds, value)
-    bar.close()
-    if not np.isfinite(value):
-        raise SolverError("training ended in a loss that is not finite; lower the learning rate")
+    problems = _problems(scenes, plan, architecture, progress)
+    spent = saved.seconds if saved is not None else 0.0
+    clock = lambda: spent + time.perf_counter() - began  # noqa: E731
+    network = problems[0].emulator.network
+    keep = Keep(Writer(path, fingerprint, network.architecture if network else None), plan, clock)
+    state = State(*problems[0].initial())
+    state = state if saved is None else saved.restore(*state[:2])
+    with Bar("pretrain", state, plan.steps, shown=progress) as bar:
+        state = optimise(state, plan.steps, Steps(problems), [bar, keep])
     record = {
         "plan": asdict(plan),
-        "final_loss": value,
+        "final_loss": require_finite(state),
         "family": [scene.fingerprint for scene in scenes],
-        "seconds": round(spent + time.perf_counter() - started, 1),
+        "seconds": round(clock(), 1),
     }
-    return [replace(p.emulator, weights=weights, record=record) for p in problems]
+    return [replace(with_weights(p.emulator, state.weights), record=record) for p in problems]
+
+
+def _problems(
+    scenes: Sequence[Scene], plan: Plan, architecture: Architecture | None, progress: bool
+) -> list[Problem]:
+    """A problem for each scene, all with the first one's untrained weights."""
+    if plan.discrepancy:
+        raise InputError(
+            f"pretraining: recipe '{plan.recipe}' fits a discrepancy model, which belongs to one "
+            "scene; use recipe network or paper"
+        )
+    first = prepare(scenes[0], plan, architecture)
+    others = tqdm(scenes[1:], "prepare", disable=not progress)
+    # Starting from the first one's network also checks that each scene can have its weights.
+    return [first, *(prepare(s, plan, architecture, start=first.emulator) for s in others)]

@@ -9,16 +9,16 @@ r"""What a training step minimises, for a batch of theta.
         \left[\Pi(u, \theta) - \Pi(u^*, \theta)\right] / |\Pi(u^*, \theta)|
 
 with :math:`u^*` the FEM solution in mm, :math:`F` the dimensionless deformation gradient in the
-Frobenius norm, :math:`s` and :math:`s_F` the spreads of both over the FEM runs, so that both data
-terms are about 1 at the centre's solution, and :math:`\Pi_0` a fixed scale. ``energy``,
-``simulations`` and ``gradients`` are the paper's PI, DD and F-DD. The energies pass through the
-barriers, which are inactive near any solution.
+Frobenius norm, :math:`s` and :math:`s_F` the root mean squares, over the FEM runs, of what both
+differ by from the centre's solution, so that each data term is 1 there, and :math:`\Pi_0` a fixed
+scale. ``energy``, ``simulations`` and ``gradients`` are the paper's PI, DD and F-DD. The energies
+pass through the barriers, which are inactive near any solution.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +26,7 @@ import jax.numpy as jnp
 from emulator.fem.functional import displacement_gradient, potential_energy
 from emulator.mechanics.barriers import Barriers
 from emulator.scenes.scene import Scene
-
-Objective = Literal["energy", "simulations", "gradients", "both"]
-OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
+from emulator.training.plan import Objective
 
 
 class Batch(NamedTuple):
@@ -40,7 +38,7 @@ class Batch(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """What makes each term dimensionless and of order 1.
+    """Divisors that make each term dimensionless and of order 1.
 
     displacement : s above, mm. gradient : s_F, dimensionless. energy : Pi_0, mN mm.
     """

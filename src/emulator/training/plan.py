@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from emulator.errors import InputError
-from emulator.training.objectives import OBJECTIVES, Objective
+
+Objective = Literal["energy", "simulations", "gradients", "both"]
+OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
 
 @dataclass(frozen=True)
@@ -17,18 +19,19 @@ class Plan:
     objective : of the network: ``energy`` (no FEM run but the centre), ``simulations``,
         ``gradients`` (simulations and their deformation gradients), or ``both`` (simulations and
         energy).
-    steps : optimiser steps; 0 with a residual is no network.
-    simulations : FEM runs to train the network on (not used by ``energy``) and the residual.
+    steps : optimiser steps; without any, which a discrepancy model allows, there is no network.
+    simulations : FEM runs to train the network on (not used by ``energy``) and to fit the
+        discrepancy model to.
     batch : theta a step.
     learning_rate : of Adam at its peak.
     schedule : ``cosine`` to zero after a warm-up, or ``halves``: the peak, then a tenth of it.
     energy_weight : weight of the energy gap in ``both``.
-    centred : start from the FEM solution at the centre of the box rather than from zero.
-    order : of the Taylor series about the centre; 0 is the solution alone.
+    centred : add the network to a Taylor series about the centre of the box, not to zero.
+    order : of that series; 0 is the FEM solution at the centre alone.
     decoder : ``pointwise`` or ``separable``.
     modes : mechanical modes given to a separable decoder, at most.
     freeze : step after which a separable decoder keeps its modes and trains its branch alone.
-    residual : learn what is left from the FEM runs and their slopes.
+    discrepancy : fit a discrepancy model to the FEM runs and their sensitivities.
     checkpoint_every : steps between checkpoints.
     seed : of the weights, the FEM runs' theta, and the batches.
     """
@@ -46,7 +49,7 @@ class Plan:
     decoder: Literal["pointwise", "separable"] = "pointwise"
     modes: int = 40
     freeze: int = 200
-    residual: bool = False
+    discrepancy: bool = False
     checkpoint_every: int = 500
     seed: int = 0
 
@@ -54,7 +57,7 @@ class Plan:
         if self.objective not in OBJECTIVES:
             *others, last = OBJECTIVES
             raise InputError(f"objective '{self.objective}': use {', '.join(others)} or {last}")
-        least = {"steps": 0 if self.residual else 1, "batch": 1, "checkpoint_every": 1}
+        least = {"steps": 0 if self.discrepancy else 1, "batch": 1, "checkpoint_every": 1}
         for name, value in least.items():
             if getattr(self, name) < value:
                 raise InputError(
@@ -73,7 +76,7 @@ class Plan:
     @property
     def runs(self) -> int:
         """FEM runs besides the centre's."""
-        return self.simulations if self.residual or self.objective != "energy" else 0
+        return self.simulations if self.discrepancy or self.objective != "energy" else 0
 
 
 RECIPES: dict[str, Plan] = {
@@ -82,7 +85,7 @@ RECIPES: dict[str, Plan] = {
         objective="energy",
         order=3,
         decoder="separable",
-        residual=True,
+        discrepancy=True,
         simulations=200,
         steps=2000,
     ),
@@ -91,7 +94,7 @@ RECIPES: dict[str, Plan] = {
         objective="energy",
         order=3,
         decoder="separable",
-        residual=True,
+        discrepancy=True,
         simulations=60,
         steps=0,
     ),
@@ -106,9 +109,9 @@ RECIPES: dict[str, Plan] = {
         steps=100_000,
     ),
 }
-"""``hybrid``: a Taylor series, a network trained on the energy in mechanical modes, and the
-residual of some FEM runs. ``mechanics``: the same without a network, from a mesh to an emulator in
-a minute. ``network``: Algorithm 1 about the centre, trained on FEM runs and the
+"""``hybrid``: a Taylor series, a network trained on the energy in mechanical modes, and a
+discrepancy model. ``mechanics``: the same without a network, from a mesh to an emulator in a
+minute. ``network``: Algorithm 1 about the FEM solution at the centre, trained on FEM runs and the
 energy. ``paper``: Algorithm 1 from zero, the energy at one theta a step, Adam at 1e-4 and then
 1e-5, as released by Dalton et al. (2023)."""
 

@@ -2,7 +2,7 @@
 
 Encoders, messages and decoders are shared by all nodes, so their weights fit any mesh (Dalton et
 al. 2023, Appendix E). Series, scale and graph belong to one scene and are never carried over; the
-ranges of the parameters may differ, because the network sees positions in the box.
+ranges of the parameters may differ, because the network takes positions in the unit box.
 """
 
 from __future__ import annotations
@@ -21,15 +21,23 @@ from emulator.surrogates.network.pignn import Architecture
 from emulator.training.plan import Plan
 
 
+def with_weights(emulator: Emulator, weights: Any) -> Emulator:
+    """``emulator`` with other weights of its network."""
+    assert emulator.network is not None, "only a network has weights"
+    return replace(emulator, network=replace(emulator.network, weights=weights))
+
+
 def with_network_of(emulator: Emulator, start: Emulator) -> Emulator:
-    """``emulator`` with a copy of the network of ``start``; all else is its own."""
-    copies = [jnp.copy(leaf) for leaf in jax.tree.leaves(start.weights)]
-    structure = jax.tree.structure(emulator.weights)
-    return replace(emulator, weights=jax.tree.unflatten(structure, copies))
+    """``emulator`` with a copy of the weights of ``start``; all else is its own."""
+    assert emulator.network is not None, "only a network has weights"
+    assert start.network is not None, "only a network has weights"
+    copies = [jnp.copy(leaf) for leaf in jax.tree.leaves(start.network.weights)]
+    structure = jax.tree.structure(emulator.network.weights)
+    return with_weights(emulator, jax.tree.unflatten(structure, copies))
 
 
 def start_record(start: Emulator) -> dict[str, Any]:
-    """What tells the emulator a training began from."""
+    """Name and fingerprints of the emulator whose weights training started from."""
     return {
         "scene": start.scene.name,
         "scene_fingerprint": start.scene.fingerprint,
@@ -45,16 +53,22 @@ def architecture_from(
     Raises
     ------
     InputError
-        Another architecture was asked for, theta or the node features are others, or a decoder's
-        coefficients belong to the mechanical modes of one mesh.
+        ``start`` has no network or another architecture than asked for, theta or the node features
+        differ, or a decoder's coefficients belong to the mechanical modes of one mesh.
     """
-    theirs, there = start.architecture, f"the emulator of '{start.scene.name}'"
+    there, network = f"the emulator of '{start.scene.name}'", start.network
     if not plan.steps:
         raise InputError(
             f"recipe '{plan.recipe}' trains no network, so it cannot start from that of {there}"
         )
+    if network is None:
+        raise InputError(
+            f"{there} has no network to start from, only {' + '.join(start.parts) or 'nothing'}; "
+            "train it with recipe network"
+        )
+    theirs = network.architecture
     ours = replace(architecture or theirs, decoder=plan.decoder)
-    if len(start.basis) or (ours.decoder == "separable" and plan.order and plan.modes):
+    if len(network.basis) or (ours.decoder == "separable" and plan.order and plan.modes):
         raise InputError(
             f"starting '{scene.name}' from {there}: coefficients of mechanical modes mean nothing "
             "on another mesh; use a decoder without them, such as recipe network's, for both"
@@ -66,7 +80,7 @@ def architecture_from(
             f"{there} has parameters {', '.join(start.scene.parameter_names)}; "
             f"'{scene.name}' has {', '.join(scene.parameter_names)}"
         )
-    widths = start.graph.node_features.shape[1], node_inputs(scene).shape[1]
+    widths = network.graph.node_features.shape[1], node_inputs(scene).shape[1]
     if widths[0] != widths[1]:
         raise InputError(
             f"{there} has {widths[0]} features a node, '{scene.name}' has {widths[1]}: one has "

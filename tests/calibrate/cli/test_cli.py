@@ -257,7 +257,8 @@ def test_a_posterior_of_another_emulator_is_not_certified(capsys, monkeypatch, t
     assert code == 0
     from dataclasses import replace
 
-    save_emulator(replace(emulator, scale=1.01 * emulator.scale), "mine")
+    series = replace(emulator.taylor, displacement=1.01 * emulator.taylor.displacement)
+    save_emulator(replace(emulator, taylor=series), "mine")
     assert "was made with another emulator map" in complaint(
         capsys, "certify", "r", "--draws", "30"
     )

@@ -38,18 +38,24 @@ def solves(monkeypatch):
     return seen
 
 
-def test_slopes_against_differences(simulator, thetas):
-    """In the position, on a log scale and on a uniform one."""
+def test_sensitivities_against_differences(simulator, thetas):
+    """du/dtheta in the parameters' own units; in the unit box on a log and on a uniform scale."""
     scene = simulator.scene
     uniform = replace(scene.parameters[1], scale="uniform")
     mixed = em.Simulator(replace(scene, parameters=(scene.parameters[0], uniform)))
-    runs = run_campaign(mixed, thetas[:2], slopes=True)
-    x = mixed.scene.to_unit(runs.theta)[1]
-    for k, step in enumerate(1e-4 * jnp.eye(2)):
-        ahead, behind = (mixed(mixed.scene.from_unit(x + s)) for s in (step, -step))
-        expected = (ahead - behind) / 2e-4
-        atol = 1e-6 * float(jnp.abs(expected).max())
-        np.testing.assert_allclose(runs.slopes[1, k], expected, atol=atol)
+    runs = run_campaign(mixed, thetas[:2], sensitivities=True)
+    in_box = mixed.scene.space.unit_sensitivities(runs.theta, runs.sensitivities)
+    theta, position = runs.theta[1], mixed.scene.to_unit(runs.theta)[1]
+    for k in range(2):
+        for found, at, solve in (
+            (runs.sensitivities, theta, mixed),
+            (in_box, position, lambda x: mixed(mixed.scene.from_unit(x))),
+        ):
+            step = 1e-4 * at[k]
+            ahead, behind = (solve(at.at[k].add(s)) for s in (step, -step))
+            expected = (ahead - behind) / (2 * step)
+            atol = 1e-6 * float(jnp.abs(expected).max())
+            np.testing.assert_allclose(found[1, k], expected, atol=atol)
 
 
 def test_better_starts_save_iterations_and_change_nothing(simulator, thetas, solves):
@@ -60,16 +66,16 @@ def test_better_starts_save_iterations_and_change_nothing(simulator, thetas, sol
         return runs, sum(int(solution.iterations) for _, solution in solves)
 
     plain, nearest = iterations()
-    moved, along = iterations(slopes=True)
+    moved, along = iterations(sensitivities=True)
     expanded, series = iterations(predictor=expand(simulator, order=2))
     assert along < nearest
     assert series < nearest
     for runs in (moved, expanded):
         np.testing.assert_allclose(runs.displacement, plain.displacement, atol=1e-8)
         np.testing.assert_allclose(runs.energy, plain.energy, rtol=1e-8)
-    assert plain.slopes is None
-    assert moved.take(slice(2)).slopes.shape == (2, 2, *simulator.scene.held.shape)
-    assert expanded.take(np.array([3])).slopes is None
+    assert plain.sensitivities is None
+    assert moved.take(slice(2)).sensitivities.shape == (2, 2, *simulator.scene.held.shape)
+    assert expanded.take(np.array([3])).sensitivities is None
 
 
 def test_an_expansion_that_crushes_elements_is_not_chosen(simulator, thetas, solves):
@@ -99,18 +105,16 @@ def test_where_a_start_fails_rest_is_tried(simulator, thetas, monkeypatch):
 
 def test_a_failure_names_the_run(simulator, thetas):
     with pytest.raises(SolverError, match="FEM run 1: theta or the starting displacement is not"):
-        run_campaign(simulator, thetas[:2].at[1, 0].set(jnp.nan), slopes=True)
+        run_campaign(simulator, thetas[:2].at[1, 0].set(jnp.nan), sensitivities=True)
 
 
-def test_slopes_are_those_of_the_solver(simulator, thetas):
-    runs = run_campaign(simulator, thetas[:1], slopes=True)
-    scene = simulator.scene
+def test_sensitivities_are_the_solvers(simulator, thetas):
+    runs = run_campaign(simulator, thetas[:1], sensitivities=True)
     _, along = jax.jvp(
-        lambda x: simulator.solve(scene.from_unit(x)).displacement,
-        (scene.to_unit(thetas[0]),),
-        (jnp.array([1.0, -2.0]),),
+        lambda theta: simulator.solve(theta).displacement, (thetas[0],), (jnp.array([1.0, -2.0]),)
     )
-    np.testing.assert_allclose(runs.slopes[0, 0] - 2.0 * runs.slopes[0, 1], along, atol=1e-10)
+    found = runs.sensitivities[0, 0] - 2.0 * runs.sensitivities[0, 1]
+    np.testing.assert_allclose(found, along, atol=1e-10)
 
 
 @pytest.mark.parametrize("at_least", [1, 4])

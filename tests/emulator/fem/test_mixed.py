@@ -10,7 +10,6 @@ from calibrate.verify.consistency import block
 from emulator.errors import InputError
 from emulator.fem.functional import strain_energy
 from emulator.fem.mixed import advance, consistent, linearise
-from emulator.geometry.bodies.box import box
 
 
 @pytest.fixture(scope="module")
@@ -71,12 +70,3 @@ def test_mean_dilatation_on_linear_elements_is_refused():
         replace(scene, dilatation="mean")
     with pytest.raises(InputError, match="dilatation 'none'; use pointwise or mean"):
         replace(scene, dilatation="none")
-
-
-def test_the_network_wants_linear_elements():
-    from emulator.geometry.quadratic import to_quadratic
-    from emulator.surrogates.network.graph import augment
-
-    quadratic = replace(block("P1"), mesh=to_quadratic(box((2.0, 3.0, 4.0), (1, 1, 1))))
-    with pytest.raises(InputError, match="linear tetrahedra"):
-        augment(quadratic)

@@ -1,6 +1,7 @@
-"""An emulator of all parts: series, network, residual."""
+"""An emulator of all parts: Taylor series, network, discrepancy model."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import jax
 import jax.numpy as jnp
@@ -11,38 +12,50 @@ import emulator as em
 from emulator.fem import design
 from emulator.fem.campaign import run_campaign
 from emulator.store import read_arrays
-from emulator.surrogates import Architecture, augment, load, save_emulator
-from emulator.surrogates.additive import BASES, fresh
-from emulator.surrogates.discrepancy import fit_residual
+from emulator.surrogates import Architecture, Emulator, augment, load, save_emulator
+from emulator.surrogates.additive import KINDS
+from emulator.surrogates.discrepancy import fit_discrepancy
+from emulator.surrogates.network.graph import AugmentedGraph
+from emulator.surrogates.network.part import fresh
 from emulator.surrogates.taylor import expand
 from emulator.training.basis import mechanical_modes
+from network_support import drawn
 
 SMALL = Architecture(steps=1, latent=8, hidden=(16, 16), decoder="separable", modes=3)
+NAMES = tuple(KINDS)
 
 
 @pytest.fixture(scope="module")
 def whole(beam, simulator):
-    """Series of order 2, five mechanical modes, weights drawn, and a residual over all of it."""
+    """Series of order 2, five mechanical modes, weights drawn, and a discrepancy model over both."""
     series = expand(simulator, order=2)
     scale = np.array([0.5, 1.0, 2.0])
     basis = (mechanical_modes(simulator, series, 5) / scale).astype(np.float32)
-    emulator = fresh(beam, augment(beam), SMALL, series, scale, 0, basis)
-    leaves, structure = jax.tree.flatten(emulator.weights)
-    rng = np.random.default_rng(2)
-    leaves = [leaf + 0.01 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves]
-    emulator = replace(emulator, weights=jax.tree.unflatten(structure, leaves))
-    runs = run_campaign(simulator, design(beam, 8, 0), slopes=True, predictor=series)
+    network = drawn(fresh(beam, augment(beam), SMALL, scale, 0, basis), 0.01)
+    emulator = Emulator(beam, taylor=series, network=network)
+    runs = run_campaign(simulator, design(beam, 8, 0), sensitivities=True, predictor=series)
     cached = emulator.cache()
-    residual = fit_residual(beam, runs, series, lambda x: cached(beam.from_unit(x)))
-    return replace(emulator, residual=residual)
+    discrepancy = fit_discrepancy(beam, runs, series, lambda x: cached(beam.from_unit(x)))
+    return replace(emulator, discrepancy=discrepancy)
 
 
 THETAS = jnp.array([[0.1, 0.9], [0.5, 0.5], [1.0, 0.0], [0.3, 0.2]])
+SUMS = [names for count in range(4) for names in combinations(NAMES, count)]
 
 
-@pytest.mark.parametrize("base", BASES)
-def test_cached_equals_uncached_whatever_the_residual_stands_on(whole, beam, base):
-    emulator = replace(whole, base=base)
+def only(emulator, names):
+    """The emulator with these parts alone."""
+    return replace(emulator, **{name: None for name in NAMES if name not in names})
+
+
+def test_the_parts_are_the_fields(whole):
+    assert list(whole.parts) == list(NAMES)
+    assert list(only(whole, ("network",)).parts) == ["network"]
+
+
+@pytest.mark.parametrize("names", SUMS, ids="+".join)
+def test_cached_equals_uncached_whatever_the_parts(whole, beam, names):
+    emulator = only(whole, names)
     cached = jax.jit(emulator.cache())
     for theta in beam.from_unit(THETAS):
         exact = emulator(theta)
@@ -50,18 +63,18 @@ def test_cached_equals_uncached_whatever_the_residual_stands_on(whole, beam, bas
         np.testing.assert_allclose(cached(theta), exact, atol=atol, rtol=0)
 
 
-def test_each_part_has_its_say(whole, beam):
+def test_an_emulator_is_the_sum_of_its_parts(whole, beam):
     theta = beam.from_unit(THETAS[3])
-    values = [replace(whole, residual=None)(theta), *(replace(whole, base=b)(theta) for b in BASES)]
-    for k, one in enumerate(values):
-        for other in values[:k]:
-            assert float(jnp.abs(one - other).max()) > 1e-6
+    alone = [np.asarray(only(whole, (name,))(theta)) for name in NAMES]
+    assert all(np.abs(one).max() > 1e-6 for one in alone)
+    np.testing.assert_allclose(whole(theta), sum(alone), atol=1e-10)
+    np.testing.assert_array_equal(Emulator(beam)(theta), beam.held_displacement)
 
 
 def test_over_the_network_it_is_fem_at_its_runs(whole, beam, simulator):
     theta = design(beam, 8, 0)[4]  # a corner of the box, and a run
     error = jnp.abs(whole(theta) - simulator(theta)).max()
-    bare = jnp.abs(replace(whole, residual=None)(theta) - simulator(theta)).max()
+    bare = jnp.abs(replace(whole, discrepancy=None)(theta) - simulator(theta)).max()
     assert error < 1e-4 * bare
 
 
@@ -82,13 +95,23 @@ def test_only_nodes_asked_for_are_decoded(whole, beam):
     np.testing.assert_allclose(whole.cache(nodes)(theta), cached(theta)[nodes], atol=1e-12)
 
 
-def test_what_the_residual_does_not_stand_on_is_not_evaluated(whole, beam):
-    work = {
-        base: jax.jit(replace(whole, base=base).cache()).lower(beam.centre).compile()
-        for base in BASES
-    }
-    flops = {base: compiled.cost_analysis()["flops"] for base, compiled in work.items()}
-    assert flops["nothing"] < flops["series"] < flops["network"]
+def test_the_modes_of_all_parts_are_one_product(whole, beam):
+    products = jax.make_jaxpr(whole.cache())(beam.centre).pretty_print().count("dot_general")
+    alone = sum(
+        jax.make_jaxpr(only(whole, (name,)).cache())(beam.centre)
+        .pretty_print()
+        .count("dot_general")
+        for name in NAMES
+    )
+    assert products == alone - 2
+
+
+def test_parts_that_are_absent_are_not_evaluated(whole, beam):
+    def flops(*names):
+        compiled = jax.jit(only(whole, names).cache()).lower(beam.centre).compile()
+        return compiled.cost_analysis()["flops"]
+
+    assert flops("discrepancy") < flops("taylor", "discrepancy") < flops(*NAMES)
 
 
 def test_the_gradient_is_that_of_the_value(whole, beam):
@@ -105,27 +128,72 @@ def test_the_gradient_is_that_of_the_value(whole, beam):
         assert float(slope[k]) == pytest.approx(float((4 * narrow - wide) / 3), rel=2e-3)
 
 
-def test_saved_and_loaded_it_is_the_same(whole, beam, tmp_path):
-    save_emulator(whole, tmp_path)
+def test_an_emulator_of_nothing_is_not_saved(beam, tmp_path):
+    with pytest.raises(em.InputError, match="without any part has nothing to save"):
+        save_emulator(Emulator(beam), tmp_path)
+
+
+@pytest.mark.parametrize("names", SUMS[1:], ids="+".join)
+def test_saved_and_loaded_it_is_the_same(whole, beam, tmp_path, names):
+    emulator = only(whole, names)
+    save_emulator(emulator, tmp_path)
     again = load(tmp_path, beam)
-    assert again.fingerprint == whole.fingerprint
-    assert again.base == whole.base
-    np.testing.assert_array_equal(again(beam.centre), whole(beam.centre))
+    assert again.fingerprint == emulator.fingerprint
+    assert tuple(again.parts) == names
+    np.testing.assert_array_equal(again(beam.centre), emulator(beam.centre))
+
+
+def test_array_names_in_the_file_are_paths_of_the_parts(whole, tmp_path):
+    save_emulator(whole, tmp_path)
+    arrays, _ = read_arrays(tmp_path / "weights.safetensors")
+    assert {name.split("/")[0] for name in arrays} == set(NAMES)
+    assert {
+        "taylor/derivatives",
+        "network/weights/processor/rounds/0/edge/layers/1/kernel",
+        "network/graph/senders",
+        "discrepancy/modes",
+        "discrepancy/warp/centre",
+    } <= set(arrays)
+    save_emulator(only(whole, ("taylor",)), tmp_path)
+    arrays, _ = read_arrays(tmp_path / "weights.safetensors")
+    assert {name.split("/")[0] for name in arrays} == {"taylor"}
 
 
 def test_numbers_float32_can_hold_are_kept_in_half_the_room(whole, tmp_path):
-    rounded = np.asarray(whole.residual.modes, dtype=np.float32).astype(np.float64)
-    small = replace(whole, residual=replace(whole.residual, modes=jnp.asarray(rounded)))
+    small = replace(whole, discrepancy=whole.discrepancy.rounded())
     save_emulator(small, tmp_path / "narrow")
     arrays, _ = read_arrays(tmp_path / "narrow" / "weights.safetensors")
-    assert arrays["['residual']['modes']"].dtype == np.float32
-    assert arrays["['residual']['slopes']"].dtype == np.float64
+    assert arrays["discrepancy/modes"].dtype == np.float32
+    assert arrays["discrepancy/derivative_weights"].dtype == np.float64
     assert load(tmp_path / "narrow", whole.scene).fingerprint == small.fingerprint
 
 
-def test_an_untrained_separable_network_is_its_series(beam, simulator):
+def test_the_fingerprint_covers_the_scene_and_every_part(whole, beam):
+    """Each change alone gives another: the scene, an array, the graph, an architecture."""
+    network, series = whole.network, whole.taylor
+    nudged = replace(series, displacement=series.displacement.at[3, 1].add(1e-12))
+    graph = AugmentedGraph(
+        **{**network.graph.arrays(), "edge_features": 1.5 * network.graph.edge_features},
+        real=network.graph.real,
+    )
+    sizes = replace(network.architecture, decoder="pointwise")
+    changed = [
+        whole,
+        replace(whole, scene=replace(beam, constants={}, origin={}, law=beam.law, loads=())),
+        replace(whole, taylor=nudged),
+        replace(whole, network=replace(network, scale=1.01 * network.scale)),
+        replace(whole, network=replace(network, graph=graph)),
+        replace(whole, network=replace(network, architecture=sizes)),
+        *(only(whole, names) for names in SUMS if len(names) < 3),
+    ]
+    assert len({one.fingerprint for one in changed}) == len(changed)
+    assert replace(whole, record={"note": 1}).fingerprint == whole.fingerprint
+
+
+def test_an_untrained_network_adds_nothing_to_its_series(beam, simulator):
     series = expand(simulator, order=1)
-    emulator = fresh(beam, augment(beam), SMALL, series, np.ones(3), 0)
+    network = fresh(beam, augment(beam), SMALL, np.ones(3), 0)
+    emulator = Emulator(beam, taylor=series, network=network)
     x = jnp.array([0.2, 0.6])
     expected = jnp.where(beam.held, 0.0, series(x))
     np.testing.assert_allclose(emulator(beam.from_unit(x)), expected, atol=1e-12)

@@ -53,10 +53,13 @@ def test_a_scene_that_does_not_match(folder):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda d: d.pop("architecture"), "lacks or garbles 'architecture'"),
-        (lambda d: d.update(format=99), "has format 99"),
+        (lambda d: d.pop("parts"), "emulator.json lacks or garbles 'parts'"),
+        (lambda d: d["parts"]["network"].clear(), "'network' lacks or garbles 'architecture'"),
+        (lambda d: d["parts"].update(discrepancy={}), "'discrepancy' lacks or garbles 'centre'"),
+        (lambda d: d["parts"].update(magic={}), "part 'magic' is unknown; known: taylor, network"),
+        (lambda d: d.update(format=2), "has format 2; this version reads 3: train .* again"),
         (lambda d: d["scene"].update(scene="heart"), "origin names scene 'heart'"),
-        (lambda d: d["architecture"].update(latent=9), "has shape .* expected"),
+        (lambda d: d["parts"]["network"]["architecture"].update(latent=9), "has shape .* expected"),
     ],
 )
 def test_damaged_descriptions(folder, edit, message):
@@ -84,3 +87,13 @@ def test_shipped_emulators_say_how_they_were_made(name):
     assert record["command"].startswith(f"calibrate train {name} ")
     assert record["seconds"] > 0
     assert record["hardware"]["cores"]
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_shipped_emulators_hold_no_network(name):
+    """Held-out runs chose the discrepancy model over the Taylor series alone."""
+    found = load(name)
+    assert list(found.parts) == ["taylor", "discrepancy"]
+    chosen = found.record["discrepancy"]
+    errors = chosen["held_out_err_u_mm"]
+    assert chosen["on"] == "taylor" == min(errors, key=errors.get)

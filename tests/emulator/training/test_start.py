@@ -11,9 +11,9 @@ import emulator as em
 from emulator.errors import InputError
 from emulator.surrogates import load, save_emulator
 from emulator.training import Plan, pretrain, recipe, train
-from emulator.training.checkpoint import CHECKPOINT
+from emulator.training.checkpoint import CHECKPOINT, Writer
+from emulator.training.problem import prepare
 from emulator.training.start import with_network_of
-from emulator.training.trainer import prepare
 from network_support import SMALL, untrained
 
 PLAN = Plan(objective="energy", steps=12, batch=2, checkpoint_every=5)
@@ -46,9 +46,9 @@ def whole(other, start, tmp_path_factory):
     return train(other, PLAN, tmp_path_factory.mktemp("whole"), start=start)
 
 
-def kill_after(writes, module, monkeypatch):
+def kill_after(writes, monkeypatch):
     """Stop a training after so many checkpoints."""
-    write, kept = module.write_checkpoint, []
+    write, kept = Writer.write, []
 
     def killed(*arguments):
         write(*arguments)
@@ -56,21 +56,22 @@ def kill_after(writes, module, monkeypatch):
         if len(kept) == writes:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "write_checkpoint", killed)
+    monkeypatch.setattr(Writer, "write", killed)
 
 
 def test_before_any_step_the_network_is_the_other_ones(other, own, start):
     problem = prepare(other, PLAN, start=start)
     emulator, own = problem.emulator, own.emulator
-    same(emulator.weights, start.weights)
-    assert emulator.architecture == SMALL
-    np.testing.assert_array_equal(emulator.scale, own.scale)
-    np.testing.assert_array_equal(emulator.series.displacement, own.series.displacement)
+    network = emulator.network
+    same(network.weights, start.network.weights)
+    assert network.architecture == SMALL
+    np.testing.assert_array_equal(network.scale, own.network.scale)
+    np.testing.assert_array_equal(emulator.taylor.displacement, own.taylor.displacement)
     # The prediction by hand: the old network on the new graph, in the new scale, on the new series.
     theta = other.theta(mu=60.0, lam=70.0)
-    decoder, prepared = own.prepared(start.weights)
-    raw = np.asarray(decoder(prepared, own.normalise(theta)), dtype=float)
-    expected = np.asarray(own.series.displacement) + own.scale * raw
+    decoder, prepared = own.network.prepare(start.network.weights)
+    raw = np.asarray(decoder(prepared, own.network.normalise(other.to_unit(theta))), dtype=float)
+    expected = np.asarray(own.taylor.displacement) + own.network.scale * raw
     expected[other.held] = other.held_displacement[other.held]
     np.testing.assert_allclose(emulator(theta), expected, atol=1e-7)
     assert np.abs(emulator(theta) - own(theta)).max() > 1e-3
@@ -78,11 +79,9 @@ def test_before_any_step_the_network_is_the_other_ones(other, own, start):
 
 def test_training_leaves_the_emulator_it_started_from(whole, start, beam):
     # A step consumes the weights it is given; these were a copy.
-    same(start.weights, untrained(beam).weights)
-    assert any(
-        (a != b).any()
-        for a, b in zip(jax.tree.leaves(whole.weights), jax.tree.leaves(start.weights), strict=True)
-    )
+    same(start.network.weights, untrained(beam).network.weights)
+    pairs = [jax.tree.leaves(e.network.weights) for e in (whole, start)]
+    assert any((a != b).any() for a, b in zip(*pairs, strict=True))
 
 
 def test_where_a_training_started_is_recorded(whole, start, tmp_path):
@@ -99,15 +98,13 @@ def test_where_a_training_started_is_recorded(whole, start, tmp_path):
 def test_a_started_run_killed_resumes_without_its_start(
     other, start, whole, tmp_path, monkeypatch, writes
 ):
-    from emulator.training import trainer
-
     with monkeypatch.context() as patch:
-        kill_after(writes, trainer, patch)
+        kill_after(writes, patch)
         with pytest.raises(KeyboardInterrupt):
             train(other, PLAN, tmp_path, start=start)
     # Neither the start nor its architecture is said again.
     resumed = train(other, Plan(), tmp_path, resume=True)
-    same(resumed.weights, whole.weights)
+    same(resumed.network.weights, whole.network.weights)
     assert resumed.record["start"] == whole.record["start"]
 
 
@@ -122,7 +119,8 @@ def test_what_cannot_be_started_from(beam, other, cube, start, tmp_path):
     refused(other, replace(PLAN, decoder="separable"), "decoder='pointwise'.*'separable'")
     refused(cube, PLAN, "'once_clamped_beam' has parameters mu, lam; 'twisting_cube' has")
     refused(other, replace(PLAN, decoder="separable", order=2), "modes mean nothing on another")
-    refused(other, PLAN, "modes mean nothing", start=em.load("once_clamped_beam"))
+    nothing = "'once_clamped_beam' has no network to start from, only taylor . discrepancy"
+    refused(other, PLAN, nothing, start=em.load("once_clamped_beam"))
     refused(other, recipe("mechanics"), "recipe 'mechanics' trains no network")
     clamped = em.Support("right", np.array([0.0, 0.0, -0.1]))
     moved = replace(other, supports=(*other.supports, clamped))
@@ -141,35 +139,33 @@ def pretrained(beam, other, tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_family_shares_one_network(beam, other, own, pretrained):
-    same(pretrained[0].weights, pretrained[1].weights)
+    same(pretrained[0].network.weights, pretrained[1].network.weights)
     assert [e.scene for e in pretrained] == [beam, other]
-    np.testing.assert_array_equal(pretrained[1].scale, own.emulator.scale)
-    same(pretrained[1].graph.edge_features, own.emulator.graph.edge_features)
+    np.testing.assert_array_equal(pretrained[1].network.scale, own.emulator.network.scale)
+    same(pretrained[1].network.graph.edge_features, own.emulator.network.graph.edge_features)
     assert pretrained[0].record["family"] == [beam.fingerprint, other.fingerprint]
 
 
 def test_a_family_takes_its_scenes_in_turn(beam, own, pretrained):
     problems = [prepare(beam, FAMILY, SMALL), own]
-    weights = with_network_of(problems[0].emulator, problems[1].emulator).weights
+    weights = with_network_of(problems[0].emulator, problems[1].emulator).network.weights
     state = problems[0].optimiser.init(weights)
     for number in range(FAMILY.steps):
         weights, state, _ = problems[number % 2].step(
             weights, state, jnp.asarray(number), jnp.asarray(FAMILY.steps)
         )
-    same(weights, pretrained[0].weights)
+    same(weights, pretrained[0].network.weights)
 
 
 @pytest.mark.slow
 def test_a_family_killed_resumes_to_the_same(beam, other, pretrained, tmp_path, monkeypatch):
-    from emulator.training import family
-
     scenes = [beam, other]
     with monkeypatch.context() as patch:
-        kill_after(1, family, patch)
+        kill_after(1, patch)
         with pytest.raises(KeyboardInterrupt):
             pretrain(scenes, FAMILY, tmp_path, architecture=SMALL)
     resumed = pretrain(scenes, Plan(), tmp_path, resume=True)
-    same(resumed[0].weights, pretrained[0].weights)
+    same(resumed[0].network.weights, pretrained[0].network.weights)
     with pytest.raises(InputError, match="belongs to another scene"):
         pretrain(scenes[::-1], FAMILY, tmp_path, resume=True)
 
@@ -177,7 +173,7 @@ def test_a_family_killed_resumes_to_the_same(beam, other, pretrained, tmp_path, 
 def test_families_that_cannot_be(beam, cube, tmp_path):
     with pytest.raises(InputError, match="no scene is given"):
         pretrain([], FAMILY, tmp_path)
-    with pytest.raises(InputError, match="learns a residual, which belongs to one scene"):
+    with pytest.raises(InputError, match="fits a discrepancy model, which belongs to one"):
         pretrain([beam], recipe("hybrid"), tmp_path)
     with pytest.raises(InputError, match="'twisting_cube' has E, nu"):
         pretrain([beam, cube], FAMILY, tmp_path, architecture=SMALL)

@@ -9,11 +9,14 @@ import emulator as em
 from emulator.error.comparison import evaluate
 from emulator.errors import InputError
 from emulator.fem import run_campaign, sobol, uniform
-from emulator.surrogates import Architecture
+from emulator.geometry.quadratic import to_quadratic
+from emulator.surrogates import Architecture, Emulator
 from emulator.training import Plan, recipe, train
-from emulator.training.checkpoint import CHECKPOINT
-from emulator.training.objectives import OBJECTIVES, Batch, Scales, make_loss
-from emulator.training.trainer import WARMUP, learning_rate
+from emulator.training.checkpoint import CHECKPOINT, Writer
+from emulator.training.objectives import Batch, Scales, make_loss
+from emulator.training.plan import OBJECTIVES
+from emulator.training.problem import _scales, prepare
+from emulator.training.step import WARMUP, learning_rate
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 SCALES = Scales(displacement=2.0, gradient=0.3, energy=7.0)
@@ -43,9 +46,7 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
     plan = Plan(steps=30, simulations=8, batch=4, checkpoint_every=10)
     whole = train(beam, plan, tmp_path / "whole", architecture=SMALL)
 
-    from emulator.training import trainer
-
-    write, kept = trainer.write_checkpoint, []
+    write, kept = Writer.write, []
 
     def kill_after_second(*arguments):
         write(*arguments)
@@ -53,13 +54,14 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
         if len(kept) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer, "write_checkpoint", kill_after_second)
+    monkeypatch.setattr(Writer, "write", kill_after_second)
     with pytest.raises(KeyboardInterrupt):
         train(beam, plan, tmp_path / "killed", architecture=SMALL)
-    monkeypatch.setattr(trainer, "write_checkpoint", write)
+    monkeypatch.setattr(Writer, "write", write)
     # The plan comes from the checkpoint, not from the call.
     resumed = train(beam, Plan(), tmp_path / "killed", architecture=SMALL, resume=True)
-    for a, b in zip(jax.tree.leaves(whole.weights), jax.tree.leaves(resumed.weights), strict=True):
+    leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
+    for a, b in zip(*leaves, strict=True):
         np.testing.assert_array_equal(a, b)
     assert resumed.record["plan"] == whole.record["plan"]
 
@@ -78,11 +80,9 @@ def test_resuming_needs_a_checkpoint_of_this_scene(beam, cube, tmp_path):
 
 
 def test_a_step_without_a_finite_gradient_is_not_taken(beam):
-    from emulator.training.trainer import prepare
-
     plan = Plan(steps=10, simulations=4, batch=2)
     problem = prepare(beam, plan, SMALL)
-    leaves, structure = jax.tree.flatten(problem.emulator.weights)
+    leaves, structure = jax.tree.flatten(problem.emulator.network.weights)
     leaves[3] = jnp.full_like(leaves[3], jnp.nan)
     weights = jax.tree.unflatten(structure, leaves)
     state = problem.optimiser.init(weights)
@@ -209,8 +209,6 @@ def test_other_objectives_do_not_know_the_scale_of_gradients(beam, tests, object
 
 def test_both_terms_of_gradients_are_one_at_the_centre(beam):
     """Over the runs its scales were taken from."""
-    from emulator.training.trainer import _scales, prepare
-
     plan = Plan(objective="gradients", steps=1, simulations=8, batch=4)
     runs = prepare(beam, plan, SMALL).runs
     _, scales = _scales(beam, plan, runs)
@@ -239,7 +237,7 @@ HYBRID = Plan(
     objective="energy",
     order=2,
     decoder="separable",
-    residual=True,
+    discrepancy=True,
     simulations=11,
     steps=30,
     freeze=10,
@@ -256,24 +254,26 @@ def hybrid(beam, tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
-    series = replace(hybrid, residual=None, base="series")
+    series = Emulator(
+        beam, taylor=prepare(beam, replace(HYBRID, steps=0, simulations=1)).emulator.taylor
+    )
     before, after = (
         evaluate(e.cache(), tests.theta, tests.displacement)["err_u"]["median"]
         for e in (series, hybrid)
     )
     assert after < 0.05 * before
-    chosen = hybrid.record["residual"]
+    chosen = hybrid.record["discrepancy"]
     assert chosen["runs"] == 12
     errors = chosen["held_out_err_u_mm"]
-    assert chosen["base"] == hybrid.base == min(errors, key=errors.get)
+    assert list(errors) == ["nothing", "taylor", "taylor + network"]
+    assert chosen["on"] == min(errors, key=errors.get)
+    assert " + ".join([chosen["on"], "discrepancy"]) == " + ".join(hybrid.parts)
 
 
 @pytest.mark.parametrize("writes", [pytest.param(3, marks=pytest.mark.slow), 5])
 def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatch, hybrid, writes):
-    """After its modes are frozen, and in the residual's fit."""
-    from emulator.training import trainer
-
-    write, kept = trainer.write_checkpoint, []
+    """After its modes are frozen, and while the discrepancy model is fitted."""
+    write, kept = Writer.write, []
 
     def killed(*arguments):
         write(*arguments)
@@ -281,25 +281,22 @@ def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatc
         if len(kept) == writes:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer, "write_checkpoint", killed)
+    monkeypatch.setattr(Writer, "write", killed)
     with pytest.raises(KeyboardInterrupt):
         train(beam, HYBRID, tmp_path, architecture=SMALL)
-    monkeypatch.setattr(trainer, "write_checkpoint", write)
+    monkeypatch.setattr(Writer, "write", write)
     resumed = train(beam, Plan(), tmp_path, architecture=SMALL, resume=True)
     assert resumed.fingerprint == hybrid.fingerprint
     assert resumed.record["plan"] == hybrid.record["plan"]
 
 
 def test_frozen_modes_do_not_move(beam):
-    from emulator.training.trainer import prepare
-
     problem = prepare(beam, HYBRID, SMALL)
-    weights = jax.tree.map(jnp.copy, problem.emulator.weights)
-    state = problem.optimiser.init(weights)
+    weights, state = problem.initial()
     number, total = jnp.asarray(0), jnp.asarray(30)
     for _ in range(2):  # momentum that would move them
         weights, state, _ = problem.step(weights, state, number, total)
-    kept = problem.emulator.prepared(weights)[1]
+    kept = problem.emulator.network.prepare(weights)[1]
     before = jax.tree.map(np.array, weights)
     weights, state, _ = problem.step(weights, state, number, total, kept)
     moved = {
@@ -311,7 +308,7 @@ def test_frozen_modes_do_not_move(beam):
     }
     assert moved
     assert all("branch" in name for name in moved)
-    np.testing.assert_array_equal(problem.emulator.prepared(weights)[1], kept)
+    np.testing.assert_array_equal(problem.emulator.network.prepare(weights)[1], kept)
 
 
 def test_the_papers_recipe_is_the_papers():
@@ -332,11 +329,60 @@ def test_plans_that_contradict_themselves():
         Plan(order=5)
 
 
-def test_mechanics_alone(beam, tests, tmp_path):
-    """No network: none is evaluated, and resuming before the residual's fit changes nothing."""
+def test_mechanics_builds_no_network(beam, tests, tmp_path, monkeypatch):
+    """No graph, no clustering, no array of a network; resumed, it is the same emulator."""
+
+    def never(*_):
+        raise AssertionError("a graph was built")
+
+    monkeypatch.setattr("emulator.training.problem.augment", never)
     plan = replace(recipe("mechanics"), simulations=5, order=2)
     emulator = train(beam, plan, tmp_path)
-    assert emulator.base == "series"
+    assert list(emulator.parts) == ["taylor", "discrepancy"]
     report = evaluate(emulator.cache(), tests.theta, tests.displacement)
     assert report["err_u"]["median"] < 1e-2
+    assert emulator.record["final_loss"] is None
     assert train(beam, Plan(), tmp_path, resume=True).fingerprint == emulator.fingerprint
+
+
+def test_mechanics_on_a_quadratic_ventricle(tmp_path):
+    """Mid-side nodes, mean dilatation, nearly incompressible: held-out FEM within micrometres."""
+    linear = em.scenes.left_ventricle(rings=2, around=6, layers=1)
+    scene = replace(linear, mesh=to_quadratic(linear.mesh), dilatation="mean", origin={})
+    plan = replace(recipe("mechanics"), simulations=8, order=2)
+    emulator = train(scene, plan, tmp_path)
+    known = run_campaign(em.Simulator(scene), sobol(scene, 3, seed=5))
+    report = evaluate(emulator.cache(), known.theta, known.displacement)
+    assert report["err_u"]["median"] < 0.02 * report["max_u"]["median"]
+
+
+def test_a_network_on_a_quadratic_mesh(tmp_path):
+    """Energy lowers from the centre's solution on."""
+    linear = em.scenes.once_clamped_beam(cells=(2, 1, 1))
+    scene = replace(linear, mesh=to_quadratic(linear.mesh), origin={})
+    emulator = train(
+        scene, Plan(objective="energy", steps=20, batch=4), tmp_path, architecture=SMALL
+    )
+    assert emulator.network.graph.real == len(scene.mesh.nodes)
+    thetas = uniform(scene, 16, jax.random.key(1))
+    Pi = jax.vmap(em.potential_energy(scene))
+    before = replace(emulator, network=None)
+    trained, untrained = (float(Pi(e.cache()(thetas), thetas).mean()) for e in (emulator, before))
+    assert trained < untrained
+
+
+def test_an_aim_follows_the_clock(monkeypatch):
+    """Steps of 1 s against a deadline in 1000 s, then of 2 s; no more than the plan's."""
+    from emulator.training import budget
+    from emulator.training.checkpoint import State
+
+    now = [0.0]
+    monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
+    aim = budget.Aim(1000.0, Plan())
+    now[0] = 200.0
+    assert aim(State({}, (), 200, 0.0), 5000) == 1000
+    now[0] = 600.0
+    assert aim(State({}, (), 400, 0.0), 1000) == 400 + int(400.0 / 1.5)
+    assert aim(State({}, (), 401, 0.0), 666) == 666
+    late = budget.Aim(0.0, Plan(recipe="hybrid", discrepancy=True, steps=300))
+    assert late(State({}, (), 200, 0.0), 300) == 200

@@ -15,6 +15,7 @@ from calibrate.cli.common import (
     seconds,
     show_progress,
 )
+from emulator.training.plan import OBJECTIVES, RECIPES
 
 
 def register(commands: Any) -> None:
@@ -23,19 +24,19 @@ def register(commands: Any) -> None:
     add_scene(parser)
     parser.add_argument(
         "--recipe",
-        choices=("hybrid", "mechanics", "network", "paper"),
-        help="default hybrid: Taylor series, network trained on the energy, residual of FEM runs; "
-        "mechanics: the same without the network, in a minute",
+        choices=tuple(RECIPES),
+        help="default hybrid: Taylor series, network trained on the energy, discrepancy model of "
+        "FEM runs; mechanics: the same without the network, in a minute",
     )
     parser.add_argument(
         "--start",
         metavar="EMULATOR",
-        help="begin from the network of this emulator (shipped name or folder), whatever its mesh; "
-        "the recipe then is network unless another is given",
+        help="begin from the network of this emulator (a folder), whatever its mesh; the recipe "
+        "then is network unless another is given",
     )
     parser.add_argument(
         "--objective",
-        choices=("energy", "simulations", "gradients", "both"),
+        choices=OBJECTIVES,
         help="what the network is trained on: the energy; FEM displacements; those and their "
         "deformation gradients; FEM displacements and the energy",
     )
@@ -103,9 +104,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def command_line(scene: str, record: Mapping[str, Any]) -> str:
-    """The command that repeats a training exactly, whatever interrupted or hurried it."""
+    """The command that repeats a training exactly, with the steps and runs it really took."""
     names = ("recipe", "objective", "steps", "simulations", "batch", "seed")
     options = " ".join(f"--{name} {record['plan'][name]}" for name in names)
-    # Which emulator it started from is in the record, by its fingerprint.
+    # The record names the emulator training started from by its fingerprint, not by its folder.
     start = " --start EMULATOR" if "start" in record else ""
     return f"calibrate train {scene} {options}{start} --out DIR"

@@ -1,5 +1,6 @@
-"""What is left between a map and FEM, learned from a few runs and their slopes."""
+"""Discrepancy models: what a map leaves of FEM, learned from a few runs and their sensitivities."""
 
-from emulator.surrogates.discrepancy.fit import Mean, Residual, fit_residual
+from emulator.surrogates.discrepancy.fit import Mean, fit_discrepancy
+from emulator.surrogates.discrepancy.model import Discrepancy, Warp
 
-__all__ = ["Mean", "Residual", "fit_residual"]
+__all__ = ["Discrepancy", "Mean", "Warp", "fit_discrepancy"]

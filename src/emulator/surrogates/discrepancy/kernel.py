@@ -1,6 +1,6 @@
-r"""Gaussian processes of values and slopes, several outputs sharing one kernel.
+r"""Gaussian processes of values and derivatives, several outputs sharing one kernel.
 
-The kernel is Matern's of smoothness 7/2 (three times differentiable) of the squared distance
+The kernel is Matérn's of smoothness 7/2 (three times differentiable) of the squared distance
 
 .. math:: \rho = |\Lambda\,[\psi(x) - \psi(y)]|^2, \qquad
           a = \sqrt{7\rho}, \qquad
@@ -17,9 +17,9 @@ between features :math:`\psi` of two inputs, scaled by inverse lengths :math:`\L
     \kappa'' = \tfrac{49}{60}(1 + a) e^{-a}, \quad
     \kappa''' = -\tfrac{343}{120} e^{-a}
 
-so a run's value and p slopes are p + 1 observations. None of these is singular where two inputs
-meet (Solak et al. 2003; Rasmussen & Williams 2006, Section 9.4). JAX is told them: through the root
-it would lose four digits there.
+so a run's value and p derivatives are p + 1 observations. None of these is singular where two
+inputs coincide (Solak et al. 2003; Rasmussen & Williams 2006, Section 9.4). JAX is given them as
+differentiation rules: differentiating the root itself would lose four digits there.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ _LOG_BOUNDS = (-6.0, 3.0)  # of inverse lengths, inputs being of order one
 
 
 class Features(NamedTuple):
-    """Features (c, q) of c inputs and their derivatives (c, q, p), not yet scaled."""
+    """Features (c, q) of c inputs and their derivatives (c, q, p), scaled or not."""
 
     value: jax.Array
-    slope: jax.Array
+    derivative: jax.Array
 
     def scaled(self, inverse_lengths: jax.Array) -> Features:
-        """The same divided by their lengths."""
-        return Features(self.value * inverse_lengths, self.slope * inverse_lengths[:, None])
+        """Features and derivatives divided by their lengths."""
+        return Features(self.value * inverse_lengths, self.derivative * inverse_lengths[:, None])
 
 
 class Radial(NamedTuple):
@@ -61,7 +61,7 @@ def radial(squared: jax.Array) -> Radial:
 
 
 def _root(squared: jax.Array) -> jax.Array:
-    return jnp.sqrt(7.0 * squared + 1e-24)  # the root's own slope is infinite at zero
+    return jnp.sqrt(7.0 * squared + 1e-24)  # the root's own derivative is infinite at zero
 
 
 @jax.custom_jvp
@@ -88,7 +88,7 @@ _second.defjvps(lambda change, _, squared: -343.0 / 120.0 * jnp.exp(-_root(squar
 
 
 def covariance(features: Features) -> jax.Array:
-    """Covariance (c (1 + p), c (1 + p)) of values and slopes, run by run, of scaled features."""
+    """Covariance (c (1 + p), c (1 + p)) of the runs' values and derivatives, features scaled."""
     psi, J = features
     count, parameters = len(psi), J.shape[2]
     gap = psi[:, None] - psi[None]
@@ -104,22 +104,22 @@ def covariance(features: Features) -> jax.Array:
 
 
 def _factor(features: Features) -> tuple[jax.Array, jax.Array]:
-    """Standard deviations (N,) of the observations, and the factor of their correlations."""
+    """Prior standard deviations (N,) of the observations, and the factor of their correlations."""
     K = covariance(features)
-    spread = jnp.sqrt(jnp.diagonal(K))
-    correlation = K / spread[:, None] / spread + JITTER * jnp.eye(len(K))
-    return spread, jnp.linalg.cholesky(correlation)
+    sd = jnp.sqrt(jnp.diagonal(K))
+    correlation = K / sd[:, None] / sd + JITTER * jnp.eye(len(K))
+    return sd, jnp.linalg.cholesky(correlation)
 
 
 def misfit(features: Features, observations: jax.Array) -> jax.Array:
-    """Negative log-likelihood a number observed, but for a constant, of scaled features.
+    """Negative log-likelihood per observed number, up to a constant, of scaled features.
 
-    Each output's variance is the most likely one, the mean square of its whitened observations.
+    Each output has its most likely variance, the mean square of its whitened observations.
     """
-    spread, factor = _factor(features)
-    white = solve_triangular(factor, observations / spread[:, None], lower=True)
+    sd, factor = _factor(features)
+    white = solve_triangular(factor, observations / sd[:, None], lower=True)
     variances = jnp.mean(white**2, axis=0)
-    determinant = jnp.mean(jnp.log(jnp.diagonal(factor)) + jnp.log(spread))
+    determinant = jnp.mean(jnp.log(jnp.diagonal(factor)) + jnp.log(sd))
     return 0.5 * jnp.mean(jnp.log(variances)) + determinant
 
 
@@ -128,7 +128,7 @@ def fit_lengths(features: Features, observations: jax.Array) -> np.ndarray:
 
     Parameters
     ----------
-    observations : (c (1 + p), r) values and slopes of r outputs, run by run.
+    observations : (c (1 + p), r) values and derivatives of r outputs, run by run.
     """
 
     @jax.jit
@@ -137,14 +137,14 @@ def fit_lengths(features: Features, observations: jax.Array) -> np.ndarray:
         return misfit(features.scaled(jnp.exp(logs)), observations)
 
     def safe(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = (np.asarray(part) for part in objective(jnp.asarray(logs)))
-        if np.isfinite(value) and np.isfinite(slope).all():
-            return float(value), slope
-        return 1e10, np.zeros_like(logs)  # a step the line search takes back
+        value, gradient = (np.asarray(part) for part in objective(jnp.asarray(logs)))
+        if np.isfinite(value) and np.isfinite(gradient).all():
+            return float(value), gradient
+        return 1e10, np.zeros_like(logs)  # so high that the line search rejects the step
 
     count = features.value.shape[1]
     start = np.zeros(count)
-    start[features.slope.shape[2] :] = -1.0
+    start[features.derivative.shape[2] :] = -1.0
     found = minimize(
         safe, start, jac=True, method="L-BFGS-B", bounds=[_LOG_BOUNDS] * count,
         options={"maxiter": 80},
@@ -154,24 +154,29 @@ def fit_lengths(features: Features, observations: jax.Array) -> np.ndarray:
 
 def fit_weights(features: Features, observations: jax.Array) -> jax.Array:
     """Weights (c (1 + p), r) that make the mean pass through the observations."""
-    spread, factor = _factor(features)
-    return cho_solve((factor, True), observations / spread[:, None]) / spread[:, None]
+    sd, factor = _factor(features)
+    return cho_solve((factor, True), observations / sd[:, None]) / sd[:, None]
 
 
 def fold(features: Features, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Weights of the values (c, r), and those of the slopes folded with the features (c, q, r)."""
-    count, _, parameters = features.slope.shape
+    """Weights of the values (c, r), and of the derivatives in feature space (c, q, r).
+
+    A derivative in position acts through the features' derivatives, so its p weights are q here.
+    """
+    count, _, parameters = features.derivative.shape
     each = weights.reshape(count, 1 + parameters, -1)
-    return each[:, 0], jnp.einsum("cqp,cpr->cqr", features.slope, each[:, 1:])
+    return each[:, 0], jnp.einsum("cqp,cpr->cqr", features.derivative, each[:, 1:])
 
 
-def mean(at: jax.Array, known: jax.Array, values: jax.Array, slopes: jax.Array) -> jax.Array:
+def mean(
+    at: jax.Array, known: jax.Array, value_weights: jax.Array, derivative_weights: jax.Array
+) -> jax.Array:
     """Posterior mean (r,) at scaled features ``at`` (q,).
 
-    known : (c, q) scaled features of the runs. values, slopes : from :func:`fold`.
+    known : (c, q) scaled features of the runs. Weights (c, r) and (c, q, r) : :func:`fold`.
     """
     gap = at - known
     k = radial(jnp.sum(gap**2, axis=-1))
-    count, width, outputs = slopes.shape
+    count, width, outputs = derivative_weights.shape
     along = (-2.0 * k.first[:, None] * gap).reshape(count * width)
-    return k.value @ values + along @ slopes.reshape(count * width, outputs)
+    return k.value @ value_weights + along @ derivative_weights.reshape(count * width, outputs)

@@ -1,8 +1,11 @@
 """The augmented graph: mesh nodes and edges, and coarser layers of virtual nodes above them.
 
 Messages travel one edge a step, so K steps over mesh edges alone reach K elements far. Virtual
-nodes, found by k-means on the layer below and joined to their kappa nearest neighbours, carry
-them across the body (Dalton et al. 2023, Section 2.2).
+nodes, the centres of a k-means clustering of the layer below and joined to their kappa nearest
+neighbours, carry messages across the body (Dalton et al. 2023, Section 2.2).
+
+The mid-side nodes of quadratic tetrahedra are nodes of the graph, joined to the two corners of
+their edge; they replace the edge between those corners.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from sklearn.neighbors import NearestNeighbors
 
 from emulator.errors import InputError
 from emulator.geometry.mesh import frozen_array
+from emulator.geometry.tetrahedra import EDGES
 from emulator.scenes.scene import Scene
 
 
@@ -35,13 +39,18 @@ class AugmentedGraph:
     receivers: np.ndarray
     real: int
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The four arrays by name."""
+        names = ("node_features", "edge_features", "senders", "receivers")
+        return {name: getattr(self, name) for name in names}
+
 
 @dataclass(frozen=True)
 class GraphOptions:
     """Shape of the virtual layers.
 
     cluster : nodes of a layer for each node of the layer above it, on average.
-    smallest : a layer would have fewer nodes than this: stop. The last layer is fully joined.
+    smallest : fewest nodes of a layer. All nodes of the last layer are joined to each other.
     neighbours : kappa, nearest neighbours each virtual node is joined to.
     """
 
@@ -51,8 +60,7 @@ class GraphOptions:
 
 
 def augment(scene: Scene, options: GraphOptions = GraphOptions()) -> AugmentedGraph:
-    """The augmented graph of a scene's mesh, the same every time."""
-    scene.mesh.require_linear("the emulator's graph")
+    """The augmented graph of a scene's mesh; equal for equal scenes."""
     features = node_inputs(scene)
     positions = scene.mesh.nodes
     edges = [mesh_edges(scene.mesh.elements)]
@@ -87,9 +95,10 @@ def augment(scene: Scene, options: GraphOptions = GraphOptions()) -> AugmentedGr
 
 
 def node_inputs(scene: Scene) -> np.ndarray:
-    """Raw features of the mesh nodes, (n, d): where held, the held displacement if any, position.
+    """Features (n, d) of the mesh nodes: held components, prescribed displacement, position.
 
-    Positions are relative to the body's middle, so moving the body changes nothing.
+    The displacement is left out where all prescribed ones are zero. Positions are relative to the
+    mean of the nodes, so that a translated body has the same features.
     """
     columns = [scene.held.astype(float)]
     if scene.held_displacement.any():
@@ -99,8 +108,15 @@ def node_inputs(scene: Scene) -> np.ndarray:
 
 
 def mesh_edges(elements: np.ndarray) -> np.ndarray:
-    """Pairs of nodes (e, 2) joined by an edge of a tetrahedron, each once."""
-    pairs = np.concatenate([elements[:, list(pair)] for pair in combinations(range(4), 2)])
+    """Pairs of nodes (e, 2) joined by an edge of a tetrahedron (m, 4 or 10), each once.
+
+    The edge a, b of a quadratic tetrahedron is two: a to its mid-side node and that node to b.
+    """
+    if elements.shape[1] == 4:
+        local = list(EDGES)
+    else:
+        local = [(end, 4 + k) for k, edge in enumerate(EDGES) for end in edge]
+    pairs = np.concatenate([elements[:, list(pair)] for pair in local])
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
@@ -125,5 +141,5 @@ def _nearest(positions: np.ndarray, neighbours: int) -> np.ndarray:
 
 def _normalise(values: np.ndarray) -> np.ndarray:
     """Each column with mean 0 and standard deviation 1; a constant column becomes 0."""
-    spread = values.std(axis=0)
-    return (values - values.mean(axis=0)) / np.where(spread > 1e-12, spread, 1.0)
+    sd = values.std(axis=0)
+    return (values - values.mean(axis=0)) / np.where(sd > 1e-12, sd, 1.0)

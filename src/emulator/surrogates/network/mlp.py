@@ -1,4 +1,4 @@
-"""The multilayer perceptron every stage is made of."""
+"""The multilayer perceptron that encoders, messages and decoders consist of."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from flax import nnx
 
 
 class MLP(nnx.Module):
-    """Dense layers with CELU between them, on an input that is several parts side by side.
+    """Dense layers with CELU between them, on an input concatenated from several parts.
 
-    The first layer of a concatenation is the sum of one product a part,
-    ``[a, b] @ W = a @ W_a + b @ W_b``, so a part shared by many rows (theta by all nodes, a node
-    by all its edges) is multiplied once and then spread: :meth:`project`, then :meth:`finish`.
+    The first layer is linear in each part, ``[a, b] @ W = a @ W_a + b @ W_b``, so a part shared by
+    many rows (theta by all nodes, a node by all its edges) is multiplied once and the product
+    copied: :meth:`project` each part, add, then :meth:`finish`.
 
     Parameters
     ----------
@@ -51,13 +51,13 @@ class MLP(nnx.Module):
         self.norm = nnx.LayerNorm(out, param_dtype=jnp.float32, rngs=rngs) if layer_norm else None
 
     def project(self, part: int, values: jax.Array) -> jax.Array:
-        """What part ``part`` adds to the first layer, (..., hidden[0])."""
+        """Contribution (..., hidden[0]) of part number ``part`` to the first layer."""
         start = sum(self.parts[:part])
         kernel = self.layers[0].kernel[start : start + self.parts[part]]
         return values.astype(kernel.dtype) @ kernel
 
     def finish(self, first: jax.Array) -> jax.Array:
-        """The output (..., out) from the summed projections."""
+        """The output (..., out) from the sum of all projections."""
         bias = self.layers[0].bias
         x = first if bias is None else first + bias
         for layer in self.layers[1:]:
@@ -65,5 +65,5 @@ class MLP(nnx.Module):
         return x if self.norm is None else self.norm(x)
 
     def __call__(self, *values: jax.Array) -> jax.Array:
-        """The output (..., out) from the parts themselves."""
+        """The output (..., out) from all parts."""
         return self.finish(reduce(jnp.add, (self.project(k, v) for k, v in enumerate(values))))

@@ -6,19 +6,20 @@ Encode every node and edge; pass K rounds of messages
     m_{ij} = \phi_e(e_{ij}, v_i, v_j), \quad m_{ji} = -m_{ij}, \qquad
     v_i \leftarrow v_i + \phi_v\Big(v_i, \sum_j m_{ij}\Big), \quad e_{ij} \leftarrow e_{ij} + m_{ij}
 
-(equal and opposite, as forces are); take :math:`z_i = \text{LN}(v_i, \sum_j e_{ij})` of the real
-nodes; and decode. The pointwise decoder, the paper's, has a network of :math:`z_i` and an encoding
-of theta for each displacement component. The separable one is
-:math:`\sum_k c_k(\theta)\, \phi_k(z_i)`: a branch that knows only theta and a trunk that knows
-only the node, so that the modes :math:`\phi_k` can be kept and a field is one matrix product. Modes
-found by mechanics may stand beside the learned ones. Nothing before the decoder knows theta, so it
-is run once per geometry.
+(equal and opposite, as forces are); take :math:`z_i = \text{LN}(v_i, \sum_j e_{ij})` of the mesh
+nodes; and decode. The pointwise decoder, the paper's, applies to :math:`z_i` and an encoding of
+theta one network for each displacement component. The separable decoder is
+:math:`\sum_k c_k(\theta)\, \phi_k(z_i)`, with a branch network :math:`c` of theta and a trunk
+network :math:`\phi` of the node, so that the modes :math:`\phi_k` can be kept and a displacement is
+one matrix product. Modes computed from mechanics may be added to the learned ones. Encoders and
+messages do not depend on theta and are evaluated once a geometry.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, Self
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +51,11 @@ class Architecture:
         if self.decoder not in ("pointwise", "separable"):
             raise InputError(f"decoder '{self.decoder}': use pointwise or separable")
 
+    @classmethod
+    def from_json(cls, description: Mapping[str, Any]) -> Self:
+        """The architecture with these fields, JSON's lists turned into tuples."""
+        return cls(**{**description, "hidden": tuple(description["hidden"])})
+
 
 class MessagePassing(nnx.Module):
     """One round of messages along every edge."""
@@ -80,7 +86,7 @@ def antisymmetric_sum(messages: jax.Array, graph: AugmentedGraph) -> jax.Array:
 
 
 class Processor(nnx.Module):
-    """Geometry to the state of each mesh node; theta plays no part."""
+    """Geometry to the state of each mesh node, for all theta alike."""
 
     def __init__(
         self, architecture: Architecture, node_width: int, edge_width: int, rngs: nnx.Rngs
@@ -106,9 +112,9 @@ class Processor(nnx.Module):
 def _recomputed(
     one_round: MessagePassing, nodes: jax.Array, edges: jax.Array, graph: AugmentedGraph
 ) -> tuple[jax.Array, jax.Array]:
-    """One round whose insides the backward pass computes again instead of keeping.
+    """One round whose intermediate values the backward pass computes again instead of storing.
 
-    Keeping them takes 79 MB for the beam, fresh pages at every step: recomputing is 1.4 times
+    Storing them takes 79 MB for the beam, allocated anew at every step: recomputing is 1.4 times
     faster (26.5 against 38.8 ms for the gradient of the processor on 2 cores).
     """
     structure, weights = nnx.split(one_round)
@@ -119,6 +125,8 @@ def _recomputed(
 
 class PointwiseDecoder(nnx.Module):
     """Node states and theta to displacement, one network a component (Algorithm 1)."""
+
+    linear = False  # its output is not a sum of modes
 
     def __init__(self, architecture: Architecture, parameters: int, rngs: nnx.Rngs) -> None:
         M, hidden = architecture.latent, architecture.hidden
@@ -131,12 +139,12 @@ class PointwiseDecoder(nnx.Module):
         )
 
     def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
-        """The part of each first layer that knows only the node: (3, n, hidden[0])."""
-        del basis  # has no coefficients here
+        """What the node states add to each component's first layer, (3, n, hidden[0])."""
+        del basis  # this decoder has no coefficients
         return jnp.stack([component.project(1, states) for component in self.components])
 
     def __call__(self, prepared: jax.Array, theta: jax.Array) -> jax.Array:
-        """Raw output (..., n, 3) for normalised ``theta`` (..., p) and prepared states."""
+        """Output (..., n, 3) for normalised ``theta`` (..., p), from :meth:`prepare`."""
         encoded = self.encode_theta(theta)
         parts = [
             component.finish(component.project(0, encoded)[..., None, :] + prepared[k])
@@ -146,7 +154,9 @@ class PointwiseDecoder(nnx.Module):
 
 
 class SeparableDecoder(nnx.Module):
-    """Coefficients that know theta times modes that know the node."""
+    """A sum of modes: coefficients of theta times modes of the node."""
+
+    linear = True
 
     def __init__(
         self, architecture: Architecture, parameters: int, fixed: int, rngs: nnx.Rngs
@@ -163,16 +173,16 @@ class SeparableDecoder(nnx.Module):
         self.trunk = MLP((2 * M,), hidden, 3 * architecture.modes, layer_norm=False, rngs=rngs)
 
     def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
-        """Modes (r, n, 3): the given ``basis`` (f, n, 3), then the learned ones."""
+        """All modes (r, n, 3): ``basis`` (f, n, 3), then the learned ones."""
         learned = self.trunk(states).reshape(len(states), 3, -1)
         return jnp.concatenate([basis.astype(learned.dtype), jnp.moveaxis(learned, -1, 0)])
 
     def coefficients(self, theta: jax.Array) -> jax.Array:
-        """Of the modes (..., r) for normalised ``theta`` (..., p)."""
+        """Coefficients (..., r) of the modes for normalised ``theta`` (..., p)."""
         return self.branch(theta)
 
     def __call__(self, prepared: jax.Array, theta: jax.Array) -> jax.Array:
-        """Raw output (..., n, 3)."""
+        """Output (..., n, 3) for normalised ``theta`` (..., p), from :meth:`prepare`."""
         return jnp.tensordot(self.coefficients(theta), prepared, axes=1)
 
 

@@ -49,10 +49,10 @@ def features(points):
 
 @pytest.fixture(scope="module")
 def observations(points):
-    """Three functions with their slopes, run by run."""
+    """Three functions with their derivatives, run by run."""
     f = lambda x: jnp.array([jnp.sin(3.0 * x[0] + x[1]), jnp.exp(x[0] * x[1]), x[1] ** 3 - x[0]])
-    slopes = jax.vmap(jax.jacfwd(f))(points).transpose(0, 2, 1)
-    return jnp.concatenate([jax.vmap(f)(points)[:, None], slopes], axis=1).reshape(-1, 3)
+    derivatives = jax.vmap(jax.jacfwd(f))(points).transpose(0, 2, 1)
+    return jnp.concatenate([jax.vmap(f)(points)[:, None], derivatives], axis=1).reshape(-1, 3)
 
 
 def test_the_kernel_is_materns(features):
@@ -89,7 +89,7 @@ def test_blocks_are_derivatives_of_the_plain_kernel(points, features):
     np.testing.assert_allclose(ours[one, 1:, other, 0], in_x, atol=1e-12)
     mixed = pairs(jax.jacfwd(jax.grad(plain, 1), 0)).transpose(0, 2, 1)
     np.testing.assert_allclose(ours[one, 1:, other, 1:], mixed, atol=1e-11)
-    for k, J in enumerate(features.slope):  # of itself with itself: 1, 0, 7/5 J'J
+    for k, J in enumerate(features.derivative):  # of itself with itself: 1, 0, 7/5 J'J
         expected = np.block([[np.eye(1), np.zeros((1, 2))], [np.zeros((2, 1)), 1.4 * J.T @ J]])
         np.testing.assert_allclose(ours[k, :, k], expected, atol=1e-12)
 
@@ -113,7 +113,7 @@ def predict(x, known):
 
 
 @jax.jit
-def predict_slopes(x, known):
+def predict_derivatives(x, known):
     return jax.jacfwd(predict)(x, known)
 
 
@@ -127,31 +127,31 @@ def test_the_mean_against_textbook_conditioning(points, features, observations, 
     K = np.asarray(covariance(features))
     K = K + JITTER * np.diag(np.diagonal(K))
     for x in (jnp.array([0.31, 0.77]), jnp.array([1.4, -0.3])):
-        value, slopes = across_to(x, points)
-        across = np.concatenate([value[:, None], slopes], axis=1).ravel()
+        value, derivatives = across_to(x, points)
+        across = np.concatenate([value[:, None], derivatives], axis=1).ravel()
         expected = across @ np.linalg.solve(K, np.asarray(observations))
         np.testing.assert_allclose(predict(x, known), expected, atol=1e-8)
 
 
-def test_values_and_slopes_are_met_at_the_runs(points, observations, known):
+def test_values_and_derivatives_are_met_at_the_runs(points, observations, known):
     given = np.asarray(observations).reshape(COUNT, EACH, 3)
-    for x, (value, *slopes) in zip(points, given, strict=True):
+    for x, (value, *derivatives) in zip(points, given, strict=True):
         np.testing.assert_allclose(predict(x, known), value, atol=1e-6)
-        np.testing.assert_allclose(predict_slopes(x, known).T, slopes, atol=1e-6)
+        np.testing.assert_allclose(predict_derivatives(x, known).T, derivatives, atol=1e-6)
 
 
 def test_smooth_at_a_run(points, known):
     """Curvature there is that next to it; reverse mode agrees with forward."""
-    curvature = jax.jit(jax.jacfwd(predict_slopes))
+    curvature = jax.jit(jax.jacfwd(predict_derivatives))
     at, beside = curvature(points[2], known), curvature(points[2] + 1e-7, known)
     assert np.isfinite(at).all()
     np.testing.assert_allclose(at, beside, rtol=1e-4, atol=1e-4)
-    slopes = lambda x: predict_slopes(x, known)
+    derivatives = lambda x: predict_derivatives(x, known)
     step = 1e-4 * jnp.array([1.0, 0.0])
-    central = (slopes(points[2] + step) - slopes(points[2] - step)) / 2e-4
+    central = (derivatives(points[2] + step) - derivatives(points[2] - step)) / 2e-4
     np.testing.assert_allclose(at[:, :, 0], central, rtol=1e-3, atol=1e-3)
     backward = jax.jit(jax.jacrev(predict))(points[2], known)
-    np.testing.assert_allclose(backward, slopes(points[2]), atol=1e-9)
+    np.testing.assert_allclose(backward, derivatives(points[2]), atol=1e-9)
 
 
 def test_misfit_against_scipy(features, observations):

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import emulator as em
 from emulator.geometry.mesh import Mesh
+from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes import Scene, Support
 from emulator.surrogates.network.graph import GraphOptions, augment, mesh_edges
 
@@ -13,6 +16,29 @@ def test_real_edges_are_those_of_the_tetrahedra():
     assert {tuple(edge) for edge in edges} == {
         (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3), (1, 4), (2, 4), (3, 4)
     }  # fmt: skip
+
+
+def test_edges_of_a_quadratic_tetrahedron_go_through_their_middle():
+    assert {tuple(edge) for edge in mesh_edges(np.arange(10)[None])} == {
+        (0, 4), (1, 4), (1, 5), (2, 5), (0, 6), (2, 6), (0, 7), (3, 7), (1, 8), (3, 8), (2, 9), (3, 9)
+    }  # fmt: skip
+
+
+def test_mid_side_nodes_are_nodes_of_the_graph_joined_to_the_ends_of_their_edge(beam):
+    mesh = to_quadratic(beam.mesh)
+    graph = augment(replace(beam, mesh=mesh, origin={}))
+    corners = len(beam.mesh.nodes)
+    assert graph.real == len(mesh.nodes) > 4 * corners
+    within = (graph.senders < graph.real) & (graph.receivers < graph.real)
+    pairs = np.sort(np.column_stack([graph.senders, graph.receivers])[within], axis=1)
+    # Corners meet mid-side nodes only, two corners each, which lie at equal distances.
+    assert (pairs[:, 0] < corners).all()
+    assert (pairs[:, 1] >= corners).all()
+    nodes, counts = np.unique(pairs[:, 1], return_counts=True)
+    assert len(nodes) == len(mesh.nodes) - corners
+    assert (counts == 2).all()
+    ends = pairs[np.argsort(pairs[:, 1], kind="stable"), 0].reshape(-1, 2)
+    np.testing.assert_allclose(mesh.nodes[ends].mean(axis=1), mesh.nodes[nodes], atol=1e-12)
 
 
 def test_every_node_reaches_every_other_in_few_steps():
@@ -40,8 +66,8 @@ def test_features_are_normalised_and_constant_columns_zero():
     graph = augment(em.scenes.once_clamped_beam(cells=(4, 2, 2)))
     for features in (graph.node_features, graph.edge_features):
         np.testing.assert_allclose(features.mean(axis=0), 0.0, atol=1e-5)
-        spread = features.std(axis=0)
-        assert ((np.abs(spread - 1.0) < 1e-4) | (spread == 0.0)).all()
+        sd = features.std(axis=0)
+        assert ((np.abs(sd - 1.0) < 1e-4) | (sd == 0.0)).all()
 
 
 def test_moving_the_body_changes_nothing():

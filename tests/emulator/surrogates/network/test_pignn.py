@@ -8,10 +8,10 @@ from flax import nnx
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.surrogates import Architecture, augment
-from emulator.surrogates.additive import fresh
+from emulator.surrogates import Architecture, Emulator, augment
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.mlp import MLP
+from emulator.surrogates.network.part import fresh
 from emulator.surrogates.network.pignn import Processor, antisymmetric_sum, build
 from emulator.surrogates.taylor import constant
 from network_support import SMALL, untrained
@@ -72,7 +72,8 @@ def test_renumbering_the_nodes_renumbers_the_states(beam):
 
 def test_an_untrained_emulator_is_its_offset(beam):
     offset = np.random.default_rng(0).normal(size=beam.held.shape)
-    emulator = fresh(beam, augment(beam), SMALL, constant(np.full(2, 0.5), offset), np.ones(3), 0)
+    network = fresh(beam, augment(beam), SMALL, np.ones(3), 0)
+    emulator = Emulator(beam, taylor=constant(np.full(2, 0.5), offset), network=network)
     expected = np.where(beam.held, 0.0, offset)
     np.testing.assert_array_equal(emulator(beam.centre), expected)
     np.testing.assert_array_equal(emulator(beam.centre * 1.2), expected)
@@ -109,7 +110,9 @@ def test_only_the_nodes_asked_for_are_decoded(emulator, beam):
         cached.at(np.array([45]))
 
 
-def test_the_processor_is_traced_once(emulator, beam, monkeypatch):
+@pytest.mark.parametrize("decoder", ["pointwise", "separable"])
+def test_the_processor_is_traced_once(beam, monkeypatch, decoder):
+    emulator = untrained(beam, architecture=replace(SMALL, decoder=decoder, modes=3))
     calls = []
     original = Processor.__call__
     monkeypatch.setattr(Processor, "__call__", lambda self, g: calls.append(1) or original(self, g))
@@ -125,7 +128,9 @@ def test_the_processor_is_traced_once(emulator, beam, monkeypatch):
 
 
 def test_float32_weights_float64_answers(emulator, beam):
-    assert {leaf.dtype for leaf in jax.tree.leaves(emulator.weights)} == {np.dtype("float32")}
+    assert {leaf.dtype for leaf in jax.tree.leaves(emulator.network.weights)} == {
+        np.dtype("float32")
+    }
     assert emulator.cache()(beam.centre).dtype == np.dtype("float64")
 
 

@@ -1,0 +1,164 @@
+r"""The graph network as a part of an emulator: :math:`s\, \text{net}(x)`, in mm.
+
+The network computes in float32, on positions scaled to standard deviation 1 and in units of
+:math:`s`; its output is added to the other parts in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from emulator.scenes.scene import Scene
+from emulator.store import fill_tree, inside, named_leaves
+from emulator.surrogates.network.graph import AugmentedGraph
+from emulator.surrogates.network.pignn import (
+    Architecture,
+    Decoder,
+    build,
+)
+from emulator.surrogates.part import CachedPart, no_modes, widened
+
+# Positions in the box are uniform on [0, 1]; this gives them standard deviation 1 (Eq. 25).
+_TO_UNIT_SD = 12.0**0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A graph network with its graph and weights.
+
+    Parameters
+    ----------
+    architecture : sizes of the network.
+    parameters : p, entries of theta.
+    graph : the augmented graph of the scene's mesh.
+    weights : state of the network, an NNX ``State``.
+    scale : (3,) mm, of the network's output.
+    basis : (f, n, 3) in units of ``scale``, modes given to a separable decoder.
+    """
+
+    architecture: Architecture
+    parameters: int
+    graph: AugmentedGraph
+    weights: nnx.State
+    scale: np.ndarray
+    basis: np.ndarray
+
+    @cached_property
+    def definition(self) -> nnx.GraphDef:
+        """Structure of the network, without its weights."""
+        network = _outline(self.architecture, self.graph, self.parameters, len(self.basis))
+        return nnx.split(network)[0]
+
+    def normalise(self, position: jax.Array) -> jax.Array:
+        """Positions (..., p) in the unit box as the network takes them, float32."""
+        return ((position - 0.5) * _TO_UNIT_SD).astype(jnp.float32)
+
+    def prepare(self, weights: nnx.State) -> tuple[Decoder, jax.Array]:
+        """The decoder, and its part that does not depend on theta, from one processor pass."""
+        network = nnx.merge(self.definition, weights)
+        states = network.processor(self.graph)
+        return network.decoder, network.decoder.prepare(states, jnp.asarray(self.basis))
+
+    def decode(self, decoder: Decoder, prepared: jax.Array, position: jax.Array) -> jax.Array:
+        """Displacement (..., k, 3) in mm at ``position`` (..., p), from :meth:`prepare`."""
+        raw = decoder(prepared, self.normalise(position)).astype(jnp.float64)
+        return raw * jnp.asarray(self.scale)
+
+    def predict(self, weights: nnx.State, position: jax.Array) -> jax.Array:
+        """Displacement (b, n, 3) in mm at ``position`` (b, p): one processor pass for all."""
+        return self.decode(*self.prepare(weights), position)
+
+    def __call__(self, position: jax.Array) -> jax.Array:
+        """Displacement (n, 3) in mm at ``position`` (p,), processor included."""
+        return self.predict(self.weights, position[None])[0]
+
+    def cache(self, nodes: np.ndarray) -> CachedPart:
+        """Run the processor and keep what decoding ``nodes`` (k,) needs."""
+        # A decoder merged by itself holds no reference to the processor.
+        decoder = nnx.merge(*nnx.split(nnx.merge(self.definition, self.weights).decoder))
+        prepared = jax.jit(lambda: self.prepare(self.weights)[1])()[:, nodes]
+        if not decoder.linear:
+            return no_modes(nodes, Decoded(self, decoder, prepared))
+
+        def coefficients(position: jax.Array) -> jax.Array:
+            return decoder.coefficients(self.normalise(position)).astype(jnp.float64)
+
+        modes = np.asarray(prepared, dtype=float) * self.scale
+        return CachedPart(np.zeros((len(nodes), 3)), modes, coefficients)
+
+    def arrays(self) -> dict[str, Any]:
+        """Weights, graph, scale and basis by name."""
+        tree = {
+            "weights": nnx.to_pure_dict(self.weights),
+            "graph": self.graph.arrays(),
+            "scale": self.scale,
+            "basis": self.basis,
+        }
+        return named_leaves(tree)
+
+    def to_json(self) -> dict[str, Any]:
+        """The architecture."""
+        return {"architecture": asdict(self.architecture)}
+
+    @classmethod
+    def restore(
+        cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> Self:
+        """The network with this description and these arrays."""
+        architecture = Architecture.from_json(description["architecture"])
+        graph = AugmentedGraph(**inside(arrays, "graph"), real=len(scene.mesh.nodes))
+        basis, parameters = arrays["basis"], len(scene.parameters)
+        state = nnx.state(_outline(architecture, graph, parameters, len(basis)))
+        weights = inside(arrays, "weights")
+        pure = fill_tree(nnx.to_pure_dict(state), weights, "the emulator's network")
+        nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))
+        return cls(architecture, parameters, graph, state, widened(arrays["scale"]), basis)
+
+
+def fresh(
+    scene: Scene,
+    graph: AugmentedGraph,
+    architecture: Architecture,
+    scale: np.ndarray,
+    seed: int,
+    basis: np.ndarray | None = None,
+) -> Network:
+    """An untrained network, whose output is zero for every theta."""
+    if basis is None:
+        basis = np.zeros((0, *scene.held.shape), dtype=np.float32)
+    count = len(scene.parameters)
+    weights = nnx.state(build(architecture, graph, count, len(basis), seed))
+    return Network(architecture, count, graph, weights, np.asarray(scale, dtype=float), basis)
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """The field of a pointwise decoder over some nodes.
+
+    prepared : the decoder's part that does not depend on theta, (3, k, hidden).
+    """
+
+    network: Network
+    decoder: Decoder
+    prepared: jax.Array
+
+    def __call__(self, position: jax.Array) -> jax.Array:
+        """Displacement (..., k, 3) in mm at ``position`` (..., p)."""
+        return self.network.decode(self.decoder, self.prepared, position)
+
+    def at(self, rows: np.ndarray) -> Decoded:
+        """The field over rows of its nodes."""
+        return replace(self, prepared=self.prepared[:, rows])
+
+
+def _outline(architecture: Architecture, graph: AugmentedGraph, parameters: int, fixed: int) -> Any:
+    """The network with shapes in place of weights."""
+    return nnx.eval_shape(lambda: build(architecture, graph, parameters, fixed, 0))

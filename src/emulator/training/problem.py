@@ -1,0 +1,152 @@
+"""What a training works on: FEM runs, an untrained emulator, and one optimiser step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from emulator.fem import Simulator
+from emulator.fem.campaign import Runs, run_campaign
+from emulator.fem.designs import design, sobol
+from emulator.scenes.scene import Scene
+from emulator.surrogates.additive import Emulator
+from emulator.surrogates.network.graph import augment
+from emulator.surrogates.network.part import Network, fresh
+from emulator.surrogates.network.pignn import Architecture
+from emulator.surrogates.taylor import Expansion, constant, expand
+from emulator.training.basis import mechanical_modes
+from emulator.training.discrepancy_stage import FEWEST
+from emulator.training.objectives import Scales, make_loss, mean_square_gradient
+from emulator.training.plan import Plan
+from emulator.training.start import architecture_from, with_network_of
+from emulator.training.step import Step, make_step
+
+# Standard deviation of the displacements as a fraction of the centre's, where no FEM run tells it.
+_GUESSED_SD = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a training works on.
+
+    plan : with as many simulations as were run.
+    emulator : untrained; without a network where the plan has no optimiser step.
+    runs : FEM solutions, the centre's first.
+    optimiser, step : of the network (:func:`~emulator.training.step.make_step`), or None.
+    """
+
+    plan: Plan
+    emulator: Emulator
+    runs: Runs
+    optimiser: optax.GradientTransformation | None
+    step: Step | None
+
+    def initial(self) -> tuple[Any, Any]:
+        """Copies of the untrained weights, and the optimiser's state; empty without a network."""
+        if self.emulator.network is None or self.optimiser is None:
+            return {}, ()
+        weights = jax.tree.map(jnp.copy, self.emulator.network.weights)
+        return weights, self.optimiser.init(weights)
+
+
+def prepare(
+    scene: Scene,
+    plan: Plan,
+    architecture: Architecture | None = None,
+    *,
+    start: Emulator | None = None,
+    deadline: float = np.inf,
+    progress: bool = False,
+) -> Problem:
+    """Run the FEM solutions a plan needs and set up its emulator; equal for equal inputs.
+
+    Parameters
+    ----------
+    start : the emulator whose network to begin from, on any mesh; its architecture then is the
+        default.
+    deadline : of the performance counter, after which no FEM run is begun, except the fewest that
+        a discrepancy model can be judged by.
+    """
+    if start is not None:
+        architecture = architecture_from(start, scene, plan, architecture)
+    simulator = Simulator(scene)
+    # Rounded as a file stores it, so that the discrepancy is fitted to the series that is loaded.
+    series = expand(simulator, order=plan.order).rounded() if plan.order else None
+    runs = _run(simulator, plan, series, deadline, progress)
+    if plan.runs:
+        plan = replace(plan, simulations=len(runs.theta) - 1)
+    if series is None and plan.centred:
+        series = constant(np.asarray(scene.to_unit(scene.centre)), runs.displacement[0])
+    emulator = Emulator(scene, taylor=series)
+    if not plan.steps:
+        return Problem(plan, emulator, runs, None, None)
+    scale, scales = _scales(scene, plan, runs)
+    network = _network(simulator, plan, architecture or Architecture(), series, scale)
+    emulator = replace(emulator, network=network)
+    if start is not None:
+        emulator = with_network_of(emulator, start)
+    loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
+    step = make_step(emulator, plan, runs, loss, optimiser)
+    return Problem(plan, emulator, runs, optimiser, step)
+
+
+def _run(
+    simulator: Simulator, plan: Plan, series: Expansion | None, deadline: float, progress: bool
+) -> Runs:
+    """The FEM solutions of a plan, the centre's first."""
+    scene = simulator.scene
+    thetas = scene.centre[None]
+    if plan.runs:
+        draw = design if plan.discrepancy else sobol
+        thetas = jnp.concatenate([thetas, draw(scene, plan.runs, plan.seed)])
+    return run_campaign(
+        simulator,
+        thetas,
+        sensitivities=plan.discrepancy,
+        predictor=series,
+        deadline=deadline,
+        at_least=FEWEST + 1,
+        progress=progress,
+    )
+
+
+def _network(
+    simulator: Simulator,
+    plan: Plan,
+    architecture: Architecture,
+    series: Expansion | None,
+    scale: np.ndarray,
+) -> Network:
+    """An untrained network; a separable decoder is given the mechanical modes of the series."""
+    architecture = replace(architecture, decoder=plan.decoder)
+    basis = None
+    if plan.decoder == "separable" and series is not None:
+        basis = (mechanical_modes(simulator, series, plan.modes) / scale).astype(np.float32)
+    scene = simulator.scene
+    return fresh(scene, augment(scene), architecture, scale, plan.seed, basis)
+
+
+def _scales(scene: Scene, plan: Plan, runs: Runs) -> tuple[np.ndarray, Scales]:
+    """Scales of the network's output by component, (3,) mm, and of the loss.
+
+    Root mean squares of the runs' deviations from the centre's solution.
+    """
+    centre = np.asarray(runs.displacement[0])
+    known = len(runs.theta) > 1 and plan.objective != "energy"
+    deviation = np.asarray(runs.displacement[1:]) - centre if known else _GUESSED_SD * centre[None]
+    free = ~scene.held
+    component = [float(np.sqrt(np.mean(deviation[:, free[:, k], k] ** 2))) for k in range(3)]
+    scales = Scales(
+        displacement=float(np.sqrt(np.mean(np.sum(deviation**2, axis=-1)))),
+        gradient=float(jnp.sqrt(mean_square_gradient(scene, jnp.asarray(deviation)))),
+        energy=float(jnp.abs(runs.energy[0])),
+    )
+    if not plan.centred:
+        return np.full(3, np.sqrt(np.mean(centre**2))), scales
+    return np.maximum(component, 1e-3 * max(component)), scales

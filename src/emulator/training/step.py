@@ -1,0 +1,108 @@
+"""One step of Adam on a batch of theta, with one pass of the network's processor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from emulator.fem.campaign import Runs
+from emulator.fem.designs import uniform
+from emulator.surrogates.additive import Emulator
+from emulator.training.objectives import Batch
+from emulator.training.plan import Plan
+
+WARMUP = 100  # steps
+
+Weights = nnx.State
+Step = Callable[..., tuple[Weights, Any, jax.Array]]
+Loss = Callable[[jax.Array, Batch], jax.Array]
+
+
+def predictor(emulator: Emulator) -> Callable[..., jax.Array]:
+    """``predict(weights, thetas, *kept)``: displacement (b, n, 3) in mm at ``thetas`` (b, p).
+
+    The emulator's with other weights of its network. ``kept`` is the decoder's prepared part, and
+    without it the processor is run.
+    """
+    scene, network, series = emulator.scene, emulator.network, emulator.taylor
+    assert network is not None, "an emulator in training has a network"
+
+    def predict(weights: Weights, thetas: jax.Array, *kept: jax.Array) -> jax.Array:
+        position = scene.to_unit(thetas)
+        if kept:
+            decoder = nnx.merge(network.definition, weights).decoder
+            free = network.decode(decoder, kept[0], position)
+        else:
+            free = network.predict(weights, position)
+        return emulator.hold(free if series is None else series(position) + free)
+
+    return predict
+
+
+def make_step(
+    emulator: Emulator, plan: Plan, runs: Runs, loss: Loss, optimiser: optax.GradientTransformation
+) -> Step:
+    """``step(weights, state, number, total, *kept) -> (weights, state, loss)``, compiled.
+
+    Batch and learning rate follow from ``number`` and ``total`` alone, so that a resumed run
+    repeats them. With ``kept``, the decoder's prepared part, only the branch is trained. The step
+    consumes the weights and the state it is given.
+    """
+    draw, predict = _batches(emulator, plan, runs), predictor(emulator)
+
+    def step(
+        weights: Weights, state: Any, number: jax.Array, total: jax.Array, *kept: jax.Array
+    ) -> tuple[Weights, Any, jax.Array]:
+        batch = draw(number)
+        value, gradient = jax.value_and_grad(lambda w: loss(predict(w, batch.theta, *kept), batch))(
+            weights
+        )
+        updates, moved = optimiser.update(gradient, state, weights)
+        rate = learning_rate(plan, number, total)
+        updates = jax.tree.map(lambda d: (-rate * d).astype(d.dtype), updates)
+        if kept:
+            # Adam's momentum would otherwise move the weights behind the prepared part.
+            updates = jax.tree_util.tree_map_with_path(_branch_only, updates)
+        new = optax.apply_updates(weights, updates), moved
+        # A step whose gradient is not finite is not taken.
+        finite = jnp.isfinite(optax.tree.norm(gradient))
+        weights, state = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, (weights, state))
+        return weights, state, value
+
+    return jax.jit(step, donate_argnums=(0, 1))
+
+
+def _batches(emulator: Emulator, plan: Plan, runs: Runs) -> Callable[[jax.Array], Batch]:
+    """The batch of a step, from its number."""
+
+    def draw(number: jax.Array) -> Batch:
+        key = jax.random.fold_in(jax.random.key(plan.seed), number)
+        if plan.objective == "energy":
+            nothing = jnp.zeros(0)
+            return Batch(uniform(emulator.scene, plan.batch, key), nothing, nothing)
+        rows = jax.random.choice(key, len(runs.theta), (plan.batch,), replace=False)
+        return Batch(runs.theta[rows], runs.displacement[rows], runs.energy[rows])
+
+    return draw
+
+
+def _branch_only(path: Any, update: jax.Array) -> jax.Array:
+    """``update`` of a weight of the decoder's branch, zero of any other."""
+    return update if "'branch'" in jax.tree_util.keystr(path) else jnp.zeros_like(update)
+
+
+def learning_rate(plan: Plan, number: jax.Array, total: jax.Array) -> jax.Array:
+    """Learning rate of step ``number`` of ``total``: see :class:`Plan`.
+
+    The cosine follows ``WARMUP`` steps in which the rate rises linearly.
+    """
+    peak = plan.learning_rate
+    if plan.schedule == "halves":
+        return jnp.where(number < total // 2, peak, 0.1 * peak)
+    warm = jnp.minimum(1.0, (number + 1) / WARMUP)
+    return peak * warm * 0.5 * (1.0 + jnp.cos(jnp.pi * number / total))
