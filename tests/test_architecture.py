@@ -1,0 +1,126 @@
+"""What ARCHITECTURE.md says of adding things: one file each, and nobody else knows their kinds."""
+
+import ast
+import re
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from calibrate.noise.registry import KINDS as NOISES
+from calibrate.observations.registry import KINDS as OBSERVATIONS
+from calibrate.samplers.registry import SAMPLERS
+
+from emulator.mechanics.laws import LAWS
+from emulator.scenes.loads import LOADS
+from emulator.scenes.supports import SUPPORTS
+from emulator.surrogates.registry import FORWARD_MAPS
+
+ROOT = Path(__file__).resolve().parents[1]
+REGISTRIES = {
+    "a load": LOADS,
+    "a support": SUPPORTS,
+    "a forward map": FORWARD_MAPS,
+    "an observation": OBSERVATIONS,
+    "a noise": NOISES,
+    "a sampler": SAMPLERS,
+}
+
+
+def rows():
+    """What each thing touches, from the table: its paths, in order."""
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    table = text[text.index("| to add |") :].split("\n\n")[0]
+    cells = [line.strip("|").split("|") for line in table.splitlines()[2:]]
+    return {thing.strip(): re.findall(r"`([^`]+)`", touched) for thing, touched in cells}
+
+
+def sources():
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.glob("src/**/*.py")}
+
+
+def test_every_path_of_the_table_exists():
+    for paths in rows().values():
+        for path in paths:
+            assert (ROOT / path.replace("<name>.py", "").replace("<name>/", "")).exists(), path
+
+
+@pytest.mark.parametrize("thing", REGISTRIES)
+def test_each_kind_has_a_file_where_the_table_says_and_a_line_in_its_registry(thing):
+    pattern, registry = rows()[thing][:2]
+    folder = ROOT / pattern.removesuffix("<name>.py")
+    line = ast.parse((ROOT / registry).read_text(encoding="utf-8"))
+    imported = {
+        node.module.rsplit(".", 1)[1]: {name.name for name in node.names}
+        for node in ast.walk(line)
+        if isinstance(node, ast.ImportFrom) and node.module and "." in node.module
+    }
+    for name, kind in REGISTRIES[thing].items():
+        homes = [
+            module
+            for module, names in imported.items()
+            if any(
+                getattr(import_module(_dotted(folder / f"{module}.py")), word, None) is kind
+                for word in names
+                if (folder / f"{module}.py").is_file()
+            )
+        ]
+        assert len(homes) == 1, f"{name} is not imported by its registry from a file in {folder}"
+
+
+def _dotted(path):
+    return ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
+
+
+def _class_names(registry):
+    return {kind.__name__ for kind in registry.values() if isinstance(kind, type)}
+
+
+def test_nobody_asks_what_kind_a_thing_is():
+    classes = set().union(*map(_class_names, REGISTRIES.values()))
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path, tree in sources().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "isinstance"
+        and classes & {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
+    ]
+    assert not found
+
+
+@pytest.mark.parametrize("thing", REGISTRIES)
+def test_nobody_compares_or_lists_names_of_kinds(thing):
+    names, folder = set(REGISTRIES[thing]), rows()[thing][0].removesuffix("<name>.py")
+
+    def constants(node):
+        return {n.value for n in ast.walk(node) if isinstance(n, ast.Constant)} & names
+
+    found = []
+    for path, tree in sources().items():
+        if str(path.relative_to(ROOT)).startswith(folder):
+            continue
+        for node in ast.walk(tree):
+            compared = isinstance(node, ast.Compare) and constants(node)
+            listed = isinstance(node, ast.Tuple | ast.List | ast.Set) and len(constants(node)) > 1
+            if compared or listed:
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno} {sorted(constants(node))}")
+    assert not found
+
+
+def test_laws_and_commands_are_found_in_their_folders():
+    laws = ROOT / rows()["a law"][0].removesuffix("<name>.py")
+    assert {path.stem for path in laws.glob("*.py")} > {"neo_hookean", "guccione"}
+    text = (laws / "__init__.py").read_text(encoding="utf-8")
+    assert not [name for name in LAWS if f'"{name}"' in text or f"laws.{name} " in text]
+    commands = ROOT / rows()["a command"][0].removesuffix("<name>.py")
+    text = (ROOT / "src/calibrate/cli/__init__.py").read_text(encoding="utf-8")
+    names = {path.stem for path in commands.glob("*.py")} - {"__init__"}
+    assert {"infer", "certify"} <= names
+    assert not [name for name in names if re.search(rf"\b{name}\b", text)]
+
+
+def test_laws_have_values_in_the_one_other_file():
+    from law_support import ARGUMENTS
+
+    assert ARGUMENTS.keys() == LAWS.keys()
