@@ -4,12 +4,16 @@ A forward map (emulator, FEM, ...) and an observation make a :func:`model`; :fun
 its posterior; :func:`certify` checks it against FEM.
 """
 
+# NumPyro is loaded before ArviZ, which replaces it by a lazy module: a submodule imported through
+# the lazy module first leaves `numpyro.distributions.distribution` undefined.
+from numpyro import distributions as _distributions  # noqa: F401
+
 import emulator
 from calibrate.certificate import Certificate, certify
 from calibrate.noise import GaussianNoise
 from calibrate.observations import CavityVolume, landmarks, nodal_displacements
 from calibrate.posterior import Posterior, sample
-from calibrate.priors import box_prior
+from calibrate.priors import box_prior, log_normal, truncated, truncated_normal
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import Model, model
 
@@ -25,7 +29,10 @@ __all__ = [
     "box_prior",
     "certify",
     "landmarks",
+    "log_normal",
     "model",
     "nodal_displacements",
     "sample",
+    "truncated",
+    "truncated_normal",
 ]
