@@ -99,7 +99,9 @@ class Run:
         found: dict[str, Noise] = {}
         for name in observe.parts:
             scale = run.noise_scale.get(name)
-            found[name] = _gaussian(name, observe, None if scale else run.noise[name], scale)
+            found[name] = _gaussian(
+                name, observe, run.noise[name] if scale is None else None, scale
+            )
         return found
 
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:

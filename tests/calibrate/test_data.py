@@ -145,3 +145,61 @@ def test_what_no_file_can_hold(beam, tmp_path):
         match="observation 'left' does not fit in a data file; there it would be called displacement",
     ):
         write_data(tmp_path / "d.csv", observations(two), dict.fromkeys(two, np.zeros((1, 3))))
+
+
+NODES = "node,ux,uy,uz\n7,0.5,-2.25,3\n30,1,2,1e-7\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        NODES,
+        NODES.replace(",", ";"),
+        NODES.replace(",", ";").replace(".", ","),
+        NODES.replace(",", "\t"),
+        NODES.replace(",", "\t").replace(".", ","),
+        NODES.replace(",", ", "),
+        NODES.replace("\n", "\r\n"),
+        "# measured by hand\n\n" + NODES.replace("\n", "\n\n# a word\n") + "\n\n",
+        "\ufeff" + NODES,
+        NODES.replace("uz\n", "uz,remark\n").replace("3\n", '3,"good, clear"\n'),
+        NODES.replace("\n", ",\n"),
+        NODES.replace("node,ux", '"node","ux"'),
+    ],
+)
+def test_dialects_of_csv(beam, tmp_path, text):
+    (tmp_path / "d.csv").write_text(text, encoding="utf-8", newline="")
+    observe, data = read_data(beam, tmp_path / "d.csv")
+    np.testing.assert_array_equal(observe.parts["displacement"].nodes, [7, 30])
+    np.testing.assert_array_equal(data["displacement"], [[0.5, -2.25, 3.0], [1.0, 2.0, 1e-7]])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("d.xlsx", b"PK\x03\x04", "d.xlsx is a spreadsheet; save it as CSV"),
+        ("d.csv", b"PK\x03\x04\x00", "is not a CSV file: it holds bytes"),
+        ("d.csv", "n\u00f6de,ux".encode("latin-1"), "is not UTF-8 text"),
+        ("d.csv", b"node,ux,uy,uz\n7,0,5,2,25,3\n", "row 1 has 6 values for 4 columns; decimal"),
+        ("d.csv", b"node;ux;uy;uz\n7;1.234,5;0;0\n", "row 1, column 'ux' is '1.234,5', not a"),
+        ("d.csv", b"node,ux,ux,uz\n7,0,0,0\n", "column 'ux' is there twice"),
+        ("d.csv", b"7,0,1,2\n30,1,2,3\n", "no data; expected columns node,ux,uy,uz or"),
+    ],
+)
+def test_files_that_cannot_be_read(beam, tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_data(beam, tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_netcdf_is_written_too(ventricle, points, tmp_path):
+    parts = {
+        "displacement": cal.landmarks(ventricle, points),
+        "volume": cal.CavityVolume(ventricle),
+    }
+    write_data(tmp_path / "d.nc", observations(parts), {"displacement": LANDMARKS, "volume": 9.5})
+    back, values = read_data(ventricle, tmp_path / "d.nc")
+    np.testing.assert_array_equal(values["displacement"], LANDMARKS)
+    np.testing.assert_array_equal(back.parts["displacement"].points, points)
+    assert values["volume"] == 9.5
