@@ -13,7 +13,7 @@ from calibrate.certificate import Certificate, certify
 from calibrate.noise import GaussianNoise
 from calibrate.observations import CavityVolume, landmarks, nodal_displacements
 from calibrate.posterior import Posterior, sample
-from calibrate.priors import box_prior
+from calibrate.priors import box_prior, log_normal, truncated, truncated_normal
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import Model, model
 
@@ -29,7 +29,10 @@ __all__ = [
     "box_prior",
     "certify",
     "landmarks",
+    "log_normal",
     "model",
     "nodal_displacements",
     "sample",
+    "truncated",
+    "truncated_normal",
 ]

@@ -11,7 +11,7 @@ posterior standard deviations, decides whether reweighting is needed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -22,7 +22,7 @@ from arviz_stats.base import array_stats
 from tqdm import tqdm
 
 from calibrate.posterior import Posterior
-from calibrate.statistical_model import Data, Model
+from calibrate.statistical_model import Data, Model, NoiseValues
 from emulator.errors import InputError
 from emulator.fem import Simulator
 
@@ -173,8 +173,8 @@ def certify(
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
         solution = simulator.solve(thetas[s], start(thetas[s]))
         if solution.converged:
-            sds = model.noise_sds({name: values[s] for name, values in chosen.items()})
-            log_ratios[s] = ratio(thetas[s], solution.displacement, sds, data)
+            noise = model.noise_values({name: values[s] for name, values in chosen.items()})
+            log_ratios[s] = ratio(thetas[s], solution.displacement, noise, data)
     # NumPy's maximum is NaN if one of them is; Python's depends on their order.
     worst = float(np.max([row["r_hat"] for row in posterior.summary().values()]))
     return judge(log_ratios, chosen, r_hat=worst)
@@ -189,9 +189,9 @@ def _compiled(model: Model) -> tuple[Callable, Callable]:
 
     @jax.jit
     def ratio(
-        theta: jax.Array, displacement: jax.Array, sds: Mapping[str, jax.Array], data: Data
+        theta: jax.Array, displacement: jax.Array, noise: NoiseValues, data: Data
     ) -> jax.Array:
-        fem = model.log_likelihood(displacement[model.observe.nodes], sds, data)
-        return fem - model.log_likelihood(model.forward(theta), sds, data)
+        fem = model.log_likelihood(displacement[model.observe.nodes], noise, data)
+        return fem - model.log_likelihood(model.forward(theta), noise, data)
 
     return jax.jit(model.full), ratio

@@ -14,7 +14,7 @@ from typing import Any
 from calibrate.figures.beam import beam_figure
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.ventricle import ventricle_figure
-from calibrate.identifiability import identifiability
+from calibrate.identifiability import identify
 from calibrate.workflow import Run, certify_and_keep, infer, report, simulator_of
 from emulator.store import check_folder
 
@@ -23,20 +23,19 @@ DEMO = Run(
     scene="once_clamped_beam",
     truth={"mu": 73.0, "lam": 61.0},
     observe="nodes:20",
-    noise_sd=0.2,
+    noise={"displacement": 0.2},
     forward="emulator",
     seed=2023,
 )
 
 # Off the centre of the box in every parameter; 1 kPa is 7.5 mmHg, a normal end-diastolic pressure.
-# The noise is optimistic: observers of one heart differ by several mL in its end-diastolic volume,
-# and automatic tracking errs by millimetres.
+# The noise is assumed to be small: observers of one heart differ by several mL in its
+# end-diastolic volume, automatic tracking by millimetres.
 VENTRICLE = Run(
     scene="left_ventricle",
     truth={"a": 0.36, "b": 1.8, "a_f": 4.6, "b_f": 2.4, "pressure": 1.0},
     observe="landmarks:24+volume",
-    noise_sd=0.2,
-    volume_noise_sd=1.0,
+    noise={"displacement": 0.2, "volume": 1.0},
     forward="emulator",
     warmup=300,
     draws=500,
@@ -80,5 +79,5 @@ def run_demo(
     result = report(run, posterior, certificate)
     result["picture"] = chosen.picture
     if chosen.identify:
-        result["identifiability"] = identifiability(posterior)
+        result["identifiability"] = identify(posterior)
     return result

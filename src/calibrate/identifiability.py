@@ -1,9 +1,8 @@
-r"""What the data has fixed: single parameters, pairs that move together, products of powers.
+r"""What the data determines: single parameters, correlated pairs, products of powers.
 
 Stiffness and load can rise together and leave the body where it is; a table of marginals hides
 that. In :math:`x = \log\theta`, with covariances :math:`S` of the posterior and :math:`P` of the
-prior, the combinations :math:`\prod_k \theta_k^{w_k}` the data speaks about, one after the other,
-solve
+prior, the combinations :math:`\prod_k \theta_k^{w_k}` that the data determines, best first, solve
 
 .. math:: S w = \lambda P w
 
@@ -25,21 +24,21 @@ _PRIOR_DRAWS = 4096
 _DIGITS = 1
 
 
-def identifiability(posterior: Posterior) -> dict[str, Any]:
+def identify(posterior: Posterior) -> dict[str, Any]:
     """Contraction, correlations and identified combinations, as plain JSON.
 
     Returns
     -------
-    contraction : per parameter, 1 less the posterior's sd over the prior's, on the parameter's
-        scale: 0 nothing learned, 1 all.
+    contraction : per parameter, 1 - sd of the posterior / sd of the prior, on the parameter's
+        scale: 0 where nothing was learned, 1 where the value is exact.
     correlation : first -> second -> correlation, posterior, on the parameters' scales.
-    combinations : best known first, each with its ``exponents``, its relative sd ``known_to`` and
-        ``prior`` that of the prior; empty where a parameter may be 0 or below.
+    combinations : best known first, each with its ``exponents``, its relative sd ``known_to`` in
+        the posterior and ``prior`` in the prior; empty where a parameter may be 0 or below.
     """
     scene = posterior.model.forward.scene
     names = scene.parameter_names
     after = np.asarray(posterior.thetas())
-    before = _prior_draws(posterior)
+    before = np.asarray(posterior.model.prior_thetas(jax.random.key(0), _PRIOR_DRAWS))
     log = np.array([parameter.scale == "log" for parameter in scene.parameters])
     x, prior = (_on_scale(thetas, log) for thetas in (after, before))
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
@@ -55,15 +54,6 @@ def identifiability(posterior: Posterior) -> dict[str, Any]:
     }
 
 
-def _prior_draws(posterior: Posterior) -> np.ndarray:
-    """Theta (s, p) from the prior."""
-    prior, names = posterior.model.prior, posterior.model.forward.scene.parameter_names
-    keys = jax.random.split(jax.random.key(0), len(names))
-    return np.stack(
-        [prior[n].sample(key, (_PRIOR_DRAWS,)) for n, key in zip(names, keys, strict=True)], axis=1
-    )
-
-
 def _on_scale(thetas: np.ndarray, log: np.ndarray) -> np.ndarray:
     return np.where(log, np.log(np.where(log, thetas, 1.0)), thetas)
 
@@ -71,14 +61,14 @@ def _on_scale(thetas: np.ndarray, log: np.ndarray) -> np.ndarray:
 def _combinations(
     names: tuple[str, ...], after: np.ndarray, before: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Directions in log theta (s, p), the one that has contracted most first."""
+    """Directions in log theta, from draws (s, p), the most contracted first."""
     covariances = [np.atleast_2d(np.cov(x, rowvar=False)) for x in (after, before)]
     _, directions = eigh(*covariances)  # eigenvalues ascend
-    spread = before.std(axis=0)
+    prior_sd = before.std(axis=0)
     found = []
     for w in directions.T:
-        # The parameter whose prior range it takes most of has exponent 1.
-        leading = int(np.argmax(np.abs(w) * spread))
+        # The parameter that contributes most to its variance under the prior has exponent 1.
+        leading = int(np.argmax(np.abs(w) * prior_sd))
         exponents = np.round(w / w[leading], _DIGITS) + 0.0
         sds = [float((x @ exponents).std(ddof=1)) for x in (after, before)]
         kept = {n: float(e) for n, e in zip(names, exponents, strict=True) if e}
@@ -87,7 +77,7 @@ def _combinations(
 
 
 def in_words(found: dict[str, Any], *, pairs: float = 0.7, best: int = 2) -> str:
-    """The result for people: contractions, pairs that move together, the best combinations.
+    """The result for people: contractions, correlated pairs, the best combinations.
 
     Parameters
     ----------

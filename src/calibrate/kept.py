@@ -7,39 +7,32 @@ certificate speaks about that run and that map, so any difference is refused.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import xarray as xr
 
 from emulator.errors import InputError
 from emulator.surrogates.protocol import ForwardMap
 
-if TYPE_CHECKING:
-    from calibrate.workflow import Run
-
 # Where scene and emulator are found may change when a folder moves; their fingerprints may not.
 _PLACES = ("scene", "root", "emulator")
 
 
-def run_as_json(run: Run) -> str:
-    """The run as the JSON kept in a posterior's attributes."""
-    return json.dumps(asdict(run))
-
-
-def check_run(path: Path, tree: xr.DataTree, run: Run) -> None:
+def check_run(path: Path, tree: xr.DataTree, run: Mapping[str, Any]) -> None:
     """:class:`InputError` names the first entry of ``run`` that the posterior was not made with.
 
     Parameters
     ----------
     path, tree : the posterior's file and its content.
+    run : entries of the run, by name.
     """
     try:
         sampled: dict[str, Any] = json.loads(tree.attrs["run"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} does not name the run it was sampled for; infer again") from error
-    now = json.loads(run_as_json(run))
+    now = json.loads(json.dumps(run))  # tuples become lists, as in the file
     for name in sorted({*sampled, *now} - set(_PLACES)):
         if sampled.get(name) != now.get(name):
             raise InputError(

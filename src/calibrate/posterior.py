@@ -16,7 +16,7 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
-from calibrate.observations import Landmarks, NodalDisplacements, Observations
+from calibrate.observations import Observations
 from calibrate.provenance import versions
 from calibrate.samplers import NUTSOptions, nuts
 from calibrate.statistical_model import Data, Model
@@ -26,7 +26,7 @@ from emulator.store import replacing
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Draws and what they are draws of.
+    """Draws, with the model and the data behind them.
 
     tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; attributes
         hold the provenance.
@@ -90,7 +90,7 @@ def read_tree(path: str | Path) -> xr.DataTree:
 
 
 def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> dict[str, Any]:
-    """What is needed to know, and to repeat, how a posterior was made; plain JSON values."""
+    """How a posterior was made, in plain JSON values, so that it can be repeated."""
     scene = model.forward.scene
     return {
         "scene": dict(scene.origin),
@@ -98,9 +98,10 @@ def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> d
         "scene_fingerprint": scene.fingerprint,
         "forward": model.forward.kind,
         "forward_fingerprint": model.full.fingerprint,
-        "observe": model.observe.describe(),
-        "noise": _describe_noise(model),
+        "observe": model.observe.to_json(),
+        "noise": {name: noise.to_json() for name, noise in model.noise.items()},
         "prior": {name: describe_distribution(d) for name, d in model.prior.items()},
+        "prior_cut": dict(model.prior_cut),
         "sampler": sampler,
         "sampler_options": asdict(options),
         "seed": seed,
@@ -108,17 +109,11 @@ def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> d
     }
 
 
-def _describe_noise(model: Model) -> dict[str, Any]:
-    """The noise of each observation by name; of a single one just that."""
-    described = {name: noise.describe() for name, noise in model.noise.items()}
-    return described if len(described) > 1 else next(iter(described.values()))
-
-
 def describe_distribution(distribution: dist.Distribution) -> str:
     """A distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
     parts = {name: getattr(distribution, name, None) for name in distribution.arg_constraints}
     base = getattr(distribution, "base_dist", None)
-    # A named transform such as LogUniform says it all by its own arguments.
+    # The arguments of a named transform such as LogUniform describe it fully.
     named = isinstance(distribution, dist.TransformedDistribution) and parts
     if isinstance(base, dist.Distribution) and not named:
         parts["base"] = base
@@ -171,7 +166,7 @@ def _tree(
     draws: Mapping[str, np.ndarray],
     stats: Mapping[str, np.ndarray],
 ) -> xr.DataTree:
-    constants, dims, coords = _places(model.observe)
+    constants, dims, coords = _labels(model.observe)
     groups: dict[str, Any] = {
         "posterior": dict(draws),
         "sample_stats": dict(stats),
@@ -181,18 +176,16 @@ def _tree(
     return arviz_base.from_dict(groups, dims=dims, coords=coords)
 
 
-def _places(
+def _labels(
     observe: Observations,
 ) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
-    """Reference positions of observed points, and how arrays of data are labelled."""
+    """Constants, dimensions and coordinates of all observations."""
     constants: dict[str, np.ndarray] = {}
     dims: dict[str, list[str]] = {}
-    coords: dict[str, Any] = {"component": ["x", "y", "z"]}
+    coords: dict[str, Any] = {}
     for name, part in observe.parts.items():
-        if isinstance(part, NodalDisplacements | Landmarks):
-            # Only one part can be called by its quantity, and it keeps the plain labels.
-            suffix = "" if name == part.quantity else f"_{name}"
-            constants[f"position{suffix}"] = part.points
-            coords[f"point{suffix}"] = np.arange(len(part.points))
-            dims[name] = dims[f"position{suffix}"] = [f"point{suffix}", "component"]
+        labels = part.labels(name)
+        constants.update(labels.constants)
+        dims.update(labels.dims)
+        coords.update(labels.coords)
     return constants, dims, coords

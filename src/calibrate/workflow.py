@@ -1,13 +1,14 @@
 """One calibration from start to end: data, forward map, posterior, certificate, files.
 
-A :class:`Run` is plain JSON, kept as ``run.json`` beside its results, so that any result can be
-certified again or repeated.
+A :class:`Run` is plain JSON and is kept as ``run.json`` beside its results: they can be certified
+again, or repeated.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,28 +16,24 @@ from typing import Any
 import numpy as np
 
 from calibrate.certificate import Certificate, certify
-from calibrate.data import DISPLACEMENT, is_volume, read_data, volume_of, write_data
-from calibrate.kept import check_forward, check_run, run_as_json
-from calibrate.noise import GaussianNoise
+from calibrate.data import read_data, write_data
+from calibrate.kept import check_forward, check_run
+from calibrate.noise import GaussianNoise, Noise
 from calibrate.observations import (
-    Landmarks,
-    NodalDisplacements,
-    Observation,
+    DISPLACEMENT,
     Observations,
-    landmarks,
-    nodal_displacements,
-    observations_from,
-    spread_landmarks,
-    spread_nodes,
+    observations_from_json,
+    parse_observation,
 )
 from calibrate.posterior import Posterior, read_tree, sample
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import Model, model
+from emulator import schema
 from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
-from emulator.store import read_json, write_json
+from emulator.store import write_json
 from emulator.surrogates import registry
 from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.protocol import ForwardMap
@@ -49,13 +46,16 @@ FORWARD = "forward.safetensors"
 class Run:
     """What to calibrate and how.
 
-    scene, root : a scene's name or file; where published data is.
+    scene, root : a scene's name or file; the folder of the published data.
     data : a file, or ``synthetic``: FEM at ``truth`` plus noise.
     truth : named parameters of synthetic data.
-    observe : of synthetic data: ``nodes:20``, ``landmarks:24``, ``all``, a node set, ``3,14,15``,
-        ``volume``, ``volume:<facet set>``, or several of these joined by ``+``.
-    noise_sd : of displacements, mm; known unless ``noise_scale``, the scale of its prior, asks to
-        infer it. volume_noise_sd, volume_noise_scale : the same of volumes, mL.
+    observe : observations of synthetic data, joined by ``+``, e.g. ``landmarks:24+volume``; each
+        kind of :data:`calibrate.observations.KINDS` says which words ask for it.
+    noise : standard deviation by the observation's name, in its unit. A bare number belongs to a
+        single observation, or to the displacements. What is not named has its kind's default.
+    noise_scale : the same for the scale of the prior of a standard deviation that is to be
+        inferred; synthetic data then still has the one of ``noise``.
+    check_scale : refuse data that is far from every prediction (:mod:`calibrate.magnitude`).
     forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
         options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
     """
@@ -65,10 +65,9 @@ class Run:
     data: str = "synthetic"
     truth: dict[str, float] = field(default_factory=dict)
     observe: str = "nodes:20"
-    noise_sd: float | None = 0.2
-    noise_scale: float | None = None
-    volume_noise_sd: float | None = 1.0
-    volume_noise_scale: float | None = None
+    noise: Mapping[str, float] | float = field(default_factory=dict)
+    noise_scale: Mapping[str, float] | float = field(default_factory=dict)
+    check_scale: bool = True
     forward: str = "emulator"
     emulator: str | None = None
     forward_options: dict[str, Any] = field(default_factory=dict)
@@ -87,34 +86,51 @@ class Run:
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be 0 or more")
 
-    def noise(self, observe: Observations) -> dict[str, GaussianNoise]:
-        """The noise of each observation's likelihood."""
-        return {
-            name: self._noise(part, *self._given_noise(part))
-            for name, part in observe.parts.items()
-        }
+    def named(self, observe: Observations) -> Run:
+        """The run with every noise by name, the defaults filled in."""
+        scales = _by_name(self.noise_scale, observe, "noise-scale")
+        given = _by_name(self.noise, observe, "noise")
+        defaults = {name: part.default_noise.upper_sd for name, part in observe.parts.items()}
+        return replace(self, noise={**defaults, **given}, noise_scale=scales)
 
-    def synthetic_sd(self, part: Observation) -> float:
-        """Standard deviation of a synthetic observation's noise, in its unit."""
-        sd, _ = self._given_noise(part)
-        if sd is None:
-            raise InputError(
-                f"synthetic data needs a noise standard deviation of the {part.quantity}, "
-                f"{part.unit}"
+    def noises(self, observe: Observations) -> dict[str, Noise]:
+        """Noise of each observation in the likelihood."""
+        run = self.named(observe)
+        assert isinstance(run.noise, Mapping)
+        assert isinstance(run.noise_scale, Mapping)
+        found: dict[str, Noise] = {}
+        for name in observe.parts:
+            scale = run.noise_scale.get(name)
+            found[name] = _gaussian(
+                name, observe, run.noise[name] if scale is None else None, scale
             )
-        self._noise(part, sd, None)
-        return sd
+        return found
 
-    def _given_noise(self, part: Observation) -> tuple[float | None, float | None]:
-        if part.quantity == "volume":
-            return self.volume_noise_sd, self.volume_noise_scale
-        return self.noise_sd, self.noise_scale
+    def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
+        """Noise of each observation of synthetic data."""
+        return replace(self, noise_scale={}).noises(observe)
 
-    def _noise(self, part: Observation, sd: float | None, scale: float | None) -> GaussianNoise:
-        try:
-            return GaussianNoise(sd if scale is None else None, scale)
-        except InputError as error:
-            raise InputError(f"{part.quantity} ({part.unit}): {error}") from error
+
+def _by_name(
+    given: Mapping[str, float] | float, observe: Observations, what: str
+) -> dict[str, float]:
+    """Values by the observation's name; a bare one is a single observation's or displacements'."""
+    if not isinstance(given, Mapping):
+        if len(observe.parts) > 1 and DISPLACEMENT in observe.parts:
+            return {DISPLACEMENT: given}
+        return observe.name(given, what)
+    for name in given:
+        if name not in observe.parts:
+            known = ", ".join(observe.parts)
+            raise InputError(f"{what}: '{name}' is not observed; observed: {known}")
+    return dict(given)
+
+
+def _gaussian(name: str, observe: Observations, sd: float | None, scale: float | None) -> Noise:
+    try:
+        return GaussianNoise(sd, scale)
+    except InputError as error:
+        raise InputError(f"{name} ({observe.parts[name].unit}): {error}") from error
 
 
 @lru_cache(maxsize=2)
@@ -140,50 +156,17 @@ def restore_forward(run: Run, scene: Scene, folder: Path) -> ForwardMap:
     return registry.restore_forward(run.forward, made_of, run.forward_options, folder / FORWARD)
 
 
-def parse_observation(scene: Scene, text: str, seed: int) -> Observations:
-    """What the words joined by ``+`` stand for; see :class:`Run`."""
-    parts: dict[str, Observation] = {}
-    for word in text.split("+"):
-        name = word if is_volume(word) else DISPLACEMENT
-        if name in parts:
-            raise InputError(f"observe '{text}': {name} is given twice; once is enough")
-        parts[name] = (
-            volume_of(scene, word) if is_volume(word) else _displacements(scene, word, seed)
-        )
-    return Observations(parts)
-
-
-def _displacements(scene: Scene, text: str, seed: int) -> NodalDisplacements | Landmarks:
-    kind, _, count = text.partition(":")
-    if kind in ("nodes", "landmarks") and count:
-        if not count.isdigit() or int(count) < 1:
-            raise InputError(f"observe '{text}': '{count}' is not a number of {kind}")
-        if kind == "nodes":
-            return nodal_displacements(scene, spread_nodes(scene, int(count), seed))
-        return landmarks(scene, spread_landmarks(scene, int(count), seed))
-    if text == "all" or text in scene.mesh.node_sets:
-        return nodal_displacements(scene, text)
-    try:
-        nodes = [int(word) for word in text.split(",")]
-    except ValueError as error:
-        raise InputError(
-            f"observe '{text}': give nodes:N, landmarks:N, all, volume, node numbers like "
-            f"3,14,15, or a node set: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
-        ) from error
-    return nodal_displacements(scene, nodes)
-
-
 def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarray]]:
-    """The observations and data of a run by name, read from a file or made by FEM."""
+    """Observations and data of a run by name, read from a file or made by FEM."""
     if run.data != "synthetic":
         return read_data(scene, run.data)
     theta = scene.theta(**run.truth)
     observe = parse_observation(scene, run.observe, run.seed)
-    sds = {name: run.synthetic_sd(part) for name, part in observe.parts.items()}
+    noises = run.synthetic_noise(observe)
     exact = observe(simulator_of(scene)(theta)[observe.nodes])
     rng = np.random.default_rng([run.seed, 1])
     return observe, {
-        name: np.asarray(exact[name]) + rng.normal(0.0, sds[name], part.shape)
+        name: np.asarray(exact[name]) + noises[name].simulate(rng, part.shape)
         for name, part in observe.parts.items()
     }
 
@@ -192,22 +175,24 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
     """Sample the posterior of a run; with ``folder``, keep run, data and posterior there."""
     scene = find_scene(run.scene, run.root)
     observe, data = make_data(run, scene)
-    noise = run.noise(observe)
-    built = model(build_forward(run, scene, progress=progress), observe, noise)
+    run, noises = run.named(observe), run.noises(observe)
+    built = model(
+        build_forward(run, scene, progress=progress), observe, noises, check_scale=run.check_scale
+    )
     options = NUTSOptions(run.warmup, run.draws, run.chains)
     posterior = sample(
         built, data, sampler=run.sampler, options=options, seed=run.seed, progress=progress
     )
     if folder is not None:
         folder = Path(folder)
-        # An earlier result goes first and the posterior comes last: killed in between, the folder
-        # holds no posterior rather than one beside another's certificate.
+        # An earlier result is removed first and the posterior is written last: a run that is killed
+        # leaves no posterior, rather than one beside the certificate of another.
         for name in (CERTIFICATE, POSTERIOR, FORWARD):
             (folder / name).unlink(missing_ok=True)
         write_data(folder / DATA, observe, data)
         write_json(folder / RUN, asdict(run))
         registry.keep_forward(posterior.model.full, folder / FORWARD)
-        posterior.tree.attrs["run"] = run_as_json(run)
+        posterior.tree.attrs["run"] = json.dumps(asdict(run))
         posterior.save(folder / POSTERIOR)
     return posterior
 
@@ -223,20 +208,18 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     """
     folder = Path(folder)
     path = folder / POSTERIOR
-    text = read_json(folder / RUN)
-    try:
-        run = Run(**text)
-    except TypeError as error:
-        raise InputError(f"{folder / RUN} does not describe a run: {error}") from error
+    run = schema.read_json_as(Run, folder / RUN)
     scene = find_scene(run.scene, run.root)
     tree = read_tree(path)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{path} was made for another scene than '{run.scene}'")
-    check_run(path, tree, run)
+    check_run(path, tree, asdict(run))
     forward = restore_forward(run, scene, folder)
     check_forward(path, tree, forward)
-    observe = observations_from(scene, json.loads(tree.attrs["observe"]))
-    built: Model = model(forward, observe, run.noise(observe))
+    observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
+    noises = run.noises(observe)
+    # Its data was checked when it was sampled, or the check was overruled.
+    built: Model = model(forward, observe, noises, check_scale=False)
     data = built.check_data({n: np.asarray(tree["observed_data"][n]) for n in observe.parts})
     return run, Posterior(tree, built, data)
 
@@ -263,6 +246,7 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "divergences": posterior.divergences,
         "verdict": "not certified",
         "k_hat": None,
+        "prior_cut": dict(posterior.model.prior_cut),
         "draws": int(posterior.tree["posterior"].sizes["draw"]),
         "chains": int(posterior.tree["posterior"].sizes["chain"]),
     }

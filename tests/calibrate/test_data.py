@@ -32,7 +32,10 @@ def test_netcdf(beam, tmp_path):
     np.testing.assert_array_equal(observe.nodes, [7, 30])
     np.testing.assert_array_equal(values["displacement"], VALUES)
     data.drop_vars("node").to_netcdf(tmp_path / "e.nc", engine="h5netcdf")
-    with pytest.raises(InputError, match="needs variables displacement and node"):
+    with pytest.raises(
+        InputError,
+        match="variable 'node' is missing; expected variables node,displacement or position",
+    ):
         read_data(beam, tmp_path / "e.nc")
     (tmp_path / "f.nc").write_bytes((tmp_path / "d.nc").read_bytes()[:200])
     with pytest.raises(InputError, match="neither CSV .* nor readable netCDF"):
@@ -45,12 +48,12 @@ def test_netcdf(beam, tmp_path):
         ("node,ux,uy,uz\n3,0,0,nan\n", "row 1 has a displacement that is not finite"),
         ("node,ux,uy,uz\n3,0,0,0\n400,0,0,0\n", "node 400 is unknown"),
         ("node,ux,uy,uz\n3,0,0,x\n", "row 1, column 'uz' is 'x', not a number"),
-        ("node,ux,uy,uz\n3,0,0\n", "row 1, column 'uz' is 'None', not a number"),
+        ("node,ux,uy,uz\n3,0,0\n", "row 1, column 'uz' is empty"),
         ("node,ux,uy\n3,0,0\n", "column 'uz' is missing"),
         ("node,ux,uy,uz\n3.5,0,0,0\n", "nodes must be whole numbers"),
         ("x,y,z,ux,uy,uz\n500,0,0,0,0,0\n", "lies outside the body"),
         ("x,y,z,ux,uy,uz\n5,nan,0,0,0,0\n", "row 1 has a position that is not finite"),
-        ("", "column 'x' is missing"),
+        ("", "no data; expected columns node,ux,uy,uz or x,y,z,ux,uy,uz or volume"),
     ],
 )
 def test_one_line_for_every_mistake(beam, tmp_path, text, message):
@@ -111,20 +114,20 @@ def test_a_volume_in_netcdf(ventricle, points, tmp_path):
     data[["volume"]].to_netcdf(tmp_path / "v.nc", engine="h5netcdf")
     assert list(read_data(ventricle, tmp_path / "v.nc")[0].parts) == ["volume"]
     data.assign(volume=("point", [1.0, 2.0])).to_netcdf(tmp_path / "w.nc", engine="h5netcdf")
-    with pytest.raises(InputError, match=r"volume has shape \(2,\); give one number, in mL"):
+    with pytest.raises(InputError, match="volume has 2 values; give one, in mL"):
         read_data(ventricle, tmp_path / "w.nc")
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("volume\n120\n130\n", "column 'volume' has 2 values; give one, in mL"),
-        ("node,ux,uy,uz,volume\n3,0,0,0,\n", "column 'volume' has 0 values"),
+        ("volume\n120\n130\n", "volume has 2 values; give one, in mL"),
+        ("node,ux,uy,uz,volume\n3,0,0,0,\n", "volume has 0 values"),
         ("volume\nmuch\n", "row 1, column 'volume' is 'much', not a number"),
         ("volume\n-120\n", "volume is -120.0 mL; it must be above 0"),
-        ("volume\nnan\n", "volume is nan mL"),
+        ("volume\nnan\n", "volume is nan; it must be finite"),
         ("volume:atrium\n120\n", "facet set 'atrium' is not in the mesh"),
-        ("ux,uy,uz,volume\n0,0,0,1\n", "column 'x' is missing"),
+        ("ux,uy,uz,volume\n0,0,0,1\n", "column 'node' is missing"),
     ],
 )
 def test_one_line_for_every_mistake_with_a_volume(ventricle, tmp_path, text, message):
@@ -137,5 +140,66 @@ def test_one_line_for_every_mistake_with_a_volume(ventricle, tmp_path, text, mes
 
 def test_what_no_file_can_hold(beam, tmp_path):
     two = {"left": cal.nodal_displacements(beam, [3]), "right": cal.nodal_displacements(beam, [4])}
-    with pytest.raises(InputError, match="observations left, right do not fit in one CSV file"):
+    with pytest.raises(
+        InputError,
+        match="observation 'left' does not fit in a data file; there it would be called displacement",
+    ):
         write_data(tmp_path / "d.csv", observations(two), dict.fromkeys(two, np.zeros((1, 3))))
+
+
+NODES = "node,ux,uy,uz\n7,0.5,-2.25,3\n30,1,2,1e-7\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        NODES,
+        NODES.replace(",", ";"),
+        NODES.replace(",", ";").replace(".", ","),
+        NODES.replace(",", "\t"),
+        NODES.replace(",", "\t").replace(".", ","),
+        NODES.replace(",", ", "),
+        NODES.replace("\n", "\r\n"),
+        "# measured by hand\n\n" + NODES.replace("\n", "\n\n# a word\n") + "\n\n",
+        "\ufeff" + NODES,
+        NODES.replace("uz\n", "uz,remark\n").replace("3\n", '3,"good, clear"\n'),
+        NODES.replace("\n", ",\n"),
+        NODES.replace("node,ux", '"node","ux"'),
+    ],
+)
+def test_dialects_of_csv(beam, tmp_path, text):
+    (tmp_path / "d.csv").write_text(text, encoding="utf-8", newline="")
+    observe, data = read_data(beam, tmp_path / "d.csv")
+    np.testing.assert_array_equal(observe.parts["displacement"].nodes, [7, 30])
+    np.testing.assert_array_equal(data["displacement"], [[0.5, -2.25, 3.0], [1.0, 2.0, 1e-7]])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("d.xlsx", b"PK\x03\x04", "d.xlsx is a spreadsheet; save it as CSV"),
+        ("d.csv", b"PK\x03\x04\x00", "is not a CSV file: it holds bytes"),
+        ("d.csv", "n\u00f6de,ux".encode("latin-1"), "is not UTF-8 text"),
+        ("d.csv", b"node,ux,uy,uz\n7,0,5,2,25,3\n", "row 1 has 6 values for 4 columns; decimal"),
+        ("d.csv", b"node;ux;uy;uz\n7;1.234,5;0;0\n", "row 1, column 'ux' is '1.234,5', not a"),
+        ("d.csv", b"node,ux,ux,uz\n7,0,0,0\n", "column 'ux' is there twice"),
+        ("d.csv", b"7,0,1,2\n30,1,2,3\n", "no data; expected columns node,ux,uy,uz or"),
+    ],
+)
+def test_files_that_cannot_be_read(beam, tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_data(beam, tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_netcdf_is_written_too(ventricle, points, tmp_path):
+    parts = {
+        "displacement": cal.landmarks(ventricle, points),
+        "volume": cal.CavityVolume(ventricle),
+    }
+    write_data(tmp_path / "d.nc", observations(parts), {"displacement": LANDMARKS, "volume": 9.5})
+    back, values = read_data(ventricle, tmp_path / "d.nc")
+    np.testing.assert_array_equal(values["displacement"], LANDMARKS)
+    np.testing.assert_array_equal(back.parts["displacement"].points, points)
+    assert values["volume"] == 9.5

@@ -28,7 +28,7 @@ def test_the_demo_ends_accepted(folder, capsys):
     assert report["parameters"]["lam"]["sd"] > 5.0
     tree = read_tree(folder / "posterior.nc")
     assert tree.attrs["forward_fingerprint"]
-    assert json.loads(tree.attrs["observe"])["kind"] == "nodes"
+    assert json.loads(tree.attrs["observe"])["displacement"]["kind"] == "nodes"
     assert json.loads(tree.attrs["sampler_options"])["chains"] == 4
     assert json.loads(tree.attrs["prior"])["mu"] == "LogUniform(low=50.0, high=100.0)"
     picture = (folder / "beam.png").read_bytes()

@@ -78,7 +78,11 @@ def test_its_files_hold_both_observations(folder):
     assert tree["observed_data"]["displacement"].shape == (24, 3)
     assert tree["observed_data"]["volume"].shape == ()
     assert tree["constant_data"]["position"].shape == (24, 3)
-    assert json.loads(tree.attrs["noise"])["volume"] == {"sd": 1.0, "sd_scale": None}
+    assert json.loads(tree.attrs["noise"])["volume"] == {
+        "kind": "gaussian",
+        "sd": 1.0,
+        "sd_scale": None,
+    }
     observe, data = read_data(scene, folder / "data.csv")
     assert list(observe.parts) == ["displacement", "volume"]
     np.testing.assert_array_equal(data["volume"], tree["observed_data"]["volume"])
@@ -90,7 +94,7 @@ def test_its_files_hold_both_observations(folder):
     gap = data["displacement"] - observe.parts["displacement"](
         jnp.asarray(u[observe.parts["displacement"].nodes])
     )
-    assert np.std(gap) == pytest.approx(RUN.noise_sd, rel=4 / np.sqrt(2 * gap.size))
+    assert np.std(gap) == pytest.approx(RUN.noise["displacement"], rel=4 / np.sqrt(2 * gap.size))
 
 
 def test_its_folder_is_read_back(folder):
@@ -105,32 +109,26 @@ def test_its_folder_is_read_back(folder):
 def test_infer_takes_both_and_infers_a_noise(setting, folder, tmp_path, capsys):
     words = ["infer", "left_ventricle", "--data", str(folder / "data.csv"), "--forward", "reduced"]
     words += ["--fem-runs", "6", "--warmup", "20", "--draws", "20", "--chains", "2", "--no-certify"]
-    words += [
-        "--noise",
-        "0.2",
-        "--volume-noise-scale",
-        "2.0",
-        "--out",
-        str(tmp_path / "r"),
-        "--json",
-    ]
+    words += ["--noise", "0.2", "--noise-scale", "volume=2.0"]
+    words += ["--out", str(tmp_path / "r"), "--json"]
     assert main(words) == 0
     report = json.loads(capsys.readouterr().out)
     assert list(report["parameters"])[-1] == "noise_sd_volume"
     kept = json.loads((tmp_path / "r" / "run.json").read_text())
-    assert (kept["noise_sd"], kept["volume_noise_scale"]) == (0.2, 2.0)
+    assert (kept["noise"]["displacement"], kept["noise_scale"]) == (0.2, {"volume": 2.0})
     noise = json.loads(read_tree(tmp_path / "r" / "posterior.nc").attrs["noise"])
-    assert noise["displacement"] == {"sd": 0.2, "sd_scale": None}
-    assert noise["volume"] == {"sd": None, "sd_scale": 2.0}
+    assert noise["displacement"] == {"kind": "gaussian", "sd": 0.2, "sd_scale": None}
+    assert noise["volume"] == {"kind": "gaussian", "sd": None, "sd_scale": 2.0}
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (
-            ["--volume-noise", "0"],
+            ["--noise", "volume=0"],
             "volume (mL): noise: standard deviation is 0.0; it must be above",
         ),
+        (["--noise", "pressure=1"], "noise: 'pressure' is not observed; observed: displacement"),
         (["--observe", "landmarks:3+volume+volume"], "volume is given twice"),
         (["--observe", "volume:atrium"], "facet set 'atrium' is not in the mesh"),
     ],

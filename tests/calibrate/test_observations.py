@@ -7,9 +7,9 @@ import pytest
 
 import calibrate as cal
 from calibrate.observations import (
-    observation_from,
+    observation_from_json,
     observations,
-    observations_from,
+    observations_from_json,
     spread_landmarks,
     spread_nodes,
 )
@@ -55,7 +55,7 @@ def test_measured_surface_points_are_on_the_surface_give_or_take(beam):
     noisy[:, :2] = np.clip(noisy[:, :2], 0.0, [100.0, 10.0])
     observe = cal.landmarks(beam, noisy)
     np.testing.assert_allclose(
-        (beam.mesh.nodes[observe.nodes][observe.corners] * observe.weights[:, :, None]).sum(1),
+        (beam.mesh.nodes[observe.nodes][observe.members] * observe.weights[:, :, None]).sum(1),
         noisy,
         atol=0.06,
     )
@@ -65,7 +65,7 @@ def test_measured_surface_points_are_on_the_surface_give_or_take(beam):
 
 def test_descriptions_make_the_same_operator(beam):
     for observe in (cal.nodal_displacements(beam, [3, 9]), cal.landmarks(beam, [[10.0, 5.0, 5.0]])):
-        again = observation_from(beam, observe.describe())
+        again = observation_from_json(beam, observe.to_json())
         np.testing.assert_array_equal(again.nodes, observe.nodes)
         np.testing.assert_array_equal(again.points, observe.points)
 
@@ -85,7 +85,10 @@ def test_descriptions_make_the_same_operator(beam):
         (lambda s: cal.landmarks(s, [[1, 1, 1], [500.0, 0, 0]]), "landmark 1 at .* lies outside"),
         (lambda s: cal.landmarks(s, [[np.nan, 1, 1]]), "expected .*finite"),
         (lambda s: spread_nodes(s, 1000, 0), "cannot observe 1000 nodes"),
-        (lambda s: observation_from(s, {"kind": "smell"}), "observation kind 'smell' is unknown"),
+        (
+            lambda s: observation_from_json(s, {"kind": "smell"}),
+            "observation kind 'smell' is unknown",
+        ),
     ],
 )
 def test_what_cannot_be_observed(beam, make, message):
@@ -124,13 +127,13 @@ def test_several_observations_need_the_union_of_their_nodes(ventricle):
     seen = several(jnp.asarray(u[:, several.nodes]))
     for name, part in parts.items():
         np.testing.assert_allclose(seen[name], part(jnp.asarray(u[:, part.nodes])), rtol=1e-13)
-    again = observations_from(ventricle, json.loads(json.dumps(several.describe())))
+    again = observations_from_json(ventricle, json.loads(json.dumps(several.to_json())))
     assert list(again.parts) == ["displacement", "volume"]
     np.testing.assert_array_equal(again.nodes, several.nodes)
-    # A single one is described as it always was, and is called by what it measures.
+    # A single one needs no name.
     alone = observations(parts["displacement"])
-    assert alone.describe()["kind"] == "landmarks"
-    assert list(observations_from(ventricle, alone.describe()).parts) == ["displacement"]
+    assert alone.to_json()["displacement"]["kind"] == "landmarks"
+    assert list(observations_from_json(ventricle, alone.to_json()).parts) == ["displacement"]
 
 
 def test_the_largest_part_is_a_slice_of_the_union(ventricle):

@@ -49,7 +49,7 @@ def by_hand(ventricle, forward, parts, data, sds):
     moved = np.array(
         [
             w @ u[landmarks.nodes[c]]
-            for c, w in zip(landmarks.corners, landmarks.weights, strict=True)
+            for c, w in zip(landmarks.members, landmarks.weights, strict=True)
         ]
     )
     volume = enclosed(ventricle.mesh.nodes + u, ventricle.mesh.facet_set("endocardium"))
@@ -72,7 +72,7 @@ def test_the_density_of_two_observations_is_the_one_by_hand(ventricle, parts, da
     likelihood = by_hand(ventricle, forward, parts, data, (0.5, 4.0))
     assert float(found) == pytest.approx(prior + likelihood, rel=1e-10)
     seen = model.forward(jnp.array(list(THETA.values())))
-    assert float(model.log_likelihood(seen, model.noise_sds({}), checked)) == pytest.approx(
+    assert float(model.log_likelihood(seen, model.noise_values({}), checked)) == pytest.approx(
         likelihood, rel=1e-10
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -23,37 +24,44 @@ class Parser(argparse.ArgumentParser):
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
-    """Every command can answer in JSON."""
+    """Add ``--json``, which every command has."""
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
-    """The scene and, for published ones, the folder of the data."""
+    """Add the scene and, for published ones, the folder of the data."""
     parser.add_argument(
         "scene", metavar="SCENE", help="built-in name, .toml file, or published:<Model>"
     )
     parser.add_argument("--root", metavar="DIR", help="folder of the published data")
 
 
-def assignments(words: Sequence[str]) -> dict[str, float]:
-    """``name=value`` words as a dict; :class:`InputError` names the one that is not."""
+def assignments(words: Sequence[str], example: str = "mu=73") -> dict[str, float]:
+    """``name=number`` words as a dict; :class:`InputError` for other words or a repeated name."""
     values: dict[str, float] = {}
     for word in words:
         name, _, text = word.partition("=")
+        if name in values:
+            raise InputError(f"'{name}' is given twice; once is enough")
         try:
             values[name] = float(text)
         except ValueError as error:
-            raise InputError(f"'{word}' is not name=number, e.g. mu=73") from error
+            raise InputError(f"'{word}' is not name=number, e.g. {example}") from error
     return values
 
 
+_DURATION = re.compile(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s)?", re.ASCII)
+
+
 def seconds(text: str) -> float:
-    """A duration such as ``90``, ``90s``, ``15m`` or ``2h`` in seconds."""
-    factor = {"s": 1.0, "m": 60.0, "h": 3600.0}.get(text[-1:])
-    try:
-        value = float(text[:-1] if factor else text) * (factor or 1.0)
-    except ValueError as error:
-        raise InputError(f"duration '{text}' is not a number with s, m or h, e.g. 15m") from error
+    """A duration such as ``90s``, ``15m``, ``2h`` or ``1h30m`` in seconds."""
+    found = _DURATION.fullmatch(text)
+    if found is None or not text:
+        bare = text.strip().isdigit()
+        hint = f"{text.strip()} what? give {text.strip()}s or {text.strip()}m" if bare else ""
+        raise InputError(f"duration '{text}': {hint or 'give 90s, 15m, 2h or 1h30m, no blanks'}")
+    hours, minutes, rest = (float(part or 0.0) for part in found.groups())
+    value = 3600.0 * hours + 60.0 * minutes + rest
     if not 0.0 < value < float("inf"):
         raise InputError(f"duration '{text}' must be above 0")
     return value

@@ -24,6 +24,8 @@ def summary(report: dict[str, Any]) -> str:
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
         f", forward map: {report['forward']}"
     )
+    for name, mass in report.get("prior_cut", {}).items():
+        lines.append(f"prior of {name} cut to its range: {100.0 * mass:.2g} % of its mass")
     if "certificate" not in report:
         lines.append("not checked against FEM yet: calibrate certify")
     else:

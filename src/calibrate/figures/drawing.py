@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import numpy as np
 
 from calibrate.certificate import Certificate
-from calibrate.observations import Landmarks, NodalDisplacements
+from calibrate.observations import DISPLACEMENT
+from calibrate.observations.points import DisplacementPoints
 from calibrate.posterior import Posterior
 from emulator.errors import InputError
 from emulator.store import replacing
@@ -39,12 +40,12 @@ def displacement_draws(posterior: Posterior, count: int = 200) -> np.ndarray:
     return np.asarray(jax.jit(lambda t: jax.lax.map(posterior.model.full, t))(thetas[rows]))
 
 
-def displacement_part(posterior: Posterior) -> NodalDisplacements | Landmarks:
-    """The observation of displacements; :class:`InputError` when there is none."""
-    part = posterior.model.observe.parts.get("displacement")
-    if not isinstance(part, NodalDisplacements | Landmarks):
+def displacement_part(posterior: Posterior) -> DisplacementPoints:
+    """The observation called ``displacement``; :class:`InputError` when there is none."""
+    parts = posterior.model.observe.parts
+    if DISPLACEMENT not in parts:
         raise InputError("figure: the posterior observes no displacements")
-    return part
+    return cast(DisplacementPoints, parts[DISPLACEMENT])
 
 
 def title_and_save(

@@ -45,21 +45,12 @@ def ventricle_figure(
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35))
     _draw_body(left, posterior, fields)
     axes = right.subplots(2, 3)
-    prior = _prior_thetas(posterior)
+    prior = posterior.model.prior_thetas(jax.random.key(1), 400)
     for panel, parameter in zip(axes.flat, posterior.model.forward.scene.parameters, strict=False):
         _draw_marginal(panel, posterior, parameter, theta[parameter.name])
     _draw_volume(axes.flat[-1], posterior, np.asarray(truth), prior)
     axes.flat[0].legend(loc="best", frameon=False, fontsize=8)
     title_and_save(figure, posterior, certificate, path)
-
-
-def _prior_thetas(posterior: Posterior, count: int = 400) -> jax.Array:
-    """Theta (count, p) from the prior."""
-    prior, names = posterior.model.prior, posterior.model.forward.scene.parameter_names
-    keys = jax.random.split(jax.random.key(1), len(names))
-    return jax.numpy.stack(
-        [prior[n].sample(key, (count,)) for n, key in zip(names, keys, strict=True)], axis=1
-    )
 
 
 def _draw_body(figure: Any, posterior: Posterior, fields: np.ndarray) -> None:
@@ -118,13 +109,14 @@ def _draw_volume(axes: Axes, posterior: Posterior, truth: np.ndarray, prior: jax
         lambda thetas: jax.lax.map(lambda t: model.observe(model.forward(t))["volume"], thetas)
     )
     before, after = np.asarray(predict(prior)), np.asarray(predict(posterior.thetas()[::4]))
-    measured, sd = float(posterior.data["volume"]), model.noise["volume"].sd
+    measured, noise = float(posterior.data["volume"]), model.noise["volume"]
     axes.hist(after, 25, density=True, color=_POSTERIOR, alpha=0.75)
     for quantile in np.quantile(after, [0.05, 0.95]):
         axes.axvline(quantile, color=_POSTERIOR, lw=1, ls=":")
     axes.axvline(float(volume(truth[volume.nodes])), color="black", lw=1.6)
     axes.axvline(measured, color=_DATA, lw=1.6, label="measured")
-    if sd is not None:
+    if not noise.priors:
+        sd = noise.upper_sd
         axes.axvspan(measured - sd, measured + sd, color=_DATA, alpha=0.2, lw=0, label="noise sd")
     low, high = np.quantile(before, [0.05, 0.95])
     axes.set(

@@ -7,7 +7,9 @@ import meshio
 import numpy as np
 import pytest
 
+import emulator as em
 from calibrate.cli import main
+from calibrate.cli.common import seconds
 from emulator.geometry.bodies.box import box
 from emulator.surrogates.files import SHIPPED, load
 
@@ -27,6 +29,9 @@ range = [5, 20]
 [constants]
 lam = 30.0
 """
+
+
+FREE_END = em.scenes.once_clamped_beam().mesh.node_set("right").tolist()
 
 
 @pytest.fixture
@@ -51,6 +56,14 @@ def complaint(capsys, *words):
     assert len(lines) == 1
     assert lines[0].startswith("calibrate: ")
     return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("90s", 90.0), ("15m", 900.0), ("2h", 7200.0), ("1h30m", 5400.0), ("1.5m", 90.0)],
+)
+def test_durations(text, expected):
+    assert seconds(text) == expected
 
 
 def test_scenes(capsys):
@@ -152,6 +165,7 @@ def test_bad_meshes_in_scene_files(capsys, block):
         ),
         (["simulate", "once_clamped_beam", "--theta", "mu"], "'mu' is not name=number"),
         (["simulate", "once_clamped_beam", "--theta", "mu=60"], "no value for parameter 'lam'"),
+        (["simulate", "once_clamped_beam", "--theta", "mu=60", "mu=70"], "'mu' is given twice"),
         (["simulate", "once_clamped_beam", "--out", "u.png"], "must end in .vtu"),
         (
             ["simulate", "once_clamped_beam", "--out", "/no/where/u.vtu"],
@@ -163,7 +177,16 @@ def test_bad_meshes_in_scene_files(capsys, block):
         (["train", "liver", "--objective", "luck", "--out", "e"], "invalid choice: 'luck'"),
         (
             ["train", "once_clamped_beam", "--budget", "soon", "--out", "x"],
-            "duration 'soon' is not",
+            "duration 'soon': give 90s, 15m, 2h or 1h30m",
+        ),
+        (["train", "liver", "--budget", "5", "--out", "x"], "5 what? give 5s or 5m"),
+        (["train", "liver", "--budget", "5 ", "--out", "x"], "5 what? give 5s or 5m"),
+        (["train", "liver", "--budget", "10 m", "--out", "x"], "duration '10 m': give 90s"),
+        (["train", "liver", "--budget", "", "--out", "x"], "duration '': give 90s"),
+        (["train", "liver", "--budget", "0s", "--out", "x"], "duration '0s' must be above 0"),
+        (
+            ["train", "once_clamped_beam", "--resume", "--budget", "", "--out", "x"],
+            "--budget has no effect with --resume",
         ),
         (["train", "once_clamped_beam", "--steps", "-1", "--out", "x"], "steps is -1"),
         (
@@ -203,6 +226,22 @@ def test_bad_calls(capsys, monkeypatch, tmp_path, words, message):
         (["--data", "missing.csv"], "missing.csv does not exist"),
         (["--data", "nan.csv"], "row 2 has a displacement that is not finite"),
         (["--data", "node.csv"], "node 4000 is unknown"),
+        (["--data", "book.xlsx"], "book.xlsx is a spreadsheet; save it as CSV"),
+        (["--data", "metres.csv"], "m instead of mm? multiply by 1000"),
+        (["--data", "centimetres.csv"], "cm instead of mm? multiply by 10 "),
+        (["--data", "zero.csv"], "displacement data are all zero; predictions reach"),
+        (["--data", "huge.csv"], "times larger than predicted (largest 1e+09"),
+        (["--truth", "mu=73", "mu=74", "lam=61"], "'mu' is given twice"),
+        (
+            ["--truth", "mu=73", "lam=61", "--noise", "volume=1.0"],
+            "noise: 'volume' is not observed; observed: displacement",
+        ),
+        (["--truth", "mu=73", "lam=61", "--noise", "1", "2"], "--noise: '2' needs a name, as in"),
+        (["--truth", "mu=73", "lam=61", "--noise", "much"], "--noise: 'much' is not a number"),
+        (
+            ["--truth", "mu=73", "lam=61", "--noise-scale", "displacement=0"],
+            "displacement (mm): noise: standard deviation is 0.0",
+        ),
         (["--truth", "mu=73"], "no value for parameter 'lam'"),
         (["--truth", "mu=73", "lam=10"], "parameter 'lam' is 10 kPa"),
         (["--truth", "mu=73", "lam=61", "--observe", "4000"], "node 4000 is unknown"),
@@ -228,6 +267,11 @@ def test_bad_inference_leaves_nothing_behind(capsys, monkeypatch, tmp_path, word
     monkeypatch.chdir(tmp_path)
     (tmp_path / "nan.csv").write_text("node,ux,uy,uz\n30,0,0,0\n31,0,nan,0\n")
     (tmp_path / "node.csv").write_text("node,ux,uy,uz\n4000,0,0,0\n")
+    (tmp_path / "book.xlsx").write_bytes(b"PK")
+    # The free end sags by 10 to 20 mm.
+    for name, sag in (("metres", 0.015), ("centimetres", 1.5), ("zero", 0.0), ("huge", 1e9)):
+        rows = [f"{node},0,0,{-sag}" for node in FREE_END]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["node,ux,uy,uz", *rows]))
     for name in ("broken", "other"):
         shutil.copytree(SHIPPED / "once_clamped_beam", tmp_path / name)
     weights = tmp_path / "broken" / "weights.safetensors"

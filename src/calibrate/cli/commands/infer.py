@@ -9,6 +9,7 @@ from typing import Any
 from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments, emit, show_progress
 from calibrate.cli.forward import add_forward, forward_options
 from calibrate.cli.posterior_table import summary
+from emulator.errors import InputError
 
 
 def register(commands: Any) -> None:
@@ -25,7 +26,7 @@ def register(commands: Any) -> None:
         "--observe",
         default="nodes:20",
         metavar="WHAT",
-        help="of synthetic data: nodes:N, landmarks:N, all, a node set, 3,14,15, volume, "
+        help="of synthetic data, e.g. nodes:N, landmarks:N, all, a node set, 3,14,15, volume, "
         "volume:FACETSET; several joined by +, as in landmarks:24+volume",
     )
     _add_noise(parser)
@@ -47,24 +48,44 @@ def register(commands: Any) -> None:
 
 
 def _add_noise(parser: argparse.ArgumentParser) -> None:
-    """Noise of displacements and of volumes, known or to be inferred."""
-    for option, quantity, unit, default in (
-        ("--noise", "displacements", "MM", 0.2),
-        ("--volume-noise", "volumes", "ML", 1.0),
-    ):
-        parser.add_argument(
-            option,
-            type=float,
-            metavar=unit,
-            default=default,
-            help=f"standard deviation of {quantity} (default {default})",
-        )
-        parser.add_argument(
-            f"{option}-scale",
-            type=float,
-            metavar=unit,
-            help=f"infer the noise of {quantity}; scale of its half-normal prior",
-        )
+    """Noise by observation, known or to be inferred, and the check of the data's unit."""
+    parser.add_argument(
+        "--noise",
+        nargs="+",
+        default=[],
+        metavar="[NAME=]SD",
+        help="standard deviation by observation, e.g. volume=1.0 displacement=0.2, mL and mm; a "
+        "bare number is a single observation's or the displacements' (default 0.2 mm, 1 mL)",
+    )
+    parser.add_argument(
+        "--noise-scale",
+        nargs="+",
+        default=[],
+        metavar="[NAME=]SCALE",
+        help="infer the noise: scale of the half-normal prior of its standard deviation",
+    )
+    parser.add_argument(
+        "--no-unit-check",
+        action="store_true",
+        help="take data however far from every prediction (m for mm, mm3 for mL, zero)",
+    )
+
+
+def noise_by_name(words: list[str], option: str) -> dict[str, float] | float:
+    """Numbers by observation; a bare number alone is left as it is, for the data to name.
+
+    Beside named ones, a bare number is the displacements'.
+    """
+    bare = [word for word in words if "=" not in word]
+    if len(bare) > 1:
+        raise InputError(f"{option}: '{bare[1]}' needs a name, as in volume={bare[1]}")
+    try:
+        if bare and len(words) == 1:
+            return float(bare[0])
+        return assignments([w if "=" in w else f"displacement={w}" for w in words], "volume=1.0")
+    except ValueError as error:
+        text = error if isinstance(error, InputError) else f"'{bare[0]}' is not a number"
+        raise InputError(f"{option}: {text}") from error
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -80,10 +101,9 @@ def run(arguments: argparse.Namespace) -> int:
         data=_absolute(arguments.data, is_path=arguments.data != "synthetic"),
         truth=assignments(arguments.truth),
         observe=arguments.observe,
-        noise_sd=arguments.noise,
-        noise_scale=arguments.noise_scale,
-        volume_noise_sd=arguments.volume_noise,
-        volume_noise_scale=arguments.volume_noise_scale,
+        noise=noise_by_name(arguments.noise, "--noise"),
+        noise_scale=noise_by_name(arguments.noise_scale, "--noise-scale"),
+        check_scale=not arguments.no_unit_check,
         forward=arguments.forward,
         emulator=_emulator(arguments.emulator),
         forward_options=forward_options(arguments),
@@ -104,7 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _absolute(word: str, *, is_path: bool = True) -> str:
-    """A path that still means the same from another folder, kept results being read from any."""
+    """An absolute path, because a kept run may be read from any folder."""
     return str(Path(word).resolve()) if is_path else word
 
 

@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     names = ("objective", "steps", "simulations", "batch", "seed")
     given = {name: getattr(arguments, name) for name in names}
     given = {name: value for name, value in given.items() if value is not None}
-    others = [name for name in ("recipe", "start", "budget") if getattr(arguments, name)]
+    others = [n for n in ("recipe", "start", "budget") if getattr(arguments, n) is not None]
     if arguments.resume and (given or others):
         option = next(iter([*given, *others]))
         raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
         replace(plan, **given),
         arguments.out,
         start=start,
-        budget=None if fixed else seconds(arguments.budget or "10m"),
+        budget=None if fixed else seconds("10m" if arguments.budget is None else arguments.budget),
         resume=arguments.resume,
         progress=show_progress(arguments),
     )

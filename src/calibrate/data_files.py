@@ -1,0 +1,203 @@
+"""Data files as named arrays: CSV in its dialects, and netCDF.
+
+A CSV file has one header line, and columns separated by commas, semicolons or tabs, whichever the
+header has; with the latter two, numbers may have decimal commas. Blanks around words, empty lines
+and lines that begin with ``#`` are ignored.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from calibrate.observations import Field
+from emulator.errors import InputError
+from emulator.store import replacing, write_atomically
+
+_TEXT = (".csv", ".tsv", ".txt")
+_SPREADSHEETS = (".xlsx", ".xls", ".ods")
+
+
+class DataFile(ABC):
+    """Named arrays of a file.
+
+    words : names of its columns or variables.
+    what : ``column`` or ``variable``, for errors.
+    """
+
+    words: Sequence[str]
+    what: str
+
+    @abstractmethod
+    def needs(self, field: Field) -> tuple[str, ...]:
+        """Words that hold ``field`` in a file of this kind."""
+
+    @abstractmethod
+    def arrays(self, fields: Sequence[Field]) -> dict[str, np.ndarray]:
+        """Arrays of numbers by variable; every word they need is there."""
+
+
+def open_data(path: Path) -> DataFile:
+    """The file at ``path``: CSV by its suffix, else netCDF; :class:`InputError` for others."""
+    if not path.is_file():
+        raise InputError(f"data file {path} does not exist")
+    if path.suffix.lower() in _SPREADSHEETS:
+        raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
+    return CSVFile(path) if path.suffix.lower() in _TEXT else NetCDFFile(path)
+
+
+class CSVFile(DataFile):
+    """Columns of a CSV file; rows are counted from 1 after the header."""
+
+    what = "column"
+
+    def __init__(self, path: Path) -> None:
+        lines = _lines(path)
+        delimiter = _delimiter(lines[0]) if lines else ","
+        try:
+            table = list(
+                csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
+            )
+        except csv.Error as error:
+            raise InputError(f"data file {path} is not a CSV file: {error}") from error
+        cells = [[cell.strip() for cell in row] for row in table]
+        self.path, self.decimal_comma = path, delimiter != ","
+        self.words = cells[0] if cells else []
+        twice = [w for w in self.words if w and self.words.count(w) > 1]
+        if twice:
+            raise InputError(f"data file {path}: column '{twice[0]}' is there twice")
+        self.rows = [
+            self._row(k, row) for k, row in enumerate(cells[1:], 1) if any(row) or len(row) > 1
+        ]
+
+    def _row(self, number: int, cells: list[str]) -> dict[str, str]:
+        if any(cells[len(self.words) :]):
+            hint = "" if self.decimal_comma else "; decimal commas need semicolons between columns"
+            raise InputError(
+                f"data file {self.path}: row {number} has {len(cells)} values for "
+                f"{len(self.words)} columns{hint}"
+            )
+        padded = cells + [""] * (len(self.words) - len(cells))
+        return dict(zip(self.words, padded, strict=False))
+
+    def needs(self, field: Field) -> tuple[str, ...]:
+        """The field's columns."""
+        return field.columns
+
+    def arrays(self, fields: Sequence[Field]) -> dict[str, np.ndarray]:
+        """Rows in which any of the fields has a value."""
+        words = [word for field in fields for word in field.columns]
+        filled = [(k, row) for k, row in enumerate(self.rows, 1) if any(row[w] for w in words)]
+        found = {}
+        for field in fields:
+            numbers = [[self._number(k, row, w) for w in field.columns] for k, row in filled]
+            array = np.array(numbers, dtype=float).reshape(len(filled), len(field.columns))
+            found[field.variable] = array[:, 0] if len(field.columns) == 1 else array
+        return found
+
+    def _number(self, number: int, row: Mapping[str, str], word: str) -> float:
+        text = row[word]
+        if self.decimal_comma and "." not in text:
+            text = text.replace(",", ".")
+        try:
+            return float(text)
+        except ValueError as error:
+            found = f"'{row[word]}', not a number" if row[word] else "empty"
+            raise InputError(
+                f"data file {self.path}: row {number}, column '{word}' is {found}"
+            ) from error
+
+
+def _lines(path: Path) -> list[str]:
+    """Lines that say something, the header first."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"data file {path} is not UTF-8 text; save it as CSV UTF-8") from error
+    if "\0" in text:
+        raise InputError(f"data file {path} is not a CSV file: it holds bytes that are no text")
+    lines = [line.strip(" \r") for line in text.split("\n")]
+    return [line for line in lines if line.strip() and not line.startswith("#")]
+
+
+def _delimiter(header: str) -> str:
+    """What separates the words of the header; what is quoted does not count."""
+    bare = re.sub(r'"[^"]*"', "", header)
+    return next((mark for mark in ";\t" if mark in bare), ",")
+
+
+class NetCDFFile(DataFile):
+    """Variables and coordinates of a netCDF file."""
+
+    what = "variable"
+
+    def __init__(self, path: Path) -> None:
+        try:
+            with xr.open_dataset(path, engine="h5netcdf") as file:
+                self.data = file.load()
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(
+                f"data file {path} is neither CSV ({', '.join(_TEXT)}) nor readable netCDF"
+            ) from error
+        self.path = path
+        self.words = list(map(str, self.data.variables))
+
+    def needs(self, field: Field) -> tuple[str, ...]:
+        """The field's variable."""
+        return (field.variable,)
+
+    def arrays(self, fields: Sequence[Field]) -> dict[str, np.ndarray]:
+        """The variables as numbers."""
+        found = {}
+        for name in (field.variable for field in fields):
+            try:
+                found[name] = np.asarray(self.data[name], dtype=float)
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"data file {self.path}: variable '{name}' does not hold numbers"
+                ) from error
+        return found
+
+
+Block = Sequence[tuple[Field, np.ndarray]]
+"""The fields of one observation with their arrays."""
+
+
+def write_csv(path: str | Path, blocks: Sequence[Block]) -> None:
+    """Columns of every block side by side; those of one number share a last row of their own."""
+    header = [word for block in blocks for field, _ in block for word in field.columns]
+    rows: list[list[str]] = []
+    single = [""] * len(header)
+    column = 0
+    for block in blocks:
+        for field, array in block:
+            cells = np.asarray(array).reshape(-1, len(field.columns))
+            for k, values in enumerate(cells.tolist() if np.ndim(array) else ()):
+                if k == len(rows):
+                    rows.append([""] * len(header))
+                rows[k][column : column + len(values)] = map(repr, values)
+            if not np.ndim(array):
+                single[column] = repr(float(array))
+            column += len(field.columns)
+    rows += [single] if any(single) else []
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    write_atomically(path, text.getvalue().encode())
+
+
+def write_netcdf(path: str | Path, blocks: Sequence[Block]) -> None:
+    """Every array a variable; arrays of as many rows as the block's first share a dimension."""
+    variables = {}
+    for k, block in enumerate(blocks):
+        for field, array in block:
+            dims = [f"point_{k}", *(f"component_{n}" for n in np.shape(array)[1:])]
+            variables[field.variable] = (dims[: np.ndim(array)], np.asarray(array))
+    with replacing(path) as temporary:
+        xr.Dataset(variables).to_netcdf(temporary, engine="h5netcdf")

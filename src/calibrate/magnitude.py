@@ -1,0 +1,157 @@
+r"""Data against what the model can predict: units that are wrong by factors, data that is zero.
+
+Predictions :math:`g_s` are made at draws of the prior and at its ends, where they are smallest and
+largest. Data :math:`y` is refused as too small when for every one of them
+
+.. math:: \|y\| < \tfrac12 \|g_s\| \quad\text{and}\quad
+          \|g_s\| - y \cdot g_s / \|g_s\| > 5 \sigma
+
+and as too large when
+
+.. math:: \|y\| > 2 \|g_s\| \quad\text{and}\quad \|y - g_s\| > \sigma (\sqrt n + 5),
+
+with the noise's standard deviation :math:`\sigma` (the largest plausible one where it is inferred)
+and n numbers. The second conditions keep noisy data: however large the noise, data made at
+:math:`g_s` meets one of them with a probability below 4e-6. The first conditions keep data from a
+corner of the prior that no draw came near.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.noise import Noise
+from calibrate.observations import Observation, Observations
+from emulator.errors import InputError
+from emulator.surrogates.protocol import ForwardMap
+
+_DRAWS = 32  # predictions at draws of the prior
+PRIOR_DRAWS = 4096  # whose extremes stand for the ends of a parameter's prior
+_FACTOR = 2.0
+_NOISE_SD = 5.0
+_OVERRULE = "check_scale=False or --no-unit-check overrules"
+
+
+def check_magnitudes(
+    forward: ForwardMap,
+    observe: Observations,
+    noise: Mapping[str, Noise],
+    thetas: np.ndarray,
+    data: Mapping[str, np.ndarray],
+) -> None:
+    """Raise :class:`InputError` where ``data`` is far from every prediction.
+
+    ``thetas`` (c, p) are draws of the prior, ``PRIOR_DRAWS`` of them or so.
+    """
+    predictions = predict_over_prior(forward, observe, thetas)
+    for name, part in observe.parts.items():
+        check_magnitude(name, part, data[name], predictions[name], noise[name].upper_sd)
+
+
+def predict_over_prior(
+    forward: ForwardMap, observe: Observations, thetas: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Predictions (s, ...) without noise at draws of the prior and at its ends, by observation.
+
+    The ends are taken one parameter at a time, and then together where each makes the prediction
+    smaller, or larger.
+
+    Raises
+    ------
+    InputError
+        The forward map has no valid answer at any of them.
+    """
+
+    @jax.jit
+    def one(theta: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        prediction = forward.evaluate(theta)
+        return observe(prediction.displacement), prediction.valid
+
+    found: dict[str, list[np.ndarray]] = {name: [] for name in observe.parts}
+
+    def sizes(theta: np.ndarray) -> dict[str, float]:
+        means, valid = one(jnp.asarray(theta))
+        if not bool(valid):
+            return dict.fromkeys(found, np.nan)
+        for name, mean in means.items():
+            found[name].append(np.asarray(mean))
+        return {name: _norm(np.asarray(mean)) for name, mean in means.items()}
+
+    middle, ends = np.median(thetas, axis=0), np.stack([thetas.min(axis=0), thetas.max(axis=0)])
+    for theta in thetas[:_DRAWS]:
+        sizes(theta)
+    reached = {name: np.empty(ends.shape) for name in found}
+    for end, k in np.ndindex(ends.shape):
+        theta = middle.copy()
+        theta[k] = ends[end, k]
+        for name, size in sizes(theta).items():
+            reached[name][end, k] = size
+    columns = np.arange(ends.shape[1])
+    for by_end in reached.values():
+        smaller = (by_end[1] < by_end[0]).astype(int)
+        sizes(ends[smaller, columns])
+        sizes(ends[1 - smaller, columns])
+    if not all(found.values()):
+        raise InputError(
+            f"forward map '{forward.kind}' has no valid answer at any of {_DRAWS} draws of "
+            "the prior; give a prior inside the range in which it answers"
+        )
+    return {name: np.stack(values) for name, values in found.items()}
+
+
+def check_magnitude(
+    name: str, part: Observation, data: np.ndarray, predictions: np.ndarray, sd: float
+) -> None:
+    """Raise :class:`InputError` where data (...) is far from all of ``predictions`` (s, ...)."""
+    y, g = np.ravel(data), predictions.reshape(len(predictions), -1)
+    norms = np.array([_norm(row) for row in g])
+    if not norms.min() > 0.0:
+        return  # a body that may be at rest explains data of any size
+    size, count = _norm(y), y.size
+    along = np.array([row @ y for row in g / norms[:, None]])
+    small = (size < norms / _FACTOR) & (norms - along > _NOISE_SD * sd)
+    apart = np.array([_norm(y - row) for row in g])
+    large = (size > _FACTOR * norms) & (apart > sd * (np.sqrt(count) + _NOISE_SD))
+    if small.all() or large.all():
+        raise InputError(_complaint(name, part, y, g, norms))
+
+
+def _complaint(
+    name: str, part: Observation, y: np.ndarray, g: np.ndarray, norms: np.ndarray
+) -> str:
+    """What the data looks like, in one line."""
+    largest = np.abs(g).max(axis=1)
+    predicted = f"{largest.min():.3g} to {largest.max():.3g} {part.unit}"
+    size = _norm(y)
+    if size == 0.0:
+        return f"{name} data are all zero; predictions reach {predicted} ({_OVERRULE})"
+    ratio = float(np.sqrt(norms.min() * norms.max())) / size
+    word, times = ("smaller", ratio) if ratio > 1.0 else ("larger", 1.0 / ratio)
+    guess = _guess(part, size, norms, ratio)
+    return (
+        f"{name} data are about {float(f'{times:.1g}'):g} times {word} than predicted "
+        f"(largest {np.abs(y).max():.3g} against {predicted}): {guess} ({_OVERRULE})"
+    )
+
+
+def _guess(part: Observation, size: float, norms: np.ndarray, ratio: float) -> str:
+    """The unit that would bring the data to the size of the predictions."""
+    fitting = {
+        unit: factor
+        for unit, factor in part.other_units.items()
+        if norms.min() / _FACTOR < factor * size < norms.max() * _FACTOR
+    }
+    if not fitting:
+        return "check their unit, and that they belong to this scene"
+    unit = min(fitting, key=lambda other: abs(np.log(fitting[other] / ratio)))
+    return f"{unit} instead of {part.unit}? multiply by {fitting[unit]:g}"
+
+
+def _norm(values: np.ndarray) -> float:
+    """Euclidean norm, also of numbers whose squares overflow."""
+    largest = float(np.abs(values).max(initial=0.0))
+    return largest * float(np.linalg.norm(values / largest)) if largest > 0.0 else 0.0

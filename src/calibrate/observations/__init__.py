@@ -1,0 +1,40 @@
+"""Observation operators: what of a displacement field was measured, one kind a file.
+
+Each stands for one measurement; :class:`Observations` holds those made at once, by name. The kinds
+are listed in :data:`KINDS`.
+"""
+
+from calibrate.observations.landmarks import Landmarks, landmarks, spread_landmarks
+from calibrate.observations.nodes import NodalDisplacements, nodal_displacements, spread_nodes
+from calibrate.observations.points import DISPLACEMENT
+from calibrate.observations.protocol import Field, Labels, Observation
+from calibrate.observations.registry import (
+    KINDS,
+    observation_from_json,
+    observations_from_json,
+    parse_observation,
+)
+from calibrate.observations.scalar import Scalar
+from calibrate.observations.several import Observations, observations
+from calibrate.observations.volume import CavityVolume
+
+__all__ = [
+    "DISPLACEMENT",
+    "KINDS",
+    "CavityVolume",
+    "Field",
+    "Labels",
+    "Landmarks",
+    "NodalDisplacements",
+    "Observation",
+    "Observations",
+    "Scalar",
+    "landmarks",
+    "nodal_displacements",
+    "observation_from_json",
+    "observations",
+    "observations_from_json",
+    "parse_observation",
+    "spread_landmarks",
+    "spread_nodes",
+]

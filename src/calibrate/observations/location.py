@@ -1,0 +1,117 @@
+r"""The element a material point lies in, and the shape functions there.
+
+scikit-fem finds the element of a point inside the body. A point outside, or inside a curved element
+but not inside its straight-edged one, is moved onto the nearest element, by inverting the element's
+map :math:`x(\xi) = \sum_a N_a(\xi)\, X_a` with Newton's method.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from skfem import ElementTetP1, ElementTetP2, MeshTet
+
+from emulator.errors import InputError
+from emulator.geometry.mesh import Mesh
+
+# How far outside the body a point may lie, as a fraction of the body's size. Measured surface
+# points rarely lie on the mesh to the last digit.
+_SLACK = 1e-3
+_ON_THE_FACE = 1e-9  # round-off of a barycentric coordinate
+_CANDIDATES = 32  # nearest elements, by their straight-edged shape, in which a point is sought
+_NEWTON_STEPS = 12  # at most; an element with straight edges takes one
+
+
+def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Element (d,) of each point (d, 3), and the element's shape functions there (d, 4 or 10).
+
+    Raises
+    ------
+    InputError
+        A point further outside than a thousandth of the body's size.
+    """
+    straight = MeshTet(mesh.nodes.T.copy(), mesh.corners.T.copy(), sort_t=False, validate=False)
+    finder, nodes = straight.element_finder(), mesh.nodes[mesh.elements]
+    elements, coordinates = [], []
+    for k, point in enumerate(points):
+        try:
+            found = finder(*point[:, None])
+        except ValueError:  # outside every straight-edged element
+            found = None
+        inside = None if found is None else _invert(nodes[found], point)[0]
+        if found is None or inside is None or not inside.min() >= -_ON_THE_FACE:
+            found, inside = _nearest(mesh, k, point)
+        elements.append(int(found[0]))
+        coordinates.append(inside[0])
+    return np.array(elements), shape_values(mesh.order, np.array(coordinates))
+
+
+def shape_values(order: int, barycentric: np.ndarray) -> np.ndarray:
+    """Shape functions (d, 4 or 10) at barycentric coordinates (d, 4)."""
+    return barycentric if order == 1 else _tabulate(order, barycentric)[0]
+
+
+def _tabulate(order: int, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shape functions (c, a) and their derivatives (c, a, 3) in the last three coordinates."""
+    element = ElementTetP1() if order == 1 else ElementTetP2()
+    xi = barycentric[:, 1:].T
+    shapes = [element.lbasis(xi, a) for a in range(len(element.doflocs))]
+    values = np.stack([np.broadcast_to(value, xi.shape[1:]) for value, _ in shapes], axis=1)
+    slopes = np.stack([np.broadcast_to(slope.T, xi.T.shape) for _, slope in shapes], axis=1)
+    return values, slopes
+
+
+def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Barycentric coordinates (c, 4) of ``point`` in elements with nodes ``X`` (c, a, 3).
+
+    They are not clipped: one below 0 says that the point lies beyond a face. Also their gradients
+    (c, 4, 3) in space, 1/mm.
+    """
+    order = 1 if X.shape[1] == 4 else 2
+    xi = np.full((len(X), 3), 0.25)
+    for _ in range(1 if order == 1 else _NEWTON_STEPS):
+        values, slopes = _tabulate(order, _barycentric(xi))
+        # d xi / d x, the inverse of the element map's Jacobian; NumPy, no batched LAPACK of JAX's.
+        inverse = np.linalg.inv(np.einsum("cai,caj->cij", X, slopes))
+        step = np.einsum("cji,ci->cj", inverse, point - np.einsum("ca,cai->ci", values, X))
+        # The map of a curved element folds far outside it; Newton is kept from going there.
+        xi = xi + step if order == 1 else np.clip(xi + step, -0.5, 1.5)
+        if np.abs(step).max() < 1e-13:
+            break
+    return _barycentric(xi), np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+
+
+def _barycentric(xi: np.ndarray) -> np.ndarray:
+    return np.concatenate([1.0 - xi.sum(axis=1, keepdims=True), xi], axis=1)
+
+
+def _nearest(mesh: Mesh, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The element nearest to ``point``, and barycentric coordinates (1, 4) of the point on it."""
+    every = mesh.nodes[mesh.elements]
+    distances, _ = _onto(every[:, :4], point)
+    near = np.argsort(distances, kind="stable")[:_CANDIDATES]
+    distances, inside = _onto(every[near], point)
+    best = int(np.argmin(distances))
+    if not distances[best] <= _SLACK * mesh.size:
+        raise InputError(
+            f"landmark {k} at {point.tolist()} mm lies outside the body, "
+            f"about {distances[best]:.2g} mm away"
+        )
+    return near[[best]], inside[[best]]
+
+
+def _onto(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (c,) of ``point`` to elements with nodes ``X`` (c, a, 3), and where it meets them.
+
+    Beyond a face, the point goes back onto it along the face's normal; coordinates that are still
+    below 0 are clipped.
+    """
+    coordinates, gradients = _invert(X, point)
+    rows = np.arange(len(X))
+    lowest = np.argmin(coordinates, axis=1)
+    normal = gradients[rows, lowest]
+    beyond = np.minimum(coordinates[rows, lowest], 0.0) / np.sum(normal**2, axis=1)
+    inside = coordinates - beyond[:, None] * np.einsum("cai,ci->ca", gradients, normal)
+    inside = np.maximum(inside, 0.0)
+    inside /= inside.sum(axis=1, keepdims=True)
+    reached = np.einsum("ca,cai->ci", shape_values(1 if X.shape[1] == 4 else 2, inside), X)
+    return np.linalg.norm(reached - point, axis=1), inside

@@ -1,0 +1,66 @@
+"""The kinds of observations there are: the one list of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from calibrate.observations.landmarks import Landmarks
+from calibrate.observations.nodes import NodalDisplacements
+from calibrate.observations.protocol import Observation
+from calibrate.observations.several import Observations
+from calibrate.observations.volume import CavityVolume
+from emulator.errors import InputError
+from emulator.scenes.scene import Scene
+
+# In this order they look for their columns in a file: `node` decides before `x,y,z`.
+KINDS: dict[str, type[Observation]] = {
+    kind.kind: kind for kind in (NodalDisplacements, Landmarks, CavityVolume)
+}
+
+
+def parse_observation(scene: Scene, text: str, seed: int = 0) -> Observations:
+    """What the words joined by ``+`` ask for, e.g. ``landmarks:24+volume``.
+
+    Raises
+    ------
+    InputError
+        A word that no kind understands, or two observations of the same name.
+    """
+    parts: dict[str, Observation] = {}
+    for word in text.split("+"):
+        name, part = _parse_word(scene, word, seed)
+        if name in parts:
+            raise InputError(f"observe '{text}': {name} is given twice; once is enough")
+        parts[name] = part
+    return Observations(parts)
+
+
+def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
+    """Name and observation; the word before a colon names the kind, others are tried in turn."""
+    named = KINDS.get(word.partition(":")[0])
+    for kind in (named,) if named else KINDS.values():
+        found = kind.parse(scene, word, seed)
+        if found is not None:
+            return found
+    raise InputError(
+        f"observe '{word}': give {', '.join(kind.usage for kind in KINDS.values())}; "
+        f"node sets: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
+    )
+
+
+def observation_from_json(scene: Scene, description: Mapping[str, Any]) -> Observation:
+    """The observation that :meth:`Observation.to_json` described."""
+    kind = description.get("kind")
+    if kind not in KINDS:
+        raise InputError(f"observation kind '{kind}' is unknown; known: {', '.join(KINDS)}")
+    return KINDS[kind].from_json(scene, description)
+
+
+def observations_from_json(
+    scene: Scene, description: Mapping[str, Mapping[str, Any]]
+) -> Observations:
+    """What :meth:`Observations.to_json` described."""
+    return Observations(
+        {name: observation_from_json(scene, part) for name, part in description.items()}
+    )

@@ -1,0 +1,96 @@
+"""Several observations of one displacement field, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import numpy as np
+
+from calibrate.observations.protocol import Observation
+from emulator.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Observations made at once, by name; one forward map serves them all."""
+
+    parts: Mapping[str, Observation]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", MappingProxyType(dict(self.parts)))
+        if not self.parts:
+            raise InputError("nothing is observed; name one observation or more")
+        for name in self.parts:
+            if not isinstance(name, str) or not name or "/" in name:
+                raise InputError(f"observation is called {name!r}; use a name without '/'")
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """Nodes a forward map must return, (k,): the union of the parts', each once.
+
+        The nodes of the largest part come first, in its order, so that its rows are a slice. The
+        reverse derivative of a slice scatters nothing; for many theta at once, scattering would
+        take most of the time.
+        """
+        parts = sorted((part.nodes for part in self.parts.values()), key=len, reverse=True)
+        nodes, first = np.unique(np.concatenate(parts), return_index=True)
+        return nodes[np.argsort(first)]
+
+    @cached_property
+    def _rows(self) -> dict[str, np.ndarray | slice]:
+        order = np.argsort(self.nodes)
+        rows = {
+            name: order[np.searchsorted(self.nodes, part.nodes, sorter=order)]
+            for name, part in self.parts.items()
+        }
+        return {
+            name: slice(len(k)) if np.array_equal(k, np.arange(len(k))) else k
+            for name, k in rows.items()
+        }
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each part's data."""
+        return {name: part.shape for name, part in self.parts.items()}
+
+    def __call__(self, displacement: jax.Array) -> dict[str, jax.Array]:
+        """Data of each part without noise, from the displacement of ``nodes`` (..., k, 3) mm."""
+        return {
+            name: part(displacement[..., self._rows[name], :]) for name, part in self.parts.items()
+        }
+
+    def name[T](self, values: T | Mapping[str, T], what: str) -> dict[str, T]:
+        """``values`` by the parts' names, in their order; a bare value belongs to a single part.
+
+        Raises
+        ------
+        InputError
+            A part without a value, or a value without a part; the message begins with ``what``.
+        """
+        known = ", ".join(self.parts)
+        if not isinstance(values, Mapping):
+            if len(self.parts) > 1:
+                raise InputError(f"{what}: give one for each of {known}, by name")
+            return dict.fromkeys(self.parts, values)
+        for name in (*values, *self.parts):
+            if name not in self.parts:
+                raise InputError(f"{what}: '{name}' is not observed; observed: {known}")
+            if name not in values:
+                raise InputError(f"{what}: nothing for '{name}'; observed: {known}")
+        return {name: values[name] for name in self.parts}
+
+    def to_json(self) -> dict[str, Any]:
+        """The description of each part, by name."""
+        return {name: part.to_json() for name, part in self.parts.items()}
+
+
+def observations(observe: Observation | Mapping[str, Observation] | Observations) -> Observations:
+    """Observations by name; a single one without a name gets its usual one."""
+    if isinstance(observe, Observations):
+        return observe
+    return Observations(observe if isinstance(observe, Mapping) else {observe.names[0]: observe})

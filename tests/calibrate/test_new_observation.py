@@ -1,0 +1,107 @@
+"""A new kind of observation is one class and one line of the registry, and then works everywhere."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import arviz_base
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import calibrate as cal
+from calibrate.data import read_data, write_data
+from calibrate.observations import KINDS, Scalar, observations_from_json, parse_observation
+from calibrate.posterior import _labels
+from calibrate.workflow import Run, make_data
+from emulator.errors import InputError
+from linear_support import linear_forward
+
+
+@dataclass(frozen=True, eq=False)
+class Length(Scalar):
+    """Distance in mm between two nodes, asked for as ``length:3,14``."""
+
+    nodes: np.ndarray
+    points: np.ndarray
+
+    kind: ClassVar = "length"
+    usage: ClassVar = "length:NODE,NODE"
+    quantity: ClassVar = "length"
+    unit: ClassVar = "mm"
+    other_units: ClassVar = {"m": 1e3, "cm": 10.0}
+    default_noise: ClassVar = cal.GaussianNoise(sd=0.1)
+
+    def __call__(self, displacement):
+        x = self.points + displacement
+        return jnp.linalg.norm(x[..., 1, :] - x[..., 0, :], axis=-1)
+
+    @property
+    def names(self):
+        return (f"length:{self.nodes[0]},{self.nodes[1]}",)
+
+    @classmethod
+    def parse(cls, scene, word, seed):
+        kind, _, text = word.partition(":")
+        if kind != cls.kind:
+            return None
+        nodes = cal.nodal_displacements(scene, [int(n) for n in text.split(",")])
+        return word, cls(nodes.nodes, nodes.points)
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    monkeypatch.setitem(KINDS, "length", Length)  # the one line
+
+
+def test_from_the_command_line_through_model_and_file_and_back(beam, tmp_path):
+    observe = parse_observation(beam, "length:3,14+nodes:5", seed=1)
+    assert list(observe.parts) == ["length:3,14", "displacement"]
+    u = np.random.default_rng(0).normal(size=beam.mesh.nodes.shape)
+    x = beam.mesh.nodes + u
+    seen = observe(jnp.asarray(u[observe.nodes]))
+    assert float(seen["length:3,14"]) == pytest.approx(np.linalg.norm(x[14] - x[3]), rel=1e-12)
+    data = {name: np.asarray(value) for name, value in seen.items()}
+    for file in ("d.csv", "d.nc"):
+        write_data(tmp_path / file, observe, data)
+        back, values = read_data(beam, tmp_path / file)
+        assert set(back.parts) == set(observe.parts)
+        for name in data:
+            np.testing.assert_array_equal(values[name], data[name])
+    again = observations_from_json(beam, observe.to_json())
+    np.testing.assert_array_equal(again.nodes, observe.nodes)
+    # Labels in the DataTree: the length has no dimensions, the displacements keep theirs.
+    constants, dims, coords = _labels(observe)
+    tree = arviz_base.from_dict(
+        {"observed_data": data, "constant_data": constants}, dims=dims, coords=coords
+    )
+    assert tree["observed_data"]["length:3,14"].shape == ()
+    assert tree["observed_data"]["displacement"].dims == ("point", "component")
+
+
+def test_in_a_model_with_a_noise_of_its_own(beam):
+    forward = linear_forward(beam)
+    observe = parse_observation(beam, "length:3,14")
+    model = cal.model(forward, observe, cal.GaussianNoise(sd_scale=0.2))
+    assert model.names == ("mu", "lam", "noise_sd")
+    value = observe(model.forward(jnp.array([70.0, 60.0])))["length:3,14"]
+    checked = model.check_data(np.asarray(value))
+    density = model.log_likelihood(
+        model.forward(jnp.array([70.0, 60.0])), {"length:3,14": {"noise_sd": 0.5}}, checked
+    )
+    assert float(density) == pytest.approx(-np.log(0.5 * np.sqrt(2.0 * np.pi)))
+    with pytest.raises(InputError, match=r"length:3,14 is -1.0 mm; it must be above 0"):
+        model.check_data(-1.0)
+    with pytest.raises(InputError, match=r"m instead of mm\? multiply by 1000"):
+        model.check_data(1e-3 * np.asarray(value))
+
+
+def test_in_a_run(beam):
+    run = Run(
+        "once_clamped_beam", observe="length:3,14", noise=0.3, truth={"mu": 70.0, "lam": 60.0}
+    )
+    observe, data = make_data(run, beam)
+    assert run.named(observe).noise == {"length:3,14": 0.3}
+    assert Run("once_clamped_beam").named(observe).noise == {"length:3,14": 0.1}
+    assert data["length:3,14"].shape == ()
+    with pytest.raises(InputError, match="observe 'lengths': give nodes:N.*length:NODE,NODE"):
+        parse_observation(beam, "lengths")
