@@ -43,7 +43,7 @@ class Part(Protocol):
     def restore(
         cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> Self:
-        """The part with this :meth:`to_json` and these :meth:`arrays`, of whatever precision."""
+        """The part with this :meth:`to_json` and these :meth:`arrays`, in float32 or float64."""
         ...
 
 

@@ -49,25 +49,22 @@ def pretrain(
     if not scenes:
         raise InputError("pretraining: no scene is given")
     fingerprint = "+".join(scene.fingerprint for scene in scenes)
-    names = ", ".join(scene.name for scene in scenes)
-    saved = read_checkpoint(path, fingerprint, names) if resume else None
+    saved = None
+    if resume:
+        saved = read_checkpoint(path, fingerprint, ", ".join(scene.name for scene in scenes))
     if saved is not None:
         plan, architecture = saved.plan, saved.architecture or architecture
     problems = _problems(scenes, plan, architecture, progress)
     spent = saved.seconds if saved is not None else 0.0
     clock = lambda: spent + time.perf_counter() - began  # noqa: E731
-    network = problems[0].emulator.network
-    keep = Keep(Writer(path, fingerprint, network.architecture if network else None), plan, clock)
+    keep = Keep(Writer(path, fingerprint, problems[0].architecture), plan, clock)
     state = State(*problems[0].initial())
     state = state if saved is None else saved.restore(*state[:2])
     with Bar("pretrain", state, plan.steps, shown=progress) as bar:
         state = optimise(state, plan.steps, Steps(problems), [bar, keep])
-    record = {
-        "plan": asdict(plan),
-        "final_loss": require_finite(state),
-        "family": [scene.fingerprint for scene in scenes],
-        "seconds": round(clock(), 1),
-    }
+    family = [scene.fingerprint for scene in scenes]
+    record = {"plan": asdict(plan), "final_loss": require_finite(state), "family": family}
+    record["seconds"] = round(clock(), 1)
     return [replace(with_weights(p.emulator, state.weights), record=record) for p in problems]
 
 

@@ -46,6 +46,12 @@ class Problem:
     optimiser: optax.GradientTransformation | None
     step: Step | None
 
+    @property
+    def architecture(self) -> Architecture | None:
+        """Sizes of the network; None without one."""
+        network = self.emulator.network
+        return None if network is None else network.architecture
+
     def initial(self) -> tuple[Any, Any]:
         """Copies of the untrained weights, and the optimiser's state; empty without a network."""
         if self.emulator.network is None or self.optimiser is None:

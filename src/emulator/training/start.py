@@ -80,10 +80,15 @@ def architecture_from(
             f"{there} has parameters {', '.join(start.scene.parameter_names)}; "
             f"'{scene.name}' has {', '.join(scene.parameter_names)}"
         )
-    widths = network.graph.node_features.shape[1], node_inputs(scene).shape[1]
-    if widths[0] != widths[1]:
+    _check_features(network.graph.node_features.shape[1], scene, there)
+    return theirs
+
+
+def _check_features(width: int, scene: Scene, there: str) -> None:
+    """Refuse a scene whose nodes have another number of features than ``width``."""
+    ours = node_inputs(scene).shape[1]
+    if width != ours:
         raise InputError(
-            f"{there} has {widths[0]} features a node, '{scene.name}' has {widths[1]}: one has "
+            f"{there} has {width} features a node, '{scene.name}' has {ours}: one has "
             "supports that move, the other has not"
         )
-    return theirs

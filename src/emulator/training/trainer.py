@@ -56,14 +56,13 @@ def train(
     limit = None if budget is None else Budget(budget, began)
     deadline = np.inf if limit is None else limit.fem_deadline(plan)
     problem = prepare(scene, plan, architecture, start=start, deadline=deadline, progress=progress)
-    network = problem.emulator.network
-    writer = Writer(path, scene.fingerprint, network.architecture if network else None, source)
+    writer = Writer(path, scene.fingerprint, problem.architecture, source)
     spent = saved.seconds if saved is not None else 0.0
     clock = lambda: spent + time.perf_counter() - began  # noqa: E731
     state = _optimise(problem, saved, limit, Keep(writer, problem.plan, clock), progress)
     emulator, record = _finish(problem, state)
-    start_of = {"start": source} if source else {}
-    return replace(emulator, record={**record, **start_of, "seconds": round(clock(), 1)})
+    record |= {"start": source} if source else {}
+    return replace(emulator, record={**record, "seconds": round(clock(), 1)})
 
 
 def _optimise(

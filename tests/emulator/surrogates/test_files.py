@@ -55,7 +55,10 @@ def test_a_scene_that_does_not_match(folder):
     [
         (lambda d: d.pop("parts"), "emulator.json lacks or garbles 'parts'"),
         (lambda d: d["parts"]["network"].clear(), "'network' lacks or garbles 'architecture'"),
-        (lambda d: d["parts"].update(discrepancy={}), "'discrepancy' lacks or garbles 'centre'"),
+        (
+            lambda d: d["parts"].update(discrepancy={}),
+            "'discrepancy' lacks or garbles 'coefficients'",
+        ),
         (lambda d: d["parts"].update(magic={}), "part 'magic' is unknown; known: taylor, network"),
         (lambda d: d.update(format=2), "has format 2; this version reads 3: train .* again"),
         (lambda d: d["scene"].update(scene="heart"), "origin names scene 'heart'"),

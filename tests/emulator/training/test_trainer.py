@@ -345,6 +345,7 @@ def test_mechanics_builds_no_network(beam, tests, tmp_path, monkeypatch):
     assert train(beam, Plan(), tmp_path, resume=True).fingerprint == emulator.fingerprint
 
 
+@pytest.mark.slow
 def test_mechanics_on_a_quadratic_ventricle(tmp_path):
     """Mid-side nodes, mean dilatation, nearly incompressible: held-out FEM within micrometres."""
     linear = em.scenes.left_ventricle(rings=2, around=6, layers=1)
@@ -384,5 +385,9 @@ def test_an_aim_follows_the_clock(monkeypatch):
     now[0] = 600.0
     assert aim(State({}, (), 400, 0.0), 1000) == 400 + int(400.0 / 1.5)
     assert aim(State({}, (), 401, 0.0), 666) == 666
-    late = budget.Aim(0.0, Plan(recipe="hybrid", discrepancy=True, steps=300))
+    now[0] = 0.0
+    late = budget.Aim(100.0, Plan(recipe="hybrid", discrepancy=True, steps=300))
+    now[0] = 200.0  # past the deadline: no step more
     assert late(State({}, (), 200, 0.0), 300) == 200
+    now[0] = 20.0  # well before it: no more than the plan's
+    assert late(State({}, (), 200, 0.0), 300) == 300

@@ -15,6 +15,7 @@ from calibrate.cli.common import (
     seconds,
     show_progress,
 )
+from emulator.errors import InputError
 from emulator.training.plan import OBJECTIVES, RECIPES
 
 
@@ -60,7 +61,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
     from emulator.catalogue import find_scene
-    from emulator.errors import InputError
     from emulator.store import check_folder
     from emulator.surrogates import load, save_emulator
     from emulator.training import recipe, remove_checkpoint
@@ -68,13 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     scene = find_scene(arguments.scene, arguments.root)
     check_folder(arguments.out)
-    names = ("objective", "steps", "simulations", "batch", "seed")
-    given = {name: getattr(arguments, name) for name in names}
-    given = {name: value for name, value in given.items() if value is not None}
-    others = [n for n in ("recipe", "start", "budget") if getattr(arguments, n) is not None]
-    if arguments.resume and (given or others):
-        option = next(iter([*given, *others]))
-        raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
+    given = _given(arguments)
     start = load(arguments.start) if arguments.start else None
     plan = recipe(arguments.recipe or ("network" if start else "hybrid"))
     fixed = arguments.resume or "steps" in given
@@ -101,6 +95,18 @@ def run(arguments: argparse.Namespace) -> int:
     text = f"trained {scene.name}: {steps} steps, {record['seconds']:.0f} s, in {arguments.out}"
     emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
     return DONE
+
+
+def _given(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Fields of the plan given on the command line; with ``--resume`` there may be none."""
+    names = ("objective", "steps", "simulations", "batch", "seed")
+    given = {name: getattr(arguments, name) for name in names}
+    given = {name: value for name, value in given.items() if value is not None}
+    others = [n for n in ("recipe", "start", "budget") if getattr(arguments, n) is not None]
+    if arguments.resume and (given or others):
+        option = next(iter([*given, *others]))
+        raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
+    return given
 
 
 def command_line(scene: str, record: Mapping[str, Any]) -> str:
