@@ -10,6 +10,7 @@ gives forward derivatives by one more solve with the tangent, and reverse ones b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Literal
@@ -21,7 +22,7 @@ from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
 from emulator.fem.functional import volume_ratio
-from emulator.fem.newton import newton
+from emulator.fem.loading_path import find_equilibrium
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
@@ -182,7 +183,7 @@ class Simulator:
 
     @cached_property
     def _equilibrium(self):  # noqa: ANN202 - closures, private
-        closed = jax.jit(partial(newton, self.system, self.options))
+        closed = jax.jit(_one_by_one(partial(find_equilibrium, self.system, self.options)))
 
         @jax.custom_jvp
         def equilibrium(theta: jax.Array, start: jax.Array) -> Solution:
@@ -212,6 +213,26 @@ class Simulator:
     @cached_property
     def _columns(self):  # noqa: ANN202
         return {s.factorisation: jax.jit(partial(_columns, s)) for s in self._systems}
+
+
+def _one_by_one(solve: Callable[..., Solution]) -> Callable[..., Solution]:
+    """``solve`` whose ``vmap`` takes theta after theta.
+
+    Solved side by side, every theta would take the iterations of the slowest, and each iteration
+    the factorisations of all routes.
+    """
+    alone = jax.custom_batching.custom_vmap(solve)
+
+    @alone.def_vmap
+    def together(size, batched, theta, start):  # noqa: ANN001, ANN202
+        theta, start = (
+            x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+            for x, is_batched in zip((theta, start), batched, strict=True)
+        )
+        solutions = jax.lax.map(lambda each: alone(*each), (theta, start))
+        return solutions, jax.tree.map(lambda _: True, solutions)
+
+    return alone
 
 
 def displacement_derivative(
