@@ -62,7 +62,9 @@ class Driver:
                     continue
                 # Where the tangent has been indefinite for long, ask less often.
                 wait, patience = patience, min(2 * patience, _MOST_PATIENCE)
+                convex = jnp.array(False)
                 state = _forget_tangent(state, self.general)
+                state = state._replace(newton=state.newton._replace(convex=convex))
             state = jax.block_until_ready(self._general_step(theta, state))
             wait -= 1
             definite = wait <= 0

@@ -1,7 +1,9 @@
 """Load levels: when one is solved or given up, which comes next, and when the iteration ends.
 
 The whole load is tried at once unless the options say otherwise. A level that does not converge is
-tried again with half the load increment; an easy one earns a longer next increment.
+tried again with half the load increment; an easy one earns a longer next increment. Where the
+loading path is to be followed, a level whose way is not convex is given up too, as long as its
+increment is not small.
 """
 
 from __future__ import annotations
@@ -43,6 +45,7 @@ def judge_level(state: NewtonState, outcome: Outcome, options: NewtonOptions) ->
     if state.volumes is not None:
         spent |= at_level >= _MIXED_ITERATIONS
     spent |= (_squeezed(state, outcome) >= _SQUEEZES) & (_halved(state) >= options.min_increment)
+    spent |= ~_convex(state, outcome) & (_halved(state) >= state.careful)
     return Verdict(solved, ~solved & (stuck | spent))
 
 
@@ -74,7 +77,7 @@ def next_state(
         error=outcome.error,
         tangent=tangent,
         refresh=moved | ~_keeps_tangent(state, outcome, options),
-        convex=state.convex & ~failed & ~_cut_short(state, outcome),
+        convex=moved | _convex(state, outcome),
         crushed=crushed,
         squeezed=jnp.where(moved, 0, _squeezed(state, outcome)),
         status=jnp.asarray(status, dtype=state.status.dtype),
@@ -111,6 +114,9 @@ def _keeps_tangent(state: NewtonState, outcome: Outcome, options: NewtonOptions)
     return good & (state.volumes is None)
 
 
-def _cut_short(state: NewtonState, outcome: Outcome) -> jax.Array:
-    """Whether less than the full step was taken; a kept tangent's step is replaced, not cut."""
-    return state.refresh & (outcome.fraction < 1.0)
+def _convex(state: NewtonState, outcome: Outcome) -> jax.Array:
+    """Whether the way so far was convex, and this step a full one.
+
+    A step with a kept tangent that will not do is replaced, not cut short.
+    """
+    return state.convex & (~state.refresh | (outcome.fraction == 1.0))

@@ -65,6 +65,8 @@ _CARRIED = 0.9
 # First level and largest increment of the climb where all ramps are lost (docs/experiments.md,
 # "Several equilibria in the soft corner").
 _TENTH = 0.1
+# Load increment below which the climb takes steps that are not convex.
+_CAREFUL = 1.0 / 40.0
 _SHORT = 15  # iterations of Newton's method that a route may take, unless it is the last
 
 
@@ -165,7 +167,9 @@ class LoadingPath:
         newton = self._newton.step(state.newton)
         after = state._replace(newton=newton)
         failed = ~newton.running & (newton.status != Status.CONVERGED)
-        astray = failed | ~newton.convex | (newton.running & (newton.at_level >= _SHORT))
+        # A level that failed is followed by a lower one.
+        astray = failed | ~newton.convex | (newton.level < 1.0)
+        astray |= newton.running & (newton.at_level >= _SHORT)
         return jax.lax.cond(
             astray & (state.route < Route.CLIMB), self.give_up, lambda state: state, after
         )
@@ -190,8 +194,13 @@ class LoadingPath:
         if self.ramps:
             level = jnp.array([ramp.first for ramp in _RAMPS] + [_TENTH])[route]
             mip = self._mip(level).begin(u)
-            climb = jnp.where(route == Route.CLIMB, _TENTH, 1.0)
-            newton = newton._replace(level=climb, increment=climb)
+            climb = route == Route.CLIMB
+            level_of_newton = jnp.where(climb, _TENTH, 1.0)
+            newton = newton._replace(
+                level=level_of_newton,
+                increment=level_of_newton,
+                careful=jnp.where(climb, _CAREFUL, jnp.inf),
+            )
         return PathState(
             newton=newton._replace(
                 iterations=state.newton.iterations, factorisations=state.newton.factorisations

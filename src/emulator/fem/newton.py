@@ -68,6 +68,7 @@ class Newton:
             tangent=jnp.zeros(len(self.system.pattern.rows)),
             refresh=jnp.array(True),
             convex=jnp.array(True),
+            careful=jnp.array(jnp.inf),
             crushed=jnp.array(False),
             singular=jnp.array(False),
             squeezed=jnp.array(0),

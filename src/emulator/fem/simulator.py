@@ -66,8 +66,20 @@ class Simulator:
     def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:
         """Equilibrium at ``theta`` (p,), from ``start`` (n, 3) mm or from rest.
 
-        The displacement is differentiable in ``theta``; ``start`` only affects the time taken.
-        Never raises on a hard case: read ``status``.
+        A soft body may have several equilibria. The one sought is the end of the loading path from
+        rest, in Python as under ``jit``, ``vmap`` and ``grad``; :mod:`emulator.fem.loading_path`
+        has the strategy. An answer from ``start`` is kept if Newton's method came to it at the full
+        load in a few full steps, each down the potential; otherwise ``start`` is left and the body
+        is loaded from rest.
+
+        What this cannot exclude: a ``start`` close to another equilibrium leads there in a few
+        good steps, or is one already; a path that jumps where it loses stability may jump
+        elsewhere with other load steps; and under ``jit`` only directions that climb the potential
+        show that a tangent is indefinite. ``NewtonOptions.load_steps`` follows the path in small
+        steps, whatever the start.
+
+        The displacement is differentiable in ``theta``. Never raises on a hard case: read
+        ``status``. ``vmap`` solves one theta after the other.
 
         Raises
         ------
@@ -149,7 +161,7 @@ class Simulator:
         return theta, start
 
     def _singular(self) -> Solution:
-        """What the direct solver's refusal of an exactly singular tangent amounts to."""
+        """The result where the direct solver refuses an exactly singular tangent."""
         return Solution(
             displacement=self.rest,
             status=jnp.asarray(Status.SINGULAR_TANGENT, dtype=jnp.int64),
@@ -246,13 +258,13 @@ def displacement_derivative(
 def _moved(
     system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
 ) -> jax.Array:
-    """The same with the tangent (nnz,) at hand."""
+    """:func:`displacement_derivative` with the tangent (nnz,) at hand."""
     _, force = jax.jvp(lambda t: system.residual(u, t), (theta,), (direction,))
     return system.extend(-system.solve(tangent, force))
 
 
 def _columns(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array) -> jax.Array:
-    """The same along each entry of theta, (p, n, 3)."""
+    """Derivatives (p, n, 3) of the equilibrium ``u`` along each entry of theta."""
     forces = jax.jacfwd(lambda t: system.residual(u, t))(theta)
     return jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
 

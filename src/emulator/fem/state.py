@@ -31,7 +31,9 @@ class NewtonState(NamedTuple):
     negligible : residual in mN that is round-off.
     tangent : (nnz,) mN/mm, the last one assembled. refresh : whether the next iteration needs a
     new one.
-    convex : whether every step so far was a full one, down the potential.
+    convex : whether every step at this level was a full one, down the potential.
+    careful : a level whose way is not convex is given up if its next increment would be this or
+    more; inf for never.
     crushed : whether the last level was given up because elements would invert.
     singular : whether the last step came of a singular tangent.
     squeezed : steps at this level shortened because elements would invert.
@@ -53,6 +55,7 @@ class NewtonState(NamedTuple):
     tangent: jax.Array
     refresh: jax.Array
     convex: jax.Array
+    careful: jax.Array
     crushed: jax.Array
     singular: jax.Array
     squeezed: jax.Array
