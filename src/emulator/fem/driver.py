@@ -67,7 +67,7 @@ class Driver:
                 state = state._replace(newton=state.newton._replace(convex=convex))
             state = jax.block_until_ready(self._general_step(theta, state))
             wait -= 1
-            definite = wait <= 0
+            definite = wait <= 0 or int(state.newton.at_level) == 0  # a new level: ask anew
             if definite:
                 state = _forget_tangent(state, self.definite)
         return state

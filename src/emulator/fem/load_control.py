@@ -77,7 +77,7 @@ def next_state(
         error=outcome.error,
         tangent=tangent,
         refresh=moved | ~_keeps_tangent(state, outcome, options),
-        convex=moved | _convex(state, outcome),
+        convex=(moved & ~complete) | _convex(state, outcome),
         crushed=crushed,
         squeezed=jnp.where(moved, 0, _squeezed(state, outcome)),
         status=jnp.asarray(status, dtype=state.status.dtype),

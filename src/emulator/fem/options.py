@@ -18,7 +18,7 @@ class NewtonOptions:
     round_off : a relative residual below this is accepted where Newton no longer reduces it.
     absolute : residual in mN that is accepted whatever the forces at work; round-off of the forces
         at rest always is.
-    max_iterations : over all load levels.
+    max_iterations : over all routes and load levels.
     level_iterations : after which a load level is given up and its increment halved.
     increment : first and largest load increment, as a fraction of the whole. Small ones follow the
         loading path from rest, which matters to a body that has several equilibria; a start other
@@ -34,7 +34,7 @@ class NewtonOptions:
     tolerance: float = 1e-11
     round_off: float = 1e-8
     absolute: float = 0.0
-    max_iterations: int = 200
+    max_iterations: int = 300
     level_iterations: int = 40
     increment: float = 1.0
     min_increment: float = 1.0 / 256.0

@@ -15,8 +15,10 @@ def conditions(jaxpr):
     for equation in jaxpr.eqns:
         if equation.primitive.name == "while":
             yield equation.params["cond_jaxpr"].jaxpr
-        for inner in jax.core.jaxprs_in_params(equation.params):
-            yield from conditions(inner)
+        for value in jax.tree.leaves(list(equation.params.values())):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                yield from conditions(inner)
 
 
 @pytest.mark.parametrize("name", ["beam", "ventricle"])
