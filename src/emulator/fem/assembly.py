@@ -158,11 +158,11 @@ class System:
         nodes = self.scene.discretisation.connectivity
         force, change = jax.jvp(lambda v: self.others(v, theta, load), (u,), (move,))
         local = move[nodes].reshape(len(nodes), -1)
-        change = change + self.spread(jnp.einsum("mij,mj->mi", condensed.tangent, local))
-        return self.restrict(self.spread(condensed.force) + force), self.restrict(change)
+        change = change + self.scatter(jnp.einsum("mij,mj->mi", condensed.tangent, local))
+        return self.restrict(self.scatter(condensed.force) + force), self.restrict(change)
 
-    def spread(self, local: jax.Array) -> jax.Array:
-        """Nodal sums (n, 3) of what the elements have at their nodes, (m, ...)."""
+    def scatter(self, local: jax.Array) -> jax.Array:
+        """Nodal sums (n, 3) of element vectors (m, ...)."""
         nodes = self.scene.discretisation.connectivity
         at_nodes = local.reshape(*nodes.shape, 3)
         return jnp.zeros(self.scene.held.shape, local.dtype).at[nodes].add(at_nodes)
@@ -219,7 +219,7 @@ def balance(
     u: jax.Array,
     theta: jax.Array,
     load: jax.Array | float = 1.0,
-    negligible: float = 0.0,
+    negligible: jax.Array | float = 0.0,
 ) -> tuple[jax.Array, jax.Array]:
     """Free residual (f,) in mN, and its norm relative to the forces at work, shape ().
 

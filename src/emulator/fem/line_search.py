@@ -1,4 +1,13 @@
-"""How much of a Newton step to take."""
+r"""Line search: how much of a Newton step to take.
+
+The largest :math:`\alpha \in \{1, \tfrac12, \tfrac14, \dots\}` that keeps every element's
+:math:`J` above a fraction of its present least value and, once the supports are met, lowers the
+potential energy by Armijo's rule. Exponential laws diverge without it (docs/experiments.md,
+"Newton's steps: guard J only, or ask for descent").
+
+The loops carry their verdicts as state, so that their conditions read a flag: under ``vmap`` a
+condition that evaluates the potential itself never returned on a ventricle.
+"""
 
 from __future__ import annotations
 
@@ -9,24 +18,39 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System
+from emulator.fem.direction import Direction
 from emulator.fem.functional import volume_ratio
 
-_LEAST_FRACTION = 2.0**-20
-_LEAST_NATURAL = 2.0**-7  # natural monotonicity fails early: a lower load is cheaper
-_ARMIJO = 1e-4
+_LEAST_FRACTION = 2.0**-19
+# Natural monotonicity fails early: a lower load is cheaper than many short steps
+# (docs/experiments.md, "Mean dilatation from far away").
+_LEAST_NATURAL = 2.0**-6
+_ARMIJO = 1e-4  # textbook value; the energy is hardly ever near this bound
+# Least fraction that is halved because the potential falls further; below, the search has found a
+# valley (docs/experiments.md, "Fewer factorisations from rest").
 _SMALLEST_HALVED = 0.02
-_ROUND_OFF = 1e-13
+_ROUND_OFF = 1e-13  # of the energy's parts, in which a decrease near the solution drowns
 
 
-class Direction(NamedTuple):
-    """Newton's full step, and what judges how much of it to take."""
+class _Trial(NamedTuple):
+    """A fraction of the step, and the verdicts on it.
 
-    move: jax.Array  # (n, 3) mm
-    residual: jax.Array  # (f,) mN where it starts
-    pull: jax.Array  # (f,) mN, what moving the supports adds to it
-    slope: jax.Array  # residual . move before it was turned round, mN mm
-    settled: jax.Array  # whether the supports are where they belong
-    singular: jax.Array  # whether its tangent was
+    good : whether it is sound and makes progress. sound : whether no element is crushed.
+    crushed : whether twice the fraction was not sound.
+    """
+
+    fraction: jax.Array
+    good: jax.Array
+    sound: jax.Array
+    crushed: jax.Array
+
+
+class _Valley(NamedTuple):
+    """A fraction of the step, its potential, and the potential of half the fraction."""
+
+    fraction: jax.Array
+    energy: jax.Array
+    of_half: jax.Array
 
 
 def choose_fraction(
@@ -63,26 +87,53 @@ def choose_fraction(
         J = volume_ratio(system.scene, u + fraction * direction.move)
         return jnp.min(J) > floor  # False for NaN
 
-    def halve(fraction: jax.Array) -> jax.Array:
-        return 0.5 * fraction
-
     least = _LEAST_FRACTION if nearer is None else _LEAST_NATURAL
     lowers = _progress(system, u, level, theta, direction, potential) if nearer is None else nearer
-    fraction = jax.lax.while_loop(
-        lambda f: (f > least) & ~(sound(f) & lowers(f)), halve, jnp.array(1.0)
-    )
-    found = fraction > least
-    crushed = (fraction < 1.0) & ~sound(2.0 * fraction)
-    if nearer is not None:
-        return jnp.where(found, fraction, 0.0), crushed
-    fraction = jax.lax.while_loop(
-        lambda f: (
-            direction.settled & (f > _SMALLEST_HALVED) & (potential(halve(f))[0] < potential(f)[0])
-        ),
-        halve,
-        fraction,
-    )
-    return jnp.where(found, fraction, 0.0), crushed
+    trial = _largest_good(sound, lowers, least)
+    fraction = trial.fraction
+    if nearer is None:
+        fraction = _valley(lambda f: potential(f)[0], fraction, direction.settled & trial.good)
+    return jnp.where(trial.good, fraction, 0.0), trial.crushed
+
+
+def largest_sound(sound: Callable[[jax.Array], jax.Array], least: float) -> jax.Array:
+    """The largest of 1, 1/2, 1/4, ... that is ``sound``; 0 where that is below ``least``."""
+    trial = _largest_good(sound, lambda _: jnp.array(True), least)
+    return jnp.where(trial.good, trial.fraction, 0.0)
+
+
+def _largest_good(
+    sound: Callable[[jax.Array], jax.Array],
+    lowers: Callable[[jax.Array], jax.Array],
+    least: float,
+) -> _Trial:
+    """Halve the step until it is sound and makes progress, or would go below ``least``."""
+
+    def judge(fraction: jax.Array, crushed: jax.Array) -> _Trial:
+        fine = sound(fraction)
+        return _Trial(fraction, fine & lowers(fraction), fine, crushed)
+
+    def wanted(trial: _Trial) -> jax.Array:
+        return ~trial.good & (trial.fraction >= 2.0 * least)
+
+    first = judge(jnp.array(1.0), jnp.array(False))
+    return jax.lax.while_loop(wanted, lambda t: judge(0.5 * t.fraction, ~t.sound), first)
+
+
+def _valley(
+    potential: Callable[[jax.Array], jax.Array], fraction: jax.Array, wanted: jax.Array
+) -> jax.Array:
+    """``fraction`` halved as long as that lowers the potential, where ``wanted``."""
+
+    def falls(at: _Valley) -> jax.Array:
+        return wanted & (at.fraction > _SMALLEST_HALVED) & (at.of_half < at.energy)
+
+    def halve(at: _Valley) -> _Valley:
+        half = 0.5 * at.fraction
+        return _Valley(half, at.of_half, potential(0.5 * half))
+
+    first = _Valley(fraction, potential(fraction), potential(0.5 * fraction))
+    return jax.lax.while_loop(falls, halve, first).fraction
 
 
 def _progress(
@@ -95,7 +146,6 @@ def _progress(
 ) -> Callable[[jax.Array], jax.Array]:
     """Whether a fraction of the step makes progress, besides crushing no element."""
     energy, size = potential(jnp.array(0.0))
-    # Near the solution the decrease drowns in the round-off of the energy's parts.
     ceiling = energy + _ROUND_OFF * size
     descent = jnp.where(direction.settled, -_ARMIJO * jnp.abs(direction.slope), jnp.inf)
 

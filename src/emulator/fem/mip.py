@@ -35,10 +35,11 @@ import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
 from emulator.fem.functional import displacement_gradient, strain_law, volume_ratio
+from emulator.fem.line_search import largest_sound
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
 
-_SHORTEST = 2.0**-4
+_SHORTEST = 2.0**-4  # fraction of a step; where less is left, the ramp of loads is lost
 _BISECTIONS = 7
 _REFINEMENTS = 3
 
@@ -46,15 +47,19 @@ _REFINEMENTS = 3
 class MipState(NamedTuple):
     """What the next iteration needs.
 
-    u : (n, 3) mm. measures : (m, q, k) those the stresses belong to.
-    error : residual of u relative to the forces at work, supports met. fraction : of the last step
-    that was taken; below 1 where elements would have been crushed, 0 where there was no step.
+    u : (n, 3) mm. measures : (m, q, k), the strain measures that the stresses belong to.
+    error : residual of u relative to the forces at work, supports met.
+    fraction : of the last step that was taken; below 1 where elements would have been crushed, 0
+    where there was no step.
+    descends : whether the last step went against the forces out of balance, as every step with a
+    positive definite tangent does.
     """
 
     u: jax.Array
     measures: jax.Array
     error: jax.Array
     fraction: jax.Array
+    descends: jax.Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +88,7 @@ class MipNewton:
         """The state at ``u`` (n, 3) mm that Newton's method would start from."""
         H = displacement_gradient(self.system.scene, u)
         measures = self._everywhere(lambda H, at: self._measures.of(H, at.directions), H)
-        return MipState(u, measures, self._error(u), jnp.array(1.0))
+        return MipState(u, measures, self._error(u), jnp.array(1.0), jnp.array(True))
 
     def step(self, state: MipState, stiffening: jax.Array) -> MipState:
         """One iteration, with ``stiffening`` times the stiffness of the loads in its tangent."""
@@ -92,16 +97,17 @@ class MipNewton:
         H = displacement_gradient(scene, u)
         stress, tangent = self._everywhere(self._linearise, H, state.measures)
         force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
-        residual = system.restrict(system.spread(force) + system.others(u, self.theta, self.level))
+        residual = system.restrict(system.scatter(force) + system.others(u, self.theta, self.level))
         K = system.assemble(system.element_blocks(tangent), u, self.theta, stiffening)
         move = system.solve(system.pattern.safe_values(K), -residual)
+        descends = jnp.vdot(residual, move) <= 0.0
         move = system.extend(jnp.where(system.pattern.solvable(K), move, jnp.nan))
         fraction = self._fraction(u, move)
         ahead = jnp.where(fraction > 0.0, u + fraction * move, u)
         change = displacement_gradient(scene, move)
         measures = self._everywhere(self._at_stress, H, change, state.measures)
         measures = jnp.where(fraction > 0.0, measures, state.measures)
-        return MipState(ahead, measures, self._error(ahead), fraction)
+        return MipState(ahead, measures, self._error(ahead), fraction, descends)
 
     def _error(self, u: jax.Array) -> jax.Array:
         return balance(self.system, u, self.theta, self.level)[1]
@@ -145,20 +151,17 @@ class MipNewton:
         """How much of a step crushes no element; 0 if almost none of it does."""
         floor = self.shrink * jnp.min(volume_ratio(self.system.scene, u))
 
-        def crushes(fraction: jax.Array) -> jax.Array:
-            return ~(jnp.min(volume_ratio(self.system.scene, u + fraction * move)) > floor)
+        def sound(fraction: jax.Array) -> jax.Array:
+            return jnp.min(volume_ratio(self.system.scene, u + fraction * move)) > floor
 
-        fraction = jax.lax.while_loop(
-            lambda f: (f > 0.5 * _SHORTEST) & crushes(f), lambda f: 0.5 * f, jnp.array(1.0)
-        )
-        return jnp.where(fraction >= _SHORTEST, fraction, 0.0)
+        return largest_sound(sound, _SHORTEST)
 
 
 def applies(system: System) -> bool:
     """Whether a scene's stresses can be iterates of their own, and whether that pays.
 
-    Its law must be exponential and read measures only; mean dilatation has iterates of another kind
-    already.
+    Its law must be exponential and read measures only. Mean dilatation has volumes and pressures as
+    iterates already.
     """
     law = system.scene.law
     return law.exponential and not system.mixed and measures_read(law) is not None
@@ -175,7 +178,7 @@ def fraction_at_stress(energy: Callable[[jax.Array], jax.Array]) -> jax.Array:
 
     def slope(beta: jax.Array) -> jax.Array:
         value, along = jax.jvp(energy, (beta,), (jnp.ones(()),))
-        # That of a logarithm is finite where the logarithm itself is not.
+        # The slope of a logarithm is finite where the logarithm itself is not.
         return jnp.where(jnp.isfinite(value), along, jnp.inf)
 
     def both(beta: jax.Array) -> tuple[jax.Array, jax.Array]:

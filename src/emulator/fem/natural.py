@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System
-from emulator.fem.line_search import Direction
-from emulator.fem.mixed import Condensed, Volumes, advance, carried
+from emulator.fem.direction import Direction
+from emulator.fem.mixed import Volumes, advance, carried
 
 
 def natural_monotonicity(
@@ -30,8 +30,6 @@ def natural_monotonicity(
     volumes: Volumes,
     level: jax.Array,
     theta: jax.Array,
-    at: Condensed,
-    tangent: jax.Array,
     direction: Direction,
 ) -> Callable[[jax.Array], jax.Array]:
     """``fraction -> bool``: whether that much of ``direction`` leaves less to go.
@@ -39,14 +37,15 @@ def natural_monotonicity(
     Parameters
     ----------
     u, volumes, level, theta : where the step starts.
-    at, tangent : the equations there, linearised; ``tangent`` (nnz,).
+    direction : the step, with the tangent and the condensed linearisation it came of.
     """
-    move = direction.move
+    move, at, tangent = direction.move, direction.condensed, direction.tangent
+    assert at is not None
 
     def nearer(fraction: jax.Array) -> jax.Array:
         after = advance(system.scene, volumes, at, move, fraction)
         there = u + fraction * move
-        force = system.spread(carried(system.scene, there, after, theta, at))
+        force = system.scatter(carried(system.scene, there, after, theta, at))
         force = system.restrict(force + system.others(there, theta, level))
         left = system.extend(system.solve(tangent, -(force + (1.0 - fraction) * direction.pull)))
         left = left + (1.0 - fraction) * jnp.where(system.scene.held, move, 0.0)

@@ -11,25 +11,30 @@ from emulator.errors import InputError
 class NewtonOptions:
     """Controls of the solver.
 
+    In docs/experiments.md: "The stopping rule of the released solutions" for the tolerances, "Fewer
+    factorisations from rest" for ``keep_tangent``.
+
     tolerance : residual relative to the internal forces, reactions included.
-    round_off : a residual below this that Newton no longer reduces has met round-off, and will do.
-    absolute : residual in mN that is small enough whatever the forces; 0 asks for the others.
-    max_iterations : over all load levels.
+    round_off : a relative residual below this is accepted where Newton no longer reduces it.
+    absolute : residual in mN that is accepted whatever the forces at work; round-off of the forces
+        at rest always is.
+    max_iterations : over all routes and load levels.
     level_iterations : after which a load level is given up and its increment halved.
     increment : first and largest load increment, as a fraction of the whole. Small ones follow the
-        loading path, which matters to a body that has several equilibria.
+        loading path from rest, which matters to a body that has several equilibria; a start other
+        than rest is then used only if it is the solution already.
     min_increment : smallest load increment.
     shrink : least fraction of the present smallest ``J`` that a step may leave.
     keep_tangent : a step that leaves less than this fraction of the residual has its tangent used
         again; 0 is Newton's method to the letter.
-    stress_iterates : begin, when far from equilibrium, with :mod:`emulator.fem.mip` where it can be
-        done; never inside ``jit``, with a factorisation of your choice, or in load increments.
+    stress_iterates : begin, when far from equilibrium, with :mod:`emulator.fem.mip` where the scene
+        allows it (see :func:`emulator.fem.mip.applies`); never in load increments.
     """
 
     tolerance: float = 1e-11
     round_off: float = 1e-8
     absolute: float = 0.0
-    max_iterations: int = 200
+    max_iterations: int = 300
     level_iterations: int = 40
     increment: float = 1.0
     min_increment: float = 1.0 / 256.0

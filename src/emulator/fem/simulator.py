@@ -10,6 +10,7 @@ gives forward derivatives by one more solve with the tangent, and reverse ones b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Literal
@@ -21,7 +22,7 @@ from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
 from emulator.fem.functional import volume_ratio
-from emulator.fem.newton import newton
+from emulator.fem.loading_path import find_equilibrium
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
@@ -65,8 +66,20 @@ class Simulator:
     def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:
         """Equilibrium at ``theta`` (p,), from ``start`` (n, 3) mm or from rest.
 
-        The displacement is differentiable in ``theta``; ``start`` only affects the time taken.
-        Never raises on a hard case: read ``status``.
+        A soft body may have several equilibria. The one sought is the end of the loading path from
+        rest, in Python as under ``jit``, ``vmap`` and ``grad``; :mod:`emulator.fem.loading_path`
+        has the strategy. An answer from ``start`` is kept if Newton's method came to it at the full
+        load in a few full steps, each down the potential; otherwise ``start`` is left and the body
+        is loaded from rest.
+
+        What this cannot exclude: a ``start`` close to another equilibrium leads there in a few
+        good steps, or is one already; a path that jumps where it loses stability may jump
+        elsewhere with other load steps; and under ``jit`` only directions that climb the potential
+        show that a tangent is indefinite. ``NewtonOptions.load_steps`` follows the path in small
+        steps, whatever the start.
+
+        The displacement is differentiable in ``theta``. Never raises on a hard case: read
+        ``status``. ``vmap`` solves one theta after the other.
 
         Raises
         ------
@@ -148,7 +161,7 @@ class Simulator:
         return theta, start
 
     def _singular(self) -> Solution:
-        """What the direct solver's refusal of an exactly singular tangent amounts to."""
+        """The result where the direct solver refuses an exactly singular tangent."""
         return Solution(
             displacement=self.rest,
             status=jnp.asarray(Status.SINGULAR_TANGENT, dtype=jnp.int64),
@@ -182,7 +195,7 @@ class Simulator:
 
     @cached_property
     def _equilibrium(self):  # noqa: ANN202 - closures, private
-        closed = jax.jit(partial(newton, self.system, self.options))
+        closed = jax.jit(_one_by_one(partial(find_equilibrium, self.system, self.options)))
 
         @jax.custom_jvp
         def equilibrium(theta: jax.Array, start: jax.Array) -> Solution:
@@ -214,6 +227,26 @@ class Simulator:
         return {s.factorisation: jax.jit(partial(_columns, s)) for s in self._systems}
 
 
+def _one_by_one(solve: Callable[..., Solution]) -> Callable[..., Solution]:
+    """``solve`` whose ``vmap`` takes theta after theta.
+
+    Solved side by side, every theta would take the iterations of the slowest, and each iteration
+    the factorisations of all routes.
+    """
+    alone = jax.custom_batching.custom_vmap(solve)
+
+    @alone.def_vmap
+    def together(size, batched, theta, start):  # noqa: ANN001, ANN202
+        theta, start = (
+            x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+            for x, is_batched in zip((theta, start), batched, strict=True)
+        )
+        solutions = jax.lax.map(lambda each: alone(*each), (theta, start))
+        return solutions, jax.tree.map(lambda _: True, solutions)
+
+    return alone
+
+
 def displacement_derivative(
     system: System, u: jax.Array, theta: jax.Array, direction: jax.Array
 ) -> jax.Array:
@@ -225,13 +258,13 @@ def displacement_derivative(
 def _moved(
     system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
 ) -> jax.Array:
-    """The same with the tangent (nnz,) at hand."""
+    """:func:`displacement_derivative` with the tangent (nnz,) at hand."""
     _, force = jax.jvp(lambda t: system.residual(u, t), (theta,), (direction,))
     return system.extend(-system.solve(tangent, force))
 
 
 def _columns(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array) -> jax.Array:
-    """The same along each entry of theta, (p, n, 3)."""
+    """Derivatives (p, n, 3) of the equilibrium ``u`` along each entry of theta."""
     forces = jax.jacfwd(lambda t: system.residual(u, t))(theta)
     return jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
 

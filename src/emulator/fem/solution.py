@@ -42,9 +42,9 @@ _TEXT = {
 class Solution(NamedTuple):
     """Result of a simulation; every field gains leading axes under ``vmap``.
 
-    displacement : (n, 3) mm; when not converged, that of the largest load that was.
+    displacement : (n, 3) mm; when not converged, the solution at ``load_reached``.
     status : a :class:`Status` as an integer.
-    iterations : Newton iterations over all load levels.
+    iterations : of Newton's method and of the stress iterates, over all routes and load levels.
     factorisations : tangents factorised on the way; the other iterations kept the last one.
     residual : force out of balance relative to the forces at work.
     load_reached : largest fraction of the load with a converged solution.

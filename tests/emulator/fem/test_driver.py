@@ -23,7 +23,7 @@ def test_an_indefinite_tangent_is_left_to_umfpack(cube, monkeypatch, error):
     theta = cube.centre
     expected = simulator(theta)
     definite = simulator._driver._definite_step
-    calls = []
+    calls = []  # a scene without ramps is on its last route at once
 
     def refuse_twice(theta, state):
         calls.append(1)

@@ -182,7 +182,7 @@ def test_mean_dilatation_has_regions_too():
     u = jnp.asarray(0.05 * np.random.default_rng(0).normal(size=scene.held.shape))
     theta = with_stiffness(scene, scene.centre, stiffness_2=0.6, stiffness_7=1.9)
     spread = jax.jit(
-        lambda u, t: System(scene).spread(linearise(scene, u, consistent(scene, u, t), t).force)
+        lambda u, t: System(scene).scatter(linearise(scene, u, consistent(scene, u, t), t).force)
     )
     force = spread(u, theta)
     expected = jax.jit(jax.grad(strain_energy(scene)))(u, theta)

@@ -1,0 +1,239 @@
+r"""The way to equilibrium: which routes are tried, in which order, and when one is given up.
+
+A body with several equilibria has one that loading leads to from rest. These routes look for it:
+
+======  ==================================================================================
+WARM    Newton's method from the caller's start, at the whole load
+RAMPS   stress iterates (:mod:`emulator.fem.mip`) from rest up a ramp of loads, three ramps
+        of ever smaller increments, and Newton's method from where a ramp leads
+CLIMB   Newton's method from rest, load step by load step
+======  ==================================================================================
+
+Every route but the last has to be short and convex: Newton's method takes full steps only, each
+down the potential with, as far as is known, a positive definite tangent, and no more than a few.
+Otherwise the next route is tried, from rest. Scenes whose stresses cannot be iterates have no
+ramps.
+
+:class:`LoadingPath` has the steps of all routes as pure functions of one state. One strategy then
+runs in two ways: inside ``jit`` (:func:`find_equilibrium`) and driven from Python
+(:mod:`emulator.fem.driver`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from emulator.fem.assembly import System
+from emulator.fem.mip import MipNewton, MipState, applies
+from emulator.fem.newton import Newton
+from emulator.fem.options import NewtonOptions
+from emulator.fem.solution import Solution, Status
+from emulator.fem.state import NEAR, UNBALANCED, NewtonState
+
+
+class Route(IntEnum):
+    """Ways to equilibrium, in the order in which they are tried."""
+
+    WARM = 0
+    RAMP = 1  # the first of three
+    CLIMB = 4
+
+
+class _Ramp(NamedTuple):
+    """Load levels that stress iterates climb, a step or more on each."""
+
+    first: float
+    increment: float
+    steps: int
+
+
+# By route. The first is for a start that balances about half of the load or more. The second takes
+# ventricles from rest to all but their softest corners, in four to six steps: with the whole load
+# at once one in three is lost. The last is for beams that turn. (docs/experiments.md, "Stresses as
+# iterates")
+_RAMPS = (_Ramp(1.0, 0.0, 8), _Ramp(0.5, 0.25, 12), _Ramp(0.25, 0.125, 20), _Ramp(0.1, 0.1, 40))
+# Relative residual below which a level of a ramp is carried well enough to go up
+# (docs/experiments.md, "Stresses as iterates").
+_CARRIED = 0.9
+# First level and largest increment of the climb where all ramps are lost (docs/experiments.md,
+# "Several equilibria in the soft corner").
+_TENTH = 0.1
+# Load increment below which the climb takes steps that are not convex.
+_CAREFUL = 1.0 / 40.0
+_SHORT = 15  # iterations of Newton's method that a route may take, unless it is the last
+
+
+class PathState(NamedTuple):
+    """Where the search for equilibrium stands.
+
+    newton : the iteration of Newton's method; its status and its counts are those of the search.
+    mip : the stress iterates, or None where the scene has no ramps.
+    route : a :class:`Route`. ramping : whether stress iterates are on their way up its ramp.
+    level : load level on the ramp. on_ramp : steps taken there.
+    """
+
+    newton: NewtonState
+    mip: MipState | None
+    route: jax.Array
+    ramping: jax.Array
+    level: jax.Array
+    on_ramp: jax.Array
+
+    @property
+    def running(self) -> jax.Array:
+        """Whether the search has not ended."""
+        return self.newton.running
+
+
+@dataclass(frozen=True, eq=False)
+class LoadingPath:
+    """The steps of all routes, for one theta."""
+
+    system: System
+    options: NewtonOptions
+    theta: jax.Array
+
+    @cached_property
+    def ramps(self) -> bool:
+        """Whether stresses can be iterates, up ramps that begin at rest."""
+        wanted = self.options.stress_iterates and self.options.increment == 1.0
+        return wanted and applies(self.system) and not self.system.scene.held_displacement.any()
+
+    @property
+    def _newton(self) -> Newton:
+        return Newton(self.system, self.options, self.theta)
+
+    def _mip(self, level: jax.Array) -> MipNewton:
+        return MipNewton(self.system, self.options.shrink, self.theta, level)
+
+    def begin(self, start: jax.Array) -> PathState:
+        """The state to search from, at ``start`` (n, 3) mm."""
+        rest = jnp.zeros_like(start)
+        newton = self._newton.begin(start)
+        # A load increment of the caller's choice is meant to be followed from rest.
+        warm = jnp.any(newton.u != 0.0) & (self.options.increment == 1.0)
+        if self.ramps:
+            warm &= newton.error <= UNBALANCED
+        first = Route.RAMP if self.ramps else Route.CLIMB
+        route = jnp.where(warm, Route.WARM, first)
+        state = PathState(
+            newton=newton,
+            mip=self._mip(jnp.array(1.0)).begin(newton.u) if self.ramps else None,
+            route=route,
+            ramping=(newton.error > NEAR) & self.ramps,
+            level=jnp.array(1.0),
+            on_ramp=jnp.array(0),
+        )
+        keep = warm | ~newton.running
+        return jax.lax.cond(
+            keep, lambda: state, lambda: self._enter(state, rest, route, jnp.array(True))
+        )
+
+    def ramp_step(self, state: PathState) -> PathState:
+        """One step of the stress iterates."""
+        assert state.mip is not None
+        # Loads that nothing balances yet lend no stiffness, as in Newton's method.
+        unbalanced = (state.route != Route.WARM) & (state.on_ramp == 0)
+        stiffening = jnp.where(unbalanced, 0.0, state.level)
+        mip = self._mip(state.level).step(state.mip, stiffening)
+        newton = state.newton._replace(
+            iterations=state.newton.iterations + 1, factorisations=state.newton.factorisations + 1
+        )
+        _, increment, steps = jnp.array(_RAMPS)[state.route]
+        sound = (mip.fraction > 0.0) & jnp.isfinite(mip.error) & mip.descends
+        # A residual that rises again is what inside ``jit`` shows of an indefinite tangent.
+        sound &= (mip.error < _CARRIED) | (state.mip.error >= _CARRIED)
+        found = sound & (state.level == 1.0) & (mip.error <= NEAR)
+        lost = ~sound | (~found & (state.on_ramp + 1 >= steps))
+        higher = jnp.minimum(1.0, state.level + increment)
+        after = state._replace(
+            newton=newton,
+            mip=mip,
+            level=jnp.where(mip.error < _CARRIED, higher, state.level),
+            on_ramp=state.on_ramp + 1,
+        )
+        route = jnp.where(lost, self._next(state.route), state.route)
+        u = jnp.where(lost, 0.0, mip.u)
+        enter = lambda: self._enter(after, u, route, lost)  # noqa: E731
+        return jax.lax.cond(lost | found, enter, lambda: after)
+
+    def newton_step(self, state: PathState) -> PathState:
+        """One iteration of Newton's method."""
+        newton = self._newton.step(state.newton)
+        after = state._replace(newton=newton)
+        failed = ~newton.running & (newton.status != Status.CONVERGED)
+        # A level that failed is followed by a lower one.
+        astray = failed | ~newton.convex | (newton.level < 1.0)
+        astray |= newton.running & (newton.at_level >= _SHORT)
+        return jax.lax.cond(
+            astray & (state.route < Route.CLIMB), self.give_up, lambda state: state, after
+        )
+
+    def give_up(self, state: PathState) -> PathState:
+        """The state at the beginning of the next route."""
+        rest = jnp.zeros_like(state.newton.u)
+        return self._enter(state, rest, self._next(state.route), jnp.array(True))
+
+    def _next(self, route: jax.Array) -> jax.Array:
+        return route + 1 if self.ramps else jnp.full_like(route, Route.CLIMB)
+
+    def _enter(
+        self, state: PathState, u: jax.Array, route: jax.Array, ramping: jax.Array
+    ) -> PathState:
+        """The state at ``u`` (n, 3) mm on ``route``, at the foot of its ramp if ``ramping``.
+
+        Iterations are counted on.
+        """
+        newton, level, mip = self._newton.begin(u), jnp.array(1.0), None
+        ramping &= newton.running & (route < Route.CLIMB) & self.ramps
+        if self.ramps:
+            level = jnp.array([ramp.first for ramp in _RAMPS] + [_TENTH])[route]
+            mip = self._mip(level).begin(u)
+            climb = route == Route.CLIMB
+            level_of_newton = jnp.where(climb, _TENTH, 1.0)
+            newton = newton._replace(
+                level=level_of_newton,
+                increment=level_of_newton,
+                careful=jnp.where(climb, _CAREFUL, jnp.inf),
+            )
+        return PathState(
+            newton=newton._replace(
+                iterations=state.newton.iterations, factorisations=state.newton.factorisations
+            ),
+            mip=mip,
+            route=route,
+            ramping=ramping,
+            level=level,
+            on_ramp=jnp.array(0),
+        )
+
+
+def find_equilibrium(
+    system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array
+) -> Solution:
+    """Minimise the potential energy of ``system``, as one loop inside ``jax.jit``.
+
+    Parameters
+    ----------
+    theta : (p,) parameters.
+    start : (n, 3) mm, where to start.
+
+    Returns
+    -------
+    Solution, whose status is CONVERGED or names the failure; its displacement is always finite.
+    """
+    path = LoadingPath(system, options, theta)
+    step: Callable[[PathState], PathState] = path.newton_step
+    if path.ramps:
+        step = lambda state: jax.lax.cond(  # noqa: E731
+            state.ramping, path.ramp_step, path.newton_step, state
+        )
+    state = jax.lax.while_loop(lambda state: state.running, step, path.begin(start))
+    return state.newton.solution()

@@ -1,0 +1,159 @@
+"""One equilibrium for every route: Python, jit, vmap, cold and warm."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.fem.loading_path import LoadingPath, Route
+from emulator.scenes import Support
+from emulator.scenes.loads.dead import Gravity
+from scene_support import block
+
+
+@pytest.fixture(scope="module")
+def ventricle_simulator(ventricle):
+    return em.Simulator(ventricle)
+
+
+@pytest.fixture(scope="module")
+def inside_jit(ventricle_simulator):
+    return jax.jit(ventricle_simulator.solve)
+
+
+SOFT = [
+    # jit ended 12.5 to 15.8 mm from Python's equilibrium, both converged
+    (0.2153, 1.1541, 3.4823, 1.0086, 1.3036),
+    (0.2237, 1.0179, 3.4797, 1.3072, 1.3278),
+    (0.2045, 1.0336, 3.4427, 1.2098, 1.2683),
+]
+
+
+@pytest.mark.parametrize("theta", SOFT)
+def test_one_equilibrium_for_python_jit_and_warm_starts(ventricle_simulator, inside_jit, theta):
+    """Where fibres go slack there are several equilibria."""
+    theta = jnp.array(theta)
+    cold, inside = ventricle_simulator.solve(theta), inside_jit(theta)
+    assert cold.converged
+    assert inside.converged
+    np.testing.assert_allclose(inside.displacement, cold.displacement, atol=1e-6)
+    far = ventricle_simulator(ventricle_simulator.scene.centre)
+    warm = ventricle_simulator.solve(theta, far)
+    np.testing.assert_allclose(warm.displacement, cold.displacement, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_soft_corner_of_the_default_ventricle():
+    """Python, jit and 40 load steps, where they differed by 1.7 to 4.3 mm."""
+    scene = em.scenes.left_ventricle()
+    simulator = em.Simulator(scene)
+    path = em.Simulator(scene, em.NewtonOptions.load_steps(40))
+    inside = jax.jit(simulator.solve)
+    rng = np.random.default_rng(11)
+    soft = rng.uniform(size=(60, 5)) * np.array([0.6, 0.2, 0.2, 0.2, -0.25])
+    soft[:, 4] += 1.0
+    for k in (1, 10, 11, 17):
+        theta = scene.from_unit(jnp.asarray(soft[k]))
+        expected = path.solve(theta).displacement
+        for solve in (simulator.solve, inside):
+            np.testing.assert_allclose(solve(theta).displacement, expected, atol=1e-4)
+
+
+def routes(simulator, theta, start):
+    """The routes that the steps of the search take, by name."""
+    path = LoadingPath(simulator.system, simulator.options, theta)
+    ramp, newton = jax.jit(path.ramp_step), jax.jit(path.newton_step)
+    state, seen = path.begin(start), []
+    while bool(state.running):
+        kind = "ramp" if bool(state.ramping) else "newton"
+        seen.append((int(state.route), kind))
+        state = (ramp if kind == "ramp" else newton)(state)
+    return list(dict.fromkeys(seen)), state
+
+
+def test_from_rest_up_a_ramp_then_newton(ventricle_simulator, inside_jit):
+    theta = ventricle_simulator.scene.centre
+    seen, state = routes(ventricle_simulator, theta, ventricle_simulator.rest)
+    assert seen == [(Route.RAMP, "ramp"), (Route.RAMP, "newton")]
+    inside = inside_jit(theta)
+    assert inside.iterations == state.newton.iterations
+    np.testing.assert_allclose(inside.displacement, state.newton.u, atol=1e-10)
+
+
+def test_jit_takes_the_iterations_that_python_takes(ventricle_simulator, inside_jit):
+    theta = ventricle_simulator.scene.centre
+    python, inside = ventricle_simulator.solve(theta), inside_jit(theta)
+    assert python.iterations == inside.iterations
+    assert python.factorisations == inside.factorisations
+    np.testing.assert_allclose(python.displacement, inside.displacement, atol=1e-9)
+
+
+def test_a_warm_start_whose_way_is_not_convex_is_left_for_rest(ventricle_simulator, inside_jit):
+    """A state balanced well enough to be tried, far off the loading path."""
+    scene = ventricle_simulator.scene
+    theta = scene.centre
+    expected = ventricle_simulator(theta)
+    start = -0.5 * expected  # a ventricle sucked empty
+    seen, _ = routes(ventricle_simulator, theta, start)
+    assert seen[0][0] != Route.WARM
+    for solve in (ventricle_simulator.solve, inside_jit):
+        np.testing.assert_allclose(solve(theta, start).displacement, expected, atol=1e-8)
+
+
+def test_a_good_warm_start_is_kept(ventricle_simulator):
+    scene = ventricle_simulator.scene
+    theta = scene.centre
+    seen, _ = routes(ventricle_simulator, theta, ventricle_simulator(1.01 * theta))
+    assert [route for route, _ in seen] == [Route.WARM]
+
+
+def test_a_scene_without_ramps_goes_from_warm_to_rest(beam, simulator):
+    theta = beam.centre
+    seen, state = routes(simulator, theta, -simulator(theta))
+    assert {route for route, _ in seen} <= {Route.WARM, Route.CLIMB}
+    np.testing.assert_allclose(state.newton.u, simulator(theta), atol=1e-8)
+
+
+@pytest.mark.parametrize("pressure", [0.0, 1e-13])
+def test_a_ventricle_without_pressure_rests(ventricle_simulator, inside_jit, pressure):
+    theta = ventricle_simulator.scene.centre
+    u = ventricle_simulator(theta)
+    empty = theta.at[-1].set(pressure)
+    for solve in (ventricle_simulator.solve, inside_jit):
+        for start in (ventricle_simulator.rest, 0.01 * u, u):
+            solution = solve(empty, start)
+            assert solution.converged
+            np.testing.assert_allclose(solution.displacement, 0.0, atol=1e-10)
+
+
+def test_sensitivities_without_pressure_are_finite(ventricle_simulator):
+    """The moduli change nothing. In the pressure the switch of the fibres has a kink at rest."""
+    theta = ventricle_simulator.scene.centre.at[-1].set(0.0)
+    columns = ventricle_simulator.sensitivities(ventricle_simulator.rest, theta)
+    np.testing.assert_allclose(columns[:-1], 0.0, atol=1e-12)
+    assert np.isfinite(columns).all()
+    together = jax.jit(jax.jacfwd(lambda t: ventricle_simulator.solve(t).displacement))(theta)
+    np.testing.assert_allclose(together[..., -1], columns[-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3])
+def test_a_block_without_weight(shift):
+    """It rests, or goes where its supports take it; from any start."""
+    scene = replace(
+        block(loads=(Gravity(density=0.0),)), supports=(Support("left", (shift, 0.0, 0.0)),)
+    )
+    simulator = em.Simulator(scene)
+    expected = jnp.zeros(scene.held.shape).at[:, 0].set(shift)
+    solves = (simulator.solve, jax.jit(simulator.solve))
+    near = expected + jnp.where(scene.held, 0.0, 0.01)
+    for solve in solves:
+        for start in (simulator.rest, near):
+            solution = solve(scene.centre, start)
+            assert solution.converged
+            np.testing.assert_allclose(solution.displacement, expected, atol=1e-11)
+    together = jax.vmap(simulator.solve)(jnp.stack([scene.centre, 0.9 * scene.centre]))
+    assert together.converged.all()
+    assert np.isfinite(simulator.sensitivities(simulator.rest, scene.centre)).all()
