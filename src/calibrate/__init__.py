@@ -4,6 +4,10 @@ A forward map (emulator, FEM, ...) and an observation make a :func:`model`; :fun
 its posterior; :func:`certify` checks it against FEM.
 """
 
+# NumPyro is loaded before ArviZ, which replaces it by a lazy module: a submodule imported through
+# the lazy module first leaves `numpyro.distributions.distribution` undefined.
+from numpyro import distributions as _distributions  # noqa: F401
+
 import emulator
 from calibrate.certificate import Certificate, certify
 from calibrate.noise import GaussianNoise
