@@ -37,7 +37,7 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--fem-runs", type=int, default=30, help="that the reduced model is fitted to"
     )
-    parser.add_argument("--sampler", choices=("nuts",), default="nuts")
+    parser.add_argument("--sampler", default="nuts", metavar="NAME", help="default: nuts")
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--warmup", type=int, default=500)
     parser.add_argument("--chains", type=int, default=4)
