@@ -18,7 +18,7 @@ import xarray as xr
 
 from calibrate.observations import Observations
 from calibrate.provenance import versions
-from calibrate.samplers import NUTSOptions, nuts
+from calibrate.samplers import check_options, density_of, find_sampler, named_draws, r_hat
 from calibrate.statistical_model import Data, Model
 from emulator.errors import InputError
 from emulator.store import replacing
@@ -49,7 +49,6 @@ class Posterior:
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
         """Per parameter: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
         draws = self.tree["posterior"].to_dataset()
-        rhat = arviz_stats.rhat(draws)
         bulk, tail = arviz_stats.ess(draws, method="bulk"), arviz_stats.ess(draws, method="tail")
         edge = 0.5 * (1.0 - probability)
         table = {}
@@ -60,7 +59,7 @@ class Posterior:
                 "sd": float(values.std(ddof=1)),
                 "low": float(low),
                 "high": float(high),
-                "r_hat": float(rhat[name]),
+                "r_hat": r_hat(np.asarray(draws[name])),
                 "ess_bulk": float(bulk[name]),
                 "ess_tail": float(tail[name]),
             }
@@ -89,8 +88,8 @@ def read_tree(path: str | Path) -> xr.DataTree:
         raise InputError(f"posterior file {path} is truncated or not netCDF") from error
 
 
-def provenance(model: Model, seed: int, sampler: str, options: NUTSOptions) -> dict[str, Any]:
-    """How a posterior was made, in plain JSON values, so that it can be repeated."""
+def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str, Any]:
+    """What is needed to know, and to repeat, how a posterior was made; plain JSON values."""
     scene = model.forward.scene
     return {
         "scene": dict(scene.origin),
@@ -133,24 +132,27 @@ def sample(
     data: np.ndarray | Mapping[str, np.ndarray],
     *,
     sampler: str = "nuts",
-    options: NUTSOptions = NUTSOptions(),
+    options: Any | None = None,
     seed: int = 0,
     progress: bool = False,
 ) -> Posterior:
     """Draw from the posterior of ``model`` given ``data``.
 
     ``data`` is by name where several things are observed: displacements (d, 3) mm, a volume in mL.
+    ``sampler`` is a name of :data:`calibrate.samplers.SAMPLERS`; ``options`` are its own, with its
+    defaults for ``None``.
 
     Raises
     ------
     InputError
-        Unknown sampler, data of the wrong shape or with values that are not finite.
+        Unknown sampler, options of another sampler, data of the wrong shape or with values that
+        are not finite.
     """
-    if sampler != "nuts":
-        raise InputError(f"sampler '{sampler}' is unknown; known: nuts")
+    chosen = find_sampler(sampler)
+    options = check_options(chosen, options)
     checked = model.check_data(data)
-    draws, stats = nuts(model, checked, options, seed, progress=progress)
-    tree = _tree(model, checked, draws, stats)
+    z, stats = chosen.sample(density_of(model), checked, options, seed, progress=progress)
+    tree = _tree(model, checked, named_draws(model, checked, z), stats)
     tree.attrs.update(
         {
             key: value if isinstance(value, str | int) else json.dumps(value)

@@ -26,7 +26,7 @@ from calibrate.observations import (
     parse_observation,
 )
 from calibrate.posterior import Posterior, read_tree, sample
-from calibrate.samplers import NUTSOptions
+from calibrate.samplers import find_sampler
 from calibrate.statistical_model import Model, model
 from emulator import schema
 from emulator.catalogue import find_scene
@@ -173,13 +173,15 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
 
 def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
     """Sample the posterior of a run; with ``folder``, keep run, data and posterior there."""
+    options = find_sampler(run.sampler).options(
+        warmup=run.warmup, draws=run.draws, chains=run.chains
+    )
     scene = find_scene(run.scene, run.root)
     observe, data = make_data(run, scene)
     run, noises = run.named(observe), run.noises(observe)
     built = model(
         build_forward(run, scene, progress=progress), observe, noises, check_scale=run.check_scale
     )
-    options = NUTSOptions(run.warmup, run.draws, run.chains)
     posterior = sample(
         built, data, sampler=run.sampler, options=options, seed=run.seed, progress=progress
     )

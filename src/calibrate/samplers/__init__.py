@@ -1,5 +1,24 @@
-"""Samplers, one a file."""
+"""Samplers behind one protocol: ``protocol`` says what they give, ``registry`` finds them."""
 
-from calibrate.samplers.nuts import NUTSOptions, nuts
+from calibrate.samplers.blackjax_nuts import BlackJAXNUTSOptions
+from calibrate.samplers.density import density_of, named_draws
+from calibrate.samplers.nuts import NUTSOptions
+from calibrate.samplers.protocol import Draws, Kernel, Sampler
+from calibrate.samplers.registry import SAMPLERS, check_options, find_sampler
+from calibrate.samplers.run import ChainSampler
+from calibrate.samplers.stopping import r_hat
 
-__all__ = ["NUTSOptions", "nuts"]
+__all__ = [
+    "SAMPLERS",
+    "BlackJAXNUTSOptions",
+    "ChainSampler",
+    "Draws",
+    "Kernel",
+    "NUTSOptions",
+    "Sampler",
+    "check_options",
+    "density_of",
+    "find_sampler",
+    "named_draws",
+    "r_hat",
+]

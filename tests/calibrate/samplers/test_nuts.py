@@ -6,7 +6,7 @@ import numpyro.distributions as dist
 import pytest
 
 import calibrate as cal
-from calibrate.samplers import shear
+from calibrate.samplers import transport
 from emulator.errors import InputError
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates.corrected import corrected
@@ -111,14 +111,14 @@ def test_fem_inside_the_sampler(beam, simulator, kind):
 def test_a_shear_keeps_volumes_and_can_be_undone():
     rng = np.random.default_rng(0)
     for dimension in (2, 3, 5):
-        start = shear.identity(dimension)
-        map_ = shear.Shear(
+        start = transport.identity(dimension)
+        map_ = transport.TransportMap(
             jnp.asarray(rng.permutation(dimension)),
             jnp.asarray(rng.normal(size=start.coefficients.shape)),
         )
         zeta = jnp.asarray(rng.normal(size=dimension))
-        np.testing.assert_array_equal(shear.apply(start, zeta), zeta)
-        jacobian = jax.jacfwd(lambda x, m=map_: shear.apply(m, x))(zeta)
+        np.testing.assert_array_equal(transport.apply(start, zeta), zeta)
+        jacobian = jax.jacfwd(lambda x, m=map_: transport.apply(m, x))(zeta)
         assert np.linalg.det(jacobian) == pytest.approx(1.0, abs=1e-10)
 
 
@@ -127,10 +127,10 @@ def test_a_fitted_shear_straightens_a_bent_ridge():
     first = rng.logistic(size=2000)
     x = 1 / (1 + np.exp(-first))
     second = 2 * x - 3 * x**2 + 1e-3 * rng.normal(size=2000)
-    map_ = shear.fit(np.column_stack([second, first]))
+    map_ = transport.fit(np.column_stack([second, first]))
     np.testing.assert_array_equal(map_.order, [1, 0])
     # The residual of the fit, which is the second coordinate of zeta, is what is left of it.
-    straight = jax.vmap(lambda z: shear.apply(map_, z))(
+    straight = jax.vmap(lambda z: transport.apply(map_, z))(
         jnp.asarray(np.column_stack([0 * x, first]))
     )
     residual = second - np.asarray(straight[:, 0])

@@ -10,7 +10,7 @@ import pytest
 import emulator as em
 from emulator.fem.loading_path import LoadingPath, Route
 from emulator.scenes import Support
-from emulator.scenes.loads.dead import Gravity
+from emulator.scenes.loads import Gravity
 from scene_support import block
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments, emit, show_progress
 from calibrate.cli.forward import add_forward, forward_options
 from calibrate.cli.posterior_table import summary
+from calibrate.samplers import SAMPLERS
 from emulator.errors import InputError
 
 
@@ -34,7 +35,7 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
     )
-    parser.add_argument("--sampler", choices=("nuts",), default="nuts")
+    parser.add_argument("--sampler", choices=tuple(SAMPLERS), default="nuts")
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--warmup", type=int, default=500)
     parser.add_argument("--chains", type=int, default=4)

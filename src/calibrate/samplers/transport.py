@@ -1,14 +1,15 @@
-r"""A change of variables that straightens the curved ridges of calibration posteriors.
+r"""A transport map: the change of variables that straightens curved ridges of the posterior.
 
-Displacements often fix one combination of the elastic parameters sharply and the rest hardly at
-all: the posterior is a thin, bent sheet, and a sampler with one metric crawls along it. In
-unconstrained coordinates :math:`z`, ordered from the least to the best determined, take
+Displacements often fix one combination of the elastic parameters sharply and leave the others
+uncertain: the posterior is a thin, bent sheet, on which a sampler with one metric needs small
+steps. In unconstrained coordinates :math:`z`, ordered from the least to the best determined, take
 
 .. math:: z_k = \zeta_k + c_k \cdot \varphi(s(z_1), \dots, s(z_{k-1})), \qquad s = \text{sigmoid}
 
 with :math:`\varphi` all monomials up to a degree. The map is triangular with unit diagonal, so its
 Jacobian determinant is 1 and the density of :math:`\zeta` is that of :math:`z`: *any* coefficients
-leave the posterior exact, good ones make it round. They are fitted to a pilot run by least squares.
+leave the posterior exact, and good ones remove its curvature. They are fitted to the draws of a
+pilot run by least squares.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 
-class Shear(NamedTuple):
-    """order : (p,) coordinates from least to best determined. coefficients : (p, features)."""
+class TransportMap(NamedTuple):
+    """A triangular map: ``order`` (p,), least determined first; ``coefficients`` (p, features)."""
 
     order: jax.Array
     coefficients: jax.Array
@@ -45,29 +46,29 @@ def monomials(values: jax.Array, count: int) -> jax.Array:
     return jnp.stack(terms, axis=-1)
 
 
-def identity(dimension: int) -> Shear:
+def identity(dimension: int) -> TransportMap:
     """The map that changes nothing."""
     if dimension == 1:
         width = 0
     else:
         width = max(monomials(jnp.zeros(dimension), k).size for k in range(1, dimension))
-    return Shear(jnp.arange(dimension), jnp.zeros((dimension, width)))
+    return TransportMap(jnp.arange(dimension), jnp.zeros((dimension, width)))
 
 
-def apply(shear: Shear, zeta: jax.Array) -> jax.Array:
+def apply(map_: TransportMap, zeta: jax.Array) -> jax.Array:
     """``z`` (p,) from ``zeta`` (p,)."""
-    ordered = zeta[shear.order]
+    ordered = zeta[map_.order]
     squashed = jax.nn.sigmoid(ordered)
     columns = [ordered[0]]
     for k in range(1, len(zeta)):
         terms = monomials(squashed, k)
-        z = ordered[k] + shear.coefficients[k, : terms.size] @ terms
+        z = ordered[k] + map_.coefficients[k, : terms.size] @ terms
         squashed = squashed.at[k].set(jax.nn.sigmoid(z))
         columns.append(z)
-    return jnp.zeros_like(zeta).at[shear.order].set(jnp.stack(columns), unique_indices=True)
+    return jnp.stack(columns)[jnp.argsort(map_.order)]
 
 
-def fit(draws: np.ndarray) -> Shear:
+def fit(draws: np.ndarray) -> TransportMap:
     """The map fitted to pilot draws (s, p) of ``z``."""
     dimension = draws.shape[1]
     squashed = 1.0 / (1.0 + np.exp(-draws))
@@ -77,14 +78,14 @@ def fit(draws: np.ndarray) -> Shear:
     for k in range(1, dimension):
         terms = np.asarray(monomials(jnp.asarray(squashed[:, order]), k))
         target = draws[:, order[k]]
-        # A touch of ridge: a short pilot must not buy wild coefficients for features it hardly saw.
-        spread = np.maximum(terms.std(axis=0), 1e-12)
+        # Ridge penalty: features that a short pilot hardly varied get small coefficients.
+        sd = np.maximum(terms.std(axis=0), 1e-12)
         design = np.vstack(
             [
-                (terms - terms.mean(axis=0)) / spread,
+                (terms - terms.mean(axis=0)) / sd,
                 1e-3 * np.eye(terms.shape[1]) * len(terms) ** 0.5,
             ]
         )
         wanted = np.concatenate([target - target.mean(), np.zeros(terms.shape[1])])
-        coefficients[k, : terms.shape[1]] = np.linalg.lstsq(design, wanted, rcond=None)[0] / spread
-    return Shear(jnp.asarray(order), jnp.asarray(coefficients))
+        coefficients[k, : terms.shape[1]] = np.linalg.lstsq(design, wanted, rcond=None)[0] / sd
+    return TransportMap(jnp.asarray(order), jnp.asarray(coefficients))

@@ -1,0 +1,46 @@
+"""Settings that all Markov-chain samplers share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from emulator.errors import InputError
+
+
+@dataclass(frozen=True)
+class ChainOptions:
+    """Length of a run.
+
+    warmup : adapting iterations, not kept.
+    draws : kept iterations of a round; the pilot has one round.
+    chains : independent chains.
+    rounds : largest number of rounds; another one begins while R-hat or ESS miss their limits.
+    r_hat, ess : largest R-hat and smallest bulk and tail ESS of any parameter to stop at.
+    """
+
+    warmup: int = 500
+    draws: int = 1000
+    chains: int = 4
+    rounds: int = 8
+    r_hat: float = 1.008
+    ess: float = 400.0
+
+    label: ClassVar[str] = "chains"
+
+    def __post_init__(self) -> None:
+        for name in ("warmup", "draws", "chains", "rounds"):
+            if getattr(self, name) < 1:
+                raise InputError(
+                    f"{self.label}: {name} is {getattr(self, name)}; it must be 1 or more"
+                )
+        if not self.r_hat > 1.0:
+            raise InputError(f"{self.label}: r_hat is {self.r_hat}; it must be above 1")
+        if not self.ess >= 0.0:
+            raise InputError(f"{self.label}: ess is {self.ess}; it must be 0 or more")
+
+
+def check_target_accept(label: str, value: float) -> None:
+    """:class:`InputError` unless an acceptance rate lies in (0, 1)."""
+    if not 0.0 < value < 1.0:
+        raise InputError(f"{label}: target_accept is {value}; give one in (0, 1)")

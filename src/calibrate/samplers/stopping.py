@@ -1,0 +1,37 @@
+"""The rule that ends a run: R-hat and effective sample size of every coordinate."""
+
+from __future__ import annotations
+
+import numpy as np
+from arviz_stats.base import array_stats
+
+_AXES = {"chain_axis": 0, "draw_axis": 1}
+_FEWEST = 8  # draws of a single chain: two in each quarter
+
+
+def r_hat(values: np.ndarray) -> float:
+    """Rank-normalised split R-hat of ``values`` (chains, draws), Vehtari et al. (2021).
+
+    A single chain is cut in halves first, so that its quarters are compared; NaN below 8 draws.
+    """
+    if values.shape[0] == 1:
+        if values.shape[1] < _FEWEST:
+            return float("nan")
+        values = values[:, : values.shape[1] // 2 * 2].reshape(2, -1)
+    return float(array_stats.rhat(values, **_AXES))
+
+
+def converged(z: np.ndarray, largest_r_hat: float, smallest_ess: float) -> bool:
+    """Whether the draws ``z`` (chains, draws, p) meet both limits in every coordinate.
+
+    R-hat and ESS are of ranks, so a monotone map of a coordinate, as from ``z`` to a parameter,
+    leaves them unchanged.
+    """
+    for values in np.moveaxis(z, -1, 0):
+        if not r_hat(values) <= largest_r_hat:
+            return False
+        bulk = array_stats.ess(values, method="bulk", **_AXES)
+        tail = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **_AXES)
+        if not min(bulk, tail) >= smallest_ess:
+            return False
+    return True
