@@ -1,6 +1,16 @@
-"""Shared fixtures. Importing emulator turns on float64 before any test touches JAX."""
+"""Shared fixtures. Importing emulator turns on float64 before any test touches JAX.
 
+Compiled programs are kept in a folder that all workers, and the processes that tests start, share:
+compilation is most of the time, and most programs are wanted by several of them.
+"""
+
+import os
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+# Read by JAX when it is imported, here and in the processes that tests start.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 import jax
 import pytest
@@ -9,7 +19,7 @@ import calibrate  # noqa: F401 - with all it imports, before pytest turns warnin
 import emulator as em
 from emulator.scenes import Scene
 
-PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "published"
+PUBLISHED = ROOT.parent / "shared" / "published"
 
 
 @pytest.fixture(scope="session")

@@ -6,10 +6,10 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from calibrate.samplers.registry import SAMPLERS
 
 from calibrate.noise.registry import KINDS as NOISES
 from calibrate.observations.registry import KINDS as OBSERVATIONS
+from calibrate.samplers.registry import SAMPLERS
 from emulator.mechanics.laws import LAWS
 from emulator.scenes.loads import LOADS
 from emulator.scenes.supports import SUPPORTS
