@@ -1,0 +1,98 @@
+"""Every sampler of the registry against a closed form, and the rules that all of them share."""
+
+import arviz_stats
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+
+import calibrate as cal
+from calibrate.samplers import SAMPLERS, BlackJAXNUTSOptions, find_sampler, r_hat
+from calibrate.samplers.options import ChainOptions
+from calibrate.samplers.stopping import converged
+from emulator.errors import InputError
+from linear_support import closed_form, linear_forward
+
+PRIOR_MEAN, PRIOR_SD = np.array([70.0, 75.0]), np.array([5.0, 8.0])
+
+
+@pytest.fixture(scope="module")
+def problem(beam):
+    forward = linear_forward(beam)
+    observe = cal.nodal_displacements(beam, [3, 11, 20])
+    prior = {
+        name: dist.Normal(m, s)
+        for name, m, s in zip(beam.parameter_names, PRIOR_MEAN, PRIOR_SD, strict=True)
+    }
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), prior)
+    noise = 0.1 * np.random.default_rng(0).normal(size=(3, 3))
+    data = np.asarray(forward.at(observe.nodes)(jnp.array([72.0, 68.0]))) + noise
+    return forward, observe, model, data
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_a_linear_gaussian_posterior_is_the_known_one(name, problem, beam):
+    forward, observe, model, data = problem
+    options = find_sampler(name).options(warmup=400, draws=1000)
+    posterior = cal.sample(model, data, sampler=name, options=options, seed=1)
+    mean, covariance = closed_form(forward, observe.nodes, data, 0.1, PRIOR_MEAN, PRIOR_SD)
+    draws, table = posterior.draws(), posterior.summary()
+    for k, parameter in enumerate(beam.parameter_names):
+        sd = np.sqrt(covariance[k, k])
+        ess = table[parameter]["ess_bulk"]
+        assert ess > 400
+        assert table[parameter]["r_hat"] < 1.01
+        # Four standard errors at the effective sample size.
+        assert abs(draws[parameter].mean() - mean[k]) < 4 * sd / np.sqrt(ess)
+        assert draws[parameter].std() == pytest.approx(sd, rel=4 / np.sqrt(2 * ess))
+    exact = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
+    assert np.corrcoef(*draws.values())[0, 1] == pytest.approx(exact, abs=4 / np.sqrt(400))
+    statistics = posterior.tree["sample_stats"]
+    assert set(statistics.data_vars) == set(find_sampler(name).statistics)
+    assert all(np.isfinite(np.asarray(values)).all() for values in statistics.data_vars.values())
+    assert posterior.divergences == 0
+    assert posterior.tree.attrs["sampler"] == name
+
+
+def test_one_chain_stops_and_has_an_r_hat(problem):
+    _, _, model, data = problem
+    # 1500 draws of an easy posterior meet the default limits; without the rule, 8 rounds follow.
+    posterior = cal.sample(model, data, options=cal.NUTSOptions(400, 1500, chains=1), seed=1)
+    assert posterior.tree["posterior"].sizes["draw"] < 8 * 1500
+    assert all(1.0 <= row["r_hat"] + 1e-2 < 1.03 for row in posterior.summary().values())
+
+
+def test_r_hat_of_one_chain_sees_a_drift():
+    rng = np.random.default_rng(0)
+    still = rng.normal(size=(1, 2000))
+    assert r_hat(still) < 1.01
+    assert r_hat(still + np.linspace(0.0, 3.0, 2000)) > 1.1
+    assert np.isnan(r_hat(still[:, :7]))
+
+
+def test_r_hat_of_several_chains_is_arviz_s():
+    values = np.random.default_rng(1).normal(size=(4, 200))
+    values[0] += 1.0
+    assert r_hat(values) == pytest.approx(float(arviz_stats.rhat(values)))
+
+
+def test_the_stopping_rule_asks_for_agreement_and_for_enough_draws():
+    z = np.random.default_rng(2).normal(size=(4, 500, 2))
+    assert converged(z, 1.01, 400.0)
+    assert not converged(z, 1.01, 5000.0)
+    z[0, :, 1] += 1.0
+    assert not converged(z, 1.01, 400.0)
+
+
+def test_an_unknown_sampler_and_options_of_another_are_refused(problem):
+    _, _, model, data = problem
+    with pytest.raises(InputError, match="sampler 'hmc' is unknown; known: nuts, blackjax_nuts"):
+        cal.sample(model, data, sampler="hmc")
+    with pytest.raises(InputError, match="'nuts' takes NUTSOptions, not BlackJAXNUTSOptions"):
+        cal.sample(model, data, options=BlackJAXNUTSOptions())
+
+
+@pytest.mark.parametrize("bad", [{"rounds": 0}, {"r_hat": 1.0}, {"ess": -1.0}])
+def test_limits_that_cannot_work(bad):
+    with pytest.raises(InputError, match=f"chains: {next(iter(bad))} is"):
+        ChainOptions(**bad)
