@@ -1,4 +1,7 @@
-"""Studies run from a clean clone with one command; here on a few cases."""
+"""Studies run from a clean clone with one command; here on a few cases.
+
+A new study is its folder and a line in ``QUICK``; ``CHECKS`` may say more of its results.
+"""
 
 import importlib.util
 import json
@@ -11,6 +14,22 @@ import numpy as np
 import pytest
 
 STUDIES = Path(__file__).parents[1] / "studies"
+QUICK = {
+    "accuracy_vs_time": "--cases 4",
+    "beam_coverage": "PUBLISHED --cases 2",
+    "decoder_speed": "--quick",
+    "error_bar": "--scenes once_clamped_beam --cases 3 --outside 1",
+    # No dolfin here: compiling its forms alone takes longer than all the rest.
+    "fem_speed": "--quick --fenics-python ABSENT",
+    "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
+    "many_solves": "--solves 3",
+    "new_ventricle": "--ventricles 1 --runs 8 --tests 3",
+    "objectives": "--quick",
+    "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
+    "squeezed_to_half",
+    "transfer": "--quick --one --family 2 --pretrain 6 --steps 3 --longest 4 --runs 3 --tests 2",
+}
+FAST = ("many_solves",)
 
 
 def run(name: str, *words: object) -> dict:
@@ -36,39 +55,59 @@ def test_every_study_is_complete(folder):
         assert figure.name in readme
 
 
-@pytest.mark.slow
-def test_accuracy_vs_time(tmp_path):
-    results = run("accuracy_vs_time", "--cases", 4, "--out", tmp_path)
+def accuracy_vs_time(results):
     assert len(results["cases"]) >= 8
-    assert (tmp_path / "pareto.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_fem_speed(tmp_path):
-    # No dolfin here: compiling its forms alone takes longer than all the rest.
-    words = ("--quick", "--fenics-python", tmp_path / "absent", "--out", tmp_path)
-    results = run("fem_speed", *words)
+def decoder_speed(results):  # the study asserts equal gradients
+    cases = {case["name"]: case for case in results["cases"]}
+    assert 20 < cases["emulator"]["observed_nodes"] < cases["emulator"]["nodes"]
+    assert cases["twisting cube, 27 nodes"]["landmark_nodes"] <= 27
+    assert results["summary"]["times_faster_than_fem"] > 1.0
+
+
+def error_bar(results):
+    cases = {case["name"]: case for case in results["cases"]}
+    inside = cases["once_clamped_beam, shipped 'once_clamped_beam', inside"]
+    assert inside["effectivity"]["error bar"]["within_factor_2"] == 1.0
+    assert cases["once_clamped_beam, reduced, 5 FEM runs, 50 % outside"]["theta"] == 4
+
+
+def fem_speed(results):
     cases = {case["name"]: case for case in results["cases"]}
     assert cases["scikit-fem + SciPy, cold"]["difference"] <= 1e-6
     assert cases["FEniCS, cold"]["status"].startswith("skipped")
     assert cases["cube, 4 cells an edge"]["nodes"] == 125
-    assert (tmp_path / "speed.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_fem_speed_in_full(tmp_path, published):
-    run("fem_speed", "--published", published, "--out", tmp_path)  # asserts its own claims
+def few_runs(results):
+    errors = {(c["method"], c["runs"]): c["err_u_mm"]["median"] for c in results["cases"]}
+    ratio = results["summary"]["left_ventricle"]["residual over the series / POD + GP"]["5"]
+    assert ratio == errors["residual over the series", 5] / errors["POD + GP", 5] < 1.0 / 3.0
+    assert 0.0 < errors["Taylor series", 1] < 0.2
 
 
-@pytest.mark.slow
-def test_stability(tmp_path):
-    names = (
-        "theta_zero_inside_jit",
-        "theta_too_short",
-        "pushed_through_itself",
-        "squeezed_to_half",
-    )
-    results = run("stability", "--cases", *names, "--workers", 1, "--out", tmp_path)
+def many_solves(results):
+    assert [case["status"] for case in results["cases"]] == ["converged"] * 3
+    assert results["summary"]["solves"] == 3
+
+
+def new_ventricle(results):
+    (case,) = results["cases"]
+    assert case["fem_runs"] == 9
+    assert case["err_V"]["median"] < 0.1
+
+
+def objectives(results):
+    cases = {case["name"]: case for case in results["cases"]}
+    trained = [cases[name] for name in ("simulations", "gradients", "energy", "both")]
+    assert {case["steps"] for case in trained} == {60}
+    assert [case["fem_runs"] for case in trained] == [17, 17, 1, 17]
+    start = cases["the centre's solution"]
+    assert cases["gradients"]["err_F"]["median"] < start["err_F"]["median"]
+
+
+def stability(results):
     status = {case["name"]: case["status"] for case in results["cases"]}
     assert status == {
         "theta_zero_inside_jit": "SINGULAR_TANGENT",
@@ -77,6 +116,50 @@ def test_stability(tmp_path):
         "squeezed_to_half": "CONVERGED",
     }
     assert results["summary"]["silent_wrong"] == 0
+
+
+def transfer(results):
+    cases = {case["name"]: case for case in results["cases"]}
+    assert len(cases) == 8
+    # Before any step, from scratch is the centre's solution and a transfer is not.
+    scratch, family = (cases[f"from {name}, 0 steps"] for name in ("scratch", "the family"))
+    assert scratch["err_u"]["median"] != family["err_u"]["median"]
+
+
+CHECKS = {
+    check.__name__: check
+    for check in (
+        accuracy_vs_time,
+        decoder_speed,
+        error_bar,
+        fem_speed,
+        few_runs,
+        many_solves,
+        new_ventricle,
+        objectives,
+        stability,
+        transfer,
+    )
+}
+
+
+def test_every_study_has_a_line():
+    assert {path.parent.name for path in STUDIES.glob("*/run.py")} == set(QUICK)
+    assert set(CHECKS) <= set(QUICK)
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in QUICK]
+)
+def test_a_few_cases(name, tmp_path, request):
+    given = {"ABSENT": str(tmp_path / "absent")}
+    if "PUBLISHED" in QUICK[name]:
+        given["PUBLISHED"] = str(request.getfixturevalue("published"))
+    words = [given.get(word, word) for word in QUICK[name].split()]
+    results = run(name, *words, "--out", tmp_path)
+    CHECKS.get(name, lambda _: None)(results)
+    for figure in (STUDIES / name).glob("*.png"):
+        assert (tmp_path / figure.name).stat().st_size > 10_000
 
 
 def test_a_hang_in_stability_is_recorded_and_loses_nothing(tmp_path):
@@ -106,13 +189,16 @@ def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
 
 
 @pytest.mark.slow
-def test_stability_in_full(tmp_path):
-    run("stability", "--out", tmp_path)  # asserts its own claims
+@pytest.mark.parametrize(
+    "name", ["accuracy_vs_time", "decoder_speed", "error_bar", "few_runs", "stability"]
+)
+def test_in_full(name, tmp_path):
+    run(name, "--out", tmp_path)  # asserts its own claims
 
 
 @pytest.mark.slow
-def test_accuracy_vs_time_in_full(tmp_path):
-    run("accuracy_vs_time", "--out", tmp_path)  # asserts its own claims, times included
+def test_fem_speed_in_full(tmp_path, published):
+    run("fem_speed", "--published", published, "--out", tmp_path)  # asserts its own claims
 
 
 @pytest.mark.slow
@@ -120,103 +206,3 @@ def test_beam_coverage_in_full(tmp_path, published):
     results = run("beam_coverage", published, "--out", tmp_path)
     assert results["summary"]["accepted"] >= 48
     assert all(40 <= hits <= 50 for hits in results["summary"]["covered"].values())
-
-
-def test_many_solves(tmp_path):
-    results = run("many_solves", "--solves", 3, "--out", tmp_path)
-    assert [case["status"] for case in results["cases"]] == ["converged"] * 3
-    assert results["summary"]["solves"] == 3
-    assert (tmp_path / "many_solves.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_error_bar(tmp_path):
-    words = ("--scenes", "once_clamped_beam", "--cases", 3, "--outside", 1, "--out", tmp_path)
-    cases = {case["name"]: case for case in run("error_bar", *words)["cases"]}
-    inside = cases["once_clamped_beam, shipped 'once_clamped_beam', inside"]
-    assert inside["effectivity"]["error bar"]["within_factor_2"] == 1.0
-    assert cases["once_clamped_beam, reduced, 5 FEM runs, 50 % outside"]["theta"] == 4
-    assert (tmp_path / "effectivity.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_few_runs(tmp_path):
-    small = ("--mesh", 4, 8, 1, "--runs", 1, 5, "--tests", 3, "--order", 1)
-    results = run("few_runs", "--parts", "left_ventricle", *small, "--out", tmp_path)
-    errors = {(c["method"], c["runs"]): c["err_u_mm"]["median"] for c in results["cases"]}
-    ratio = results["summary"]["left_ventricle"]["residual over the series / POD + GP"]["5"]
-    assert ratio == errors["residual over the series", 5] / errors["POD + GP", 5] < 1.0 / 3.0
-    assert 0.0 < errors["Taylor series", 1] < 0.2
-    for figure in ("runs.png", "time.png"):
-        assert (tmp_path / figure).stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_few_runs_in_full(tmp_path):
-    run("few_runs", "--out", tmp_path)  # asserts its own claims
-
-
-@pytest.mark.slow
-def test_error_bar_in_full(tmp_path):
-    run("error_bar", "--out", tmp_path)  # asserts its own claims
-
-
-@pytest.mark.slow
-def test_new_ventricle(tmp_path):
-    words = ("--ventricles", 1, "--runs", 8, "--tests", 3, "--out", tmp_path)
-    (case,) = run("new_ventricle", *words)["cases"]
-    assert case["fem_runs"] == 9
-    assert case["err_V"]["median"] < 0.1
-
-
-@pytest.mark.slow
-def test_transfer(tmp_path):
-    small = (
-        "--family",
-        2,
-        "--pretrain",
-        6,
-        "--steps",
-        3,
-        "--longest",
-        4,
-        "--runs",
-        3,
-        "--tests",
-        2,
-    )
-    results = run("transfer", "--quick", "--one", *small, "--out", tmp_path)
-    cases = {case["name"]: case for case in results["cases"]}
-    assert len(cases) == 8
-    # Before any step, from scratch is the centre's solution and a transfer is not.
-    scratch, family = (cases[f"from {name}, 0 steps"] for name in ("scratch", "the family"))
-    assert scratch["err_u"]["median"] != family["err_u"]["median"]
-    assert (tmp_path / "transfer.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_decoder_speed(tmp_path):
-    results = run("decoder_speed", "--quick", "--out", tmp_path)  # asserts equal gradients
-    cases = {case["name"]: case for case in results["cases"]}
-    assert 20 < cases["emulator"]["observed_nodes"] < cases["emulator"]["nodes"]
-    assert cases["twisting cube, 27 nodes"]["landmark_nodes"] <= 27
-    assert results["summary"]["times_faster_than_fem"] > 1.0
-    assert (tmp_path / "decoder_speed.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_decoder_speed_in_full(tmp_path):
-    run("decoder_speed", "--out", tmp_path)  # asserts its own claims
-
-
-@pytest.mark.slow
-def test_objectives(tmp_path):
-    cases = {
-        case["name"]: case for case in run("objectives", "--quick", "--out", tmp_path)["cases"]
-    }
-    trained = [cases[name] for name in ("simulations", "gradients", "energy", "both")]
-    assert {case["steps"] for case in trained} == {60}
-    assert [case["fem_runs"] for case in trained] == [17, 17, 1, 17]
-    start = cases["the centre's solution"]
-    assert cases["gradients"]["err_F"]["median"] < start["err_F"]["median"]
-    assert (tmp_path / "objectives.png").stat().st_size > 10_000

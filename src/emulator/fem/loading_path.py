@@ -147,9 +147,7 @@ class LoadingPath:
             iterations=state.newton.iterations + 1, factorisations=state.newton.factorisations + 1
         )
         _, increment, steps = jnp.array(_RAMPS)[state.route]
-        sound = (mip.fraction > 0.0) & jnp.isfinite(mip.error) & mip.descends
-        # A residual that rises again is what inside ``jit`` shows of an indefinite tangent.
-        sound &= (mip.error < _CARRIED) | (state.mip.error >= _CARRIED)
+        sound = (mip.fraction > 0.0) & jnp.isfinite(mip.error) & mip.definite
         found = sound & (state.level == 1.0) & (mip.error <= NEAR)
         lost = ~sound | (~found & (state.on_ramp + 1 >= steps))
         higher = jnp.minimum(1.0, state.level + increment)

@@ -51,15 +51,14 @@ class MipState(NamedTuple):
     error : residual of u relative to the forces at work, supports met.
     fraction : of the last step that was taken; below 1 where elements would have been crushed, 0
     where there was no step.
-    descends : whether the last step went against the forces out of balance, as every step with a
-    positive definite tangent does.
+    definite : whether the tangent of the last step was positive definite.
     """
 
     u: jax.Array
     measures: jax.Array
     error: jax.Array
     fraction: jax.Array
-    descends: jax.Array
+    definite: jax.Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +98,24 @@ class MipNewton:
         force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
         residual = system.restrict(system.scatter(force) + system.others(u, self.theta, self.level))
         K = system.assemble(system.element_blocks(tangent), u, self.theta, stiffening)
-        move = system.solve(system.pattern.safe_values(K), -residual)
-        descends = jnp.vdot(residual, move) <= 0.0
+        values = system.pattern.safe_values(K)
+        move = system.solve(values, -residual)
+        definite = self._definite(values, residual, move)
         move = system.extend(jnp.where(system.pattern.solvable(K), move, jnp.nan))
         fraction = self._fraction(u, move)
         ahead = jnp.where(fraction > 0.0, u + fraction * move, u)
         change = displacement_gradient(scene, move)
         measures = self._everywhere(self._at_stress, H, change, state.measures)
         measures = jnp.where(fraction > 0.0, measures, state.measures)
-        return MipState(ahead, measures, self._error(ahead), fraction, descends)
+        return MipState(ahead, measures, self._error(ahead), fraction, definite)
+
+    def _definite(self, values: jax.Array, residual: jax.Array, move: jax.Array) -> jax.Array:
+        """Whether the tangent ``values`` (nnz,) is positive definite, as far as can be told."""
+        if self.system.factorisation == "cholmod":
+            return jnp.array(True)  # CHOLMOD refuses any other
+        if self.system.forces:  # not symmetric: at least the step goes down
+            return jnp.vdot(residual, move) <= 0.0
+        return self.system.pattern.positive_definite(values)
 
     def _error(self, u: jax.Array) -> jax.Array:
         return balance(self.system, u, self.theta, self.level)[1]

@@ -141,7 +141,7 @@ def test_where_it_fails_newton_climbs_from_rest(ventricle, monkeypatch, how):
         if how == "crushed":
             return after._replace(fraction=jnp.array(0.0))
         if how == "climbs":
-            return after._replace(descends=jnp.array(False))
+            return after._replace(definite=jnp.array(False))
         return after._replace(error=jnp.array(jnp.nan if how == "nan" else 0.9))
 
     monkeypatch.setattr(MipNewton, "step", fail)
