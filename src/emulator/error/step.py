@@ -109,7 +109,7 @@ def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Di
         state, _, _ = carry
         after = newton.step(state)
         way, step = _norm(after.u - u), _norm(after.u - state.u)
-        # A step that line search cut is short too, but leaves most of its residual.
+        # A shortened step is small too, but leaves most of its residual.
         good = (after.error <= _GOOD_STEP * state.error) & (step <= _CONTRACTION * way)
         good &= after.level >= 1.0
         return after, good | (after.status == Status.CONVERGED), step / jnp.where(way > 0, way, 1.0)
