@@ -25,9 +25,10 @@ from emulator.errors import InputError
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary file beside ``path`` to write to; it takes its place if nothing goes wrong.
+    """A temporary file beside ``path`` to write to; it replaces ``path`` if nothing raises.
 
-    Folders are made as needed. The temporary name keeps the suffix, which some writers go by.
+    Folders are made as needed. The temporary name keeps the suffix, from which some writers take
+    the format.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -36,14 +37,14 @@ def replacing(path: str | Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        temporary.chmod(0o644)  # mkstemp's 0600 would keep colleagues out
+        temporary.chmod(0o644)  # mkstemp makes files that only their owner may read
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:
-    """Put ``content`` at ``path``, or leave what was there."""
+    """Replace ``path`` by ``content``; on failure the old file stays."""
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
@@ -66,12 +67,12 @@ def _finite(content: Any) -> Any:
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write ``content`` as :func:`to_json` has it."""
+    """Write ``content`` as :func:`to_json` formats it."""
     write_atomically(path, (to_json(content) + "\n").encode())
 
 
 def check_folder(path: str | Path) -> Path:
-    """``path`` as a folder that can be written to, before hours are spent on what goes there."""
+    """``path``; :class:`InputError` if it cannot be a writable folder. Call before long work."""
     path = Path(path)
     existing = path
     while not existing.exists() and existing != existing.parent:
@@ -93,13 +94,13 @@ def read_json(path: str | Path) -> Any:
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """Leaves of a pytree by their place in it, e.g. ``rounds/0/edge/kernel``."""
+    """Leaves of a pytree by their path, e.g. ``rounds/0/edge/kernel``."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {"/".join(filter(None, map(_word, path))): leaf for path, leaf in leaves}
 
 
 def _word(key: Any) -> str:
-    """One step of a leaf's path: a dictionary's key, a place in a list, or an attribute."""
+    """One step of a leaf's path: a dictionary's key, a list index, or an attribute."""
     for attribute in ("key", "idx", "name"):
         if hasattr(key, attribute):
             word = str(getattr(key, attribute))
@@ -118,7 +119,7 @@ def save_arrays(
 
 
 def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Arrays and metadata of a file; :class:`InputError` when missing, truncated or not one."""
+    """Arrays and metadata of a safetensors file; :class:`InputError` if missing or unreadable."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"weights file {path} does not exist")
@@ -150,6 +151,6 @@ def fill_tree[Tree](template: Tree, arrays: Mapping[str, np.ndarray], what: str)
 
 
 def inside(arrays: Mapping[str, np.ndarray], folder: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin with ``folder/``, by the rest of their names."""
+    """The arrays whose names begin with ``folder/``, keyed by the rest of the name."""
     start = f"{folder}/"
     return {name.removeprefix(start): a for name, a in arrays.items() if name.startswith(start)}

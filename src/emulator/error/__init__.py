@@ -1,1 +1,1 @@
-"""How far a prediction is from the truth, and whether to trust it."""
+"""Errors of predictions: against references, estimated without one, and warnings."""

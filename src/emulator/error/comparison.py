@@ -77,10 +77,10 @@ def _percent(value: jax.Array, exact: jax.Array) -> jax.Array:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of each test case for which the forward map has an answer.
+    """Errors of each test case for which the forward map returns a valid prediction.
 
-    thetas : (c, p). fields : name -> (c, ...), those of :func:`field_errors`, and ``max_u`` and
-    ``mean_u`` (c,), the size of the reference. invalid : cases without an answer, left out.
+    thetas : (c, p). fields : name -> (c, ...), as in :func:`field_errors`, with ``max_u`` and
+    ``mean_u`` (c,), the size of the reference. invalid : number of the other cases, left out.
     """
 
     thetas: np.ndarray
@@ -100,9 +100,9 @@ def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) ->
     Raises
     ------
     InputError
-        The map does not return all nodes.
+        The map does not return all nodes, or a load of the scene has no potential.
     SolverError
-        It has no valid answer for any case.
+        The map has no valid prediction for any case.
     """
     scene = forward.scene
     if len(forward.nodes) != len(scene.mesh.nodes):
@@ -142,6 +142,6 @@ def evaluate(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) -> di
     -------
     dict with err_u, err_F, err_I1, err_Pi and, where the scene has a cavity, err_V (quantiles; over
     nodes, points or cavities and cases together), max_u and mean_u (of |u| over the nodes of each
-    case), units, cases, and how many more were invalid.
+    case), units, cases (valid ones), and invalid, the number of the others.
     """
     return case_errors(forward, thetas, reference).report()

@@ -1,4 +1,4 @@
-r"""The error of a prediction, from the forces it leaves out of balance: no solution needed.
+r"""The error of a prediction, estimated from its residual: no solution needed.
 
 A prediction :math:`u = u^* + e` near the equilibrium :math:`u^*`, where :math:`r(u^*) = 0`, has
 the residual of the energy's expansion about :math:`u`,
@@ -8,30 +8,31 @@ the residual of the energy's expansion about :math:`u`,
     \quad\Rightarrow\quad
     K(u)^{-1} r(u) = e - \tfrac12 K^{-1} K'[e, e] + \dots
 
-so :math:`\hat e = K^{-1} r` is the error less a term of its square: Newton's step, turned round.
-The energy it closes is :math:`\Pi(u) - \Pi(u^*) = \tfrac12\, r \cdot K^{-1} r` to second order, and
+so :math:`\hat e = K^{-1} r`, Newton's step with the opposite sign, is the error to first order.
+The energy gap is :math:`\Pi(u) - \Pi(u^*) = \tfrac12\, r \cdot K^{-1} r` to second order, and
 the error of an observed quantity :math:`q` is :math:`dq(u)[\hat e]` to first.
 
 **Effectivity** :math:`|\hat e| / |e|` differs from 1 by
-:math:`\tfrac12 |K^{-1} K'[e, e]| / |e|`, which is proportional to the error: it tends to 1 as the
-prediction gets better, whatever made the prediction, and leaves 1 where the error is so large that
-the body's stiffness changes along it, as it does outside the box. How far it leaves is seen by one
-back-substitution more with the factors at hand, the *contraction*
+:math:`\tfrac12 |K^{-1} K'[e, e]| / |e|`, which is proportional to the error: it tends to 1
+as predictions of any kind improve, and departs from 1 where the error is so large that the body's
+stiffness changes along it, as it does outside the box. One more back-substitution with the factors
+at hand measures the departure, by the *contraction*
 
 .. math:: \Theta = \frac{|K(u)^{-1} r(u - \hat e)|}{|\hat e|},
 
-about the error of :math:`\hat e` relative to itself. For a contraction
+about the relative error of :math:`\hat e`. If every further step shrinks by this factor,
 :math:`|\hat e - e| \le \Theta |\hat e| / (1 - \Theta)`, so :math:`\Theta \le 1/4`
 means an effectivity between 3/4 and 3/2.
-Where it is larger, or the step would invert an element or comes of an indefinite tangent, one step
-says nothing; it may be ten times too long. Then FEM's own guarded iteration is taken from
-the prediction until a step gets less than a quarter of the way so far, and the error is that way.
-Where the prediction itself inverts elements, it starts from the first sound state on the line to
-the solution at the centre of the box, and what lies between counts as error.
+Where it is larger, or the step would invert an element, or the tangent is indefinite, one step may
+be ten times too long. Then FEM's guarded iteration starts from the prediction and runs until a step
+is less than a quarter of the way travelled so far; the error is the whole way.
+Where the prediction itself inverts elements, the iteration starts from the first sound state on the
+line to the solution at the centre of the box, and the way to that state is part of the error.
 
-The tangent at the prediction costs a factorisation. That of the centre of the box is factorised
-once; with it, a few conjugate gradients on :math:`K(u)\, \hat e = r` are cheaper and less sharp:
-good where the body turns little between the centre and :math:`u`, poor for a bending beam.
+The tangent at the prediction costs a factorisation. The tangent at the centre of the box is
+factorised once; as preconditioner of a few conjugate gradients on :math:`K(u)\, \hat e = r` it is
+cheaper and less accurate: good where the body turns little between the centre and :math:`u`, poor
+for a bending beam (docs/experiments.md, "An error bar from the forces out of balance").
 """
 
 from __future__ import annotations
@@ -66,18 +67,18 @@ Tangent = Literal["present", "centre"]
 class ErrorEstimate(NamedTuple):
     """The error of one prediction; every field gains leading axes under ``vmap``, all are finite.
 
-    displacement : (n, 3) mm, the prediction; the centre's solution where that is not finite.
+    displacement : (n, 3) mm, the prediction; the centre's solution if it is not finite.
     field : (n, 3) mm, the prediction less the equilibrium.
-    err_u : (n,) mm, its length at each node. median, mean, max : () of it.
-    energy_gap : () mN mm, the prediction's potential energy less the least. An inverted
-        prediction's is infinite; then that of the sound state nearest to it.
-    least_energy : () mN mm, that least energy. Without a potential these two mean nothing.
-    contraction : () about how wrong ``field`` is, relative to itself; with the tangent of the
-        centre only how much of the residual is left, which bounds nothing.
-    iterations : () of FEM that one step had to be replaced by; 0 where it was not.
-    valid : () whether ``field`` may be believed. Outside the box it may be, and say that the
-        prediction may not.
-    guard : what speaks against the prediction.
+    err_u : (n,) mm, length of ``field`` at each node. median, mean, max : () of ``err_u``.
+    energy_gap : () mN mm, the prediction's potential energy less ``least_energy``. If the
+        prediction is inverted, its energy is infinite; the nearest sound state's is taken.
+    least_energy : () mN mm, potential energy of the equilibrium. Both energies are meaningless
+        without a potential.
+    contraction : () about the relative error of ``field``; with the tangent of the centre, the
+        fraction of the residual that is left, which bounds nothing.
+    iterations : () of FEM that replaced the single step; 0 where that was accepted.
+    valid : () whether ``field`` is reliable. It may be where the prediction itself is not.
+    guard : reasons not to trust the prediction.
     """
 
     displacement: jax.Array
@@ -94,7 +95,7 @@ class ErrorEstimate(NamedTuple):
     guard: Guard
 
     def of(self, quantity: Callable[[jax.Array], jax.Array]) -> jax.Array:
-        """Error of ``quantity(u)`` to first order, in its unit: its slope along ``field``.
+        """Error of ``quantity(u)`` to first order, in its unit: its derivative along ``field``.
 
         ``quantity`` is any differentiable function of the displacement (n, 3) in mm.
         """
@@ -116,14 +117,14 @@ class ErrorBar:
 
     @property
     def scene(self) -> Scene:
-        """What is mapped."""
+        """The scene of the forward map."""
         return self.forward.scene
 
     def __call__(self, theta: jax.Array) -> ErrorEstimate:
         """Error of the forward map at ``theta`` (p,), inside the box or not.
 
-        Outside ``jit`` the tangent is factorised by CHOLMOD, which also tells for certain whether
-        it is indefinite; inside, by UMFPACK.
+        Outside ``jit`` CHOLMOD factorises the tangent, and refuses it if it is indefinite; inside,
+        UMFPACK does, and an indefinite tangent may go unnoticed.
         """
         theta = jnp.asarray(theta, dtype=float)
         self._check_shape("theta", theta, (len(self.scene.parameters),))
@@ -131,7 +132,7 @@ class ErrorBar:
         return self.of_field(self.forward(theta) if traced else self._forward(theta), theta)
 
     def of_field(self, u: jax.Array, theta: jax.Array) -> ErrorEstimate:
-        """Error of any displacement ``u`` (n, 3) mm, said to be the one at ``theta`` (p,)."""
+        """Error of any displacement ``u`` (n, 3) mm as a prediction at ``theta`` (p,)."""
         u, theta = jnp.asarray(u, dtype=float), jnp.asarray(theta, dtype=float)
         self._check_shape("theta", theta, (len(self.scene.parameters),))
         self._check_shape("displacement", u, self.scene.held.shape)
@@ -179,7 +180,7 @@ class ErrorBar:
 
     @cached_property
     def _centre_tangent(self) -> tuple[System, np.ndarray]:
-        """The system whose factorisation fits the centre's tangent, and that tangent, (nnz,)."""
+        """The system with CHOLMOD, and the tangent (nnz,) at the centre's solution."""
         system = System(self.scene, "cholmod")
         with jax.ensure_compile_time_eval():
             values = jax.jit(system.tangent)(self.centre, self.scene.centre)
@@ -216,8 +217,8 @@ def error_bar(
 
     Parameters
     ----------
-    tangent : ``present`` (at each prediction, factorised) or ``centre`` (of the box, factorised
-        once: cheaper and less sharp).
+    tangent : ``present`` (at each prediction, factorised each time) or ``centre`` (of the box,
+        factorised once: cheaper, less accurate).
     iterations : conjugate gradients with the tangent of the centre, 1 or more.
 
     Raises
@@ -255,13 +256,13 @@ def _report(
     sound: jax.Array,
     step: Distance,
 ) -> ErrorEstimate:
-    """The estimate, finite whatever happened."""
+    """The estimate, with finite numbers even where the step failed."""
     against = guard(system.scene, theta, u)
     given = jnp.where(against.finite, u, centre)
     field = given - sound + step.move
     known = against.finite & jnp.all(jnp.isfinite(field)) & jnp.isfinite(step.gap)
     valid = known & step.settled
-    # Nothing known: as wrong as the box is wide, or as the displacement is large.
+    # No estimate: take the distance to the centre's solution, or the whole displacement.
     unknown = given - jnp.where(against.finite, centre, 0.0)
     field = jnp.where(known, field, unknown)
     err_u = jnp.sqrt(jnp.sum(field**2, axis=-1))

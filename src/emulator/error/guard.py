@@ -1,7 +1,7 @@
-"""Why a prediction is not to be trusted: what can be seen of it without solving anything.
+"""Reasons not to trust a prediction, found without solving.
 
-Inside ``jit`` a :class:`Guard` is flags and numbers; outside, :meth:`Guard.sentence` puts the worst
-of them in words.
+Inside ``jit`` a :class:`Guard` is flags and numbers; outside, :meth:`Guard.sentence` puts them in
+words.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from emulator.scenes.scene import Scene
 
 
 class Guard(NamedTuple):
-    """What speaks against a prediction; every field gains leading axes under ``vmap``.
+    """Reasons not to trust a prediction; every field gains leading axes under ``vmap``.
 
-    theta : (p,) what was asked for.
-    outside : (p,) which of its entries lie outside the scene's box.
+    theta : (p,) where the prediction was made.
+    outside : (p,) bool, entries of theta outside the scene's box.
     finite : whether theta and the prediction are finite numbers.
-    least_J : () smallest volume ratio; an element is inverted where it is not above 0.
-    barrier : () whether a point is so deformed that a training barrier would act on it, so that an
-        emulator was never trained on its exact energy (see :mod:`emulator.mechanics.barriers`).
+    least_J : () smallest volume ratio; not above 0 if an element is inverted.
+    barrier : () whether a training barrier on J, I1 or I4f would act somewhere, so that training
+        did not see the exact energy of this state (see :mod:`emulator.mechanics.barriers`).
     indefinite : () whether the tangent at the prediction is known to be indefinite.
     unsettled : () whether no equilibrium was found near the prediction.
     """
@@ -43,12 +43,12 @@ class Guard(NamedTuple):
 
     @property
     def trusted(self) -> jax.Array:
-        """Whether nothing speaks against the prediction, () bool."""
+        """Whether there is no reason to distrust the prediction, () bool."""
         sound = self.finite & (self.least_J > 0.0) & ~self.barrier
         return sound & ~jnp.any(self.outside, axis=-1) & ~self.indefinite & ~self.unsettled
 
     def sentence(self, scene: Scene) -> str:
-        """All that speaks against the prediction, for people; empty when nothing does."""
+        """All reasons not to trust the prediction, in words; empty when there are none."""
         if not self.finite:
             faults = [] if np.isfinite(self.theta).all() else ["theta is not finite"]
             return "; ".join([*self._beyond(scene), *faults, "the prediction is not finite"][:2])
@@ -74,7 +74,7 @@ class Guard(NamedTuple):
 
 
 def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
-    """What theta (p,) and the prediction ``u`` (n, 3) mm themselves say; nothing is factorised."""
+    """Guard from theta (p,) and the prediction ``u`` (n, 3) mm alone; nothing is factorised."""
     finite = jnp.all(jnp.abs(u) < ENDLESS) & jnp.all(jnp.isfinite(theta))
     J, I1, I4f = invariants(scene, jnp.where(finite, u, 0.0))
     limits = Barriers()
@@ -94,17 +94,17 @@ def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
 def outside_box(scene: Scene, theta: jax.Array) -> jax.Array:
     """Which entries of ``theta`` (p,) lie outside their range, (p,) bool; NaN does.
 
-    The others are put in the middle of theirs, so that one entry decides for itself.
+    Each entry is tested with all others at the centre of the box.
     """
     each = jnp.where(jnp.eye(len(scene.parameters), dtype=bool), theta[None, :], scene.centre)
     return ~scene.space.contains(each)
 
 
 def invariants(scene: Scene, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """``J``, and the larger of each of I1, I4f and its isochoric part, at every point, (m, q).
+    """``J``, ``I1`` and ``I4f`` at every point, (m, q); the last two or their isochoric parts.
 
-    Laws use the one or the other. Isochoric parts of inverted points are NaN and left out; without
-    fibres I4f is 0.
+    The larger of each pair is returned, as laws use either. Isochoric parts of inverted points are
+    NaN and left out; without fibres I4f is 0.
     """
 
     def measures(H: jax.Array, own: Tissue) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -1,7 +1,7 @@
-r"""How far a displacement is from the equilibrium near it, found in three ways.
+r"""Distance of a displacement from the nearby equilibrium, by three methods.
 
-One Newton step and a check of it; FEM's own guarded iteration, where that says too little; and
-conjugate gradients with a tangent factorised elsewhere. :mod:`emulator.error.estimate` has the
+One Newton step with a check; FEM's guarded iteration, where the check fails; and conjugate
+gradients preconditioned by a tangent factorised elsewhere. :mod:`emulator.error.estimate` has the
 theory.
 """
 
@@ -21,24 +21,26 @@ from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Status
 from emulator.scenes.scene import Scene
 
-ENDLESS = 1e100  # mm; beyond this, squares overflow
-_CONTRACTION = 0.25  # above which one step says too little; see emulator.error.estimate
-_SHRINK = 0.2  # least fraction of the smallest J that a step may leave
-_ROUND_OFF = 1e-9  # an error this small beside the displacement is round-off, and does not contract
-_GOOD_STEP = 0.1  # of the residual is the most that a step to be believed leaves
+ENDLESS = 1e100  # mm; larger displacements count as not finite: J, their cube, would overflow
+# Largest contraction of an accepted step (docs/experiments.md, "An error bar from the forces out of
+# balance").
+_CONTRACTION = 0.25
+_SHRINK = 0.2  # least fraction of the smallest J that a step or a replacement state keeps
+_ROUND_OFF = 1e-9  # errors below this fraction of the displacement are round-off: not checked
+_GOOD_STEP = 0.1  # the iteration stops only after a step that leaves at most this much residual
 _MOST_ITERATIONS = 30
-_FRACTIONS = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of the way from the centre to a prediction
+_FRACTIONS = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of the line from centre to prediction, tried
 
 
 class Distance(NamedTuple):
-    """How far a field is from equilibrium, as one way of finding out has it.
+    """Distance of a field from equilibrium, by one of the three methods.
 
     move : (n, 3) mm, the field less the equilibrium.
-    gap : () mN mm, its potential energy less that of the equilibrium.
-    contraction : () about how wrong ``move`` is, relative to itself.
-    iterations : () of FEM's iteration that were taken.
+    gap : () mN mm, the field's potential energy less the equilibrium's.
+    contraction : () about the relative error of ``move``.
+    iterations : () that FEM took.
     indefinite : () whether the tangent is known to be indefinite.
-    settled : () whether the rest is to be believed.
+    settled : () whether the method's own check accepts the result.
     """
 
     move: jax.Array
@@ -60,22 +62,23 @@ def _norm(field: jax.Array) -> jax.Array:
 def sound_state(
     scene: Scene, centre: jax.Array, u: jax.Array, theta: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """``u`` (n, 3) on its supports if no element is inverted, else what is sound on the way back.
+    """``u`` (n, 3) and ``theta`` made safe to linearise at.
 
-    With it a theta that is finite.
+    ``u`` is put on its supports and, if an element is inverted, moved towards ``centre`` until none
+    is; a theta that is not finite is replaced by the centre of the box, entry by entry.
     """
     fine = jnp.all(jnp.abs(u) < ENDLESS)
     placed = jnp.where(scene.held, scene.held_displacement, jnp.where(fine, u, centre))
     fractions = jnp.array(_FRACTIONS)[:, None, None]
     states = jnp.where(fractions == 1.0, placed, centre + fractions * (placed - centre))
     J = jax.vmap(partial(_least_J, scene))(states)
-    # The prediction need only be sound; what it is replaced by should be well clear.
+    # The prediction need only have J > 0; a replacement must keep J well above 0.
     sound = (_SHRINK * J[-1] < J).at[0].set(J[0] > 0.0)
     return states[jnp.argmax(sound)], jnp.where(jnp.isfinite(theta), theta, scene.centre)
 
 
 def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
-    """Newton's step turned round, and whether it is to be believed."""
+    """Newton's step with the opposite sign, and a check by one more back-substitution."""
     residual, tangent = system.residual(u, theta), system.tangent(u, theta)
     values = system.pattern.safe_values(tangent)
     move = system.extend(system.solve(values, residual))
@@ -98,7 +101,7 @@ def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
 
 
 def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Distance:
-    """The way FEM's own iteration goes from ``u`` until what is left is short beside it."""
+    """Distance FEM's iteration travels from ``u`` until its steps are short beside it."""
     system = simulator.system
     newton = Newton(system, simulator.options, theta)
 
@@ -106,7 +109,7 @@ def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Di
         state, _, _ = carry
         after = newton.step(state)
         way, step = _norm(after.u - u), _norm(after.u - state.u)
-        # A step cut short is short too, but leaves its residual.
+        # A shortened step is small too, but leaves most of its residual.
         good = (after.error <= _GOOD_STEP * state.error) & (step <= _CONTRACTION * way)
         good &= after.level >= 1.0
         return after, good | (after.status == Status.CONVERGED), step / jnp.where(way > 0, way, 1.0)

@@ -93,7 +93,7 @@ class System:
         return flat.at[self.free].set(free_values, unique_indices=True).reshape(-1, 3)
 
     def internal_energy(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Energy stored in the body and its elastic supports, mN mm."""
+        """Elastic energy of the body and its springs, mN mm."""
         energy = strain_energy(self.scene)(u, theta)
         if self.springs:
             values = self.scene.resolve(theta)
@@ -101,7 +101,7 @@ class System:
         return energy
 
     def internal_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Gradient of the stored energy, (n, 3) in mN, reactions included."""
+        """Gradient of the elastic energy, (n, 3) in mN; at held entries, the reactions."""
         return jax.grad(self.internal_energy)(u, theta)
 
     def external_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
@@ -138,12 +138,12 @@ class System:
         return stored - load * work, jnp.abs(stored) + jnp.abs(load * work)
 
     def residual(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
-        """Free part (f,) of the force out of balance in mN, at ``load`` times the loads."""
+        """Residual (f,) in mN: internal less ``load`` times external force, free entries."""
         return self.restrict(self.internal_force(u, theta) - load * self.external_force(u, theta))
 
     @property
     def mixed(self) -> bool:
-        """Whether elements have volumes and pressures of their own."""
+        """Whether each element has a volume and a pressure as unknowns."""
         return self.scene.dilatation == "mean"
 
     def mixed_residual(
@@ -168,7 +168,7 @@ class System:
         return jnp.zeros(self.scene.held.shape, local.dtype).at[nodes].add(at_nodes)
 
     def others(self, u: jax.Array, theta: jax.Array, load: jax.Array | float) -> jax.Array:
-        """Force (n, 3) in mN out of balance that is not the bulk's: springs less loads."""
+        """Part (n, 3) of the residual outside the bulk, mN: springs less loads."""
         values = self.scene.resolve(theta)
         springs = jax.grad(lambda w: sum((s.total(w, values) for s in self.springs), 0.0))(u)
         return springs - load * self.external_force(u, theta)
@@ -180,7 +180,7 @@ class System:
     def assemble(
         self, bulk: jax.Array, u: jax.Array, theta: jax.Array, load: jax.Array | float
     ) -> jax.Array:
-        """Nonzeros (nnz,) of the tangent whose elements' blocks are ``bulk``, loads included."""
+        """Nonzeros (nnz,) of the tangent from element blocks ``bulk``, springs and loads."""
         values = self.scene.resolve(theta)
         blocks = [bulk]
         blocks += [spring.tangents(u, values) for spring in self.springs]
@@ -197,7 +197,7 @@ class System:
         return self.element_blocks(at_points(scene, jax.hessian(point_energy(scene, theta)), H))
 
     def element_blocks(self, A: jax.Array) -> jax.Array:
-        """Blocks (m, a, 3, a, 3) in mN/mm of a tangent A (m, q, 3, 3, 3, 3) in kPa of H."""
+        """Blocks (m, a, 3, a, 3) in mN/mm from the moduli ``A = d2W/dH2`` (m, q, 3, 3, 3, 3)."""
         grid = self.scene.discretisation
         A = A * grid.weights[:, :, None, None, None, None]
         return jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
@@ -210,7 +210,7 @@ class System:
 def relative_residual(
     system: System, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
 ) -> jax.Array:
-    """Force out of balance relative to the forces at work, reactions included, shape ()."""
+    """Norm of the residual relative to the internal and external forces, shape ()."""
     return balance(system, u, theta, load)[1]
 
 
@@ -221,10 +221,10 @@ def balance(
     load: jax.Array | float = 1.0,
     negligible: jax.Array | float = 0.0,
 ) -> tuple[jax.Array, jax.Array]:
-    """Free residual (f,) in mN, and its norm relative to the forces at work, shape ().
+    """Residual (f,) in mN, and its norm relative to internal and external forces, shape ().
 
-    ``negligible`` is a norm in mN that counts as none. A body at rest without loads has no forces
-    at all, and its relative residual is 0 too. NaN stays NaN.
+    The forces include reactions. A norm up to ``negligible`` (mN) counts as 0, and so does the
+    relative residual of a body without any forces. NaN stays NaN.
     """
     internal = system.internal_force(u, theta)
     external = load * system.external_force(u, theta)

@@ -1,4 +1,4 @@
-"""FEM runs over the parameter box, each started from what the earlier ones say of it."""
+"""FEM runs over the parameter box, each started from a prediction of the earlier ones."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 
 Predictor = Callable[[jax.Array], jax.Array]
-"""Position in the parameter box (p,) to a displacement (n, 3) mm to start Newton from."""
+"""Maps a position in the unit box (p,) to a starting displacement (n, 3) mm."""
 
 
 class Runs(NamedTuple):
     """Converged FEM solutions.
 
     theta : (c, p). displacement : (c, n, 3) mm. energy : (c,) mN mm.
-    sensitivities : (c, p, n, 3), du/dtheta in mm a unit of each parameter; None where they were not
-        asked for.
+    sensitivities : (c, p, n, 3), du/dtheta in mm per unit of each parameter; None unless requested.
     """
 
     theta: jax.Array
@@ -35,8 +34,8 @@ class Runs(NamedTuple):
 
     def take(self, rows: slice | np.ndarray) -> Runs:
         """Some of the runs."""
-        columns = None if self.sensitivities is None else self.sensitivities[rows]
-        return Runs(self.theta[rows], self.displacement[rows], self.energy[rows], columns)
+        sensitivities = None if self.sensitivities is None else self.sensitivities[rows]
+        return Runs(self.theta[rows], self.displacement[rows], self.energy[rows], sensitivities)
 
 
 def run_campaign(
@@ -51,26 +50,26 @@ def run_campaign(
 ) -> Runs:
     """Solve at every theta (c, p).
 
-    Each run starts from the nearest one done, from the same moved along its sensitivities, or from
-    ``predictor``: of those there are, the one with the least force out of balance. Where that start
-    fails, from rest.
+    Each run starts from the solution at the nearest theta so far, from that solution extrapolated
+    along its sensitivities, or from ``predictor``: whichever has the smallest residual. If that
+    start fails, the run starts again from rest.
 
     Parameters
     ----------
-    sensitivities : find du/dtheta too, from each run's own factor: a tenth of its time on a
-        ventricle with five parameters.
-    deadline : of the performance counter, after which no run but the first ``at_least`` is begun.
+    sensitivities : compute du/dtheta too, from each run's own factor: a tenth of the run's time on
+        a ventricle with five parameters.
+    deadline : value of ``time.perf_counter`` after which only the first ``at_least`` runs begin.
 
     Raises
     ------
     SolverError
-        A solve failed; the message says which and how.
+        A solve failed; the message names the run and the reason.
     """
     scene = simulator.scene
     positions = np.asarray(scene.to_unit(thetas))
     fields: list[jax.Array] = []
     found: list[jax.Array] = []  # du/dtheta
-    moved: list[jax.Array] = []  # the same in the unit box
+    moved: list[jax.Array] = []  # du/dx, x the position in the unit box
     best = _chooser(simulator)
     for k, theta in enumerate(tqdm(thetas, "FEM", disable=not progress, unit="run")):
         if k >= at_least and time.perf_counter() > deadline:
@@ -110,16 +109,16 @@ def _starts(
 
 
 def _chooser(simulator: Simulator):  # noqa: ANN202 - a jitted closure, private
-    """Of several starts (s, n, 3), the one with the least force out of balance."""
+    """Function that picks the start with the smallest residual among several (s, n, 3)."""
     scene: Scene = simulator.scene
 
     @jax.jit
     def choose(starts: jax.Array, theta: jax.Array) -> jax.Array:
-        def imbalance(u: jax.Array) -> jax.Array:
+        def residual(u: jax.Array) -> jax.Array:
             error = relative_residual(simulator.system, u, theta)
             sound = jnp.isfinite(error) & (jnp.min(volume_ratio(scene, u)) > 0.0)
             return jnp.where(sound, error, jnp.inf)
 
-        return starts[jnp.argmin(jax.lax.map(imbalance, starts))]
+        return starts[jnp.argmin(jax.lax.map(residual, starts))]
 
     return choose

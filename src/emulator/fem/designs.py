@@ -1,4 +1,4 @@
-"""Where in the parameter box to train and to test."""
+"""Sets of theta in the parameter box, for training and testing."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.stats import qmc
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
-_CORNER_EVERY = 5
-_MOST_CORNERED = 6  # parameters
+_CORNER_EVERY = 5  # every fifth theta of a design is a corner of the box
+_MOST_CORNERED = 6  # parameters; the box of more has too many corners, and none is used
 
 
 def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
@@ -35,9 +35,9 @@ def uniform(scene: Scene, count: int, key: jax.Array) -> jax.Array:
 def design(scene: Scene, count: int, seed: int) -> jax.Array:
     """``count`` theta (count, p) for FEM runs: a Sobol sequence, and with it the box's corners.
 
-    A surrogate is worst at the corners, which no sequence reaches. Every fifth theta is one, in
-    random order, until they run out; more than 64 of them are left out. A shorter design is the
-    beginning of a longer one.
+    A surrogate is worst at the corners, which a Sobol sequence does not reach (docs/experiments.md,
+    "When k-hat cries wolf"). Every fifth theta is a corner, in random order, until all are used;
+    with more than 6 parameters there are none. A shorter design is the beginning of a longer one.
     """
     whole = sobol(scene, count, seed)
     parameters = len(scene.parameters)

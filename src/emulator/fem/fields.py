@@ -1,4 +1,4 @@
-r"""What a solution says of each element, for pictures and tables.
+r"""Stress, strain and fibre stretch of each element, for pictures and tables.
 
 .. math::
     P = \partial W / \partial F, \quad \sigma = P F^T / J, \quad E = (F^T F - I)/2
@@ -35,15 +35,15 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
     Returns
     -------
-    ``J`` (m,), ``cauchy_stress`` (m, 3, 3) in kPa, ``green_lagrange`` (m, 3, 3); and where the
-    scene has fibres ``fibres`` (m, 3), ``deformed_fibres`` (m, 3), unit length both, and
-    ``fibre_stretch`` (m,); and where it has regions their ``regions`` (m,).
+    ``J`` (m,), ``cauchy_stress`` (m, 3, 3) in kPa, ``green_lagrange`` (m, 3, 3); with fibres also
+    ``fibres`` and ``deformed_fibres`` (m, 3), both of unit length, and ``fibre_stretch`` (m,); with
+    regions also ``regions`` (m,).
     """
     H = displacement_gradient(scene, jnp.asarray(u))
     F = H + jnp.eye(3, dtype=H.dtype)
     J = jax.vmap(jax.vmap(determinant))(F)
     P = _first_piola(scene, H, theta)
-    # sigma is symmetric up to round-off, which eigenvalue routines trip over.
+    # Round-off leaves sigma slightly asymmetric; eigenvalue routines need it symmetric.
     sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]
     E = _symmetric(H + 0.5 * jnp.swapaxes(H, -1, -2) @ H)
     weights = scene.discretisation.weights
@@ -66,7 +66,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
 
 def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
-    """Stress (m, q, 3, 3) in kPa that does the strain energy's work on ``H``."""
+    """First Piola-Kirchhoff stress (m, q, 3, 3) in kPa, from the strain energy's gradient."""
     if scene.dilatation == "pointwise":
         return at_points(scene, jax.grad(point_energy(scene, theta)), H)
     weights = jnp.asarray(scene.discretisation.weights)

@@ -1,4 +1,4 @@
-r"""Total potential energy of a scene, built of only the terms the scene has.
+r"""Total potential energy of a scene, summed over the terms the scene has.
 
 .. math::
     \Pi(u, \theta) = \int_\Omega W(\nabla u; \theta)\, dX + \text{springs}
@@ -7,7 +7,7 @@ r"""Total potential energy of a scene, built of only the terms the scene has.
 in mN mm (= micro J; kPa mm3), Dalton et al. (2023), Eq. 20. The displacement ``u`` is the full
 nodal field, (n, 3) in mm, supports included.
 
-With mean dilatation the volume change of an element is that of its mean,
+With mean dilatation the volume ratio of an element is its mean,
 
 .. math::
     \hat F = \left(\bar J / J\right)^{1/3} F, \qquad
@@ -48,7 +48,7 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 def strain_law(scene: Scene, theta: jax.Array) -> Callable:
-    """``W(strain, tissue)`` in kPa of the strain of one point, at ``theta`` (p,)."""
+    """``W(strain, tissue)`` in kPa, from the strain at one point, at ``theta`` (p,)."""
     values, law = scene.resolve(theta), scene.law
     scale = factors(scene.regions, values)
 
@@ -62,7 +62,7 @@ def strain_law(scene: Scene, theta: jax.Array) -> Callable:
 
 
 def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
-    """``W(H, tissue)`` in kPa of one displacement gradient (3, 3), at ``theta`` (p,)."""
+    """``W(H, tissue)`` in kPa, from one displacement gradient (3, 3), at ``theta`` (p,)."""
     constitutive = strain_law(scene, theta)
 
     def energy(H: jax.Array, at: Tissue = Tissue()) -> jax.Array:
@@ -85,7 +85,7 @@ def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -
 def with_volume_change(
     H: jax.Array, change: jax.Array, barriers: Barriers | None = None
 ) -> jax.Array:
-    """Displacement gradients ``H`` (q, 3, 3) stretched evenly to ``J - 1 = change``."""
+    """Displacement gradients ``H`` (q, 3, 3) scaled isotropically to ``J - 1 = change``."""
     ln_J = jax.vmap(lambda h: Strain(h, barriers).ln_J)(H)
     stretch = jnp.expm1((jnp.log1p(change) - ln_J) / 3.0)[:, None, None]
     return H + stretch * (H + jnp.eye(3, dtype=H.dtype))
@@ -102,8 +102,8 @@ def with_mean_dilatation(
 def at_volume(scene: Scene, theta: jax.Array) -> Callable:
     """``(change, u, gradients, weights, tissue) -> ()``: strain energy of an element, mN mm.
 
-    Its volume ratio less 1 is ``change`` throughout, whatever ``u`` (a, 3) in mm says;
-    ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3.
+    ``change``, the volume ratio less 1, replaces the one that follows from ``u`` (a, 3) mm at every
+    point; ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3.
     """
     at_point = point_energy(scene, theta)
 

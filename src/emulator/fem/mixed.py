@@ -1,7 +1,8 @@
 r"""Newton steps for mean dilatation, with each element's volume and pressure as iterates.
 
-On the displacements alone, a stiff volume term lets Newton move only as far as the constraint is
-straight: hundreds of tiny steps at nu = 0.4999. So the element's volume ratio :math:`\theta` and
+With displacements alone, a stiff volume term limits Newton's steps to where the constraint is
+nearly linear: hundreds of tiny steps at nu = 0.4999 (docs/experiments.md, "Mean dilatation on the
+displacements alone"). So each element's volume ratio :math:`\theta` and
 pressure :math:`p` become unknowns (Simo, Taylor & Pister 1985), stationary points of
 
 .. math::
@@ -56,14 +57,14 @@ class Condensed(NamedTuple):
 
 
 def _arguments(scene: Scene, u: jax.Array) -> tuple:
-    """Displacements, gradients, weights and tissue of every element, to map over."""
+    """Displacements, gradients, weights and tissue of every element, for ``vmap``."""
     grid = scene.discretisation
     local = (u[grid.connectivity], jnp.asarray(grid.gradients), jnp.asarray(grid.weights))
     return (*local, scene.tissue)
 
 
 def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:
-    """Volumes and pressures that belong to the displacement ``u`` (n, 3)."""
+    """Volumes and pressures that follow from the displacement ``u`` (n, 3)."""
 
     def one(*element: Any) -> Volumes:
         change = mean_volume_change(*element[:3])
@@ -113,8 +114,8 @@ def carried(
 ) -> jax.Array:
     """Force (m, a, 3) of every element at ``u`` and ``volumes``, eliminated with ``at``.
 
-    What :func:`linearise` calls force, but with the couplings of an earlier iterate: solving with
-    that iterate's tangent gives the simplified Newton step.
+    The force of :func:`linearise`, but with the couplings of an earlier iterate: solving with that
+    iterate's tangent gives the simplified Newton step.
     """
     energy = at_volume(scene, theta)
 

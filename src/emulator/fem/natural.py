@@ -1,15 +1,16 @@
-r"""Whether a step of mean dilatation's Newton makes progress: Deuflhard's natural monotonicity.
+r"""Step acceptance for Newton with mean dilatation: Deuflhard's natural monotonicity test.
 
-The point sought is a saddle of displacements, volumes and pressures, so no energy tells a good step
-from a bad one, and in a residual the stiff volumes drown all else. Instead, from where a fraction
-of the step leads, Newton with the tangent of where it started must have less far to go,
+The solution is a saddle point in displacements, volumes and pressures, so no energy can judge a
+step, and the residual is dominated by the stiff volumes. Instead, the simplified Newton step (with
+the old tangent) after a fraction of the step must be shorter than the step,
 
 .. math::
     \left| K(x)^{-1} r(x + \alpha \Delta x) \right|
     \le \left(1 - \frac{\alpha}{4}\right) |\Delta x|
 
-in mm (P. Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 3.3). The factors are
-there already, so this costs one evaluation of the forces and one back-substitution.
+in mm (P. Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 3.3). The tangent
+is factorised already, so the test costs one evaluation of the forces and one back-substitution
+(docs/experiments.md, "Mean dilatation from far away: what judges a step").
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ def natural_monotonicity(
     theta: jax.Array,
     direction: Direction,
 ) -> Callable[[jax.Array], jax.Array]:
-    """``fraction -> bool``: whether that much of ``direction`` leaves less to go.
+    """``fraction -> bool``: whether that fraction of ``direction`` passes the test.
 
     Parameters
     ----------
     u, volumes, level, theta : where the step starts.
-    direction : the step, with the tangent and the condensed linearisation it came of.
+    direction : the step, with its tangent and condensed linearisation.
     """
     move, at, tangent = direction.move, direction.condensed, direction.tangent
     assert at is not None

@@ -1,4 +1,4 @@
-"""Controls of the solver."""
+"""Options of the solver."""
 
 from __future__ import annotations
 
@@ -9,26 +9,28 @@ from emulator.errors import InputError
 
 @dataclass(frozen=True)
 class NewtonOptions:
-    """Controls of the solver.
+    """Options of the solver.
 
-    In docs/experiments.md: "The stopping rule of the released solutions" for the tolerances, "Fewer
-    factorisations from rest" for ``keep_tangent``.
-
-    tolerance : residual relative to the internal forces, reactions included.
+    tolerance : largest norm of the residual relative to the internal and external forces, reactions
+        included (docs/experiments.md, "The stopping rule of the released solutions").
     round_off : a relative residual below this is accepted where Newton no longer reduces it.
-    absolute : residual in mN that is accepted whatever the forces at work; round-off of the forces
-        at rest always is.
+    absolute : residual in mN that is accepted whatever the forces; round-off of the forces at rest
+        always is.
     max_iterations : over all routes and load levels.
     level_iterations : after which a load level is given up and its increment halved.
-    increment : first and largest load increment, as a fraction of the whole. Small ones follow the
-        loading path from rest, which matters to a body that has several equilibria; a start other
-        than rest is then used only if it is the solution already.
+    increment : first and largest load increment, as a fraction of the whole. Small increments
+        follow the loading path from rest, for bodies with several equilibria (docs/experiments.md,
+        "Several equilibria in the soft corner"); another start is then used only if it is already
+        the solution.
     min_increment : smallest load increment.
-    shrink : least fraction of the present smallest ``J`` that a step may leave.
-    keep_tangent : a step that leaves less than this fraction of the residual has its tangent used
-        again; 0 is Newton's method to the letter.
+    shrink : least fraction of the smallest ``J`` that a step keeps.
+    keep_tangent : after a step that leaves less than this fraction of the residual, its tangent is
+        used again; 0 is the full Newton method (docs/experiments.md, "Fewer factorisations from
+        rest").
     stress_iterates : begin, when far from equilibrium, with :mod:`emulator.fem.mip` where the scene
-        allows it (see :func:`emulator.fem.mip.applies`); never in load increments.
+        allows it (see :func:`emulator.fem.mip.applies`); never with load increments
+        (docs/experiments.md, "Stresses as iterates: the ventricle from rest in five
+        factorisations").
     """
 
     tolerance: float = 1e-11

@@ -1,4 +1,4 @@
-"""Reference solutions that forward maps are judged by, inside the box and outside."""
+"""Reference solutions to evaluate forward maps against, inside and outside the box."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from emulator.fem.designs import sobol
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 
-SEED = 90_210  # test points of their own: training and reduced models draw with small seeds
+SEED = 90_210  # separate test points: training and reduced models use small seeds
 
 
 class Reference(NamedTuple):
-    """Theta (c, p), displacement (c, n, 3) mm, where it is from, and how many solves failed."""
+    """Theta (c, p), displacement (c, n, 3) mm, its source, and the number of failed solves."""
 
     thetas: jax.Array
     displacement: jax.Array
@@ -36,7 +36,7 @@ def fem_reference(simulator: Simulator, cases: int, *, progress: bool = False) -
 def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
     """Theta (cases, p) outside the box, in the box widened by ``fraction`` of each side, both ways.
 
-    Widened on each parameter's scale; values that law and loads do not take are left out.
+    Widened on each parameter's scale; theta that law or loads do not admit are left out.
     """
     if not 0.0 < fraction < np.inf:
         raise InputError(f"outside is {fraction}; give a fraction above 0, e.g. 0.25")
@@ -53,7 +53,7 @@ def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
 
 
 def _admissible(scene: Scene, thetas: np.ndarray) -> np.ndarray:
-    """Whether law, loads and regions take every entry of each theta (c, p), (c,) bool."""
+    """Whether law, loads and regions admit every entry of each theta (c, p), (c,) bool."""
     quantities = [scene.quantities[name] for name in scene.parameter_names]
     return np.array(
         [
@@ -71,9 +71,9 @@ def outside_reference(
     *,
     progress: bool = False,
 ) -> Reference:
-    """Our FEM outside the box, each from the nearest solution there is, else from rest.
+    """Our FEM outside the box, each run started from the nearest solution, or else from rest.
 
-    What does not converge is left out and counted.
+    Runs that do not converge are left out and counted.
     """
     scene = simulator.scene
     thetas = sample_outside(scene, cases, fraction)

@@ -1,4 +1,4 @@
-"""What a simulation returns: a displacement, and whether and how far to believe it."""
+"""Result of a simulation: a displacement, how the solve ended, and its residual."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Status(IntEnum):
 
     @property
     def text(self) -> str:
-        """One line for people."""
+        """One line in words."""
         return _TEXT[self]
 
 
@@ -46,7 +46,7 @@ class Solution(NamedTuple):
     status : a :class:`Status` as an integer.
     iterations : of Newton's method and of the stress iterates, over all routes and load levels.
     factorisations : tangents factorised on the way; the other iterations kept the last one.
-    residual : force out of balance relative to the forces at work.
+    residual : norm of the residual relative to the internal and external forces.
     load_reached : largest fraction of the load with a converged solution.
     """
 
@@ -59,7 +59,7 @@ class Solution(NamedTuple):
 
     @property
     def converged(self) -> jax.Array:
-        """Boolean of the status' shape."""
+        """Whether each status is CONVERGED; bool of the status' shape."""
         return self.status == Status.CONVERGED
 
     def require_converged(self, what: str = "simulation") -> Solution:

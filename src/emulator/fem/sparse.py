@@ -1,8 +1,8 @@
 """Sparse direct solves inside ``jax.jit``, and the pattern that assembled tangents share.
 
 The factorisations are SuiteSparse's, through sparsax: CHOLMOD for positive definite tangents,
-UMFPACK for any. CHOLMOD raises on an indefinite matrix, even inside ``jit``, so it is a choice for
-callers who know theirs is not.
+UMFPACK for any. CHOLMOD raises on an indefinite matrix, even inside ``jit``, so callers who choose
+it must know that theirs is definite, or catch :data:`REFUSALS`.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 from threadpoolctl import ThreadpoolController
 
+# Relative increase of the diagonal, four units of round-off: an exactly zero pivot becomes tiny.
 _RAISE = 2.0**-50
-_LEAST_ROW = 1e-290
+_LEAST_ROW = 1e-290  # a row whose absolute sum is below this is empty
 
 Factorisation = Literal["umfpack", "cholmod"]
 
 REFUSALS = (jax.errors.JaxRuntimeError, ValueError)
-"""What a factorisation that refuses its matrix raises. JAX has the one where it learns of it when
-waiting for the result, and the other where the call itself does; which of them is a matter of
-timing. Both say ``sparsax`` and the reason."""
+"""Exceptions of a factorisation that refuses its matrix. Timing decides: the first if JAX meets the
+failure while waiting for the result, the second if the call itself fails. Both messages name
+``sparsax`` and the reason."""
 
 
-# sparsax would keep up to 32 UMFPACK and 8 CHOLMOD factors a pattern, and 64 tokens' worth, against
-# values that return. Ours never do, and a factor of a large mesh is a gigabyte.
+# By default sparsax caches up to 32 UMFPACK and 8 CHOLMOD factors of each pattern, for matrices
+# that recur. Ours recur only in consecutive solves, and a factor of a large mesh takes a gigabyte.
 sparsax.set_umf_cache_size(2)
 sparsax.set_num_cache_size(2)
 
@@ -38,8 +39,8 @@ sparsax.set_num_cache_size(2)
 def quiet_blas() -> None:
     """Hold the BLAS inside the sparse solver to one thread.
 
-    Beside XLA's own threads a second pool oversubscribes the cores: a factorisation of 2.5 ms has
-    been seen to take 250 ms. Only the library bundled with sparsax is touched, not NumPy's.
+    A second thread pool beside XLA's oversubscribes the cores: a factorisation of 2.5 ms then took
+    up to 250 ms. Only the library bundled with sparsax is changed, not NumPy's.
     """
     for library in ThreadpoolController().lib_controllers:
         if "sparsax" in library.filepath:
@@ -51,8 +52,8 @@ class Pattern:
     """Nonzeros of a matrix over the free degrees of freedom, fixed for a mesh.
 
     rows, columns : (nnz,) int32 position of each nonzero.
-    source : (k,) which entries of the flattened element blocks are used.
-    target : (k,) the nonzero each of them is added to.
+    source : (k,) indices of the entries of the flattened element blocks that are used.
+    target : (k,) index of the nonzero that each of these entries is added to.
     size : number of free degrees of freedom.
     """
 
@@ -106,10 +107,11 @@ class Pattern:
         return np.array(on_diagonal and bool((factors.U.diagonal() > 0.0).all()))
 
     def safe_values(self, values: jax.Array) -> jax.Array:
-        """``values`` the solver will not raise on: the identity's for what cannot be solved.
+        """``values`` that UMFPACK does not raise on; the identity's where they are not solvable.
 
-        UMFPACK raises on NaN, and on a pivot that is zero to the last bit. A diagonal larger by
-        round-off makes such a pivot tiny instead, and the step so long that Newton sees it.
+        UMFPACK raises on NaN, and on a pivot that is exactly zero. A diagonal larger by round-off
+        makes such a pivot tiny instead, and the step so long that Newton's method rejects it. Apply
+        once to each tangent (docs/experiments.md, "A tangent that was never the same").
         """
         diagonal = jnp.asarray(self.rows == self.columns, dtype=values.dtype)
         raised = values * (1.0 + _RAISE * diagonal)

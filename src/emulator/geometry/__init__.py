@@ -1,1 +1,1 @@
-"""Meshes and what can be said of them without a material: sets, facets, volumes, fibres, bodies."""
+"""Meshes, and their geometry without a material: sets, facets, volumes, fibres, bodies."""

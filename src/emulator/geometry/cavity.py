@@ -7,10 +7,10 @@ openings. By the divergence theorem the closed surface encloses
     V = \frac13 \int_\Omega \nabla \cdot x \, dv = \frac13 \oint x \cdot n \, da
       = \sum_\text{facets} \frac16\, x_1 \cdot (x_2 \times x_3),
 
-the last for linear facets; quadratic ones are integrated exactly. A closed surface has
-:math:`\oint n\, da = 0`, so the volume does not depend on the origin. A mesh has its facets face
-out of the tissue; the sign is the one that makes the volume at rest positive, on whichever side of
-the wall the tissue is. It is fixed there, so that the volume stays differentiable.
+the sum for linear facets; quadratic ones are integrated exactly. A closed surface has
+:math:`\oint n\, da = 0`, so the volume does not depend on the origin. Facets of a mesh point out of
+the tissue, which may lie on either side of the wall. The sign is therefore chosen once, so that the
+volume at rest is positive, and then kept, so that the volume stays differentiable.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from emulator.geometry.facets import enclosed_volume
 from emulator.geometry.mesh import Mesh
 
 MM3_PER_ML = 1000.0
-_FLAT = 1e-9  # of the mesh's size cubed: round-off of a plane patch, which encloses nothing
+_FLAT = 1e-9  # volumes below this fraction of the mesh's size cubed are round-off: a plane patch
 
 
 class Cavity:
@@ -53,9 +53,9 @@ class Cavity:
         facets = mesh.facet_set(facet_set)
         self.nodes: np.ndarray = np.unique(facets)
         X = mesh.nodes[self.nodes]
-        self._X = X - X.mean(axis=0)  # cancels less
+        self._X = X - X.mean(axis=0)  # less cancellation: coordinates about the centroid
         self._volume = enclosed_volume(np.searchsorted(self.nodes, facets))
-        with jax.ensure_compile_time_eval():  # a number, also where a trace is going on
+        with jax.ensure_compile_time_eval():  # a number even inside jit
             signed = float(self._volume(self._X))
         if abs(signed) <= _FLAT * mesh.size**3:
             raise InputError(

@@ -17,7 +17,7 @@ from emulator.geometry.mesh import Mesh, frozen_array
 class Discretisation:
     """A mesh with its shape functions; ``m`` elements, ``q`` quadrature points, ``a`` local nodes.
 
-    mesh : what is discretised.
+    mesh : linear or quadratic tetrahedra.
     connectivity : (m, a) node of each local shape function.
     gradients : (m, q, a, 3) reference gradients of the shape functions, 1/mm.
     values : (q, a) shape functions at the quadrature points.
@@ -36,7 +36,7 @@ class FacetRule:
     """Quadrature on a reference triangle; ``q`` points, ``a`` nodes of the facet.
 
     values : (q, a) shape functions.
-    slopes : (q, a, 2) their derivatives along the two reference directions.
+    slopes : (q, a, 2) derivatives of the shape functions along the two reference directions.
     weights : (q,) summing to 1/2, the reference triangle's area.
     """
 
@@ -46,7 +46,9 @@ class FacetRule:
 
 
 def discretise(mesh: Mesh) -> Discretisation:
-    """Linear elements with one point, quadratic ones with four: each exact for its stiffness.
+    """Linear elements with one quadrature point, quadratic ones with four.
+
+    The rule integrates the small-strain stiffness of a straight element exactly.
 
     The geometry is interpolated by the same shape functions, so a quadratic mesh may be curved.
 
@@ -81,7 +83,7 @@ def facet_rule(order: int, degree: int) -> FacetRule:
 
 
 def _tabulate(element: Any, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (q, a) and slopes (q, a, d) of a nodal reference element at ``points`` (d, q)."""
+    """Shape functions (q, a) and their derivatives (q, a, d) at ``points`` (d, q)."""
     count = len(element.doflocs)
     shapes = [element.lbasis(points, k) for k in range(count)]
     values = np.stack([np.broadcast_to(value, points.shape[1]) for value, _ in shapes], axis=1)

@@ -50,7 +50,7 @@ def rim(facets: np.ndarray) -> np.ndarray:
 
 
 def openings(facets: np.ndarray) -> list[np.ndarray]:
-    """The rim of ``facets``, one array (e, 2 or 3) of edges for each opening it goes round."""
+    """Rim edges of ``facets``, one array (e, 2 or 3) for each opening."""
     edges = rim(facets)
     if not len(edges):
         return []

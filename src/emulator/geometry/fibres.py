@@ -76,9 +76,9 @@ def biventricular_directions(
     """The rule for two ventricles; the left one's governs the septum.
 
     Three harmonic fields, each 1 on one of lv_endocardium, rv_endocardium, epicardium and 0 on
-    the other two, add up to one. The least of them names the surface an element's wall does not
-    touch. Where that is the left endocardium, the wall is the right ventricle's and depth runs
-    from rv_endocardium to epicardium; elsewhere it runs from lv_endocardium to the other two.
+    the other two, add up to one. Where the field of lv_endocardium is the smallest of the three,
+    the element lies in the right ventricle's free wall and depth runs from rv_endocardium to the
+    other two surfaces; elsewhere depth runs from lv_endocardium to the other two.
     The directions jump where the walls meet.
     """
     surfaces = ("lv_endocardium", "rv_endocardium", "epicardium")
@@ -123,9 +123,10 @@ def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Dept
 
 
 def turned(wall: Depth, angles: Angles, axis: Axis) -> Directions:
-    """Directions in a wall of known depth, by the rule of this module.
+    """Directions in a wall of known depth, by the rule in the module docstring.
 
-    On the axis itself, where no direction is circumferential, one across it is picked.
+    Where the transmural direction is along the axis, as at the apex, no direction is
+    circumferential; an arbitrary one across the axis is taken.
     """
     k = np.asarray(axis, dtype=float)
     if k.shape != (3,) or not np.isfinite(k).all() or not k.any():

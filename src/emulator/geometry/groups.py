@@ -1,8 +1,8 @@
 """Named groups of a mesh file as node and facet sets, and back.
 
-gmsh, Abaqus and others keep names in forms of their own, which meshio hands on as ``field_data``
-with tags, ``cell_sets`` or ``point_sets``. Formats that keep no names (VTU, XDMF) carry a set as
-data of 0 and 1 called ``set:<name>``, on triangles or on points.
+gmsh, Abaqus and others store names differently; meshio returns them as ``field_data`` with tags,
+``cell_sets`` or ``point_sets``. In formats without named sets (VTU, XDMF) a set is an array of 0
+and 1 called ``set:<name>``, on triangles or on points.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _point_sets(found: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _on_surface(groups: Sets, elements: np.ndarray) -> Sets:
-    """Each triangle as the surface of ``elements`` has it: turned out, with its edge nodes."""
+    """Each triangle as ``boundary_facets`` lists it: facing out, with its mid-edge nodes."""
     if not groups:
         return {}
     surface = {tuple(sorted(row[:3])): row for row in boundary_facets(elements).tolist()}

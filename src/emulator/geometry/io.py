@@ -20,13 +20,13 @@ from emulator.store import replacing
 # Cells by their number of nodes: (tetrahedron, triangle).
 _KINDS = {4: ("tetra", "triangle"), 10: ("tetra10", "triangle6")}
 _LOWER = {"triangle", "triangle6", "line", "line3", "vertex"}
-# Files hold seven digits at times; what is further from unit length was not meant to be.
+# A direction whose length differs from 1 by more is refused; single precision stays far below.
 _UNIT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A mesh with the directions its file has: fibres and sheets (m, 3), or ``None``."""
+    """A mesh with fibres and sheets (m, 3); ``None`` where the file has none."""
 
     mesh: Mesh
     fibres: np.ndarray | None = None
@@ -49,10 +49,10 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def read_body(path: str | Path) -> Body:
-    """The mesh as :func:`read_mesh` has it, with its ``fibres`` and ``sheets``.
+    """The mesh as :func:`read_mesh` returns it, with its ``fibres`` and ``sheets``.
 
-    Both are cell data, or point data averaged over each element's corners, where their signs do
-    not matter.
+    Both are cell data, or point data averaged over each element's corners; a direction and its
+    opposite count as equal in the average.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def write_mesh(
     Raises
     ------
     InputError
-        Another suffix, or what the format cannot hold: for .msh, directions, or different nodes in
+        Another suffix, or data the format cannot hold: for .msh, directions, or different nodes in
         a node set and a facet set of one name; for .xdmf, facet sets of a quadratic mesh.
     """
     directions = {
@@ -116,7 +116,7 @@ def write_mesh(
             content = _with_tags(mesh)
             meshio.write(temporary, content, file_format="gmsh22", binary=True)
         else:
-            # XDMF would otherwise put its numbers in a second file, named after the temporary.
+            # By default XDMF writes its arrays to a second file, named after the temporary one.
             options = {"data_format": "XML"} if suffix == ".xdmf" else {}
             content = _with_marks(mesh, directions)
             meshio.write(temporary, content, file_format=suffix[1:], **options)
@@ -132,7 +132,7 @@ def write_solution(
     mesh : the reference body, mm.
     displacement : (n, 3) mm.
     fields : cell data (m,), (m, 3) or (m, 3, 3), the last written as nine components, row by row;
-        :func:`emulator.fem.fields.element_fields` has those of a solution.
+        :func:`emulator.fem.fields.element_fields` computes them from a solution.
     """
     cells = {}
     for name, values in fields.items():
@@ -154,7 +154,7 @@ def _load(path: Path) -> meshio.Mesh:
         raise InputError(f"mesh file {path} does not exist")
     said = io.StringIO()
     try:
-        # meshio's readers raise whatever they meet, or print and exit.
+        # meshio's readers raise exceptions of many types, or print a reason and exit.
         with redirect_stdout(said), redirect_stderr(said):
             return meshio.read(path)
     except (Exception, SystemExit) as error:
@@ -181,7 +181,7 @@ def _mesh(found: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
     elements = np.concatenate([block.data for block in found.cells if block.type == kind])
     used, points = np.unique(elements), np.asarray(found.points, dtype=float)
     if used[0] < 0 or used[-1] >= len(points):
-        return Mesh(points, elements), used  # which says so
+        return Mesh(points, elements), used  # raises InputError and names the range
     number = np.full(len(points), -1)
     number[used] = np.arange(len(used))
     nodes = points[used]
@@ -219,7 +219,7 @@ def _directions(found: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str) -> 
     if name in found.point_data:
         at_nodes = _unit(np.asarray(found.point_data[name])[used], name, "node")
         corners = at_nodes[mesh.elements[:, :4]]
-        # A direction and its opposite are the same: turn all to the first corner's side.
+        # A direction and its opposite are equal: turn all to the first corner's side.
         sides = np.where(np.einsum("mai,mi->ma", corners, corners[:, 0]) < 0.0, -1.0, 1.0)
         mean = np.einsum("mai,ma->mi", corners, sides)
         return mean / np.linalg.norm(mean, axis=1, keepdims=True)
@@ -242,7 +242,7 @@ def _unit(values: np.ndarray, name: str, where: str) -> np.ndarray:
 
 # ---- writing -------------------------------------------------------------------------------------
 def _check_format(path: str | Path, mesh: Mesh, directions: Mapping[str, np.ndarray]) -> None:
-    """Refuse what a format cannot hold, or meshio cannot read back from it."""
+    """Refuse data that the format cannot hold or meshio cannot read back."""
     suffix = Path(path).suffix
     if suffix not in (".msh", ".vtu", ".xdmf"):
         raise InputError(f"mesh file {path}: cannot write '{suffix}'; use .msh, .vtu or .xdmf")
@@ -301,5 +301,5 @@ def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh
 
 
 def _padded(values: np.ndarray, blocks: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
-    """``values`` (m, 3) of the tetrahedra, and zeros for the other cells."""
+    """Cell data of every block: ``values`` (m, 3) on the tetrahedra, zeros elsewhere."""
     return [values, *(np.zeros((len(rows), 3)) for _, rows in blocks[1:])]

@@ -20,7 +20,7 @@ _FLAT = 1e-10
 
 
 def frozen_array(values: object, dtype: type = float) -> np.ndarray:
-    """A read-only copy of ``values``, so that what holds it cannot change under a trace."""
+    """A read-only copy of ``values``: a function compiled from it stays valid."""
     array: np.ndarray = np.array(values, dtype=dtype)
     array.flags.writeable = False
     return array
@@ -104,7 +104,7 @@ class Mesh:
     def _check_facets(self) -> None:
         if not self.facet_sets:
             return
-        # By corners and midpoints alike, each facet as the surface lists it: facing out.
+        # Sorted nodes of each surface facet -> the facet as ``surface`` lists it, facing out.
         surface = dict(
             zip(map(tuple, np.sort(self.surface, axis=1).tolist()), self.surface, strict=True)
         )
@@ -130,7 +130,7 @@ class Mesh:
         return 1 if self.elements.shape[1] == 4 else 2
 
     def require_linear(self, user: str) -> None:
-        """Raise :class:`InputError` on a quadratic mesh, on behalf of ``user``."""
+        """Raise :class:`InputError` on a quadratic mesh; the message names ``user``."""
         if self.order != 1:
             raise InputError(f"mesh: {user} needs linear tetrahedra; these are quadratic")
 
@@ -150,7 +150,7 @@ class Mesh:
         return float(np.linalg.norm(np.ptp(self.nodes, axis=0)))
 
     def node_set(self, name: str) -> np.ndarray:
-        """Indices of the nodes in set ``name``; :class:`InputError` lists the sets there are."""
+        """Indices of the nodes in set ``name``; :class:`InputError` lists the mesh's sets."""
         if name not in self.node_sets:
             known = ", ".join(sorted(self.node_sets)) or "none"
             raise InputError(f"node set '{name}' is not in the mesh; its sets: {known}")

@@ -9,7 +9,7 @@ third      segments     centred at
 =========  ===========  ===============================================================
 basal      1 to 6       0, 60, ..., 300 degrees: anterior, anteroseptal, inferoseptal,
                         inferior, inferolateral, anterolateral
-mid        7 to 12      the same
+mid        7 to 12      0, 60, ..., 300 degrees, named as the basal ones
 apical     13 to 16     0, 90, 180, 270 degrees: anterior, septal, inferior, lateral
 apex       17
 =========  ===========  ===============================================================
@@ -24,7 +24,7 @@ from emulator.geometry.fibres import Axis
 from emulator.geometry.mesh import Mesh
 
 SEGMENTS = 17
-# Centroids on a border would otherwise be parted by round-off, differently on each machine.
+# Decimals kept, so that a centroid on a border gets the same segment on every machine.
 _DIGITS = 9
 
 
@@ -44,14 +44,14 @@ def aha_segments(
         cavity's tip and the base.
     axis : from apex to base, any length.
     through : a point on the axis, mm.
-    anterior : from the axis to the middle of the anterior wall, any length; what it has along the
-        axis is left out. The default puts the septum towards positive x, where our biventricle has
-        it.
+    anterior : from the axis to the middle of the anterior wall, any length; its component along
+        the axis is ignored. The default puts the septum towards positive x, as in
+        :mod:`~emulator.geometry.bodies.biventricle`.
 
     Raises
     ------
     InputError
-        Directions that are none, or a mesh so coarse that a segment has no element.
+        A zero direction, or a mesh so coarse that a segment has no element.
     """
     up = _unit(np.asarray(axis, dtype=float), "axis", axis)
     front = np.asarray(anterior, dtype=float)
@@ -76,7 +76,7 @@ def aha_segments(
 
 
 def _sector(turn: np.ndarray, count: int) -> np.ndarray:
-    """Which of ``count`` sectors, the first centred at 0, each of ``turn`` (m,) is in, 0 up."""
+    """Sector 0 to ``count - 1`` of each ``turn`` (m,), a full turn being 1; 0 is centred at 0."""
     return np.floor(np.round(turn * count + 0.5, _DIGITS)).astype(int) % count
 
 

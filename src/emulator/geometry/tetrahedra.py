@@ -1,4 +1,4 @@
-"""Numbering inside a tetrahedron, and what follows from it: volume, orientation, surface.
+"""Local numbering of a tetrahedron; signed volumes, orientation and boundary facets.
 
 Linear elements have four corners. Quadratic ones add a node on each edge, in VTK's order.
 """

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 @dataclass(frozen=True)
 class Barriers:
-    """Where each barrier starts, and the smallest ``J`` it allows (published values)."""
+    """Published values: the start of each barrier, and the lower limit ``J_min`` of ``J``."""
 
     J_min: float = 0.001
     J_start: float = 0.05
@@ -29,7 +29,7 @@ class Barriers:
     def limit_J(self, J: jax.Array) -> jax.Array:
         """``J`` above ``J_start``, below it a positive exponential tail (Eq. 21); shape kept."""
         width = self.J_start - self.J_min
-        # The clip keeps the branch that is not taken finite, so that its gradient is zero, not NaN.
+        # Clipping keeps the unused branch of the where finite: its gradient is zero, not NaN.
         below = jnp.minimum(J, self.J_start)
         tail = self.J_min + width * jnp.exp((below - self.J_start) / width)
         return jnp.where(self.J_start < J, J, tail)

@@ -28,13 +28,13 @@ def determinant(A: jax.Array) -> jax.Array:
 
 @dataclass(frozen=True)
 class Strain:
-    """What a hyperelastic law may ask of one material point; each measure is computed on demand.
+    """Strain measures of one material point, each computed on demand.
 
     Parameters
     ----------
     H : (3, 3) displacement gradient, dimensionless.
     barriers : limits on the invariants, for training only. ``None`` leaves them exact.
-    directions : unit vectors in the reference body, for laws that ask for them: the fibre (3,), or
+    directions : unit vectors in the reference body, for laws that read them: the fibre (3,), or
         the fibre and the sheet (2, 3).
     """
 
@@ -44,14 +44,14 @@ class Strain:
 
     @property
     def fibre(self) -> jax.Array:
-        """The fibre direction, (3,); a scene gives one to every law that asks for it."""
+        """The fibre direction, (3,); present where the law declares ``fibres``."""
         if self.directions is None:
             raise TypeError("this point has no fibre")
         return self.directions if self.directions.ndim == 1 else self.directions[0]
 
     @property
     def sheet(self) -> jax.Array:
-        """The sheet direction, (3,); a scene gives one to every law that asks for it."""
+        """The sheet direction, (3,); present where the law declares ``sheets``."""
         if self.directions is None or self.directions.ndim == 1:
             raise TypeError("this point has no sheet")
         return self.directions[1]
@@ -76,7 +76,7 @@ class Strain:
 
     @property
     def isochoric_I1_minus_3(self) -> jax.Array:
-        """``J^(-2/3) I1 - 3``, blind to volume change, shape ()."""
+        """``J^(-2/3) I1 - 3``, independent of volume change, shape ()."""
         change = 2.0 * jnp.trace(self.H) + jnp.sum(self.H * self.H)
         power = -2.0 / 3.0 * self.ln_J
         return self._limited_I1(change * jnp.exp(power) + 3.0 * jnp.expm1(power))
@@ -88,7 +88,7 @@ class Strain:
 
     @property
     def isochoric_I4s_minus_1(self) -> jax.Array:
-        """``J^(-2/3) s . C s - 1``: the same of the sheet, shape ()."""
+        """``J^(-2/3) s . C s - 1``: squared sheet stretch less 1, volume change taken out, ()."""
         return self._isochoric_stretch(self.sheet)
 
     @property
@@ -100,7 +100,7 @@ class Strain:
         shear = shear * jnp.exp(-2.0 / 3.0 * self.ln_J)
         if self.barriers is None:
             return shear
-        # No barrier is published; that of I4f, either way.
+        # No barrier is published for I8fs; the I4f barrier limits it for both signs.
         limit = self.barriers.limit_I4f
         return jnp.where(shear < 0.0, 1.0 - limit(1.0 - shear), limit(1.0 + shear) - 1.0)
 

@@ -1,14 +1,13 @@
-r"""The strain measures a law reads, and its energy as a function of them alone.
+r"""The strain measures a law reads, and the law's energy as a function of these alone.
 
 A law is a function of measures of the displacement gradient,
 
 .. math::
     W(H) = \varphi(\xi(H)), \qquad \xi = (J - 1,\ \bar I_1 - 3,\ \bar I_{4f} - 1, \dots)
 
-and which ones is found by having it read a strain that takes notes. All that is large in a
-hyperelastic law, the exponentials and the bulk modulus, is in :math:`\varphi`, which is convex or
-nearly so; :math:`\xi` is a polynomial or close to one. Newton's method profits from the two being
-kept apart (:mod:`emulator.fem.mip`).
+which are found by calling it with a strain that records every measure read. The exponentials and
+the bulk modulus are in :math:`\varphi`, which is convex or nearly so; :math:`\xi` is a polynomial
+or close to one. The solver uses the separation (:mod:`emulator.fem.mip`).
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 
 
 class _GradientRead(Exception):
-    """A law asked for the displacement gradient itself."""
+    """The law read the displacement gradient itself."""
 
 
 def _given(name: str) -> property:
@@ -43,12 +42,12 @@ def _given(name: str) -> property:
 
 
 class GivenStrain(Strain):
-    """A strain whose measures are given one by one, as if they had nothing to do with each other.
+    """A strain whose measures are given as independent values.
 
     Parameters
     ----------
     values : measure by name; :attr:`ln_J` follows from ``J_minus_1``.
-    directions : as of a :class:`~emulator.mechanics.kinematics.Strain`.
+    directions : as in :class:`~emulator.mechanics.kinematics.Strain`.
     """
 
     values: Mapping[str, jax.Array]
@@ -60,7 +59,7 @@ class GivenStrain(Strain):
 
     @property
     def H(self) -> jax.Array:
-        """Not known."""
+        """Unknown here: reading it raises."""
         raise _GradientRead
 
     J_minus_1 = _given("J_minus_1")
@@ -73,7 +72,7 @@ class GivenStrain(Strain):
 
 
 class _Notes(Mapping[str, jax.Array]):
-    """Values of a strain at rest that remember which of them were asked for."""
+    """Measures of a strain at rest, all zero; ``read`` lists the ones that were read."""
 
     def __init__(self) -> None:
         self.read: list[str] = []
@@ -92,9 +91,9 @@ class _Notes(Mapping[str, jax.Array]):
 
 @lru_cache(maxsize=64)
 def measures_read(law: Law) -> tuple[str, ...] | None:
-    """Names of the measures that ``law`` reads; ``None`` if it asks for H or what follows from it.
+    """Names of the measures that ``law`` reads; ``None`` if it reads H or another measure.
 
-    The answer is a property of the code of the law, found once by tracing it.
+    Found by tracing the law once.
     """
     notes = _Notes()
     directions = jnp.eye(3)[:2] if law.sheets else jnp.eye(3)[0] if law.fibres else None
@@ -110,11 +109,11 @@ def measures_read(law: Law) -> tuple[str, ...] | None:
 
 
 class Measures:
-    """A law's measures, in a row.
+    """A law's measures as one flat vector.
 
     Parameters
     ----------
-    names : of them, as :func:`measures_read` gives them.
+    names : of the measures, from :func:`measures_read`.
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:
@@ -124,7 +123,7 @@ class Measures:
 
     @property
     def blocks(self) -> np.ndarray:
-        """Which entries each measure has, (measures, size) of 0 and 1."""
+        """Entries that belong to each measure, (measures, size) of 0 and 1."""
         return np.repeat(np.eye(len(self.names)), self._sizes, axis=1)
 
     def of(self, H: jax.Array, directions: jax.Array | None) -> jax.Array:

@@ -1,4 +1,4 @@
-"""What the parameters of laws and loads are: names with a unit and the values that make sense."""
+"""Parameters of laws and loads: name, unit and admissible values."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ class Quantity:
 
     Parameters
     ----------
-    name : as scenes call it.
-    unit : the one its values are in; empty when dimensionless.
+    name : its name in scenes.
+    unit : of its values; empty when dimensionless.
     low, high : values lie between these, both excluded.
-    hint : added where a wrong unit is refused.
+    hint : added to the message that refuses a wrong unit.
     """
 
     name: str
@@ -25,7 +25,7 @@ class Quantity:
     hint: str = ""
 
     def unit_fault(self, unit: str, owner: str) -> str | None:
-        """What is wrong with a value in ``unit`` for ``owner``; ``None`` when nothing is."""
+        """Message if ``owner`` cannot take a value in ``unit``, else ``None``."""
         if unit == self.unit:
             return None
         found = f"in {unit}" if unit else "given no unit"
@@ -34,7 +34,7 @@ class Quantity:
         return f"parameter '{self.name}' is {found}; {owner} takes {expected}{hint}"
 
     def range_fault(self, low: float, high: float) -> str | None:
-        """What is wrong with the range from ``low`` to ``high``; ``None`` when nothing is."""
+        """Message if the range from ``low`` to ``high`` is not admissible, else ``None``."""
         if not low > self.low:
             return f"{self._with_unit('ranges down to', low)}; it must stay above {self.low:g}"
         if not high < self.high:
@@ -42,7 +42,7 @@ class Quantity:
         return None
 
     def value_fault(self, value: float) -> str | None:
-        """What is wrong with ``value``; ``None`` when nothing is."""
+        """Message if ``value`` is not admissible, else ``None``."""
         if not math.isfinite(value):
             return f"{self._with_unit('is', value)}; it must be finite"
         if not value > self.low:

@@ -1,8 +1,8 @@
 """Reader of the data released with Dalton et al. (2023): geometry and FEniCS test solutions.
 
-The folder layout is the release's own, ``<model>/geometryData`` and
-``<model>/simulationData/test``, so a user's clone, or its folder ``data``, works as it is. Lengths
-become mm, stresses kPa, energies mN mm.
+The folder layout is the release's, ``<model>/geometryData`` and ``<model>/simulationData/test``: a
+clone of the release, or its folder ``data``, can be read as it is. Lengths are converted to mm,
+stresses to kPa, energies to mN mm.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class PublishedUnits:
 
 
 PRESSURE_SURFACE = "endocardium"
-_POINTER = b"version https://git-lfs"  # how a large file that was not fetched begins
+_POINTER = b"version https://git-lfs"  # first bytes of a git-lfs file that was not fetched
 _CGS = PublishedUnits(length=10.0, stress=1e-4)
 UNITS = {
     "OnceClampedBeam": _CGS,
@@ -117,14 +117,14 @@ def models_in(root: str | Path) -> tuple[str, ...]:
 
 
 def units(model: str) -> PublishedUnits:
-    """Units of ``model``; :class:`InputError` lists the models there are."""
+    """Units of ``model``; :class:`InputError` lists the known models."""
     if model not in UNITS:
         raise InputError(f"published model '{model}' is unknown; known: {', '.join(UNITS)}")
     return UNITS[model]
 
 
 def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
-    """The mesh of ``model`` in mm, with node set ``held`` and, where pressed, its facet set."""
+    """The mesh of ``model`` in mm, with node set ``held`` and, if released, the pressed facets."""
     scale, folder = units(model).length, "geometryData"
     nodes = _array(root, model, f"{folder}/reference-coords.npy", (None, 3)) * scale
     elements = _array(root, model, f"{folder}/elements.npy", (None, 4)).astype(np.int64)
@@ -138,7 +138,7 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
     held = np.flatnonzero(~interior.astype(bool))
     moved = _array_if_there(root, model, f"{folder}/disp-add.npy", nodes.shape)
     displacement = np.zeros((len(held), 3)) if moved is None else moved[held] * scale
-    # The release leaves the orientation of its elements and facets open.
+    # The release does not orient its elements and facets.
     elements = orient(nodes, elements)
     pressed = _array_if_there(root, model, f"{folder}/pressure-surface-facets.npy", (None, 4))
     facets = {}

@@ -14,15 +14,15 @@ from emulator.fem.simulator import Simulator
 from emulator.released.scenes import published_scene, published_tests
 from emulator.scenes.scene import Scene
 
-# Largest relative difference of energies: the ventricle's fibres are stored in float32.
+# Largest relative difference of energies; the ventricle's fibres are stored in float32.
 ENERGY_TOLERANCE = 1e-6
 
 
 def published_reference(scene: Scene, folder: str | Path, *, progress: bool = False) -> Reference:
     """The released test cases in ``folder``, for a scene that is the released model.
 
-    Where the release holds no displacements they are ours at the released theta, and their energies
-    must be the released ones.
+    Where the release has no displacements, our FEM solves at the released theta, and its energies
+    must equal the released ones.
 
     Raises
     ------

@@ -28,7 +28,7 @@ _GRAVITY = Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80)
 
 
 class _Model(NamedTuple):
-    """Law, parameters in the order of the stored theta, loads, constants."""
+    """Law, parameters (in the order of the stored theta), loads and constants of a model."""
 
     law: str
     parameters: tuple[Parameter, ...]
@@ -92,7 +92,7 @@ def _find(model: str) -> _Model:
 
 
 def published_tests(model: str, root: str | Path) -> tuple[jax.Array, PublishedTests]:
-    """Theta (c, p) in the scene's units, and the stored solutions they belong to."""
+    """Theta (c, p) in the scene's units, and the stored solutions at these theta."""
     parameters = _find(model).parameters
     tests = read_tests(root, model)
     if tests.theta.shape[1] != len(parameters):

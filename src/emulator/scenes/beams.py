@@ -34,5 +34,5 @@ def once_clamped_beam(cells: tuple[int, int, int] = (12, 4, 5)) -> Scene:
 
 
 def twice_clamped_beam(cells: tuple[int, int, int] = (12, 4, 5)) -> Scene:
-    """The same beam held at both ends."""
+    """The beam of :func:`once_clamped_beam`, held at both ends."""
     return _beam("twice_clamped_beam", cells, ("left", "right"))

@@ -23,8 +23,8 @@ def biventricle(
 
     theta = (a, b, a_f, b_f, pressure), ranges and ``kappa`` as in
     :func:`~emulator.scenes.left_ventricle.left_ventricle`; ``pressure`` is the left ventricle's.
-    The appendix was not at hand: the geometry is idealised, and the right pressure, 2 mmHg unless
-    said otherwise, is ours; as in a healthy heart it is lower than any left one.
+    We had no access to the appendix: the geometry is idealised, and the right pressure, 2 mmHg by
+    default, is our choice; as in a healthy heart it is below every left pressure of the range.
 
     Parameters
     ----------

@@ -10,9 +10,9 @@ ENDOCARDIUM = "endocardium"
 
 
 def cavity_sets(scene: Scene) -> tuple[str, ...]:
-    """Facet sets of the scene's cavities: those under pressure, and one called ``endocardium``.
+    """Facet sets of the scene's cavities: sets under pressure, and the one named ``endocardium``.
 
-    A patch that encloses no volume, such as a plane one, is no cavity.
+    Sets that enclose no volume, such as a plane patch, are left out.
     """
     pressed = [load.pressed for load in scene.loads if load.pressed is not None]
     named = [ENDOCARDIUM] if ENDOCARDIUM in scene.mesh.facet_sets else []

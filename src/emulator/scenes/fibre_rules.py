@@ -1,4 +1,4 @@
-"""Rules for fibres and sheets that a scene file can name; ``FIBRE_RULES`` is their registry.
+"""Fibre and sheet rules for scene files; ``FIBRE_RULES`` is their registry.
 
 A new rule is a frozen dataclass with a method ``directions``; its fields are the keys of the table
 ``[fibres]``.

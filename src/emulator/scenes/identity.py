@@ -1,9 +1,9 @@
-"""The identity of a scene: all that its solutions depend on, in one form.
+"""The identity of a scene: everything its solutions depend on, in a canonical form.
 
-The form does not depend on how tetrahedra and facets are listed, nor on the order of theta or its
-ranges. Two scenes have the same solutions where their identities agree; a scene's *fingerprint*
-hashes its identity together with theta's order and box. Emulators and posteriors carry the
-fingerprint and refuse a scene with another.
+The form does not depend on the order of tetrahedra and facets, nor on the order of theta or its
+ranges. Two scenes have equal solutions if their identities agree; a scene's *fingerprint*
+hashes its identity together with theta's order and box. Emulators and posteriors store the
+fingerprint and refuse a scene whose fingerprint differs.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ import numpy as np
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import ParameterSpace
 
-_LENGTH_DIGITS = 9  # of mm, in the fingerprint
-_DIRECTION_DIGITS = 6  # of unit vectors, which some files store in single precision
-_TOLERANCE = 1e-6  # of two scenes' lengths, relative to the size of the body, and of directions
+_LENGTH_DIGITS = 9  # decimals of lengths in mm that the fingerprint hashes
+_DIRECTION_DIGITS = 6  # decimals of unit vectors; some files store them in single precision
+_TOLERANCE = 1e-6  # lengths relative to the body's size, and directions, agree within this
 _HASH_LENGTH = 16  # hexadecimal digits
 
 
 @dataclass(frozen=True, eq=False)
 class Identity:
-    """What the solutions of a scene depend on at given values of its parameters.
+    """Everything the solutions of a scene depend on, apart from theta.
 
     lengths : arrays in mm by name: nodes, prescribed displacements.
-    directions : unit vectors by name: fibres, sheets; those that the scene has.
+    directions : unit vectors by name: fibres and sheets, if the scene has them.
     indices : arrays of whole numbers by name: tetrahedra, held, regions, facet sets under a load
         or a support.
     description : law, constants, loads, springs and the names of the parameters, plain JSON.
@@ -42,7 +42,7 @@ class Identity:
     description: Mapping[str, Any]
 
     def agrees(self, other: Identity) -> bool:
-        """Whether both have the same solutions, nodes in the same order."""
+        """Whether both scenes have equal solutions; the order of nodes must match."""
         size = float(np.linalg.norm(np.ptp(self.lengths["nodes"], axis=0)))
         return (
             _close(self.lengths, other.lengths, _TOLERANCE * size)
@@ -101,7 +101,7 @@ def fingerprint(identity: Identity, space: ParameterSpace) -> str:
     box = [[p.name, float(p.low), float(p.high), p.scale] for p in space.parameters]
     digest = hashlib.sha256()
     for part in [*identity.parts(), _text(box)]:
-        # The length keeps the end of one part from passing for the beginning of the next.
+        # Lengths mark where each part ends, so that two lists of parts never hash alike.
         digest.update(len(part).to_bytes(8, "little"))
         digest.update(part)
     return digest.hexdigest()[:_HASH_LENGTH]

@@ -39,15 +39,14 @@ def left_ventricle(
 ) -> Scene:
     """Holzapfel-Ogden ventricle under cavity pressure, its base held.
 
-    theta = (a, b, a_f, b_f, pressure): the paper's law in textbook form, its ranges and its
-    pressures, on an idealised geometry of our own. The pressure's work is exact, unlike the
-    released code's.
+    theta = (a, b, a_f, b_f, pressure): the paper's law in textbook form, with the paper's ranges,
+    on an idealised geometry. The pressure's work is exact, unlike in the released code.
 
     The default ``kappa`` is the released one. At the centre of the box it lets the wall's volume
     change by 1.0 %, at the soft corner by 2.1 %. Linear tetrahedra are too stiff in a thick wall,
-    and more so the larger it is: at the centre the cavity grows by 45 mL on the default mesh, 51 mL
-    on one of 4145 nodes and 68 mL with quadratic elements and mean dilatation; with ``kappa`` four
-    times as large, by 27 mL. Half the ``kappa`` would give 52 mL for twice the volume change.
+    and more so the larger ``kappa``: at the centre the cavity grows by 45 mL on the default mesh,
+    51 mL on one of 4145 nodes and 68 mL with quadratic elements and mean dilatation; with four
+    times the ``kappa``, by 27 mL. Half the ``kappa`` would give 52 mL for twice the volume change.
 
     Parameters
     ----------
@@ -55,7 +54,7 @@ def left_ventricle(
         :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`; the default has 1564 nodes.
     angles : helix angle in degrees on the endocardium and on the epicardium.
     kappa : resistance to volume change, kPa.
-    wall : dimensions in mm, those of :class:`~emulator.geometry.bodies.ellipsoid.EllipsoidalWall`.
+    wall : the dimensions of an :class:`~emulator.geometry.bodies.ellipsoid.EllipsoidalWall`, mm.
     """
     mesh = truncated_ellipsoid(EllipsoidalWall(*wall), rings, around, layers)
     return Scene(
@@ -74,7 +73,7 @@ def left_ventricle(
             "layers": layers,
             "angles": list(angles),
             "kappa": kappa,
-            # Only where it is another, so that files of the default say what they always said.
+            # Not written for the default wall, so that files of older releases stay equal.
             **({} if wall == astuple(HUMAN) else {"wall": list(wall)}),
         },
     )

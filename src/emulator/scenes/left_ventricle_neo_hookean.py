@@ -1,4 +1,4 @@
-"""The left ventricle of an isotropic material (Dalton et al. 2023, Appendix C)."""
+"""A left ventricle of isotropic material (Dalton et al. 2023, Appendix C)."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from emulator.scenes.supports import Support
 
 
 def left_ventricle_neo_hookean(rings: int = 15, around: int = 30, layers: int = 3) -> Scene:
-    """Neo-Hookean ventricle under cavity pressure, its base held, with no fibres at all.
+    """Neo-Hookean ventricle under cavity pressure, its base held, without fibres.
 
-    theta = (mu, lam, pressure). The geometry is that of
-    :func:`~emulator.scenes.left_ventricle.left_ventricle`. The appendix was not at hand: ``mu`` 4
-    to 12 kPa and ``lam`` 40 to 120 kPa are ours.
+    theta = (mu, lam, pressure). Geometry as in
+    :func:`~emulator.scenes.left_ventricle.left_ventricle`. We had no access to the appendix: the
+    ranges, ``mu`` 4 to 12 kPa and ``lam`` 40 to 120 kPa, are our choice.
 
     Parameters
     ----------

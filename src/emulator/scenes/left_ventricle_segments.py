@@ -12,7 +12,7 @@ from emulator.scenes.scene import Scene
 STIFFNESSES = tuple(
     Parameter(f"stiffness_{label}", "", 0.5, 2.0, "log") for label in range(1, SEGMENTS + 1)
 )
-"""Half to twice the stiffness of healthy myocardium, whose own is 1."""
+"""Half to twice the stiffness of healthy myocardium, whose factor is 1."""
 
 
 def left_ventricle_segments(
@@ -25,13 +25,13 @@ def left_ventricle_segments(
     """:func:`~emulator.scenes.left_ventricle.left_ventricle` with a stiffness for each segment.
 
     theta = (stiffness_1, ..., stiffness_17, pressure). Each stiffness multiplies the energy of the
-    law in one of the 17 segments of :mod:`emulator.geometry.segments`, ``kappa`` excepted; ``a``,
-    ``b``, ``a_f`` and ``b_f`` are the geometric means of their ranges. With all stiffnesses 1 it is
-    that scene at the centre of those ranges.
+    law, except its ``kappa`` term, in one of the 17 segments of :mod:`emulator.geometry.segments`.
+    ``a``, ``b``, ``a_f`` and ``b_f`` are constants, the geometric means of their ranges in
+    ``left_ventricle``.
 
     Parameters
     ----------
-    rings, around, layers, angles, kappa : as there.
+    rings, around, layers, angles, kappa : as in ``left_ventricle``.
     """
     plain = left_ventricle(rings, around, layers, angles, kappa)
     centre = {p.name: float((p.low * p.high) ** 0.5) for p in MYOCARDIUM}

@@ -14,7 +14,7 @@ def liver(shells: int = 6) -> Scene:
     """A liver-like body held at its ligament and bending under its own weight.
 
     theta = (lam, mu), each 3.5 to 10 kPa, density 1 g/cm3 and g = 9.80 m/s2 as published; the body
-    is idealised (``published:Liver`` has the released one).
+    is idealised (``published:Liver`` is the released geometry).
 
     Parameters
     ----------

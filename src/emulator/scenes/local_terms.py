@@ -1,7 +1,7 @@
-"""Sums of local contributions: energies, or forces where there is no energy, of small node groups.
+"""Sums of local contributions of small node groups: energies, or forces without a potential.
 
-Supports and loads are built of them, one a facet; assembly takes their Hessians (or Jacobians) the
-way it takes the bulk's.
+Supports and loads are built of them, one for each facet; assembly adds their Hessians (or
+Jacobians) to the tangent as it does the element blocks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class LocalTerm:
     """A sum of local energies.
 
     nodes : (k, a) nodes each local energy depends on.
-    data : NumPy arrays with leading axis k; made under a trace, JAX ones would be its tracers.
+    data : arrays with leading axis k; NumPy's, because JAX arrays made inside jit are tracers.
     energy : ``energy(u, data_row, values) -> ()`` in mN mm for one of them, ``u`` (a, 3).
     """
 
@@ -44,7 +44,7 @@ class LocalTerm:
 class LocalForce:
     """A sum of local forces that have no potential.
 
-    nodes : (k, a) nodes each acts on and depends on.
+    nodes : (k, a) nodes that each local force acts on and depends on.
     data : NumPy arrays with leading axis k.
     force : ``force(u, data_row, values) -> (a, 3)`` in mN for one of them, ``u`` (a, 3).
     """

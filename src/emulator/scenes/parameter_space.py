@@ -1,6 +1,6 @@
-r"""Parameters of a scene: which quantities vary, between which bounds, on which scale.
+r"""Parameters of a scene: names, units, bounds and scales.
 
-A position :math:`x \in [0, 1]^p` in the box belongs to each theta,
+Each theta has a position :math:`x \in [0, 1]^p` in the box,
 
 .. math::
     x = \frac{\theta - \theta_\text{low}}{\theta_\text{high} - \theta_\text{low}}
@@ -30,10 +30,10 @@ class Parameter:
 
     Parameters
     ----------
-    name : as the law or the load calls it.
-    unit : for people, e.g. ``kPa``; empty when dimensionless.
-    low, high : range the scene is meant for.
-    scale : ``log`` when equal ratios matter equally, else ``uniform``.
+    name : the law's or the load's name for it.
+    unit : as the law or the load expects it, e.g. ``kPa``; empty when dimensionless.
+    low, high : its range.
+    scale : ``log`` to sample equal ratios equally, else ``uniform``.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Parameter:
         return asdict(self)
 
 
-_SLACK = 1e-9  # of a range: values that round-off puts outside it are inside
+_SLACK = 1e-9  # fraction of a range by which round-off may leave it
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class ParameterSpace:
     @cached_property
     def centre(self) -> jax.Array:
         """Theta in the middle of the box, on each parameter's scale, shape (p,)."""
-        with jax.ensure_compile_time_eval():  # kept, so it must not belong to a trace
+        with jax.ensure_compile_time_eval():  # cached, so it must not be a tracer
             return self.from_unit(jnp.full(len(self.parameters), 0.5))
 
     def to_unit(self, theta: jax.Array) -> jax.Array:
@@ -108,14 +108,14 @@ class ParameterSpace:
         return jnp.stack(columns, axis=-1)
 
     def unit_sensitivities(self, theta: jax.Array, du_dtheta: jax.Array) -> jax.Array:
-        r"""Sensitivities in the unit box, from those in the parameters' own units.
+        r"""Sensitivities in the unit box, from sensitivities in the parameters' own units.
 
         .. math:: \partial u / \partial x_k
             = (\partial u / \partial \theta_k)\, \mathrm{d}\theta_k / \mathrm{d}x_k
 
         Parameters
         ----------
-        theta : (c, p). du_dtheta : (c, p, n, 3) mm a unit of each parameter.
+        theta : (c, p). du_dtheta : (c, p, n, 3) mm per unit of each parameter.
 
         Returns
         -------

@@ -1,12 +1,12 @@
-r"""What differs between elements: directions of the tissue, and regions of other stiffness.
+r"""Data that differ between elements: tissue directions, and regions of different stiffness.
 
-In region k of a scene that has regions, the law's energy is multiplied by a factor of its own,
+In region k of a scene that has regions, the law's energy is multiplied by the factor :math:`s_k`,
 
 .. math::
     W = s_k\, W_\text{shape} + U(J),
 
 its volumetric part excepted: a soft region is as nearly incompressible as a stiff one. Energies are
-proportional to their ``shape_moduli``, so it is these that the factor multiplies.
+proportional to their ``shape_moduli``, so the factor multiplies these.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from emulator.mechanics.quantity import Quantity, number
 
 
 class Tissue(NamedTuple):
-    """What the law may know of an element; arrays have a leading axis m for all elements.
+    """Material data of one element, or stacked over elements with a leading axis m.
 
     directions : fibre (3,), or fibre and sheet (2, 3); None without fibres.
     region : index of the element's region among the factors, (); None without regions.
@@ -43,12 +43,12 @@ def factors(regions: np.ndarray | None, values: Mapping[str, Any]) -> jax.Array 
 
 
 def region_quantities(regions: np.ndarray) -> tuple[Quantity, ...]:
-    """The factors regions (m,) ask for, by ascending label: ``stiffness_1`` and so on."""
+    """Stiffness factors of ``regions`` (m,), by ascending label: ``stiffness_1`` and so on."""
     return tuple(number(f"stiffness_{label}") for label in np.unique(regions).tolist())
 
 
 def checked_regions(regions: object, elements: int, law: Law) -> np.ndarray:
-    """Labels (m,), frozen; :class:`InputError` if they are none, or the law cannot be scaled."""
+    """Read-only labels (m,); :class:`InputError` if invalid, or if the law cannot be scaled."""
     labels = np.asarray(regions)
     if labels.dtype.kind not in "iu":
         raise InputError(f"regions are of type {labels.dtype}; expected whole numbers")

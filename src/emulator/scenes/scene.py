@@ -1,4 +1,4 @@
-"""A scene: everything that is simulated, frozen."""
+"""A scene: geometry, law, loads, supports and parameters of one problem."""
 
 from __future__ import annotations
 
@@ -30,26 +30,25 @@ from emulator.scenes.supports.dirichlet import free_motions, prescribe
 class Scene:
     """Geometry, law, loads, supports and parameters of one problem.
 
-    Frozen, arrays included: an energy traced from it means the same for ever.
+    Frozen, arrays included, so that compiled functions of it never go stale.
 
     Parameters
     ----------
-    name : for people.
+    name : used in messages and reports.
     mesh : geometry in mm.
     law : hyperelastic law.
     parameters : entries of theta, in order.
-    loads : external loads; none is a body deformed by its supports alone.
-    supports : where the displacement is known, and where springs resist it.
+    loads : external loads; may be empty, when the supports alone deform the body.
+    supports : prescribed displacements and springs.
     constants : parameters of the law and the loads that do not vary.
-    fibres : (m, 3) unit fibre direction of each element, for laws that ask for it.
-    origin : how a built-in scene was made, so that a file can make it again.
-    dilatation : ``pointwise``, or ``mean`` to take the volume change of each element as one, which
+    fibres : (m, 3) unit fibre direction of each element, for laws that read it.
+    origin : how a built-in scene was made: its name and arguments, written to scene files.
+    dilatation : ``pointwise``, or ``mean`` to use the mean volume change of each element, which
         keeps quadratic elements from locking when the material is nearly incompressible.
-    sheets : (m, 3) unit sheet direction of each element, across its fibre, for laws that ask for
-        it.
+    sheets : (m, 3) unit sheet direction of each element, across its fibre, for laws that read it.
     regions : (m,) whole number of the region each element lies in. Region 3 takes a parameter or a
-        constant ``stiffness_3``, by which the law's energy there is multiplied, its volumetric part
-        excepted; see :mod:`emulator.scenes.regions`.
+        constant ``stiffness_3``, by which the law's energy there is multiplied, except its
+        volumetric part; see :mod:`emulator.scenes.regions`.
     """
 
     name: str
@@ -102,7 +101,7 @@ class Scene:
                 raise InputError(f"scene '{self.name}': {owner} needs '{name}'")
 
     def _check_quantities(self) -> None:
-        """Units and values of parameters and constants against what law and loads take."""
+        """Units and values of parameters and constants must be admissible to law and loads."""
         faults = [self._takers[name][0].value_fault(v) for name, v in self.constants.items()]
         for parameter in self.parameters:
             quantity, owner = self._takers[parameter.name]
@@ -180,7 +179,7 @@ class Scene:
 
     @property
     def _takers(self) -> dict[str, tuple[Quantity, str]]:
-        """Quantity of every parameter, by name, and a name for what takes it."""
+        """Quantity of every parameter, by name, and its owner: the law, a region or a load."""
         takers = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
         if self.regions is not None:
             takers |= {q.name: (q, "a region") for q in region_quantities(self.regions)}
@@ -241,23 +240,23 @@ class Scene:
 
     @cached_property
     def directions(self) -> np.ndarray | None:
-        """What a law may know of each element: fibre (m, 3), or fibre and sheet (m, 2, 3)."""
+        """Directions of each element: fibre (m, 3), or fibre and sheet (m, 2, 3); or None."""
         if self.fibres is None or self.sheets is None:
             return self.fibres
         return frozen_array(np.stack([self.fibres, self.sheets], axis=1))
 
     @cached_property
     def tissue(self) -> Tissue:
-        """What the law may know of every element, arrays of leading axis m."""
+        """Material data stacked over the elements, arrays with leading axis m."""
         region = None
         if self.regions is not None:
             region = np.unique(self.regions, return_inverse=True)[1]
-        # NumPy's arrays: made under a trace, JAX's would belong to it.
+        # NumPy arrays: JAX arrays made inside jit would be tracers, and this is cached.
         return Tissue(cast(Any, self.directions), cast(Any, region))
 
     @cached_property
     def prescribed(self) -> tuple[np.ndarray, np.ndarray]:
-        """``(held, values)``: where the displacement is known, (n, 3) bool, and it, (n, 3) mm."""
+        """``(held, values)``: where the displacement is known, (n, 3) bool; its value, in mm."""
         return prescribe(self.mesh, self.supports)
 
     @property
@@ -273,7 +272,7 @@ class Scene:
     # ---- identity ------------------------------------------------------------------------------
     @cached_property
     def identity(self) -> Identity:
-        """All that the solutions depend on; equal for scenes with the same solutions."""
+        """Everything the solutions depend on; see :mod:`emulator.scenes.identity`."""
         springs = [support.to_json() for support in self.supports]
         description = {
             "law": law_identity(self.law),

@@ -52,8 +52,8 @@ def traction_beam_holzapfel_ogden(
     """A 100 x 10 x 10 mm Holzapfel-Ogden beam, one end held, the other pulled up.
 
     theta = (a, b, a_f, b_f) with the ranges of
-    :func:`~emulator.scenes.left_ventricle.left_ventricle`. The appendix was not at hand: the
-    dimensions are those of its gravity beams; traction, fibres and ``kappa`` are ours.
+    :func:`~emulator.scenes.left_ventricle.left_ventricle`. We had no access to the appendix: the
+    dimensions are the paper's gravity beams'; traction, fibres and ``kappa`` are our choice.
 
     Parameters
     ----------
@@ -75,8 +75,8 @@ def traction_beam_guccione(
     """A 100 x 10 x 10 mm Guccione beam, one end held, the other pulled up.
 
     theta = (C, b_f, b_t, b_fs), from half to twice the 2 kPa, 8, 2 and 4 of the benchmark beam in
-    Land et al. (2015). The appendix was not at hand: the dimensions are those of its gravity beams;
-    ranges, traction, fibres and ``kappa`` are ours.
+    Land et al. (2015). We had no access to the appendix: the dimensions are the paper's gravity
+    beams'; ranges, traction, fibres and ``kappa`` are our choice.
 
     Parameters
     ----------

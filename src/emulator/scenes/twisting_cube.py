@@ -22,10 +22,10 @@ def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def twisting_cube(cells: int = 6, edge: float = 10.0, degrees: float = 60.0) -> Scene:
-    """A cube clamped at its left face, its right face turned by ``degrees`` and pulled nowhere.
+    """A cube clamped at its left face, its right face twisted about the x axis.
 
-    The right face moves by half the rigid rotation, as published: each of its points goes halfway
-    along the chord to where the rotation would take it. theta = (E, nu), 1 to 25 kPa, 0.1 to 0.4.
+    Each point of the right face moves halfway along the chord of a rigid rotation by ``degrees``,
+    as published. theta = (E, nu), 1 to 25 kPa, 0.1 to 0.4.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Bodies that the scenes are made of."""
+"""Mesh generators of the built-in scenes' bodies."""

@@ -1,4 +1,4 @@
-"""Balls and spherical triangles cut into simplices, and middles of edges along their spheres."""
+"""Balls and spherical triangles cut into simplices, and midpoints of edges on spheres."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def ball_midpoints(nodes: np.ndarray) -> Midpoints:
-    """Middles of edges between ``nodes`` (n, 3): the mean direction at the mean radius.
+    """Midpoints of edges between ``nodes`` (n, 3): the mean direction at the mean radius.
 
-    An edge from the centre, which has no direction, takes its other end's.
+    On an edge from the centre, which has no direction, the midpoint lies halfway along it.
     """
     directions = unit(nodes)
     radii = np.linalg.norm(nodes, axis=1)

@@ -81,8 +81,8 @@ class _Flat:
     """The opened disc.
 
     r, phi : coordinates of its vertices in the left wall, each (v,).
-    xi, eta : coordinates in the septum of those that have any.
-    base : which vertices lie on it.
+    xi, eta : coordinates in the septum, each (v,); meaningless outside it.
+    base : (v,) bool, vertices on the base.
     """
 
     opened: Footprint
@@ -94,12 +94,12 @@ class _Flat:
 
     @property
     def free(self) -> np.ndarray:
-        """Vertices of the septum the right wall does not stand on."""
+        """Vertices of the septum off the line that the right free wall stands on."""
         return np.setdiff1d(self.opened.inner, self.opened.line)
 
 
 def _laid_out(septum: Septum, rings: int, around: int, strips: int) -> _Flat:
-    """The disc opened around the septum, which has half the columns and all full rings."""
+    """The disc opened around the septum, which takes half of ``around`` on every full ring."""
     radius, angle, triangles = disc(rings, around)
     angle = np.angle(np.exp(1j * angle))  # from -pi to pi
     columns, ring = around // 4, -(-around // 6)
@@ -129,7 +129,7 @@ def _made_room(
     r: np.ndarray,
     phi: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """New ``r``, ``phi``: the septum and its band where they belong, the rest making room."""
+    """New ``r``, ``phi``: septum and band at their places, the other vertices moved smoothly."""
     points = _polar(r, phi)
     r, phi = r.copy(), phi.copy()
     near, band = np.unique(opened.inner), opened.levels[:, 1:]
@@ -147,8 +147,8 @@ def _made_room(
 def _sheet(flat: _Flat, wall: np.ndarray, strips: int) -> tuple[np.ndarray, np.ndarray]:
     """The free wall's columns (v, strips + 1) of nodes, -1 outside the septum, and its coordinates.
 
-    Along the line it stands on, its nodes are the left wall's outermost. The coordinates (n, 3) are
-    those of all nodes, zero where they have none.
+    Along the line it stands on, its nodes are the left wall's outermost. Coordinates (n, 3) have a
+    row for every node of the body, zero off the free wall.
     """
     opened, free = flat.opened, flat.free
     sheet = np.full((len(flat.r), strips + 1), -1)
@@ -159,7 +159,7 @@ def _sheet(flat: _Flat, wall: np.ndarray, strips: int) -> tuple[np.ndarray, np.n
 
 
 def _in_columns(columns: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Coordinates (n, 3) of nodes in columns (v, layers + 1): two of the column's, and depth."""
+    """Coordinates (n, 3) of nodes in columns (v, layers + 1): ``first``, ``second`` and depth."""
     coordinates = np.zeros((columns.max() + 1, 3))
     coordinates[columns, 0], coordinates[columns, 1] = first[:, None], second[:, None]
     coordinates[columns, 2] = _depths(columns.shape[1] - 1)
@@ -167,7 +167,7 @@ def _in_columns(columns: np.ndarray, first: np.ndarray, second: np.ndarray) -> n
 
 
 def _midpoints(septum: Septum, in_wall: np.ndarray, in_sheet: np.ndarray) -> Midpoints:
-    """Middles of edges in the coordinates of the left wall, or of the sheet for its own edges."""
+    """Midpoints of edges in the left wall's coordinates, or in the sheet's for sheet edges."""
     on_wall = wall_midpoints(septum.left, *in_wall.T)
 
     def midpoints(edges: np.ndarray) -> np.ndarray:

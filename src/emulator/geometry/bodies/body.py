@@ -1,4 +1,4 @@
-"""What the generators of curved bodies share: named surfaces, straight or quadratic edges."""
+"""Shared by the generators: oriented elements, named surfaces, straight or curved edges."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def body(
     nodes, elements : (n, 3) mm and (m, 4), any orientation.
     surfaces : name -> nodes; a surface triangle belongs to the set that has its three corners.
     node_sets : name -> nodes.
-    midpoints : where the edges' middles lie; ``None`` for straight edges.
+    midpoints : positions of the mid-edge nodes; ``None`` for straight edges.
     order : 1 for linear, 2 for quadratic tetrahedra.
     """
     if order not in (1, 2):

@@ -1,4 +1,4 @@
-"""Meshes of simple bodies."""
+"""Structured mesh of a box."""
 
 from __future__ import annotations
 

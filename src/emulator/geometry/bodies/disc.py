@@ -37,7 +37,7 @@ def disc(rings: int, around: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _zip(first_inner: int, inner: int, first_outer: int, outer: int) -> np.ndarray:
     """Triangles between two rings; whichever ring's next point has the smaller angle advances.
 
-    Between rings of one size, where all next points tie, the inner goes first on one half of the
+    Between rings of equal size, where all next points tie, the inner goes first on one half of the
     disc and the outer on the other: the triangulation is its own mirror image in the line of angle
     zero.
     """

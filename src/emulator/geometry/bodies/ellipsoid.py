@@ -81,8 +81,8 @@ LAND = EllipsoidalWall(7.0, 17.0, 10.0, 20.0, base=5.0)
 """Land et al. (2015), problem 2."""
 
 HUMAN = EllipsoidalWall(23.0, 58.0, 34.0, 65.0, base=20.0)
-"""Human-sized, dimensions chosen: cavity 96 mL, wall 131 mL, 11 mm thick at the equator and 7 mm at
-the apex; the cavity is 46 mm wide and 78 mm long."""
+"""Human-sized, dimensions our choice: cavity 96 mL, wall 131 mL, 11 mm thick at the equator and
+7 mm at the apex; the cavity is 46 mm wide and 78 mm long."""
 
 
 def truncated_ellipsoid(
@@ -128,10 +128,10 @@ def truncated_ellipsoid(
 def wall_midpoints(
     wall: EllipsoidalWall, r: np.ndarray, phi: np.ndarray, t: np.ndarray
 ) -> Midpoints:
-    """Middles of edges, for nodes at ``r``, ``phi``, ``t``, each (n,).
+    """Midpoints of edges between nodes at ``r``, ``phi``, ``t``, each (n,).
 
-    Halfway in the disc with polar coordinates r and phi, where the apex is a point like any other;
-    on the disc's rim, which is the base, along the rim.
+    Halfway in the disc with polar coordinates r and phi, where the apex is no special point; for
+    edges on the disc's rim, which is the base, halfway along the rim.
     """
     disc_points = np.column_stack([r * np.cos(phi), r * np.sin(phi)])
 

@@ -13,11 +13,11 @@ from skfem.models.poisson import laplace
 class Footprint:
     """A sheet opened along a line; the gap is filled by a band of one strip for each level.
 
-    origin : for each vertex, the new ones after the old, the old one at its place.
+    origin : for each vertex, old ones first, the old vertex it is or was copied from.
     line : (p,) old vertices along which the sheet was opened.
-    levels : (p, strips + 1) the same vertices on each line of the band, the first ``line`` itself.
+    levels : (p, strips + 1) copies of ``line`` on each line of the band; column 0 is ``line``.
     inner : (k, 3) triangles on the near side of the line.
-    outer : (k, 3) those on the far side, which now end at the band's last line.
+    outer : (k, 3) triangles on the far side, attached to the band's last line.
     band : (k, 3) triangles of the band, cut along the same diagonals as the sides of ``inner``
         extruded through ``strips`` layers (:func:`emulator.geometry.bodies.prisms.extrude`).
     """
@@ -54,7 +54,7 @@ _KEY = 1 << 31
 
 
 def _edge_keys(triangles: np.ndarray) -> np.ndarray:
-    """One number for each edge of triangles, the same from either side."""
+    """One number for each edge of triangles, whichever triangle it is seen from."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(edges[:, 0] * _KEY + edges[:, 1])
 
@@ -64,8 +64,8 @@ def spread(
 ) -> np.ndarray:
     """``points`` (v, 2) with ``held`` (h,) moved to ``places`` (h, 2) and the others following.
 
-    Displacements are harmonic over ``triangles``: they die out away from what is moved, and an
-    even grid stays even. Points outside the triangles stay.
+    Displacements are harmonic over ``triangles``: they decay away from ``held`` and keep an even
+    grid even. Points outside the triangles stay.
     """
     used, local = np.unique(triangles, return_inverse=True)
     basis = Basis(MeshTri(points[used].T.copy(), local.reshape(-1, 3).T.copy()), ElementTriP1())

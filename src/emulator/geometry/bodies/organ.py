@@ -27,7 +27,7 @@ _LIGAMENT_HALF_ANGLE = np.radians(32.0)
 def organ(
     half_axes: tuple[float, float, float] = (75.0, 45.0, 38.0), shells: int = 6, order: int = 1
 ) -> Mesh:
-    """A liver-like body, its dimensions chosen.
+    """A liver-like body; its dimensions are our choice.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ from emulator.geometry.bodies.ellipsoid import EllipsoidalWall
 
 @dataclass(frozen=True)
 class RightVentricle:
-    """Dimensions of the right ventricle, chosen.
+    """Dimensions of the right ventricle; the defaults are our choice.
 
     half_angle : degrees from the middle of the septum to the cavity's edge at the base.
     apex : of the cavity, as a fraction of the way from the left apex to the base.
@@ -76,7 +76,7 @@ class Septum:
     def _widened(
         self, across: np.ndarray, down: np.ndarray, s: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``r, phi`` of places in the half disc, its edge moved out by the thickness."""
+        """``r, phi`` of points in the half disc, its edge moved out by ``s`` thicknesses."""
         thickness = s * self.right.thickness
         step = np.array([-5e-5, 5e-5])
         below, above = self._epicardium(self.right.apex + step, np.zeros(2))
@@ -90,7 +90,7 @@ class Septum:
 
 
 def _half_disc(xi: np.ndarray, eta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rectangle of ``xi`` and ``eta`` on the half disc: places across and down.
+    """Rectangle of ``xi`` and ``eta`` mapped to the half disc: ``across`` and ``down``.
 
     A sheet over a rectangle would lie flat in its corners; on the disc's edge it stands up
     everywhere. Squares go to circles (Shirley and Chiu 1997), so a triangle in a corner stays a

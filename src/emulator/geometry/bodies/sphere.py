@@ -20,7 +20,7 @@ def sphere_octant(
     ----------
     inner, outer : radii in mm.
     cells : number along each edge of the spherical triangle, and through the wall.
-    grading : thickness of the outermost layer over that of the innermost; layers grow
+    grading : ratio of the outermost layer's thickness to the innermost layer's; layers grow
         geometrically.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the spheres.
 

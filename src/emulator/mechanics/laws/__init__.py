@@ -2,9 +2,9 @@
 
 To add one, write a file with its energy, a function of a ``Strain`` (see
 :mod:`emulator.mechanics.kinematics`) and the law's parameters; wrap it in a :class:`Law` and name
-it in the file's ``LAWS``. Every file of this package is looked through, so that is all; stress and
-tangent follow. The tests in ``tests/emulator/mechanics/test_laws.py`` take the law up once
-``tests/law_support.py`` has values for it. ``docs/extending.md`` does it step by step.
+it in the file's ``LAWS``. The registry reads every file of this package; stress and tangent follow
+by differentiation. The tests in ``tests/emulator/mechanics/test_laws.py`` include the law once
+``tests/law_support.py`` has values for it. ``docs/extending.md`` has the steps.
 """
 
 import pkgutil

@@ -9,8 +9,8 @@ resist stretch only, :math:`\langle x \rangle = \max(x, 0)`:
       + \frac{a_f}{2b_f}\left[e^{b_f \langle \bar I_{4f} - 1 \rangle^2} - 1\right] + U(J)
 
 The released variant behind the paper's published solutions has no factors 1/2 and no switch; its
-``a`` and ``a_f`` are half the textbook's. Both have their own volumetric part: kappa is a
-parameter like any other.
+``a`` and ``a_f`` are half the textbook's. Both have the volumetric part
+``quadratic_logarithmic`` (:mod:`~emulator.mechanics.laws.volumetric`) with the parameter kappa.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ LAWS = (HOLZAPFEL_OGDEN, HOLZAPFEL_OGDEN_RELEASED)
 
 
 def textbook_from_released(a: float, a_f: float) -> tuple[float, float]:
-    """Textbook ``(a, a_f)`` of the same material under tension, from the released variant's."""
+    """Textbook ``(a, a_f)`` from the released variant's; equal energies in fibre tension."""
     return 2.0 * a, 2.0 * a_f
 
 

@@ -1,11 +1,11 @@
-r"""The identity of a law: its name, its parameters, and its energy where it is probed.
+r"""The identity of a law: its name, its parameters, and its energy at fixed probes.
 
-A law is code, and code can be edited under a name that stays. So the identity holds the values
+A law's code can change while its name stays. So the identity includes the values
 
 .. math:: W(H_i; p_i), \qquad i = 1, \dots, 24
 
 of its energy at fixed displacement gradients that stretch, squeeze and shear the fibres, with fixed
-parameters; rounded to eight digits, which every processor and every release of JAX agrees on.
+parameters; the values are rounded to eight digits, so that processors and releases of JAX agree.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from emulator.mechanics.quantity import Quantity
 
 _PROBES = 24
 _DIGITS = 8
-_LARGEST = 0.25  # entry of a displacement gradient, about
+_LARGEST = 0.25  # bound of a probe's displacement gradient, entry by entry
 
 
 @lru_cache(maxsize=64)
@@ -37,7 +37,7 @@ def law_identity(law: Law) -> str:
 
 
 def probed(law: Law) -> np.ndarray:
-    """Energies (kPa) of the law at the probes, (24,); NaN where it has none."""
+    """Energies (kPa) of the law at the probes, (24,); NaN where undefined."""
     rng = np.random.default_rng(20_231)
     gradients = _LARGEST * rng.uniform(-1.0, 1.0, (_PROBES, 3, 3))
     positions = rng.random((_PROBES, len(law.quantities)))
@@ -47,7 +47,7 @@ def probed(law: Law) -> np.ndarray:
     def energy(H: jax.Array, parameters: jax.Array) -> jax.Array:
         return law.energy(Strain(H, None, directions), *parameters)
 
-    with jax.ensure_compile_time_eval():  # numbers, also where a trace is going on
+    with jax.ensure_compile_time_eval():  # numbers even inside jit
         return np.asarray(jax.jit(jax.vmap(energy))(gradients, parameters))
 
 

@@ -1,4 +1,4 @@
-"""What a hyperelastic law is to the rest of the project: a name, its parameters, one energy."""
+"""The interface of a hyperelastic law: a name, its parameters, one energy."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ class Law:
     quantities : its parameters, each with unit and admissible values, in the order ``energy``
         takes them.
     energy : ``energy(strain, *parameters) -> W``, the strain energy density (kPa) of one point.
-    fibres : whether the energy asks for ``strain.fibre``.
-    sheets : whether it asks for ``strain.sheet`` too.
-    shape_moduli : parameters that its energy, volumetric part apart, is proportional to all
-        together; regions of a scene scale these. Without any, its scenes have no regions.
-    exponential : whether stress grows exponentially with strain. Nothing depends on it but the
-        way the solver starts, see :mod:`emulator.fem.mip`.
+    fibres : whether the energy reads ``strain.fibre``.
+    sheets : whether the energy reads ``strain.sheet`` too.
+    shape_moduli : multiplying all of these by a factor multiplies the energy, except its
+        volumetric part, by that factor. Regions of a scene scale these; a law without them cannot
+        have regions.
+    exponential : whether stress grows exponentially with strain. It only affects how the solver
+        starts, see :mod:`emulator.fem.mip`.
     """
 
     name: str

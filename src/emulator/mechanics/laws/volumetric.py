@@ -1,4 +1,4 @@
-r"""Energies of volume change, the choices a nearly incompressible law can be given.
+r"""Energies of volume change for nearly incompressible laws.
 
 ==================  =============================================
 quadratic           :math:`\frac{\kappa}{2} (J - 1)^2`
@@ -29,7 +29,7 @@ def quadratic(strain: Strain, kappa: jax.Array) -> jax.Array:
 def quadratic_logarithmic(strain: Strain, kappa: jax.Array) -> jax.Array:
     """``kappa (J^2 - 1 - 2 ln J)`` in the unit of ``kappa``."""
     change = strain.J_minus_1
-    # J^2 - 1 - 2 ln J = (J-1)^2 + 2 [(J-1) - ln J], without cancelling the ones.
+    # J^2 - 1 - 2 ln J = (J-1)^2 + 2 [(J-1) - ln J], without cancellation near J = 1.
     return kappa * (change**2 + 2.0 * (change - jnp.log1p(change)))
 
 

@@ -41,7 +41,7 @@ class Gravity(Load):
             raise InputError(f"gravity: direction is {self.direction}; give 3 numbers, not all 0")
 
     def to_json(self) -> list[Any]:
-        """Kind and body force, however density, direction and acceleration were given."""
+        """Kind and body force, the product of density, acceleration and direction."""
         return [self.kind, *(float(x) + 0.0 for x in np.round(self.body_force, 12))]
 
     @property

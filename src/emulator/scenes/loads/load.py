@@ -1,4 +1,4 @@
-"""What a load is to the rest of the project."""
+"""The interface every load implements."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Load(ABC):
 
     @property
     def pressed(self) -> str | None:
-        """Facet set the load presses on, the wall of a cavity if it encloses one."""
+        """Facet set a pressure acts on: a cavity's wall if it encloses a volume; else None."""
         return None
 
     @property
@@ -66,7 +66,7 @@ class Load(ABC):
 
     @abstractmethod
     def to_json(self) -> list[Any]:
-        """Plain JSON that tells this load from any other with another effect."""
+        """Plain JSON that differs between loads with different effects."""
 
 
 def nodal_sums(mesh: Mesh, nodes: np.ndarray, amounts: np.ndarray) -> np.ndarray:

@@ -6,9 +6,9 @@ Exact for a cavity closed at a rim that does not move: the pressure does work on
           V = -\frac{1}{3} \int x \cdot n \, da + \text{lid}
 
 with the normals of the facets pointing out of the tissue, into the cavity. The lid is fixed and
-drops out. A rim that slides in a plane of symmetry through the origin will do as well: the cone
-over the opening, from the origin, then has no volume. Elsewhere a pressure that follows the surface
-has no potential: see :mod:`emulator.scenes.loads.follower`.
+drops out. A rim may also slide in a plane of symmetry through the origin: the cone over the
+opening, from the origin, then has no volume. Elsewhere a pressure that follows the surface has no
+potential: see :mod:`emulator.scenes.loads.follower`.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ KPA_PER_MMHG = 0.133322
 
 @dataclass(frozen=True)
 class SurfacePressure(Load):
-    """A pressure on a facet set; concrete pressures say how it does its work.
+    """A pressure on a facet set; subclasses define its virtual work.
 
     Parameters
     ----------
-    facet_set : where it acts.
+    facet_set : the surface it acts on.
     pressure : kPa, or ``None`` to make it a parameter of the scene.
     parameter : name of that parameter; give each of several pressures its own.
     """
@@ -51,28 +51,28 @@ class SurfacePressure(Load):
 
     @property
     def facet_sets(self) -> tuple[str, ...]:
-        """Where it acts."""
+        """The facet set it acts on."""
         return (self.facet_set,)
 
     @property
     def pressed(self) -> str:
-        """Where it acts."""
+        """The facet set it acts on."""
         return self.facet_set
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """The pressure, unless it is given; suction is negative."""
+        """The pressure, if it is a parameter; suction is negative."""
         if self.pressure is not None:
             return ()
         return (Quantity(self.parameter, "kPa", -np.inf, hint=f"1 mmHg = {KPA_PER_MMHG} kPa"),)
 
     def to_json(self) -> list[Any]:
-        """Kind, facet set, pressure or the name of the parameter."""
+        """Kind, facet set, pressure, name of the parameter; one of the last two is None."""
         by_name = self.parameter if self.pressure is None else None
         return [self.kind, self.facet_set, self.pressure, by_name]
 
     def value(self, values: Values) -> jax.Array | float:
-        """The pressure in kPa among the scene's resolved parameters."""
+        """The pressure in kPa, taken from the scene's resolved parameters if it is one."""
         return values[self.parameter] if self.pressure is None else self.pressure
 
 

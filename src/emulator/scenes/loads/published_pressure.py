@@ -25,7 +25,7 @@ from emulator.scenes.local_terms import LocalTerm, Values
 
 @dataclass(frozen=True)
 class PublishedPressure(SurfacePressure):
-    """The released pressure work, with one value of ``F`` a facet: of the element behind it."""
+    """The released pressure work; ``F`` of each facet is that of the element behind it."""
 
     kind: ClassVar[str] = "published_pressure"
 

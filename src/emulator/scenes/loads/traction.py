@@ -19,7 +19,7 @@ class Traction(Load):
 
     Parameters
     ----------
-    facet_set : where it acts.
+    facet_set : the surface it acts on.
     traction : force per reference area in kPa, three components; it keeps its direction.
     """
 
@@ -36,7 +36,7 @@ class Traction(Load):
 
     @property
     def facet_sets(self) -> tuple[str, ...]:
-        """Where it acts."""
+        """The facet set it acts on."""
         return (self.facet_set,)
 
     def to_json(self) -> list[Any]:

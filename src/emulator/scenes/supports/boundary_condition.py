@@ -1,4 +1,4 @@
-"""What a support is to the rest of the project."""
+"""The interface every support implements."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from emulator.scenes.local_terms import LocalTerm
 class Held(NamedTuple):
     """Prescribed displacements.
 
-    where : for people. nodes : (k,). displacement : (k, 3) mm. axes : those that are held.
+    where : name for error messages. nodes : (k,). displacement : (k, 3) mm. axes : held ones.
     """
 
     where: str
@@ -32,7 +32,7 @@ class Resisted(NamedTuple):
 
 
 class BoundaryCondition(ABC):
-    """A support: it prescribes displacements, or resists them by a potential.
+    """A support: it prescribes displacements, or resists them with springs.
 
     kind : name in scene files and in :data:`~emulator.scenes.supports.SUPPORTS`.
     """
@@ -45,7 +45,7 @@ class BoundaryCondition(ABC):
         return ()
 
     def held(self, mesh: Mesh) -> Held | None:
-        """Displacements it prescribes, or None."""
+        """Prescribed displacements, or None."""
         return None
 
     def term(self, grid: Discretisation) -> LocalTerm | None:
@@ -54,8 +54,8 @@ class BoundaryCondition(ABC):
 
     @abstractmethod
     def resisted(self, mesh: Mesh) -> Resisted:
-        """Where, and in which directions, it stops or resists a rigid motion of the body."""
+        """Points, and directions at them, in which a rigid motion of the body is resisted."""
 
     def to_json(self) -> list[Any] | None:
-        """Plain JSON that tells springs apart; None where :meth:`held` says it all."""
+        """Plain JSON that identifies the springs; None where :meth:`held` describes the support."""
         return None

@@ -1,4 +1,4 @@
-"""Prescribed displacements, and whether a body is held at all."""
+"""Prescribed displacements, and the count of rigid motions that supports leave free."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Support(BoundaryCondition):
 
 
 def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> tuple[np.ndarray, np.ndarray]:
-    """``(held, values)``: where the displacement is known, (n, 3) bool, and it, (n, 3) mm.
+    """``(held, values)``: where the displacement is known, (n, 3) bool, and its value, (n, 3) mm.
 
     Raises
     ------
@@ -91,8 +91,8 @@ def free_motions(points: np.ndarray, directions: np.ndarray) -> int:
     """How many of the six rigid motions remain.
 
     ``points`` (k, 3) cannot move along ``directions`` (k, 3). A small rigid motion ``a + w x X``
-    moves a point along its direction by
-    ``a . d + w . (X x d)``; the rank of those rows says how many motions are stopped.
+    moves a point along its direction by ``a . d + w . (X x d)``; the rank of these rows is the
+    number of motions stopped.
     """
     if not len(points):
         return 6

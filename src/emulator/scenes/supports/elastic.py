@@ -28,7 +28,7 @@ class ElasticSupport(BoundaryCondition):
 
     Parameters
     ----------
-    facet_set : where they are.
+    facet_set : the surface they act on.
     stiffness : k in kPa/mm, above 0.
     direction : ``all``, or ``normal`` to let the surface slide along itself.
     """
@@ -53,7 +53,7 @@ class ElasticSupport(BoundaryCondition):
 
     @property
     def facet_sets(self) -> tuple[str, ...]:
-        """Where it acts."""
+        """The facet set it acts on."""
         return (self.facet_set,)
 
     def to_json(self) -> list[Any]:
@@ -64,10 +64,10 @@ class ElasticSupport(BoundaryCondition):
         """Energy of the springs, facet by facet."""
         mesh = grid.mesh
         facets = mesh.facet_set(self.facet_set)
-        rule = facet_rule(mesh.order, 2 * mesh.order)  # u squared
+        rule = facet_rule(mesh.order, 2 * mesh.order)  # the degree of |u|^2
         corners = mesh.nodes[facets]
         slopes = np.einsum("qad,kai->kqdi", rule.slopes, corners)
-        normals = np.cross(slopes[:, :, 0], slopes[:, :, 1])  # (k, q, 3), as long as the area
+        normals = np.cross(slopes[:, :, 0], slopes[:, :, 1])  # (k, q, 3), length: area
         areas = np.linalg.norm(normals, axis=-1)
         data = (rule.weights * areas, normals / areas[..., None])
 
