@@ -89,5 +89,7 @@ def outside_reference(
             solved.append(k)
             positions.append(position)
             fields.append(solution.displacement)
-    displacement = jnp.stack(fields[len(inside.thetas) :]) if solved else jnp.zeros((0, 0, 3))
+    displacement = (
+        jnp.stack(fields[len(inside.thetas) :]) if solved else jnp.zeros((0, *scene.held.shape))
+    )
     return Reference(thetas[np.array(solved, int)], displacement, "our FEM", cases - len(solved))

@@ -83,6 +83,7 @@ class Cavity:
 
 def encloses(mesh: Mesh, facet_set: str) -> bool:
     """Whether ``facet_set`` is the wall of a cavity; a plane patch encloses nothing."""
+    mesh.facet_set(facet_set)  # a set that is not there is an error
     try:
         Cavity(mesh, facet_set)
     except InputError:

@@ -19,6 +19,14 @@ from emulator.geometry.tetrahedra import boundary_facets, signed_volumes
 _FLAT = 1e-10
 
 
+def indices(values: object, what: str) -> np.ndarray:
+    """``values`` as frozen whole numbers; :class:`InputError` where one has a fraction."""
+    array = np.asarray(values)
+    if array.dtype.kind == "f" and not (array == np.floor(array)).all():
+        raise InputError(f"mesh: {what} has numbers with a fraction; give node indices")
+    return frozen_array(array, np.int64)
+
+
 def frozen_array(values: object, dtype: type = float) -> np.ndarray:
     """A read-only copy of ``values``: a function compiled from it stays valid."""
     array: np.ndarray = np.array(values, dtype=dtype)
@@ -53,10 +61,10 @@ class Mesh:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", frozen_array(self.nodes))
-        object.__setattr__(self, "elements", frozen_array(self.elements, np.int64))
-        sets = {name: frozen_array(nodes, np.int64) for name, nodes in self.node_sets.items()}
+        object.__setattr__(self, "elements", indices(self.elements, "elements"))
+        sets = {n: indices(nodes, f"node set '{n}'") for n, nodes in self.node_sets.items()}
         object.__setattr__(self, "node_sets", MappingProxyType(sets))
-        facets = {name: frozen_array(rows, np.int64) for name, rows in self.facet_sets.items()}
+        facets = {n: indices(rows, f"facet set '{n}'") for n, rows in self.facet_sets.items()}
         object.__setattr__(self, "facet_sets", MappingProxyType(facets))
         self._check_shapes()
         self._check_volumes()

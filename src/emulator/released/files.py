@@ -146,6 +146,11 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
         surface = boundary_facets(elements)
         wanted = {tuple(row) for row in np.sort(pressed[:, 1:], axis=1).tolist()}
         inside = [tuple(row) in wanted for row in np.sort(surface, axis=1).tolist()]
+        if sum(inside) < len(wanted):
+            raise InputError(
+                f"published data: {len(wanted) - sum(inside)} of the {len(wanted)} pressed facets "
+                f"of {model} are not on the surface of its elements"
+            )
         facets[PRESSURE_SURFACE] = surface[inside]
     fibres = _array_if_there(
         root, model, f"{folder}/fibre-field-elementwise.npy", (len(elements), 3, 1)

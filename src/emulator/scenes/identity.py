@@ -19,7 +19,9 @@ import numpy as np
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import ParameterSpace
 
-_LENGTH_DIGITS = 9  # decimals of lengths in mm that the fingerprint hashes
+# Decimals of lengths in mm that the fingerprint hashes: 1 nm, so that round-off, which differs
+# between machines, hardly ever decides on one.
+_LENGTH_DIGITS = 6
 _DIRECTION_DIGITS = 6  # decimals of unit vectors; some files store them in single precision
 _TOLERANCE = 1e-6  # lengths relative to the body's size, and directions, agree within this
 _HASH_LENGTH = 16  # hexadecimal digits

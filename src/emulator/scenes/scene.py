@@ -183,8 +183,15 @@ class Scene:
         takers = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
         if self.regions is not None:
             takers |= {q.name: (q, "a region") for q in region_quantities(self.regions)}
+        own = set(takers)
         for load in self.loads:
             for quantity in load.quantities:
+                if quantity.name in own:
+                    raise InputError(
+                        f"scene '{self.name}': load {type(load).__name__} and "
+                        f"{takers[quantity.name][1]} both have a parameter '{quantity.name}'; "
+                        "call the load's by another name"
+                    )
                 takers.setdefault(quantity.name, (quantity, f"load {type(load).__name__}"))
         return takers
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -95,3 +97,10 @@ def test_shape_functions_sum_to_one_and_reproduce_linear_fields():
     u = mesh.nodes @ H.T
     found = np.einsum("mai,mqaj->mqij", u[grid.connectivity], grid.gradients)
     np.testing.assert_allclose(found, np.broadcast_to(H, found.shape), atol=1e-12)
+
+
+def test_indices_with_a_fraction_are_not_cut_off():
+    mesh = box((1.0, 1.0, 1.0), (1, 1, 1))
+    with pytest.raises(InputError, match="elements has numbers with a fraction"):
+        replace(mesh, elements=mesh.elements + 0.7)
+    assert replace(mesh, elements=mesh.elements.astype(float)).elements.dtype == np.int64

@@ -189,3 +189,9 @@ def test_constants_take_the_place_of_parameters():
     assert em.potential_energy(scene)(u, jnp.array([3.0])) == pytest.approx(
         float(em.potential_energy(whole)(u, jnp.array([3.0, 4.0])))
     )
+
+
+def test_a_load_cannot_share_the_name_of_a_parameter_of_the_law(beam):
+    load = FollowerPressure("right", parameter="mu")
+    with pytest.raises(InputError, match="load FollowerPressure and law 'neo_hookean' both have"):
+        replace(beam, loads=(load,))
