@@ -28,12 +28,13 @@ from emulator.fem import Simulator
 
 Verdict = Literal["accepted", "reweight", "not certified"]
 
-# Log weights within this range of each other are equal to 0.1 %: their tail has no shape to fit.
+# Log weights closer together than this are equal to 0.1 %: their tail has no shape to fit.
 _EQUAL_WEIGHTS = 1e-3
 # If the largest weight is below this multiple of the mean weight, a heavy tail fitted to the last
-# few weights does no harm: theta is bounded by its box, so the ratios are bounded too.
+# few weights does no harm: theta is bounded by its box, so the ratios are bounded too
+# (docs/experiments.md, "When k-hat cries wolf").
 _NO_TAIL = 2.0
-# Largest R-hat at which the chains count as draws of one posterior; good results have 1.01.
+# Largest R-hat at which the chains count as draws of one posterior; samplers aim at 1.008.
 LARGEST_R_HAT = 1.05
 
 
@@ -44,7 +45,7 @@ class Certificate:
     verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use ``mean_fem``), or
         ``not certified`` (FEM's posterior is too far away for reweighting, or the chains have not
         converged).
-    reason : why this verdict, for people.
+    reason : the verdict explained in words.
     k_hat, k_threshold : Pareto shape of the weights' tail, and the largest one allowed unless every
         weight is below twice the mean weight.
     ess : effective number of reweighted draws.
@@ -87,9 +88,9 @@ def judge(
     ----------
     log_ratios : FEM less cheap; ``-inf`` where FEM failed.
     largest_shift : of a mean, in posterior sd, for the posterior to stand as it is. At 0.25 a
-        90 % interval still covers 88.7 %.
+        90 % interval still covers 88.9 %.
     largest_failure_rate : fraction of FEM runs that may fail.
-    r_hat : largest of the parameters'; above :data:`LARGEST_R_HAT`, or NaN, nothing is certified.
+    r_hat : largest over the parameters; above :data:`LARGEST_R_HAT`, or NaN, nothing is certified.
     """
     log_ratios = np.asarray(log_ratios, dtype=float)
     fine = np.isfinite(log_ratios)
@@ -130,7 +131,7 @@ def _weights(log_ratios: np.ndarray) -> tuple[np.ndarray, float]:
     log_ratios = log_ratios - log_ratios.max()
     if np.ptp(log_ratios) < _EQUAL_WEIGHTS:
         return np.full(log_ratios.shape, 1.0 / len(log_ratios)), 0.0
-    # ArviZ takes log likelihoods, which are the log ratios' negatives.
+    # ArviZ takes log likelihoods and negates them (docs/experiments.md, "A sign").
     log_weights, k_hat = array_stats.psislw(-log_ratios)
     weights = np.exp(np.asarray(log_weights) - np.max(log_weights))
     return weights / weights.sum(), float(k_hat)
@@ -175,14 +176,14 @@ def certify(
         if solution.converged:
             noise = model.noise_values({name: values[s] for name, values in chosen.items()})
             log_ratios[s] = ratio(thetas[s], solution.displacement, noise, data)
-    # NumPy's maximum is NaN if one of them is; Python's depends on their order.
+    # NumPy's maximum is NaN if any value is; Python's depends on their order.
     worst = float(np.max([row["r_hat"] for row in posterior.summary().values()]))
     return judge(log_ratios, chosen, r_hat=worst)
 
 
 @lru_cache(maxsize=4)
 def _compiled(model: Model) -> tuple[Callable, Callable]:
-    """Compiled once a model: the cheap map over all nodes, and the log likelihood ratio.
+    """The cheap map over all nodes and the log likelihood ratio, compiled once for each model.
 
     The ratio takes FEM's displacement (n, 3) mm and is FEM's log likelihood less the cheap map's.
     """

@@ -1,4 +1,4 @@
-"""Measurements in and out of files.
+"""Reading and writing measurements.
 
 A CSV file has the columns ``node,ux,uy,uz`` (nodes of the mesh) or ``x,y,z,ux,uy,uz`` (material
 points of the reference body), all lengths in mm. The volume of a cavity is one more column,
@@ -8,8 +8,7 @@ only, which may be a row of its own. There may be a volume and no displacement.
 A netCDF file has a variable ``displacement`` with one row a point, and beside it either ``node`` or
 ``position`` (rows of x, y, z); and a number ``volume``, or ``volume:<facet set>``.
 
-Which columns and variables there are is asked of the kinds of observation
-(:data:`calibrate.observations.KINDS`).
+Each kind of observation (:data:`calibrate.observations.KINDS`) names its own columns and variables.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ def read_data(scene: Scene, path: str | Path) -> tuple[Observations, dict[str, n
 
 
 def _found(path: Path, file: DataFile) -> dict[str, tuple[type[Observation], tuple[Field, ...]]]:
-    """Kind and fields of each observation that is whole in the file, by name."""
+    """Kind and fields of each observation that the file has all columns of, by name."""
     found: dict[str, tuple[type[Observation], tuple[Field, ...]]] = {}
     partly: list[list[str]] = []
     used: set[str] = set()
@@ -61,7 +60,7 @@ def _found(path: Path, file: DataFile) -> dict[str, tuple[type[Observation], tup
             elif name not in found:
                 found[name] = kind, fields
                 used.update(words)
-    # A column that belongs to an observation of which others are missing would be lost.
+    # An incomplete observation is refused; otherwise its columns would be silently ignored.
     partly = [words for words in partly if set(words) & set(file.words) - used]
     if partly or not found:
         lacking = [[w for w in words if w not in file.words] for words in partly]
@@ -71,7 +70,7 @@ def _found(path: Path, file: DataFile) -> dict[str, tuple[type[Observation], tup
 
 
 def _expected(file: DataFile) -> str:
-    """The columns or variables of every kind, for errors."""
+    """The columns or variables of every kind, for error messages."""
     every = [
         ",".join(word for field in fields for word in file.needs(field))
         for name, kind in KINDS.items()
@@ -90,7 +89,7 @@ def write_data(
     Raises
     ------
     InputError
-        An observation whose name in a file would not be its own.
+        An observation under a name that its kind cannot have in a file.
     """
     observe = observations(observe)
     data = observe.name(values, "data")

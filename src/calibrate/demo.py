@@ -1,4 +1,4 @@
-"""The whole job on a built-in scene: synthetic data, posterior, certificate and picture.
+"""A whole calibration of a built-in scene: synthetic data, posterior, certificate and figure.
 
 The beam takes under a minute. The left ventricle is the intended use: passive stiffness of the
 muscle and filling pressure, from one cavity volume and the displacements of 24 landmarks.
@@ -29,8 +29,8 @@ DEMO = Run(
 )
 
 # Off the centre of the box in every parameter; 1 kPa is 7.5 mmHg, a normal end-diastolic pressure.
-# The noise is assumed to be small: observers of one heart differ by several mL in its
-# end-diastolic volume, automatic tracking by millimetres.
+# Real noise is larger than this: observers of one heart differ by several mL in its end-diastolic
+# volume, and automatic tracking of points by millimetres.
 VENTRICLE = Run(
     scene="left_ventricle",
     truth={"a": 0.36, "b": 1.8, "a_f": 4.6, "b_f": 2.4, "pressure": 1.0},
@@ -45,9 +45,9 @@ VENTRICLE = Run(
 
 @dataclass(frozen=True)
 class Demo:
-    """A run and its picture.
+    """A run and its figure.
 
-    figure : draws the picture, to a file called ``picture``.
+    figure : draws the figure and writes it to a file called ``picture``.
     identify : whether to report which combinations of parameters the data identifies.
     """
 

@@ -22,7 +22,7 @@ class Evaluation:
     """What to evaluate against what.
 
     emulator : shipped name or folder; its scene is the one evaluated.
-    against : ``fem``, or a published model's folder.
+    against : ``fem``, or the folder of a published model's data.
     cases : FEM runs against ``fem``, inside the box and again outside.
     outside : fraction of each side by which the box is widened for the cases outside; ``None``
         for no such cases.

@@ -20,7 +20,7 @@ from scipy.linalg import eigh
 from calibrate.posterior import Posterior
 
 _PRIOR_DRAWS = 4096
-# Exponents are rounded for people; those that round to zero are left out.
+# Exponents are rounded to be readable; those that round to zero are left out.
 _DIGITS = 1
 
 
@@ -30,7 +30,7 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     Returns
     -------
     contraction : per parameter, 1 - sd of the posterior / sd of the prior, on the parameter's
-        scale: 0 where nothing was learned, 1 where the value is exact.
+        scale: 0 where nothing was learned, 1 where the posterior has no width.
     correlation : first -> second -> correlation, posterior, on the parameters' scales.
     combinations : best known first, each with its ``exponents``, its relative sd ``known_to`` in
         the posterior and ``prior`` in the prior; empty where a parameter may be 0 or below.
@@ -77,11 +77,11 @@ def _combinations(
 
 
 def in_words(found: dict[str, Any], *, pairs: float = 0.7, best: int = 2) -> str:
-    """The result for people: contractions, correlated pairs, the best combinations.
+    """The result in words: contractions, correlated pairs, the best combinations.
 
     Parameters
     ----------
-    pairs : least correlation, either way, of the pairs that are named.
+    pairs : least absolute correlation of the pairs that are named.
     best : number of combinations that are named.
     """
     learned = ", ".join(f"{name} {100 * c:.0f} %" for name, c in found["contraction"].items())

@@ -16,7 +16,7 @@ import xarray as xr
 from emulator.errors import InputError
 from emulator.surrogates.protocol import ForwardMap
 
-# Where scene and emulator are found may change when a folder moves; their fingerprints may not.
+# Paths of scene and emulator may change when a folder moves; their fingerprints may not.
 _PLACES = ("scene", "root", "emulator")
 
 

@@ -26,11 +26,11 @@ from emulator.store import replacing
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Draws, with the model and the data behind them.
+    """Draws, with the model and the data they came from.
 
     tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; attributes
         hold the provenance.
-    model, data : the model and the data, by the observation's name, it was conditioned on.
+    model, data : what the posterior was conditioned on; data by the observation's name.
     """
 
     tree: xr.DataTree
@@ -89,7 +89,7 @@ def read_tree(path: str | Path) -> xr.DataTree:
 
 
 def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str, Any]:
-    """What is needed to know, and to repeat, how a posterior was made; plain JSON values."""
+    """Everything needed to repeat how a posterior was made; plain JSON values."""
     scene = model.forward.scene
     return {
         "scene": dict(scene.origin),
@@ -138,9 +138,9 @@ def sample(
 ) -> Posterior:
     """Draw from the posterior of ``model`` given ``data``.
 
-    ``data`` is by name where several things are observed: displacements (d, 3) mm, a volume in mL.
-    ``sampler`` is a name of :data:`calibrate.samplers.SAMPLERS`; ``options`` are its own, with its
-    defaults for ``None``.
+    With several observations, ``data`` maps their names to values: displacements (d, 3) in mm, a
+    volume in mL. ``sampler`` is a name of :data:`calibrate.samplers.SAMPLERS`; ``options`` is an
+    instance of that sampler's options, ``None`` for its defaults.
 
     Raises
     ------

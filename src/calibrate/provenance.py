@@ -1,4 +1,4 @@
-"""Where a number came from: machine, versions, commit."""
+"""Provenance of results: machine, versions of packages, commit."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _processor() -> str:
 
 
 def commit(folder: str | Path) -> str | None:
-    """Commit checked out at ``folder``, with ``+`` when changed; ``None`` without git."""
+    """Commit checked out at ``folder``, with ``+`` if files were changed; ``None`` without git."""
     try:
         words = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=12"]
         done = subprocess.run(words, capture_output=True, text=True, check=True)
@@ -63,7 +63,7 @@ def commit(folder: str | Path) -> str | None:
 
 
 def study_header(folder: str | Path, seed: int) -> dict[str, Any]:
-    """What every study's results.json begins with."""
+    """The first entries of every study's results.json."""
     return {
         "hardware": hardware(),
         "versions": versions(),

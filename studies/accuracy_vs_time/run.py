@@ -35,8 +35,8 @@ SEED = 4
 def timed(function: Callable[[jax.Array], Any], thetas: jax.Array) -> float:
     """Median seconds of one call.
 
-    Every theta is new, here and to all that ran before: direct solvers keep factors they have met
-    and skip the work, ten times too fast.
+    No theta may have been solved before: direct solvers keep factors of values they have seen, and
+    a repeated theta would take a tenth of the time.
     """
     jax.block_until_ready(function(thetas[0]))
     durations = []
@@ -48,7 +48,7 @@ def timed(function: Callable[[jax.Array], Any], thetas: jax.Array) -> float:
 
 
 def fresh(scene: Scene, count: int, *, keys: Iterator[int] = itertools.count()) -> jax.Array:
-    """Theta (count, p) that no call has seen yet."""
+    """Theta (count, p) that no call has had before."""
     return uniform(scene, count, jax.random.key(1000 + next(keys)))
 
 
@@ -62,7 +62,7 @@ def measure(
 ) -> dict[str, Any]:
     """Error at the nodes ``forward`` returns, time of a value and of a value with gradient."""
     value = jax.jit(lambda theta: forward(theta))
-    # What a sampler needs: one scalar and its gradient in theta.
+    # A sampler needs one scalar and its gradient in theta.
     gradient = jax.jit(jax.value_and_grad(lambda theta: jnp.sum(forward(theta) ** 2)))
     error = jnp.stack([value(theta) for theta in tests]) - reference[:, forward.nodes]
     case = {
@@ -85,7 +85,7 @@ def measure(
 
 
 def study(count: int) -> list[dict[str, Any]]:
-    """Every method on ``count`` theta none of them has seen."""
+    """Every method at ``count`` theta that none was fitted to."""
     trained = load("once_clamped_beam")
     scene, cached = trained.scene, trained.cache()
     simulator = Simulator(scene)
@@ -134,7 +134,7 @@ def study(count: int) -> list[dict[str, Any]]:
 
 
 def pareto(points: np.ndarray) -> np.ndarray:
-    """Which rows (time, error) no other row beats in both, (c,) bool."""
+    """Pareto front, (c,) bool: the rows (time, error) that no other row beats in both."""
     return np.array([not (points < row).all(axis=1).any() for row in points])
 
 
@@ -154,7 +154,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
             colour = colours[case["name"][:3]]
             name = f"{number}  {case['name']}, offline {case['offline_s']:.0f} s"
             axes.plot(x, y, "o", color=colour, ms=6, label=name)
-            # Neighbours' numbers go to different sides.
+            # Labels of neighbouring points are put on different sides.
             side = [(7, 5), (7, -12), (-12, -12), (-12, 5)][number % 4]
             axes.annotate(str(number), (x, y), xytext=side, textcoords="offset points")
         axes.set(xscale="log", yscale="log", xlabel=f"time of {title} (ms)")
@@ -179,7 +179,7 @@ def check(cases: list[dict[str, Any]]) -> None:
 
 
 def check_times(cases: list[dict[str, Any]]) -> None:
-    """Those about time; too few cases make no median."""
+    """The claims about time, which need enough cases for a median."""
     gradient = {case["name"]: case["gradient_s"] for case in cases}
     fast = gradient["emulator, 20 observed nodes"]
     assert fast < 0.1 * gradient["FEM started by the emulator"]

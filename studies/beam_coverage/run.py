@@ -28,7 +28,7 @@ MODEL = "OnceClampedBeam"
 
 
 def study(root: Path, count: int) -> list[dict[str, Any]]:
-    """One row a released case."""
+    """One row for each released case."""
     emulator = load("once_clamped_beam")
     scene = emulator.scene
     thetas, tests = published_tests(MODEL, root)
@@ -86,7 +86,7 @@ def conclude(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Every interval against the truth, misses in red."""
+    """Every interval with its true value; intervals that miss it in red."""
     plt = pyplot()
     names = list(rows[0]["parameters"])
     figure, panels = plt.subplots(

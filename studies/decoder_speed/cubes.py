@@ -1,8 +1,8 @@
 """The twisting cube from coarse to fine: a full field, and 24 landmarks, by size of the mesh.
 
-What a cached emulator evaluates is a sum of modes; what they are worth makes no difference to the
-time. So none is trained: the series and the mechanical modes come from one FEM solve, the network's
-weights are drawn.
+A cached emulator evaluates a sum of modes, and the time does not depend on their values. So none is
+trained: the series and the mechanical modes come from one FEM solve, and the network's weights are
+random.
 """
 
 import time
@@ -27,7 +27,7 @@ ARCHITECTURE = Architecture(decoder="separable")
 
 
 class Cube(NamedTuple):
-    """One mesh: its emulator over all nodes, what is seen of it, and what it took to make."""
+    """One mesh: its emulator over all nodes, the observation, and the seconds to make them."""
 
     cached: CachedEmulator
     seen: Landmarks
@@ -41,7 +41,7 @@ def clocked(function: Any, *arguments: Any) -> tuple[float, Any]:
 
 
 def drawn(network: Network, seed: int) -> Network:
-    """Weights moved off zero: the compiler must not find that the last layer does nothing."""
+    """``network`` with random weights, so that no compiler can drop a last layer of zeros."""
     rng = np.random.default_rng(seed)
     leaves, structure = jax.tree.flatten(network.weights)
     leaves = [leaf + 0.01 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves]
@@ -49,7 +49,7 @@ def drawn(network: Network, seed: int) -> Network:
 
 
 def cube(cells: int, order: int, points: np.ndarray | None, seed: int) -> Cube:
-    """The cube of ``cells`` cells an edge, seen at ``points`` (d, 3) mm or at points of its own."""
+    """The cube of ``cells`` cells an edge, observed at ``points`` (d, 3) mm, by default its own."""
     scene = em.scenes.twisting_cube(cells=cells)
     simulator = em.Simulator(scene)
     seconds = {}
@@ -73,7 +73,7 @@ def gradient(cube: Cube) -> Function:
 
 
 def in_turns(cubes: list[Cube], functions: list[Function], count: int) -> list[float]:
-    """Seconds a theta in a compiled loop, the meshes taking turns: a busy moment hits them all."""
+    """Seconds per theta in a compiled loop; meshes take turns, so that other load hits them all."""
     loops = [loop(function) for function in functions]
     turns = np.array(
         [
@@ -88,7 +88,7 @@ def in_turns(cubes: list[Cube], functions: list[Function], count: int) -> list[f
 
 
 def study(sizes: list[int], order: int, calls: int, batch: int, seed: int) -> list[dict]:
-    """A case a mesh, from the coarsest to the finest."""
+    """One case for each mesh, from the coarsest to the finest."""
     cubes: list[Cube] = []
     for cells in sorted(sizes):
         cubes.append(cube(cells, order, cubes[0].seen.points if cubes else None, seed))
@@ -100,7 +100,7 @@ def study(sizes: list[int], order: int, calls: int, batch: int, seed: int) -> li
 
 
 def case(cube: Cube, field_s: float, landmarks_s: float, calls: int, batch: int) -> dict:
-    """What one mesh costs."""
+    """Times of one mesh."""
     cached, scene = cube.cached, cube.cached.scene
     theta, seen = unseen(scene, 1)[0], gradient(cube)
     parts = cached.at(cube.seen.nodes)(theta) - cached(theta)[cube.seen.nodes]

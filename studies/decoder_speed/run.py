@@ -24,7 +24,7 @@ ORDER = 3  # of the cubes' series
 
 
 def summary(cases: list[dict[str, Any]]) -> dict[str, float]:
-    """The figures aimed at: milliseconds, times faster, growth with the mesh."""
+    """The numbers with a target: milliseconds, speed-up over FEM, growth with the mesh."""
     emulator = next(case for case in cases if case["name"] == "emulator")
     sizes = [case for case in cases if "landmarks_loop_s" in case]
     first, last = sizes[0], sizes[-1]
@@ -79,7 +79,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
 
 
 def check(cases: list[dict[str, Any]]) -> None:
-    """That the same thing was timed."""
+    """Assert that all methods were timed on the same quantity."""
     by_name = {case["name"]: case for case in cases}
     assert by_name["emulator"]["gradient_gap"] < 0.02
     assert by_name["emulator + 1 Newton step"]["gradient_gap"] < 0.02
@@ -88,7 +88,7 @@ def check(cases: list[dict[str, Any]]) -> None:
 
 
 def check_times(found: dict[str, float]) -> None:
-    """What the README claims."""
+    """The claims of the study's README."""
     assert found["value_and_gradient_ms"] <= 0.2
     assert found["times_faster_than_fem"] >= 300.0
     assert found["landmarks_growth"] < 1.2

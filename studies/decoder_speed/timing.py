@@ -1,4 +1,4 @@
-"""Clocks. No theta is ever timed twice: direct solvers keep factors of values they have met."""
+"""Timing. No theta is timed twice: direct solvers keep factors of values they have seen."""
 
 import itertools
 import time
@@ -16,7 +16,7 @@ Function = Callable[[jax.Array], Any]
 
 
 def unseen(scene: Scene, count: int, *, keys: Iterator[int] = itertools.count()) -> jax.Array:
-    """Theta (count, p) that no call has seen yet."""
+    """Theta (count, p) that no call has had before."""
     return uniform(scene, count, jax.random.key(2000 + next(keys)))
 
 
@@ -33,7 +33,7 @@ def per_call(function: Function, arguments: jax.Array) -> float:
 
 
 def loop(function: Function) -> Function:
-    """``function`` of one theta after the other in one program, summed so that all is done."""
+    """One program that sums ``function`` over many theta, so that nothing can be left out."""
 
     def step(total: jax.Array, theta: jax.Array) -> tuple[jax.Array, None]:
         leaves = jax.tree.leaves(function(theta))
@@ -43,13 +43,13 @@ def loop(function: Function) -> Function:
 
 
 def in_loop(function: Function, scene: Scene, count: int, repeats: int = 5) -> float:
-    """Median over ``repeats`` of the seconds a theta in a compiled loop over ``count`` of them."""
+    """Median over ``repeats`` of the seconds per theta in a compiled loop over ``count`` theta."""
     batches = unseen(scene, count * (repeats + 1)).reshape(repeats + 1, count, -1)
     return per_call(loop(function), batches) / count
 
 
 def batched(function: Function, scene: Scene, size: int, repeats: int = 5) -> float:
-    """Median over ``repeats`` of the seconds a theta in one call of ``size`` of them, ``vmap``."""
+    """Median over ``repeats`` of the seconds per theta in one call of ``size`` under ``vmap``."""
     batches = unseen(scene, size * (repeats + 1)).reshape(repeats + 1, size, -1)
     return per_call(jax.jit(jax.vmap(function)), batches) / size
 

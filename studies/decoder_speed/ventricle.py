@@ -18,7 +18,7 @@ from emulator.surrogates.protocol import ForwardMap
 SCENE = "left_ventricle"
 LANDMARKS = 24
 NOISE_MM, NOISE_ML = 0.2, 1.0
-AWAY = 0.03  # how far, relatively, the theta of FEM's start is from the one to solve
+AWAY = 0.03  # relative distance of the theta of FEM's start from the one to solve
 
 
 class Misfit:
@@ -34,7 +34,7 @@ class Misfit:
         self.data = self.observe(forward.at(self.observe.nodes)(truth))
 
     def __call__(self, displacement: jax.Array) -> jax.Array:
-        """Of the displacement (k, 3) mm of the observed nodes."""
+        """The misfit of the displacement (k, 3) mm of the observed nodes."""
         seen = self.observe(displacement)
         moved = (seen["displacement"] - self.data["displacement"]) / NOISE_MM
         volume = (seen["volume"] - self.data["volume"]) / NOISE_ML
@@ -68,19 +68,19 @@ def fem_gradients(
             solution = simulator.solve(theta, start)
             return misfit(solution.displacement[nodes]), solution.converged
 
-        (value, converged), slope = jax.value_and_grad(scalar, has_aux=True)(theta)
+        (value, converged), gradient = jax.value_and_grad(scalar, has_aux=True)(theta)
         assert converged
-        found.append(slope)
+        found.append(gradient)
         return value
 
     return per_call(one, thetas), found
 
 
 def gap(function: Function, thetas: jax.Array, exact: list[jax.Array]) -> float:
-    """Median relative difference of the gradients from FEM's."""
+    """Median over ``thetas`` of the gradient's relative difference from FEM's."""
     gaps = [
-        jnp.linalg.norm(function(theta)[1] - slope) / jnp.linalg.norm(slope)
-        for theta, slope in zip(thetas, exact, strict=True)
+        jnp.linalg.norm(function(theta)[1] - gradient) / jnp.linalg.norm(gradient)
+        for theta, gradient in zip(thetas, exact, strict=True)
     ]
     return float(np.median(gaps))
 
@@ -102,7 +102,7 @@ def row(name: str, call: float, loop: float | None, batch: float | None, **more:
 
 
 def stages(cached: CachedEmulator, misfit: Misfit, calls: int) -> list[dict]:
-    """Value and gradient of more and more of the emulator: where its time goes."""
+    """Times of value and gradient of ever longer parts of the evaluation."""
     trained = cached.emulator
     scene, series, discrepancy = trained.scene, trained.taylor, trained.discrepancy
     parts: dict[str, Function] = {"position in the box": scene.to_unit}
@@ -124,7 +124,7 @@ def _both(function: Function, scene: em.Scene, calls: int) -> tuple[float, float
 
 
 def study(calls: int, fem_calls: int, runs: int, batch: int, seed: int) -> list[dict]:
-    """Every method's value and gradient, in one run."""
+    """Times of every method's value and gradient, measured in one run."""
     trained = em.load(SCENE)
     scene, whole = trained.scene, trained.cache()
     misfit = Misfit(whole, seed)

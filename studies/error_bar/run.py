@@ -1,4 +1,4 @@
-"""Does the error bar tell the error, and how fast does Newton polish it away?
+"""How accurate is the error bar, and how fast do Newton steps reduce the error?
 
     python studies/error_bar/run.py                       # the beam and the left ventricle
     python studies/error_bar/run.py --scenes once_clamped_beam --cases 4 --out DIR
@@ -32,7 +32,7 @@ HERE = Path(__file__).parent
 SEED = 4
 TEST_SEED = 90_210
 RUNS = (5, 10, 30)
-REACHES = (0.25, 0.5)  # how far outside, in widths of the box
+REACHES = (0.25, 0.5)  # distances outside the box, in its widths
 ESTIMATES = ("error bar", "one step", "two steps", "centre tangent")
 GOOD = (0.5, 2.0)
 COLOURS = {"error bar": "tab:blue", "one step": "tab:red", "two steps": "tab:orange"}
@@ -56,7 +56,7 @@ def scenes_to_judge(names: list[str]) -> list[tuple[Scene, dict[str, ForwardMap]
 def beyond(scene: Scene, reach: float, count: int) -> jax.Array:
     """Theta with one entry ``reach`` widths beyond either end, the others inside, (c, p).
 
-    ``count`` or a few more, so that each side of each entry has its share.
+    At least ``count`` of them, equally many on each side of each entry.
     """
     size = len(scene.parameters)
     count = 2 * size * -(-count // (2 * size))
@@ -87,7 +87,7 @@ class Judge:
         self.newton = jax.jit(lambda u, theta: newton_step(self.simulator.system, u, theta))
 
     def _nothing(self) -> ForwardMap:
-        """A map whose own predictions are never asked for."""
+        """A forward map for error bars of given fields, which never call it."""
         return em.fem_forward(self.simulator)
 
     def reference(self, theta: jax.Array) -> jax.Array | None:
@@ -98,7 +98,7 @@ class Judge:
         return self.newton(self.newton(solution.displacement, theta), theta)
 
     def row(self, u: jax.Array, theta: jax.Array, exact: jax.Array) -> dict[str, Any]:
-        """One prediction: its error, what each estimate makes of it, and its polish."""
+        """One prediction: its error, each estimate of it, and the errors after Newton steps."""
         error = length(u - exact)
         seconds: dict[str, float] = {}
         seconds["error bar"], bar = timed(self.present.of_field, u, theta)
@@ -129,7 +129,7 @@ class Judge:
 
 
 def judged_case(name: str, rows: list[dict[str, Any]], failed: int) -> dict[str, Any]:
-    """What the rows of one map and one set of theta amount to."""
+    """Summary of the rows of one map at one set of theta."""
     error = np.array([row["err_u_mm"]["median"] for row in rows])
     effectivity = {}
     for estimate in ESTIMATES:

@@ -1,4 +1,4 @@
-"""Seconds JAX says it spent compiling, which a busy machine blurs less than a difference does."""
+"""Seconds that JAX reports for compilation: steadier than differences of call times."""
 
 import jax
 
@@ -9,7 +9,7 @@ _EVENTS = (
 
 
 class Compiling:
-    """Adds up lowering and compilation from when it is made; tracing is not counted."""
+    """Sum of the seconds of lowering and compilation since it was made; tracing is not counted."""
 
     def __init__(self) -> None:
         self.seconds = 0.0

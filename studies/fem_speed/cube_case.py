@@ -1,4 +1,4 @@
-"""One twisting cube, solved from rest; a process of its own, so that its peak memory is its own.
+"""One twisting cube, solved from rest in a process of its own, whose peak memory is measured.
 
     python cube_case.py CELLS
 
@@ -20,10 +20,10 @@ from emulator.fem import Status
 
 
 def peak_gb() -> float:
-    """Most memory this process ever held.
+    """Peak memory of this process.
 
-    On Linux ``ru_maxrss`` begins at that of the process which started this one; the kernel's own
-    high-water mark begins anew with the program.
+    On Linux ``ru_maxrss`` begins at the value of the parent process; the kernel's high-water mark
+    ``VmHWM`` starts afresh with the program.
     """
     status = Path("/proc/self/status")
     if status.is_file():
@@ -45,7 +45,7 @@ def main() -> None:
     before, compiling = peak_gb(), Compiling()
     scene = em.scenes.twisting_cube(cells=cells)
     simulator = em.Simulator(scene)
-    # Two theta: direct solvers keep factors they have met and would skip the work.
+    # A new theta: direct solvers keep factors of values they have seen.
     first, _ = timed_solve(simulator, scene.centre)
     after_one, compile_s = peak_gb(), compiling.so_far()
     seconds, solution = timed_solve(simulator, scene.centre * jnp.array([1.3, 0.9]))

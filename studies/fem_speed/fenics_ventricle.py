@@ -5,9 +5,9 @@ Run by run.py with an interpreter that has dolfin, which need not be the one of 
     python3 fenics_ventricle.py problem.npz solutions.npz
 
 P1 displacements, one quadrature point, nine equal load steps, dolfin's own Newton solver for
-each: residual below 1e-10 of what it was at the start of the step. The pressure's virtual work is
-that of the deformed normal, ``-p cof(F) N . v``, and is differentiated like everything else. Of
-dolfin's direct solvers, the one that is quickest on a theta of its own is used for the rest.
+each: residual below 1e-10 of its value at the start of the step. The pressure's virtual work uses
+the deformed normal, ``-p cof(F) N . v``, and is differentiated like the other terms. dolfin's
+direct solvers are timed at one extra theta, and the quickest is used for the rest.
 """
 
 import sys
@@ -37,7 +37,7 @@ def mesh_of(problem):
 
 
 def facet_markers(mesh, problem):
-    """Facet function: the pressed facets, and those whose corners are all held."""
+    """Facet function: pressed facets, and facets whose corners are all held."""
     markers = df.MeshFunction("size_t", mesh, 2, 0)
     pressed = {tuple(row) for row in np.sort(problem["facets"], axis=1).tolist()}
     held = set(problem["held"].tolist())
@@ -101,7 +101,7 @@ class Body:
         ) * ds(PRESSED)
         self.tangent = df.derivative(self.residual, self.u, du)
         x = df.SpatialCoordinate(mesh) + self.u
-        # Normals point out of the tissue, into the cavity; the fixed lid drops out of changes.
+        # Normals point out of the tissue, into the cavity; the fixed lid cancels in differences.
         self.enclosed = -df.dot(x, area) / 3.0 * ds(PRESSED)
 
     def solver(self, linear_solver):
@@ -148,7 +148,7 @@ def timed(function, *arguments):
 
 
 def quickest(body, theta):
-    """The direct solver that takes the least time for one body, and all times."""
+    """The direct solver that is quickest on this body, and the times of all."""
     seconds = {}
     for name in SOLVERS:
         if df.has_lu_solver_method(name):

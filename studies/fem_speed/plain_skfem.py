@@ -88,7 +88,7 @@ class Material:
         GG: np.ndarray,
         swapped: np.ndarray,
     ) -> np.ndarray:
-        """Second derivative of ``J^(-2/3) q`` in F, without that of ``q``."""
+        """Second derivative of ``J^(-2/3) q`` in F, without the term with ``q``."""
         mixed = _outer(dq, G)
         mixed = mixed + mixed.transpose(2, 3, 0, 1, *range(4, mixed.ndim))
         return power * (-2.0 / 3.0 * mixed + q * (4.0 / 9.0 * GG + 2.0 / 3.0 * swapped))
@@ -180,7 +180,7 @@ class Body:
         return np.setdiff1d(np.arange(self.basis.N), held)
 
     def fields(self, u: np.ndarray, material: Material) -> Fields:
-        """What the forms integrate, at every quadrature point."""
+        """The integrands of the forms at every quadrature point."""
         stress, elasticity = material.stress_and_elasticity(self.basis.interpolate(u).grad)
         F = IDENTITY + self.facet_basis.interpolate(u).grad
         normals = self.facet_basis.normals
@@ -188,7 +188,7 @@ class Body:
         return Fields(stress, elasticity, area, _turning(F, normals))
 
     def forces(self, fields: Fields, pressure: float) -> tuple[np.ndarray, np.ndarray]:
-        """Internal force, and that of the pressure, over all degrees of freedom."""
+        """Internal force and pressure force over all degrees of freedom."""
         inner = asm(internal, self.basis, stress=fields.stress)
         return inner, -pressure * asm(pressed, self.facet_basis, area=fields.area)
 
@@ -213,7 +213,7 @@ class Body:
     def _walk(self, material: Material, steps: int) -> tuple[np.ndarray, int, bool]:
         u, total = np.zeros(self.basis.N), 0
         for step in range(1, steps + 1):
-            # Only the last step needs to be exact.
+            # Only the last load step needs the tight tolerance.
             tolerance = 1e-10 if step == steps else 1e-2
             u, iterations, converged = self._newton(
                 u, material, self.pressure * step / steps, tolerance
@@ -227,7 +227,7 @@ class Body:
         self, u: np.ndarray, material: Material, pressure: float, tolerance: float
     ) -> tuple[np.ndarray, int, bool]:
         for iteration in range(26):
-            with np.errstate(all="ignore"):  # a step too far shows as NaN
+            with np.errstate(all="ignore"):  # too long a step gives NaN, seen below
                 fields = self.fields(u, material)
                 inner, outer = self.forces(fields, pressure)
                 residual = (inner - outer)[self.free]

@@ -40,12 +40,12 @@ HERE = Path(__file__).parent
 SEED = 7
 PRESSURE = 8.0 * KPA_PER_MMHG
 CUBES = (6, 9, 13, 19, 27)
-AWAY = 0.03  # how far, relatively, the theta of a warm start is from the one to solve
+AWAY = 0.03  # relative distance of the theta of a warm start from the one to solve
 LIMIT = 900.0  # seconds for one cube
 
 
 class Problem(NamedTuple):
-    """A pressurised body: its scene at the fixed pressure, and where that acts."""
+    """A pressurised body: its scene at the fixed pressure, and the facets the pressure acts on."""
 
     name: str
     scene: Scene
@@ -60,7 +60,7 @@ def ventricle(root: Path) -> Problem:
 
 
 def plate() -> Problem:
-    """A small plate held at its sides, pressed from below: the same law without any data."""
+    """A small plate held at its sides, pressed from below: the same law, no released data."""
     mesh = box((10.0, 10.0, 2.0), (4, 4, 2))
     scene = Scene(
         name="pressed_plate",
@@ -81,7 +81,7 @@ def plate() -> Problem:
 
 
 def with_free_pressure(problem: Problem) -> Scene:
-    """The same scene with the pressure as its last parameter, 4 to 10 mmHg."""
+    """The scene with the pressure as its last parameter, 4 to 10 mmHg."""
     pressure = Parameter("pressure", "kPa", 4.0 * KPA_PER_MMHG, 10.0 * KPA_PER_MMHG)
     return dataclasses.replace(
         problem.scene,
@@ -91,7 +91,7 @@ def with_free_pressure(problem: Problem) -> Scene:
 
 
 def arrays(problem: Problem) -> dict[str, Any]:
-    """The problem as plain arrays, for codes that know nothing of ours."""
+    """The problem as plain arrays, for the other codes."""
     scene = problem.scene
     return {
         "nodes": scene.mesh.nodes,
@@ -112,14 +112,14 @@ def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
 
 
 def first_call(function: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
-    """Seconds of the first call, and those of them that JAX compiled."""
+    """Seconds of the first call, and how many of them JAX spent compiling."""
     compiling = Compiling()
     seconds, _ = timed(function, *arguments)
     return seconds, compiling.so_far()
 
 
 def row(name: str, seconds: Iterable[float], converged: Iterable[bool], **more: Any) -> dict:
-    """A case of the study: the median, and the extremes, of single calls."""
+    """A case of the study: median and extremes of the seconds of single calls."""
     seconds, converged = np.asarray(list(seconds)), list(converged)
     failures = len(converged) - sum(converged)
     case = {
@@ -251,7 +251,7 @@ def find_fenics(wanted: str | None) -> str | None:
 
 
 def _plain_environment() -> dict[str, str]:
-    """This process's environment without what belongs to this Python."""
+    """This process's environment without the variables of this Python."""
     ours = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     return {name: value for name, value in os.environ.items() if name not in ours}
 
@@ -259,7 +259,7 @@ def _plain_environment() -> dict[str, str]:
 def fenics(
     problem: Problem, thetas: jax.Array, reference: np.ndarray, python: str | None
 ) -> list[dict]:
-    """FEniCS in its own process, its BLAS on one thread and on as many as it likes."""
+    """FEniCS in its own process, its BLAS on one thread and on its default number."""
     found = find_fenics(python)
     if found is None:
         return [{"name": "FEniCS, cold", "status": "skipped: no interpreter with dolfin found"}]
@@ -281,7 +281,7 @@ def _fenics(
         task, answer = Path(folder) / "problem.npz", Path(folder) / "solutions.npz"
         spare = uniform(problem.scene, 2, jax.random.key(SEED + 1))
         np.savez(task, **arrays(problem), warm_up=spare, theta=thetas[1:])
-        # An empty cache of compiled forms, so that compiling them is seen.
+        # An empty cache of compiled forms, so that their compilation is timed.
         environment = {**_plain_environment(), "DIJITSO_CACHE_DIR": str(Path(folder) / "forms")}
         if threads is not None:
             environment |= {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
@@ -312,9 +312,9 @@ def _fenics(
 
 # ---- the study -------------------------------------------------------------------------------
 def compare(problem: Problem, count: int, python: str | None) -> list[dict]:
-    """Ours, scikit-fem and FEniCS on the same ``count`` theta; one more warms each up."""
+    """Ours, scikit-fem and FEniCS at ``count`` theta, after one that compiles."""
     scene, free_scene = problem.scene, with_free_pressure(problem)
-    # A set of theta for each way of calling: what one has solved is not new to the next.
+    # New theta for each way of calling: factors of solved ones may be kept.
     cold, warm, slope = (
         uniform(body, count + 1, jax.random.key(SEED + number))
         for number, body in enumerate((scene, free_scene, free_scene), start=10)
@@ -344,7 +344,7 @@ def cube(cells: int) -> dict:
     except subprocess.TimeoutExpired:
         return {**failed, "status": f"stopped after {LIMIT:g} s"}
     if done.returncode:
-        # Killed for memory, a process says nothing.
+        # A process killed for its memory prints nothing.
         reason = (done.stderr.strip().splitlines() or ["killed"])[-1]
         return {**failed, "status": f"failed: {reason}"}
     case = {**json.loads(done.stdout.splitlines()[-1]), "problem": "cube", "cells": cells}
@@ -357,7 +357,7 @@ def cube(cells: int) -> dict:
 
 
 def ratios(cases: list[dict]) -> dict[str, float]:
-    """How many times as long as ours each of the others takes from rest."""
+    """Times of the others from rest, as multiples of ours."""
     times = {case["name"]: case["median_s"] for case in cases if "median_s" in case}
     own = times["ours, cold"]
     found = {"scikit-fem": times["scikit-fem + SciPy, cold"] / own}
@@ -423,7 +423,7 @@ def check(cases: list[dict]) -> None:
 
 
 def check_times(found: dict[str, float]) -> None:
-    """Those about time."""
+    """The claims about time."""
     assert found["scikit-fem"] > 10.0
     assert found.get("FEniCS", 20.0) >= 20.0
 

@@ -1,4 +1,4 @@
-"""Error of every method against the number of FEM runs, and what each took."""
+"""Error and seconds of every method against the number of FEM runs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -53,7 +53,7 @@ def design(scene: Scene, count: int) -> jax.Array:
 
 
 class Court:
-    """FEM at the test theta, and the errors of any fields against it."""
+    """FEM solutions at the test theta, and the errors of fields against them."""
 
     def __init__(self, scene: Scene, count: int, series: Expansion) -> None:
         self.scene, self.thetas = scene, sobol(scene, count, TEST_SEED)
@@ -67,14 +67,14 @@ class Court:
             simulator.solve(theta, series(x)).require_converged("test").displacement
             for theta, x in zip(self.thetas, self.positions, strict=True)
         ]
-        self.run_s = (clock() - first) / count  # a mean, with what is still to compile
+        self.run_s = (clock() - first) / count  # a mean, late compilation included
         self.reference = jnp.stack(fields)
         self._cavity = Cavity(scene)
         self._volume = jax.jit(lambda u: self._cavity(u[:, self._cavity.nodes]))
         self.volumes = self._volume(self.reference)
 
     def predict(self, over: Callable[[jax.Array], jax.Array]) -> jax.Array:
-        """Fields (c, n, 3) of a map of positions."""
+        """Fields (c, n, 3) in mm of ``over``, a map of positions in the unit box."""
         return jax.jit(jax.vmap(over))(self.positions)
 
     def errors(self, fields: jax.Array) -> dict[str, dict[str, float]]:
@@ -95,12 +95,12 @@ def accuracy(
     shape: tuple[int, int, int] | None = None,
     keep: Callable[[list[dict]], object] = len,
 ) -> list[dict]:
-    """All rows of one scene; ``keep`` is handed those so far whenever there is one more."""
+    """All rows of one scene; after each new one ``keep`` is called with all so far."""
     scene = scene_of(name, shape)
     thetas = design(scene, max(counts))
     series, ours, expanded, elapsed = our_campaign(scene, thetas, order)
     rival_runs, rival_elapsed = rival_campaign(scene, thetas)
-    # Different starts, one equilibrium: the rival has the very same runs.
+    # Starts differ, but the equilibria are the same: both methods have the same FEM runs.
     gap = jnp.max(jnp.abs(rival_runs.displacement - ours.displacement))
     assert gap < 1e-6 * jnp.max(jnp.abs(ours.displacement)), f"the campaigns differ by {gap} mm"
     court = Court(scene, tests, series)
@@ -169,7 +169,7 @@ def _note_rival(note, court: Court, some: Runs, done: np.ndarray, modes: int) ->
 
 
 def _ablations(court: Court, some: Runs, series: Expansion, base: jax.Array, warp):
-    """What is left of the residual without some of its parts: method, fields, seconds."""
+    """The discrepancy model without some of its parts: method, fields, seconds."""
     scene = court.scene
     for mean_map, below, name in ((series, base, OVER), (None, 0.0, PLAIN)):
         fitted, took = _timed(lambda m=mean_map: plain_kernel(scene, some, series, m))

@@ -1,4 +1,4 @@
-"""The methods compared, and the clock they are timed by."""
+"""The methods compared, and the clock that times them."""
 
 import time
 from collections.abc import Callable
@@ -18,20 +18,20 @@ from emulator.surrogates.discrepancy.kernel import Features, fit_lengths, fit_we
 from emulator.surrogates.pod_gp import ReducedForward, fit_reduced
 from emulator.surrogates.taylor import Expansion, expand
 
-RIVAL_MODES = 40  # more cost scikit-learn time and, by the row with twice as many, gain nothing
-RIVAL_STAGES = (30, 60, 120)  # runs after which its own fit starts the next ones
+RIVAL_MODES = 40  # with twice as many, scikit-learn takes longer and the error is the same
+RIVAL_STAGES = (30, 60, 120)  # runs after which its own fit predicts the starts of the next
 Map = Callable[[jax.Array], jax.Array]
 """Position in the box (p,) to displacement (n, 3) mm."""
 
 
 def clock() -> np.ndarray:
-    """Seconds (2,): the wall's, and this process's on all processors together."""
+    """Seconds (2,): wall clock, and processor time of this process over all cores."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
 @dataclass(frozen=True, eq=False)
 class Clocked(Simulator):
-    """A simulator that notes when it was last done with each theta."""
+    """A simulator that records when it last finished each theta."""
 
     marks: dict[bytes, np.ndarray] = field(default_factory=dict)
 
@@ -46,16 +46,16 @@ class Clocked(Simulator):
         return columns
 
     def elapsed(self, thetas: jax.Array, begin: np.ndarray) -> np.ndarray:
-        """Seconds (c, 2) from ``begin`` until each theta was done with, compilation included."""
+        """Seconds (c, 2) from ``begin`` until each theta was finished, compilation included."""
         return np.stack([self.marks[np.asarray(theta).tobytes()] for theta in thetas]) - begin
 
 
 def our_campaign(
     scene: Scene, thetas: jax.Array, order: int
 ) -> tuple[Expansion, Runs, np.ndarray, np.ndarray]:
-    """Series about the centre, runs with slopes, seconds of the series (2,), until each run (c, 2).
+    """Series about the centre, runs with sensitivities, seconds of the series and until each run.
 
-    The first theta is the centre: its FEM run is the series' own.
+    Seconds have shapes (2,) and (c, 2). The first theta is the centre, whose run is the series'.
     """
     begin = clock()
     simulator = Clocked(scene)
@@ -69,7 +69,7 @@ def our_campaign(
 
 
 def rival_campaign(scene: Scene, thetas: jax.Array) -> tuple[Runs, np.ndarray]:
-    """Runs, and seconds (c, 2) until each; started by the nearest run or by the rival's own fit."""
+    """Runs, and seconds (c, 2) until each; starts are the nearest run or the rival's own fit."""
     begin = clock()
     simulator = Clocked(scene)
     parts: list[Runs] = []
@@ -93,22 +93,22 @@ def fit_rival(scene: Scene, runs: Runs, modes: int = RIVAL_MODES) -> ReducedForw
 
 
 def plain_kernel(scene: Scene, runs: Runs, series: Expansion, mean_map: Map | None) -> Discrepancy:
-    """Our residual with a kernel that knows positions only."""
+    """Our discrepancy model with a kernel of positions only."""
     with patch.object(fit, "_FEATURES", 0):
         return fit_discrepancy(scene, runs, series, mean_map)
 
 
 def unscaled(warp: Warp, features: bool = True) -> Warp:
-    """``warp`` with lengths of one, with its mechanical features or without."""
+    """``warp`` with all lengths 1, with or without its mechanical features."""
     coefficients = warp.coefficients if features else warp.coefficients[:, :0]
     size = len(warp.centre) + coefficients.shape[1]
     return warp._replace(coefficients=coefficients, inverse_lengths=jnp.ones(size))
 
 
 def fit_values(scene: Scene, runs: Runs, warp: Warp, mean_map: Map | None) -> Discrepancy:
-    """Our residual without slopes: the same kernel and likelihood on displacements alone.
+    """Our discrepancy model without sensitivities: its kernel and likelihood, displacements alone.
 
-    warp : of lengths one.
+    warp : features with all lengths 1.
     """
     positions = scene.to_unit(runs.theta)
     fields = np.asarray(runs.displacement)
@@ -125,12 +125,12 @@ def fit_values(scene: Scene, runs: Runs, warp: Warp, mean_map: Map | None) -> Di
     features = Features(known, jnp.zeros((*known.shape, 0)))
     lengths = jnp.asarray(fit_lengths(features, observations[:, :20]))
     scaled = features.scaled(lengths)
-    values, slopes = fold(scaled, fit_weights(scaled, observations))
+    values, derivatives = fold(scaled, fit_weights(scaled, observations))
     return Discrepancy(
         warp._replace(inverse_lengths=lengths),
         scaled.value,
         values,
-        slopes,
+        derivatives,
         jnp.asarray(offset),
         jnp.asarray(modes.reshape(-1, *offset.shape)),
     )

@@ -25,7 +25,7 @@ from emulator.store import write_json
 
 HERE = Path(__file__).parent
 RUNS = [1, 5, 10, 20, 30, 60, 120]
-LONGER = {"left_ventricle": [300, 600, 1200]}  # what three and ten minutes pay for
+LONGER = {"left_ventricle": [300, 600, 1200]}  # FEM runs that three and ten minutes allow
 TESTS = 60
 ORDER = 3
 MESHES = {"mesh_10_20_2": (10, 20, 2), "mesh_22_44_4": (22, 44, 4), "mesh_28_56_6": (28, 56, 6)}

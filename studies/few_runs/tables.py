@@ -1,4 +1,4 @@
-"""What the rows amount to: tables, summary, and the README's claims."""
+"""Tables and summary of the rows, and the README's claims."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -25,7 +25,7 @@ def median(case: dict) -> float:
 
 
 def within(cases: list[dict], scene: str, methods: Iterable[str], budget: float) -> dict | None:
-    """The row with the most runs that ``budget`` seconds pay for."""
+    """The row with the most runs within ``budget`` seconds of processor time."""
     paid = [
         case
         for method in methods
@@ -36,7 +36,7 @@ def within(cases: list[dict], scene: str, methods: Iterable[str], budget: float)
 
 
 def rival_runs(cases: list[dict]) -> float | None:
-    """FEM runs with which the rival is at ``WANTED``, on the line through two rows (log-log)."""
+    """FEM runs the rival needs for ``WANTED``, interpolated log-log between two rows."""
     found = rows(cases, "left_ventricle", RIVAL)
     if len(found) < 2:
         return None
@@ -47,10 +47,10 @@ def rival_runs(cases: list[dict]) -> float | None:
 
 
 def mesh_totals(cases: list[dict]) -> list[dict[str, Any]]:
-    """Nodes and seconds until ``WANTED``: ours as measured, the rival's from its parts.
+    """Nodes and seconds until ``WANTED``: ours as measured, the rival's summed from its parts.
 
-    Those are: compilation and the test runs, as many runs more as it needed on the default mesh
-    (each as long as ours with its slopes, a tenth too long), and its fit of 120 runs there.
+    The parts: compilation and the test runs; further runs up to the number it needs on the default
+    mesh, each as long as ours with sensitivities, a tenth too long; and its fit on that mesh.
     """
     meshes = [case for case in cases if case["kind"] == "mesh"]
     needed = rival_runs(cases)

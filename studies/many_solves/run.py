@@ -44,7 +44,7 @@ def ventricle(published: str | None) -> Scene:
 
 
 def resident() -> float:
-    """Memory this process holds, MB."""
+    """Resident memory of this process, MB."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024.0
@@ -52,7 +52,7 @@ def resident() -> float:
 
 
 def solve_all(scene: Scene, count: int) -> list[dict[str, Any]]:
-    """One case a solve, with the memory held after it."""
+    """One case for each solve, with the memory after it."""
     simulator = em.Simulator(scene)
     thetas = uniform(scene, count, jax.random.key(SEED))
     jax.block_until_ready(simulator.solve(scene.centre))  # compilation

@@ -1,4 +1,4 @@
-"""A ventricle never seen: from its mesh to a usable emulator, and the seconds that takes.
+"""New ventricles: seconds from a mesh to a usable emulator, and its errors.
 
 ``python studies/new_ventricle/run.py [--ventricles N] [--runs N] [--tests N]``. Each ventricle gets
 a process of its own, so that imports and compilation count. Writes results.json and
@@ -38,7 +38,7 @@ VENTRICLES: dict[str, tuple[EllipsoidalWall, tuple[int, int, int], tuple[float, 
 
 
 def ventricle(name: str) -> Scene:
-    """The built-in scene on another body."""
+    """The built-in scene on the mesh and fibres of ``name``."""
     wall, mesh_size, angles = VENTRICLES[name]
     mesh = truncated_ellipsoid(wall, *mesh_size)
     fibres = rule_based_fibres(mesh, angles=angles)
@@ -46,7 +46,7 @@ def ventricle(name: str) -> Scene:
 
 
 def one(name: str, began: float, runs: int, tests: int) -> dict[str, Any]:
-    """Train on one ventricle and judge it by FEM; ``began`` is when its process was asked for."""
+    """Train on one ventricle and compare with FEM; ``began`` is when its process was started."""
     scene = ventricle(name)
     plan = replace(recipe("mechanics"), simulations=runs)
     with tempfile.TemporaryDirectory() as folder:
@@ -81,7 +81,7 @@ def in_its_own_process(name: str, runs: int, tests: int) -> dict[str, Any]:
 
 
 def draw(cases: list[dict[str, Any]], path: Path) -> None:
-    """Seconds to a usable emulator, and the errors it then has."""
+    """Seconds to a usable emulator, and its errors."""
     plt = pyplot()
     figure, panels = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained", sharey=True)
     names = [f"{case['name']}\n{case['nodes']} nodes" for case in cases]

@@ -1,11 +1,11 @@
-"""What a network learns from each training objective, in equally many steps, judged by FEM.
+"""Errors of a network after equally many steps of each training objective, against FEM.
 
     python studies/objectives/run.py [--steps N] [--simulations N] [--tests N]
     python studies/objectives/run.py --quick --out DIR    # a coarse beam, few steps
 
 Each objective is trained in a process of its own, so that compilation and FEM runs count and no
-factor of another's runs is met again. Seconds on the cores depend less than a clock's on what else
-the machine does; both are kept. Writes results.json and objectives.png beside itself, or under
+kept factor of another's runs is used. Processor time depends less than wall-clock time on other
+load of the machine; both are kept. Writes results.json and objectives.png beside itself, or under
 --out, and asserts what the README says.
 """
 
@@ -33,7 +33,7 @@ from emulator.training import Plan, recipe, remove_checkpoint, train
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
-# Our name, the paper's, and a colour.
+# By our name: the paper's name and a colour.
 OBJECTIVES = {
     "simulations": ("DD", "tab:orange"),
     "gradients": ("F-DD", "tab:green"),
@@ -51,14 +51,14 @@ def beam(quick: bool) -> Scene:
 
 
 def plan_of(objective: str, steps: int, simulations: int, quick: bool) -> Plan:
-    """The recipe ``network`` with another objective: same weights, theta and rates for all."""
+    """The recipe ``network`` with ``objective``; initial weights, theta and rates do not differ."""
     plan = replace(recipe("network"), steps=steps, simulations=simulations)
     plan = replace(plan, objective=objective)  # type: ignore[arg-type] - a name of OBJECTIVES
     return replace(plan, batch=8, learning_rate=3e-3) if quick else plan
 
 
 def train_one(scene: Scene, plan: Plan, folder: Path, quick: bool) -> None:
-    """Train and write the emulator to ``folder``, with this process's seconds on the cores."""
+    """Train and write the emulator to ``folder``, with this process's processor time."""
     trained = train(scene, plan, folder, architecture=SMALL if quick else None)
     record = {**trained.record, "processor_s": round(time.process_time(), 1)}
     save_emulator(replace(trained, record=record), folder)
@@ -66,7 +66,7 @@ def train_one(scene: Scene, plan: Plan, folder: Path, quick: bool) -> None:
 
 
 def in_its_own_process(objective: str, folder: Path, arguments: argparse.Namespace) -> None:
-    """:func:`train_one`, with nothing compiled or factorised before."""
+    """:func:`train_one` in a process that has compiled and factorised nothing before."""
     words = ["--one", objective, "--out", str(folder), "--steps", str(arguments.steps)]
     words += ["--simulations", str(arguments.simulations)]
     words += ["--quick"] if arguments.quick else []
@@ -74,7 +74,7 @@ def in_its_own_process(objective: str, folder: Path, arguments: argparse.Namespa
 
 
 def fem_seconds(scene: Scene, plan: Plan) -> float:
-    """On the cores, of the FEM runs that ``plan`` trains on, compilation included."""
+    """Processor time of the FEM runs that ``plan`` trains on, compilation included."""
     thetas = scene.centre[None]
     if plan.runs:
         thetas = jnp.concatenate([thetas, sobol(scene, plan.runs, plan.seed)])
@@ -84,7 +84,7 @@ def fem_seconds(scene: Scene, plan: Plan) -> float:
 
 
 def row(name: str, errors: Errors, **facts: object) -> dict[str, Any]:
-    """A line of the table: quantiles of the four errors, and what it took."""
+    """A row of the table: quantiles of the four errors, and seconds."""
     found = {key: quantiles(errors.fields[key]) for key in LABELS if key in errors.fields}
     told = "  ".join(f"{key} {value['median']:.2e}" for key, value in found.items())
     print(f"{name:22s} {told}", flush=True)
@@ -92,7 +92,7 @@ def row(name: str, errors: Errors, **facts: object) -> dict[str, Any]:
 
 
 def study(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Errors]]:
-    """Train by every objective and judge all by FEM at theta none of them has seen."""
+    """Train by every objective and compare with FEM at theta that none was trained on."""
     scene = beam(arguments.quick)
     plans = {
         objective: plan_of(objective, arguments.steps, arguments.simulations, arguments.quick)
@@ -119,7 +119,7 @@ def study(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str
                 "fem_processor_s": fem["both" if plan.runs else "energy"],
             }
             cases.append(row(objective, errors[objective], **facts))
-    before = replace(trained, network=None)  # of order 0: the centre's solution, whatever theta
+    before = replace(trained, network=None)  # a series of order 0: the centre's solution
     errors[UNTRAINED] = case_errors(before.cache(), known.theta, known.displacement)
     cases.append(row(UNTRAINED, errors[UNTRAINED], fem_runs=1))
     shipped = load("once_clamped_beam")
@@ -134,7 +134,7 @@ def study(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str
 
 
 def draw(errors: dict[str, Errors], path: Path, title: str) -> None:
-    """Densities of the four errors, a curve an objective."""
+    """Densities of the four errors, one curve for each objective."""
     plt = pyplot()
     figure, grid = plt.subplots(2, 2, figsize=(9.5, 6.6), layout="constrained")
     names = [name for name in LABELS if name in errors[UNTRAINED].fields]

@@ -39,7 +39,7 @@ class Case:
     start : (n, 3) mm, or from rest.
     options : controls of the solver.
     inside_jit : whether the call is made inside ``jit``, where nothing can be caught.
-    claim : what should be so of an answer that converged; returns what is wrong, or nothing.
+    claim : what must hold for a converged answer; returns what is wrong, or an empty string.
     """
 
     scene: Scene
@@ -85,7 +85,7 @@ def bar(
     engineering: bool = False,
     **rest: Any,
 ) -> Scene:
-    """A Neo-Hookean bar along x, clamped at its left end unless told otherwise."""
+    """A Neo-Hookean bar along x, by default clamped at its left end."""
     mesh = rest.pop("mesh", None) or box(lengths, cells)
     return Scene(
         name="bar",
@@ -111,7 +111,7 @@ def moved(scene: Scene, ends: dict[str, np.ndarray | tuple[float, float, float]]
 
 
 def jittered(mesh: Mesh, amount: float) -> Mesh:
-    """Inner nodes moved at random, halfway back as often as it takes to keep volumes positive."""
+    """Inner nodes moved at random; moves are halved until all volumes are positive."""
     rng = np.random.default_rng(SEED)
     spacing = np.ptp(mesh.nodes, axis=0).min() / 4
     shift = amount * spacing * rng.uniform(-1.0, 1.0, mesh.nodes.shape)
@@ -454,7 +454,7 @@ def guccione_started_where_exp_overflows() -> Case:
 
 @case("exponentials")
 def guccione_load_at_the_end_of_the_exponent() -> Case:
-    """A traction that only Q near 700 can carry is none: the load is beyond all reason."""
+    """A traction so large that only Q near 700 balances it; no tissue carries it."""
     scene = replace(
         _pulled_fibres("guccione", 1.0, _exponents(20.0, 10.0, 10.0, 100.0)),
         supports=_CLAMPED,
@@ -761,7 +761,7 @@ def springs_1e_3() -> Case:
 
 @case("supports")
 def springs_1e_3_standing() -> Case:
-    """Softer than the body's weight is heavy: it topples and ends up hanging."""
+    """Springs too soft for the body's weight: it topples and ends up hanging."""
     return _on_springs(1e-3, "bottom")
 
 
@@ -851,7 +851,7 @@ def one_cell() -> Case:
 
 @case("meshes")
 def micrometre_and_kilometre() -> Case:
-    """A body of 1e6 mm on a millimetre mesh's tolerances."""
+    """A body of 1e6 mm, with tolerances meant for millimetres."""
     return Case(bar((4e6, 1e6, 1e6), (8, 2, 2), loads=(Gravity(1e-6),)), moduli())
 
 
@@ -1054,13 +1054,13 @@ def theta_too_long() -> Case:
     return replace(_theta(5.0, 5.0, 5.0), claim=lambda _: "accepted three values for two")
 
 
-@cache  # scenes are kept by cases that share one, and compiled once
+@cache  # cases share scenes, and each is compiled once
 def _simulator(scene: Scene, options: NewtonOptions) -> Simulator:
     return Simulator(scene, options)
 
 
 def solve(found: Case) -> tuple[Simulator, Any]:
-    """The answer of the simulator, waited for."""
+    """The simulator's answer, computed when this returns."""
     simulator = _simulator(found.scene, found.options)
     call = jax.jit(simulator.solve) if found.inside_jit else simulator.solve
     solution = call(found.theta, found.start)

@@ -1,12 +1,12 @@
 r"""Whether a displacement is an equilibrium, judged without the solver's code.
 
-Shape functions, quadrature, strain energies and loads are written out again here, from the books
-and not from ``emulator``; the force is the derivative of each element's energy. The tangent's sign,
-extra information, does come from ``emulator``.
+Shape functions, quadrature, strain energies and loads are implemented a second time here, from
+textbooks and not from ``emulator``; the force is the derivative of each element's energy. Only the
+sign of the tangent, which is additional information, comes from ``emulator``.
 
-What counts as wrong in an answer that says it converged: a displacement that is not finite, a
+An answer with status converged is wrong if it has a displacement that is not finite, a
 support not met to the last bit, ``J <= 0`` at a quadrature point, a residual above 1e-6 of the
-forces at work, or a claim of the case itself that fails.
+forces at work, or if a claim of the case fails.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ _TRIANGLE_WEIGHTS = 0.5 * np.array([0.223381589678011] * 3 + [0.109951743655322]
 
 
 class UnknownError(Exception):
-    """A law or a load that is not written out here."""
+    """A law or a load that is not implemented here."""
 
 
 class Judgement(NamedTuple):
-    """What was found; ``wrong`` says in words what is wrong, and is empty when nothing is.
+    """A judged answer; ``wrong`` says in words what is wrong, and is empty if nothing is.
 
     independent : whether the force was this file's own; for laws and loads it does not know, it is
         the derivative of the package's energy.
@@ -103,7 +103,7 @@ def _holzapfel_ogden(F: jax.Array, f: Any, a: Any, b: Any, a_f: Any, b_f: Any, k
 
 
 def _guccione(F: jax.Array, f: Any, C: Any, b_f: Any, b_t: Any, b_fs: Any, kappa: Any) -> jax.Array:
-    # In a frame whose first axis is the fibre; Guccione's Q is blind to turns about it.
+    # In a frame whose first axis is the fibre; Guccione's Q does not depend on turns about it.
     helper = jnp.eye(3)[jnp.argmin(jnp.abs(f))]
     s = jnp.cross(f, helper)
     s = s / jnp.sqrt(jnp.sum(s**2))
@@ -176,7 +176,7 @@ def internal_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
         def one(f: jax.Array, fibre: jax.Array, s: jax.Array) -> jax.Array:
             if scene.regions is None:
                 return law(f, fibre, *arguments)
-            # Split into change of shape and of volume, it has the latter alone where F is even.
+            # At a pure volume change only the volumetric part of the energy is left.
             volume = law(jnp.cbrt(det(f)) * jnp.eye(3), fibre, *arguments)
             return s * (law(f, fibre, *arguments) - volume) + volume
 
@@ -246,9 +246,9 @@ def _collect(scene: Scene, nodes: np.ndarray, local: jax.Array) -> jax.Array:
 
 # ---- judgements --------------------------------------------------------------------------------
 def residual(scene: Scene, u: jax.Array, theta: jax.Array) -> tuple[float, bool]:
-    """Force out of balance over the free components, relative to the forces at work.
+    """Residual over the free components, relative to the forces at work.
 
-    And whether it was found without the package's energy.
+    Also whether it was computed without the package's energy.
     """
     u = jnp.asarray(u)
     try:
@@ -277,7 +277,7 @@ def smallest_volume_ratio(scene: Scene, u: jax.Array) -> float:
 
 
 def judge(scene: Scene, u: jax.Array, theta: jax.Array, claim: str | None = None) -> Judgement:
-    """An answer that says it converged; ``claim`` is what the case itself found wrong."""
+    """Judge an answer that converged; ``claim`` says what the case itself found wrong."""
     if not bool(jnp.all(jnp.isfinite(u))):
         return Judgement(float("nan"), False, float("nan"), "displacement not finite")
     missed = np.abs(np.asarray(u) - scene.held_displacement)[scene.held]

@@ -1,4 +1,4 @@
-"""Hard cases for the simulator: does it converge, or say why not, and never answer wrongly?
+"""Hard cases for the simulator: each must converge or name its failure, never answer wrongly.
 
 Run from anywhere: ``python studies/stability/run.py``. Writes results.json and stability.png beside
 itself and asserts what the README of the study says.
@@ -30,7 +30,7 @@ LIMIT = 120.0  # seconds for one case, compilation and judgement included
 
 
 def outcome(name: str) -> dict[str, Any]:
-    """One case, solved and judged."""
+    """Solve one case and judge its answer."""
     family, make = CASES[name]
     row: dict[str, Any] = {
         "name": name,
@@ -67,7 +67,7 @@ def outcome(name: str) -> dict[str, Any]:
 
 
 def verdict(case: Case, simulator: Any, solution: Any) -> dict[str, Any]:
-    """Whether the answer is what it says it is."""
+    """Judge an answer by what its status claims."""
     u = np.asarray(solution.displacement)
     if not np.isfinite(u).all():
         return {"silent_wrong": True, "note": "displacement not finite"}
@@ -91,13 +91,13 @@ def verdict(case: Case, simulator: Any, solution: Any) -> dict[str, Any]:
 
 # ---- workers -----------------------------------------------------------------------------------
 def work(pipe: Connection) -> None:
-    """Answer names with outcomes until told to stop."""
+    """Receive names of cases and send their outcomes, until ``None`` is received."""
     while (name := pipe.recv()) is not None:
         pipe.send(outcome(name))
 
 
 class Worker:
-    """A process that can be given up when a case hangs; the next case gets a fresh one."""
+    """A process that is killed when a case hangs; the next case gets a new one."""
 
     def __init__(self) -> None:
         self.process: Any = None
@@ -116,7 +116,7 @@ class Worker:
             self.process = None
 
     def run(self, name: str, limit: float) -> dict[str, Any]:
-        """The outcome of ``name``, or that it hung or took the process with it."""
+        """The outcome of ``name``; its status is ``hang`` or ``crash`` where there is none."""
         if self.process is None:
             self.start()
         begin = time.perf_counter()
@@ -205,7 +205,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         for row, shift in zip(found, spread, strict=False):
             colour = "tab:red" if row["silent_wrong"] else "tab:green"
             mark = "x" if row["stable"] is False else "o"
-            # A residual of nothing at all is drawn where round-off is.
+            # A residual of exactly zero is drawn at round-off.
             right.plot(max(row["residual"], 1e-17), height + shift, mark, color=colour, ms=4)
     right.axvline(TOLERANCE, color="tab:red", lw=1)
     right.set(xscale="log", xlabel="residual, judged independently (x: a saddle, not a minimum)")

@@ -1,4 +1,4 @@
-"""Transfer: a network trained on other ventricles, on one that none of them is (App. E).
+"""Transfer: a network trained on a family of ventricles, on a new one (App. E of the paper).
 
 ``python studies/transfer/run.py [--quick] [--one]``. Trains one network on a family of ventricles,
 then trains on a ventricle of another shape and another mesh, from scratch and from the family, each
@@ -35,8 +35,8 @@ from emulator.training.step import predictor
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
 FAMILY_SEED = 11
-# Of the family: ranges of short and long semi-axis inside, thickness at the equator and at the
-# apex, height of the base; mm. The ventricle never seen lies inside them, on no member.
+# Ranges of the family in mm: short and long semi-axis inside, thickness at the equator and at the
+# apex, height of the base. The new ventricle lies inside them and is no member.
 LOW, HIGH = (18.0, 48.0, 8.0, 5.5, 14.0), (29.0, 66.0, 13.0, 9.0, 22.0)
 UNSEEN = (26.0, 52.0, 35.5, 59.0, 17.0)
 MESHES = {"family": (6, 12, 2), "unseen": (7, 14, 2)}  # rings, around, layers
@@ -57,7 +57,7 @@ def family(count: int, mesh: tuple[int, int, int]) -> list[Scene]:
 
 
 def judge(problem: Problem, known: Runs) -> Callable[[Any], dict[str, Any]]:
-    """Weights to err_u in mm and err_V in percent over the ``known`` FEM solutions."""
+    """Function of weights: err_u in mm and err_V in percent at the ``known`` FEM solutions."""
     scene = problem.emulator.scene
     cavities = [Cavity(scene, name) for name in cavity_sets(scene)]
     predict = predictor(problem.emulator)
@@ -87,7 +87,7 @@ def steps_from(problem: Problem, start: Emulator, total: int) -> tuple[Any, floa
 
 
 def mechanics(scene: Scene, runs: int, known: Runs) -> dict[str, Any]:
-    """What a user should take: the recipe without a network, on the same ventricle."""
+    """The recipe without a network on the same ventricle, for comparison."""
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         forward = train(scene, replace(recipe("mechanics"), simulations=runs), folder).cache()
@@ -111,7 +111,7 @@ def curves(
     longest: int,
     report: Callable[[Any], dict[str, Any]],
 ) -> list[dict[str, Any]]:
-    """One case a start and a number of steps; the longest from scratch alone."""
+    """One case for each start and number of steps; the longest from scratch only."""
     plan = [(start, steps) for steps in (0, *budgets) for start in starts] + [("scratch", longest)]
     cases = []
     for start, steps in plan:
@@ -134,7 +134,7 @@ def curves(
 
 
 def draw(cases: list[dict[str, Any]], path: Path) -> None:
-    """Median errors against the number of steps, one line a start."""
+    """Median errors against the number of steps, one line for each start."""
     plt = pyplot()
     figure, panels = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     by_hand = next(case for case in cases if case["name"] == "mechanics")

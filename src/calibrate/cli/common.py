@@ -1,4 +1,4 @@
-"""What the commands share."""
+"""Helpers that all commands use."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ DONE, FAILED, BAD_INPUT = 0, 1, 2
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose complaints are one line."""
+    """An argument parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Leave with the message as an :class:`InputError`."""
+        """Raise the message as an :class:`InputError`."""
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
@@ -76,12 +76,12 @@ def check_vtu(path: str) -> None:
 
 
 def emit(result: Any, *, as_json: bool, text: str) -> None:
-    """Print ``result`` as JSON or ``text`` for people."""
+    """Print ``result`` as JSON, or ``text``."""
     print(to_json(result) if as_json else text)
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Columns aligned: the first to the left, numbers to the right."""
+    """A table in text: the first column aligned to the left, the others to the right."""
     lines = [list(header), *([_cell(value) for value in row] for row in rows)]
     widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
     out = []
@@ -99,5 +99,5 @@ def _cell(value: object) -> str:
 
 
 def show_progress(arguments: argparse.Namespace) -> bool:
-    """Progress bars unless JSON is asked for or nobody is watching."""
+    """Whether to show progress bars: without ``--json`` and on a terminal."""
     return not arguments.json and sys.stderr.isatty()

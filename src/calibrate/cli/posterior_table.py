@@ -1,4 +1,4 @@
-"""A posterior's parameter table and verdict, for people."""
+"""A posterior's parameter table and verdict as text."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from calibrate.cli.common import table
 
 
 def summary(report: dict[str, Any]) -> str:
-    """The parameter table and the verdict for people."""
+    """The parameter table and the verdict as text."""
     parameters = report["parameters"]
     columns = ["mean", "sd", "low", "high", "r_hat", "ess_bulk"]
     titles = ["mean", "sd", "5 %", "95 %", "R-hat", "ESS"]

@@ -1,4 +1,4 @@
-"""The picture of a beam's calibration."""
+"""The figure of a beam's calibration."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def beam_figure(
     Parameters
     ----------
     truth : (n, 3) mm, the displacement the data was made from.
-    theta : the parameters behind it.
+    theta : the true parameters by name.
     """
     plt = pyplot()
     fields = displacement_draws(posterior)
@@ -49,7 +49,7 @@ def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.n
 
     mesh = posterior.model.forward.scene.mesh
     face = mesh.nodes[:, 1] == mesh.nodes[:, 1].min()
-    mean, spread = fields.mean(axis=0), np.sqrt(fields.var(axis=0, ddof=1).sum(axis=-1))
+    mean, sd = fields.mean(axis=0), np.sqrt(fields.var(axis=0, ddof=1).sum(axis=-1))
     edges = mesh_edges(mesh.elements)
     edges = edges[face[edges].all(axis=1)]
     for displacement, colour, label in (
@@ -64,7 +64,7 @@ def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.n
     scatter = axes.scatter(
         place[:, 0],
         place[:, 2],
-        c=spread[face],
+        c=sd[face],
         cmap="viridis",
         s=26,
         zorder=3,

@@ -1,4 +1,4 @@
-"""What all pictures of posteriors share."""
+"""Helpers that all figures of posteriors use."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def displacement_part(posterior: Posterior) -> DisplacementPoints:
 def title_and_save(
     figure: Figure, posterior: Posterior, certificate: Certificate, path: str | Path
 ) -> None:
-    """Say whose posterior it is and what FEM says of it, write the picture, close it."""
+    """Add a title with scene, forward map and verdict; write the figure and close it."""
     figure.suptitle(
         f"{posterior.model.forward.scene.name}: posterior by {posterior.model.forward.kind}, "
         f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"

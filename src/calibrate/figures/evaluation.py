@@ -1,4 +1,4 @@
-"""Pictures of a forward map's errors, after Figs. 5 to 13 of Dalton et al. (2023)."""
+"""Figures of a forward map's errors, after Figs. 5 to 13 of Dalton et al. (2023)."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ LABELS = {
     "err_V": "error in cavity volume (%)",
 }
 _INSIDE, _OUTSIDE = "tab:blue", "tab:orange"
-_MOST = 20_000  # values a density is estimated from; more change nothing one can see
-# Each quadratic facet (corners, then middles of edges 01, 12, 20) as four flat ones.
+_MOST = 20_000  # values that a density is estimated from; more do not change the curve visibly
+# Nodes of a quadratic facet (corners, then middles of edges 01, 12, 20) as four flat triangles.
 _QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 
 
@@ -89,7 +89,7 @@ def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> No
             axes.axvline(found[name], color=colour, ls=style, lw=1.2, label=line)
     curve = log_density(values)
     if curve is None:
-        return  # one value: the lines say it all
+        return  # all values are alike: no density to draw
     at, density = curve
     axes.plot(at, density, color=colour, lw=1.5)
     axes.fill_between(at, density, color=colour, alpha=0.2, lw=0)
@@ -97,7 +97,7 @@ def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> No
 
 def log_density(values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Errors (300,) and the density of ``log10(values)`` there; ``None`` where all are alike."""
-    positive = values[values > 0.0]  # held nodes have no error, and no logarithm
+    positive = values[values > 0.0]  # held nodes have zero error, without a logarithm
     logs = np.log10(positive[:: max(1, len(positive) // _MOST)])
     if len(logs) < 2 or np.ptp(logs) < 1e-6:
         return None
@@ -110,7 +110,7 @@ def log_density(values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 # ---- over the parameters ----------------------------------------------------------------------
 def parameter_figure(scene: Scene, inside: Errors, outside: Errors | None, title: str) -> Any:
-    """Median err_u of each case over parameter space: a map of two, or one panel a parameter."""
+    """Median err_u of each case over theta: a map of two parameters, else a panel for each."""
     groups = [(inside, "o", "inside the box")]
     if outside is not None:
         groups.append((outside, "D", "outside"))
@@ -239,7 +239,7 @@ def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
             axis = (axes.xaxis, axes.yaxis, axes.zaxis)[k]
             getattr(axes, f"set_{name}lim")(nodes[:, k].min(), nodes[:, k].max())
             axis.set_major_locator(MaxNLocator(4))
-            if thin[k]:  # its numbers would lie on top of one another
+            if thin[k]:  # tick labels would overlap
                 axis.set_major_formatter(NullFormatter())
             else:
                 getattr(axes, f"set_{name}label")(f"{name} (mm)", labelpad=14 if thin.any() else 4)

@@ -1,4 +1,4 @@
-"""The picture of a ventricle's calibration."""
+"""The figure of a ventricle's calibration."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def ventricle_figure(
     Parameters
     ----------
     truth : (n, 3) mm, the displacement the data was made from.
-    theta : the parameters behind it.
+    theta : the true parameters by name.
     """
     plt = pyplot()
     fields = displacement_draws(posterior)
@@ -59,12 +59,12 @@ def _draw_body(figure: Any, posterior: Posterior, fields: np.ndarray) -> None:
 
     mesh = posterior.model.forward.scene.mesh
     mean = mesh.nodes + fields.mean(axis=0)
-    spread = np.sqrt(fields.var(axis=0, ddof=1).sum(axis=-1))
+    sd = np.sqrt(fields.var(axis=0, ddof=1).sum(axis=-1))
     middle = mesh.nodes[mesh.corners].mean(axis=1)
     facets = boundary_facets(mesh.elements[middle[:, 1] > 0.0])[:, :3]
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
     body = Poly3DCollection(
-        mean[facets], array=spread[facets].mean(axis=1), cmap="viridis", edgecolor="0.3", lw=0.15
+        mean[facets], array=sd[facets].mean(axis=1), cmap="viridis", edgecolor="0.3", lw=0.15
     )
     axes.add_collection3d(body)
     observe = displacement_part(posterior)

@@ -1,4 +1,4 @@
-"""Verification: measured, reference, tolerance, source."""
+"""Verification of the mechanics: tables of measured value, reference, tolerance and source."""
 
 from calibrate.verify.cases import CASES
 from calibrate.verify.released import verify_published

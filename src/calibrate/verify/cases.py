@@ -1,4 +1,4 @@
-"""The named cases of ``calibrate verify``; each gives rows."""
+"""The cases of ``calibrate verify`` by name; each returns rows of the table."""
 
 from __future__ import annotations
 

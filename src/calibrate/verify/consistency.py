@@ -1,4 +1,4 @@
-"""What must hold exactly whatever the law: patches, rigid motions, closed surfaces, slopes."""
+"""Checks that hold for every law: patch test, rigid motions, closed surfaces, derivatives."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def block(form: str) -> Scene:
 
 
 def verify_patch() -> list[Row]:
-    """An affine displacement of the surface is an affine displacement throughout."""
+    """With an affine displacement prescribed on the surface, the whole field is affine."""
     H = 0.2 * np.random.default_rng(0).normal(size=(3, 3))
     rows = []
     for form in FORMS:
@@ -59,7 +59,7 @@ def verify_patch() -> list[Row]:
 
 
 def verify_invariance() -> list[Row]:
-    """Rigid rotations cost nothing, laws do not see them, closed surfaces push nowhere."""
+    """Rigid rotations store no energy; laws do not depend on the frame; closed surfaces balance."""
     return [*_rotated_blocks(), *_rotated_points(), *_closed_surfaces()]
 
 
@@ -76,7 +76,7 @@ def _rotated_blocks() -> list[Row]:
         scene = block(form)
         u = jnp.asarray(scene.mesh.nodes @ (_rotation() - np.eye(3)).T)
         energy, force = jax.jit(jax.value_and_grad(strain_energy(scene)))(u, scene.centre)
-        # What the block would store, and be held by, at strains of order one.
+        # Energy and force are compared with mu V and mu V^(2/3), their sizes at strains of one.
         mu, volume = float(scene.centre[0]), float(scene.discretisation.weights.sum())
         name = f"rigid rotation, {form}"
         rows.append(
@@ -120,7 +120,7 @@ def _closed_surfaces() -> list[Row]:
 
 
 def verify_derivatives() -> list[Row]:
-    """Taylor: what is left after the first derivative falls with the square of the step."""
+    """Taylor: the remainder after the first derivative falls with the square of the step."""
     return [row for form in FORMS for row in _taylor(form)]
 
 
@@ -139,11 +139,11 @@ def _taylor(form: str) -> list[Row]:
     work = jnp.vdot(residual(u), system.restrict(v))
     direction = jnp.array([1.0, -2.0])
     moved = jax.jit(lambda t: simulator.solve(t).displacement)
-    solution, slope = jax.jvp(moved, (theta,), (direction,))
+    solution, sensitivity = jax.jvp(moved, (theta,), (direction,))
     checks: Sequence[tuple[str, Callable, float]] = (
         ("energy", lambda h: energy(u + h * v) - energy(u) - h * work, 1e-2),
         ("residual", lambda h: residual(u + h * v) - residual(u) - h * along, 1e-2),
-        ("du/dtheta", lambda h: moved(theta + h * direction) - solution - h * slope, 2.0),
+        ("du/dtheta", lambda h: moved(theta + h * direction) - solution - h * sensitivity, 2.0),
     )
     return [
         Row(f"Taylor, {form}: order of {name}", _order(left, first), 2.0, 0.1, "theory")
@@ -152,7 +152,7 @@ def _taylor(form: str) -> list[Row]:
 
 
 def _order(left: Callable, first: float) -> float:
-    """Slope of log remainder over log step."""
+    """Exponent with which the remainder falls: the slope of its logarithm over the step's."""
     steps = first / 2.0 ** np.arange(5)
     sizes = [float(jnp.linalg.norm(jnp.atleast_1d(left(step)).ravel())) for step in steps]
     return float(np.polyfit(np.log(steps), np.log(sizes), 1)[0])

@@ -32,7 +32,7 @@ _INCOMPRESSIBLE = (
 
 def membrane(cells: int, nu: float, form: Literal["P1", "P2", "mean"]) -> Scene:
     """One layer of cells, held at its left edge and everywhere in z."""
-    # As thick as a cell is wide, for well-shaped tetrahedra.
+    # The thickness is a cell's width, for well-shaped tetrahedra.
     thickness = 48.0 / cells
     if form == "P1":
         mesh = _parallel_diagonals(cells, thickness)
@@ -51,7 +51,11 @@ def membrane(cells: int, nu: float, form: Literal["P1", "P2", "mean"]) -> Scene:
 
 
 def _parallel_diagonals(cells: int, thickness: float) -> Mesh:
-    """Linear cells all cut the same way; cut by both diagonals, as others are, they hardly lock."""
+    """A linear mesh whose cells are all cut the same way, so that it locks.
+
+    Cells cut by both diagonals hardly do (docs/experiments.md, "Linear tetrahedra do not always
+    lock").
+    """
     square = box((1.0, 1.0, thickness), (cells, cells, 1))
     x, y, z = square.nodes.T
     nodes = np.column_stack([48.0 * x, 44.0 * x + y * (44.0 - 28.0 * x), z])
@@ -67,7 +71,7 @@ def deflection(scene: Scene) -> float:
 
 
 def verify_cook() -> list[Row]:
-    """Deflections, and P1 locking beside the form that does not."""
+    """Deflections of the forms that do not lock, and of P1, which does."""
     quadratic, mixed = deflection(membrane(8, 0.3, "P2")), deflection(membrane(8, 0.3, "mean"))
     near, nearer = (deflection(membrane(16, nu, "mean")) for nu in (0.4999, 0.49999))
     locked = deflection(membrane(16, 0.4999, "P1"))

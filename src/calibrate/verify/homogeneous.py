@@ -2,11 +2,12 @@ r"""Uniaxial and equibiaxial stretch of a cube: the solution of every law in clo
 
 The cube's edges, its fibres along x and its sheets along y, are the principal axes, so that a law
 is a function of three stretches and the first Piola stress is diagonal,
-:math:`P_i = \partial W/\partial\lambda_i`. What is not pulled is free, :math:`P_i = 0`: one
-equation for the lateral stretch; two for both of them where there are sheets.
+:math:`P_i = \partial W/\partial\lambda_i`. Directions that are not pulled are free,
+:math:`P_i = 0`. Under uniaxial stretch this is one equation for both lateral stretches; with sheets
+the two differ, and there are two equations.
 
-The formulas below are written out by hand in NumPy, for comparison with the laws: they share no
-code with them. :func:`verify_homogeneous` solves the same cubes by finite elements.
+The formulas below are written out by hand in NumPy and share no code with the laws they are
+compared with. :func:`verify_homogeneous` solves the same cubes by finite elements.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def uniaxial(law: str, stretch: float, values: Values) -> Homogeneous:
     stress = PRINCIPAL_STRESS[law]
 
     def across(z: float) -> float:
-        """The stretch along y, the sheets, that leaves no stress there."""
+        """The stretch along y (the sheets) at which the stress along y vanishes."""
         return _root(lambda y: float(stress(np.array([stretch, y, z]), values)[1]))
 
     return _solve(law, values, lambda free: (stretch, across(free), free))
@@ -66,7 +67,7 @@ def _solve(
 
 
 def _root(stress: Callable[[float], float]) -> float:
-    """The stretch at which a stress that grows with it vanishes."""
+    """The stretch at which ``stress``, which grows with it, is zero."""
     low = high = 1.0
     while stress(low) > 0.0:
         low *= 0.95
@@ -170,7 +171,7 @@ PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
     "guccione": guccione,
 }
 
-# Stiff enough to volume change to be like tissue, and with every term at work.
+# Every term of each law contributes, and volume changes are resisted as in tissue.
 PARAMETERS: dict[str, dict[str, float]] = {
     "neo_hookean": {"mu": 10.0, "lam": 30.0},
     "neo_hookean_E_nu": {"E": 30.0, "nu": 0.4},
@@ -192,7 +193,7 @@ PARAMETERS: dict[str, dict[str, float]] = {
 }
 
 STRETCHES = (0.85, 1.2)
-_TOLERANCE = 1e-8  # of the stress; the solver leaves 1e-10
+_TOLERANCE = 1e-8  # relative to the closed form; the solver leaves 1e-10
 _SOURCE = "closed form in principal stretches, written out in calibrate.verify.homogeneous"
 
 

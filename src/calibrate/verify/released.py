@@ -21,23 +21,25 @@ _SOURCE = (
 )
 DISPLACEMENT_TOLERANCE = 1e-8
 ENERGY_TOLERANCE = 1e-10
-# Its fibres were stored in float32, and FEniCS took 150 load steps to get there.
+# The released ventricle has fibres in float32 and was solved by FEniCS in 150 load steps.
 VENTRICLE_ENERGY_TOLERANCE = 1e-6
-BALANCE_TOLERANCE = 1e-6  # what FEniCS' stopping rule leaves; ours leaves 1e-11
+# Relative residual that FEniCS' stopping rule may leave; ours leaves 1e-11
+# (docs/experiments.md, "The stopping rule of the released solutions").
+BALANCE_TOLERANCE = 1e-6
 
 
 def verify_published(root: str | Path, *, most: int | None = None) -> list[Row]:
     """Largest relative errors over all test cases of every released model in ``root``.
 
     The released solutions end where FEniCS stopped, some with a visible force out of balance. The
-    comparison therefore stops by the same rule, :func:`fenics_tolerance`; how far from balance the
-    stored fields are is a row of its own.
+    comparison therefore stops by the same rule, :func:`fenics_tolerance`; the residual of the
+    stored fields is a row of its own.
 
     Parameters
     ----------
     root : folder of the release's data, ``<root>/<model>/geometryData`` and so on; models that
         are not there are left out.
-    most : cases of each model to look at; all by default.
+    most : cases of each model to compare; all by default.
 
     Raises
     ------
@@ -57,8 +59,9 @@ def fenics_tolerance(scene: Scene, model: str) -> float:
 
     FEniCS' Newton solver stops at a fraction of its first residual, whose entries are the forces
     where free and :math:`-\bar u` where held, in the model's own units. The fraction is not in the
-    release; 1e-8 is read off its fields: with it every stored field is our iterate to round-off,
-    while at FEniCS' default, 1e-9, most cubes would have taken one iteration more.
+    release; 1e-8 is inferred from its fields: with it every stored field is one of our iterates to
+    round-off, while at FEniCS' default, 1e-9, most cubes would have taken one iteration more
+    (docs/experiments.md, "The stopping rule of the released solutions").
     """
     unit = units(model)
     force = unit.stress * unit.length**2
@@ -84,7 +87,7 @@ def _verify_model(root: str | Path, model: str, most: int | None) -> list[Row]:
         tolerance = VENTRICLE_ENERGY_TOLERANCE if ventricle else ENERGY_TOLERANCE
         add("relative energy error", jnp.abs(runs.energy / energies - 1.0), tolerance)
         return rows
-    # Newton to the letter: the stored fields are where its iterates stopped.
+    # A new tangent in every iteration: the stored fields are iterates of plain Newton.
     options = NewtonOptions(absolute=fenics_tolerance(scene, model), keep_tangent=0.0)
     simulator = Simulator(scene, options)
     solution = simulator.campaign(thetas).require_converged(model)

@@ -22,7 +22,7 @@ class Row:
 
     @property
     def passed(self) -> bool:
-        """Whether the measured value is within its tolerance; NaN never is."""
+        """Whether the measured value is within its tolerance; False for NaN."""
         return abs(self.measured - self.reference) <= self.tolerance
 
     def to_json(self) -> dict[str, Any]:

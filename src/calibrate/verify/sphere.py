@@ -7,7 +7,7 @@ With the hoop stretch :math:`\lambda = r/R`, incompressibility gives
 .. math:: p = \mu\,[f(\lambda_b) - f(\lambda_a)], \qquad
           f(\lambda) = \frac{2}{\lambda} + \frac{1}{2\lambda^4} .
 
-The pressure has a maximum; loads below it are checked.
+The pressure has a maximum; the loads checked are below it.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def verify_sphere() -> list[Row]:
 
 
 def verify_pressure_work() -> list[Row]:
-    """Force of a pressure along a uniform swelling by ``lambda``, over that of ``p dV``."""
+    """Work of a pressure in a uniform swelling, exact and as released, over ``p dV``."""
     rows = []
     for stretch in (1.1, 1.5, 2.0):
         exact = _work_ratio(CavityPressure("inner", 1.0), stretch)
@@ -95,10 +95,11 @@ def verify_pressure_work() -> list[Row]:
 
 
 def _work_ratio(load: CavityPressure | PublishedPressure, stretch: float) -> float:
+    """Derivative of the load's work in ``stretch``, a uniform swelling, over ``p dV``."""
     scene = replace(sphere_scene((4, 2), 1.0, order=1), loads=(load,))
     term = load.term(scene.discretisation)
     X = jnp.asarray(scene.mesh.nodes)
-    slope = jax.grad(lambda value: term.total((value - 1.0) * X, {}))
+    derivative = jax.grad(lambda value: term.total((value - 1.0) * X, {}))
     facets = scene.mesh.nodes[scene.mesh.facet_set("inner")]
     cone = -np.einsum("ki,ki->", facets[:, 0], np.cross(facets[:, 1], facets[:, 2])) / 6.0
-    return float(-slope(stretch) / (3.0 * stretch**2 * cone))
+    return float(-derivative(stretch) / (3.0 * stretch**2 * cone))

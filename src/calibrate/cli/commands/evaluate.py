@@ -68,7 +68,7 @@ def save(evaluated: Evaluated, folder: str | Path) -> list[Path]:
 
 
 def summary(report: Mapping[str, Any]) -> str:
-    """The tables for people."""
+    """The tables of errors as text."""
     lines = [_table(report, f"{report['cases']} cases")]
     lines.append(f"forward map: {report['label']}, reference: {report['reference']}")
     if report["invalid"]:

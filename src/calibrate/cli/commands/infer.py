@@ -73,9 +73,10 @@ def _add_noise(parser: argparse.ArgumentParser) -> None:
 
 
 def noise_by_name(words: list[str], option: str) -> dict[str, float] | float:
-    """Numbers by observation; a bare number alone is left as it is, for the data to name.
+    """Numbers by the observation's name, from ``name=number`` words and bare numbers.
 
-    Beside named ones, a bare number is the displacements'.
+    A single bare number is returned as it is: which observation it belongs to depends on the data.
+    Beside named numbers, a bare one is the displacements'.
     """
     bare = [word for word in words if "=" not in word]
     if len(bare) > 1:

@@ -134,7 +134,7 @@ def error_of(estimate: ErrorEstimate) -> dict[str, Any]:
 
 
 def summary(result: dict[str, Any]) -> str:
-    """The result for people."""
+    """The result as text."""
     largest = result["max_displacement"]
     lines = [
         f"{result['scene']}: largest displacement {largest:.6g} mm"

@@ -30,7 +30,7 @@ def register(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Solve at one theta and say how it went."""
+    """Solve at one theta and print status and key figures."""
     import numpy as np
 
     from emulator.catalogue import find_scene
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     solution = simulator.solve(theta)
     status = Status(int(solution.status))
     J = np.asarray(volume_ratio(scene, solution.displacement))
-    # A pressure that follows an open patch has no potential.
+    # A follower pressure on an open patch has no potential energy.
     open_patch = not all(load.has_potential for load in scene.loads)
     energy = None if open_patch else float(potential_energy(scene)(solution.displacement, theta))
     stable = None

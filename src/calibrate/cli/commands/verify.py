@@ -13,7 +13,7 @@ from emulator.errors import InputError
 if TYPE_CHECKING:
     from calibrate.verify import Row
 
-# Named here too, so that --help needs no imports; a test compares them with calibrate.verify.CASES.
+# Listed here too, so that --help needs no imports; a test compares them with verify.CASES.
 CASE_NAMES = (
     "patch",
     "invariance",
