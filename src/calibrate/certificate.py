@@ -38,6 +38,9 @@ _NO_TAIL = 2.0
 LARGEST_R_HAT = 1.05
 
 
+_DRAWS = 200  # checked by default
+
+
 @dataclass(frozen=True)
 class Certificate:
     """Outcome of a check against FEM.
@@ -147,11 +150,11 @@ def _shift(mean: dict[str, float], draws: dict[str, np.ndarray]) -> dict[str, fl
 
 
 def certify(
-    posterior: Posterior, simulator: Simulator, *, draws: int = 200, progress: bool = False
+    posterior: Posterior, simulator: Simulator, *, draws: int | None = None, progress: bool = False
 ) -> Certificate:
     """Check ``posterior`` against FEM at ``draws`` of its draws, evenly spaced along the chains.
 
-    Each FEM solve starts from the cheap map's own prediction.
+    By default at 200 of them, or at all where there are fewer. Each FEM solve starts from the cheap map's own prediction.
 
     Raises
     ------
@@ -163,6 +166,7 @@ def certify(
         raise InputError("certify: the simulator's scene is not the posterior's")
     everything = posterior.draws()
     available = len(next(iter(everything.values())))
+    draws = min(_DRAWS, available) if draws is None else draws
     if not 25 <= draws <= available:
         raise InputError(f"certify: {draws} draws asked for; give 25 to {available}")
     rows = np.linspace(0, available - 1, draws).astype(int)

@@ -227,7 +227,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
 
 
 def certify_and_keep(
-    posterior: Posterior, folder: str | Path, *, draws: int = 200, progress: bool = False
+    posterior: Posterior, folder: str | Path, *, draws: int | None = None, progress: bool = False
 ) -> Certificate:
     """Check a posterior against FEM and write certificate.json."""
     simulator = simulator_of(posterior.model.forward.scene)

@@ -13,7 +13,7 @@ def register(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser("certify", help="check a posterior against FEM")
     parser.add_argument("folder", metavar="DIR", help="written by calibrate infer")
-    parser.add_argument("--draws", type=int, default=200, help="FEM runs")
+    parser.add_argument("--draws", type=int, help="FEM runs (default 200, or all draws)")
     add_json(parser)
     parser.set_defaults(run=run)
 
