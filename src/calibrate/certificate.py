@@ -154,7 +154,8 @@ def certify(
 ) -> Certificate:
     """Check ``posterior`` against FEM at ``draws`` of its draws, evenly spaced along the chains.
 
-    By default at 200 of them, or at all where there are fewer. Each FEM solve starts from the cheap map's own prediction.
+    By default at 200 of them, or at all where there are fewer. Each FEM solve starts from the cheap
+    map's own prediction.
 
     Raises
     ------
