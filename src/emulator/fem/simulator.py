@@ -74,8 +74,7 @@ class Simulator:
 
         What this cannot exclude: a ``start`` close to another equilibrium leads there in a few
         good steps, or is one already; a path that jumps where it loses stability may jump
-        elsewhere with other load steps; and under ``jit`` only directions that climb the potential
-        show that a tangent is indefinite. ``NewtonOptions.load_steps`` follows the path in small
+        elsewhere with other load steps. ``NewtonOptions.load_steps`` follows the path in small
         steps, whatever the start.
 
         The displacement is differentiable in ``theta``. Never raises on a hard case: read
