@@ -16,6 +16,9 @@ from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.protocol import ForwardMap
 from emulator.surrogates.registry import build_forward, full_options
 
+OUR_FEM = "fem"
+"""What to evaluate against, unless it is the folder of a released model."""
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -31,7 +34,7 @@ class Evaluation:
     """
 
     emulator: str
-    against: str = "fem"
+    against: str = OUR_FEM
     cases: int = 50
     outside: float | None = None
     forward: str = "emulator"
@@ -39,7 +42,7 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         full_options(self.forward, self.forward_options)
-        if self.outside is not None and self.against != "fem":
+        if self.outside is not None and self.against != OUR_FEM:
             raise InputError("outside: nothing was released outside the box; use --against fem")
         if self.outside is not None and not 0.0 < self.outside < float("inf"):
             raise InputError(f"outside is {self.outside}; give a fraction above 0, e.g. 0.25")
@@ -68,7 +71,7 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
     emulator = load(plan.emulator)
     scene = emulator.scene
     simulator = Simulator(scene)  # shared by references and forward map: it compiles once
-    if plan.against == "fem":
+    if plan.against == OUR_FEM:
         reference = fem_reference(simulator, plan.cases, progress=progress)
     else:
         reference = published_reference(scene, plan.against, progress=progress)

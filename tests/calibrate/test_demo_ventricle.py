@@ -44,6 +44,7 @@ def folder(setting, tmp_path_factory):
     return tmp_path_factory.mktemp("ventricle")
 
 
+@pytest.mark.slow
 def test_the_demo_finds_the_truth_and_says_what_it_does_not_know(folder, capsys):
     code = main(["demo", "--scene", "left_ventricle", "--out", str(folder), "--json"])
     report = json.loads(capsys.readouterr().out)

@@ -160,19 +160,27 @@ class LoadingPath:
         route = jnp.where(lost, self._next(state.route), state.route)
         u = jnp.where(lost, 0.0, mip.u)
         enter = lambda: self._enter(after, u, route, lost)  # noqa: E731
-        return jax.lax.cond(lost | found, enter, lambda: after)
+        return self._limited(jax.lax.cond(lost | found, enter, lambda: after))
 
     def newton_step(self, state: PathState) -> PathState:
         """One iteration of Newton's method."""
         newton = self._newton.step(state.newton)
         after = state._replace(newton=newton)
-        failed = ~newton.running & (newton.status != Status.CONVERGED)
+        ended = (newton.status == Status.CONVERGED) | (newton.status == Status.ITERATION_LIMIT)
+        failed = ~newton.running & ~ended
         # A level that failed is followed by a lower one.
         astray = failed | ~newton.convex | (newton.level < 1.0)
         astray |= newton.running & (newton.at_level >= _SHORT)
         return jax.lax.cond(
             astray & (state.route < Route.CLIMB), self.give_up, lambda state: state, after
         )
+
+    def _limited(self, state: PathState) -> PathState:
+        """The state, ended where all iterations are spent."""
+        newton = state.newton
+        spent = newton.running & (newton.iterations >= self.options.max_iterations)
+        status = jnp.where(spent, Status.ITERATION_LIMIT, newton.status)
+        return state._replace(newton=newton._replace(status=status.astype(newton.status.dtype)))
 
     def give_up(self, state: PathState) -> PathState:
         """The state at the beginning of the next route."""

@@ -150,6 +150,7 @@ class Scene:
     def _check_supports(self) -> None:
         if not self.supports:
             raise InputError(f"scene '{self.name}': no support, the body could move freely")
+        self.prescribed  # noqa: B018 - supports that contradict each other are named first
         resisted = [support.resisted(self.mesh) for support in self.supports]
         points = np.concatenate([each.points for each in resisted])
         directions = np.concatenate([each.directions for each in resisted])

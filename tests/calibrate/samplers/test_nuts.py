@@ -71,7 +71,8 @@ def test_options_that_cannot_work(options):
         cal.NUTSOptions(**options)
 
 
-@pytest.mark.parametrize("kind", [pytest.param("fem", marks=pytest.mark.slow), "corrected"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["fem", "corrected"])
 def test_fem_inside_the_sampler(beam, simulator, kind):
     """The forward maps that solve: under vmap and grad, inside NUTS."""
     theta = beam.theta(mu=73.0, lam=61.0)

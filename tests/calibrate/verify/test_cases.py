@@ -19,7 +19,10 @@ def test_the_command_line_knows_every_case():
     assert tuple(CASES) == CASE_NAMES
 
 
-@pytest.mark.parametrize("case", [verify_patch, verify_invariance, verify_barriers])
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(verify_patch, marks=pytest.mark.slow), verify_invariance, verify_barriers],
+)
 def test_what_holds_exactly(case):
     rows = case()
     assert [row for row in rows if not row.passed] == []
@@ -48,6 +51,7 @@ def test_a_coarse_sphere():
     assert inner_stretch((3, 2), pressure_at(1.2)) == pytest.approx(1.2, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_coarse_membrane_does_not_lock():
     fine = deflection(membrane(4, 0.4999, "mean"))
     assert fine == pytest.approx(12.0, rel=0.03)

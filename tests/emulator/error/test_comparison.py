@@ -5,7 +5,7 @@ import pytest
 import emulator as em
 from emulator.error.comparison import case_errors, evaluate, field_errors
 from emulator.errors import SolverError
-from emulator.geometry.cavity import Cavity
+from emulator.scenes.cavities import find_cavity
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.protocol import Extrapolated
 from network_support import untrained
@@ -38,7 +38,7 @@ def test_fem_has_no_error(beam, simulator):
 def test_volume_error_by_hand():
     scene = em.scenes.left_ventricle(rings=3, around=8, layers=1)
     X = jnp.asarray(scene.mesh.nodes)
-    cavity = Cavity(scene)
+    cavity = find_cavity(scene)
     errors = field_errors(scene, scene.centre, 0.01 * X, 0.02 * X, [cavity])
     # Both are the cavity at rest, enlarged.
     assert errors["err_V"] == pytest.approx([100.0 * (1.0 - (1.01 / 1.02) ** 3)], rel=1e-10)

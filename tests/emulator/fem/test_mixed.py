@@ -28,6 +28,7 @@ def spread(scene, local):
     return jnp.zeros(scene.held.shape).at[nodes].add(local.reshape(*nodes.shape, 3))
 
 
+@pytest.mark.slow
 def test_consistent_volumes_give_the_force_and_tangent_of_the_energy(scene, state):
     u, theta = state
     at = linearise(scene, u, consistent(scene, u, theta), theta)

@@ -71,6 +71,7 @@ def test_the_cantilever_of_land_is_reached_from_rest(beam_scene):
     assert solution.iterations <= 40  # 48 when only elements were guarded
 
 
+@pytest.mark.slow
 def test_the_ellipsoid_of_land_is_reached_from_rest():
     mesh = land_ventricle(rings=4, around=10, layers=1, order=2)
     load = CavityPressure("endocardium", 10.0)

@@ -44,6 +44,7 @@ def ventricle():
     )
 
 
+@pytest.mark.slow
 def test_an_orthotropic_ventricle_fills(ventricle):
     assert ventricle.directions.shape == (len(ventricle.mesh.elements), 2, 3)
     solution = em.Simulator(ventricle).solve(ventricle.centre)

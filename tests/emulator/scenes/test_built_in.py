@@ -23,7 +23,16 @@ COARSE = {
 }
 
 
-@pytest.mark.parametrize("name", sorted(COARSE))
+@pytest.mark.parametrize(
+    "name",
+    [
+        # The others share their laws and loads.
+        pytest.param(
+            n, marks=pytest.mark.slow if n in ("biventricle", "left_ventricle_segments") else []
+        )
+        for n in sorted(COARSE)
+    ],
+)
 def test_the_centre_is_solved(name):
     scene = BUILT_IN[name](**COARSE[name])
     solution = em.Simulator(scene).solve(scene.centre)

@@ -64,7 +64,10 @@ def orders(simulator, series, directions, steps):
     return [slope(steps, errors) for errors in np.array(left).T]
 
 
-@pytest.mark.parametrize("kind", SCENES)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(k, marks=pytest.mark.slow if k == "mean dilatation" else []) for k in SCENES],
+)
 def test_the_error_against_fem_is_of_one_order_more(kind):
     scene = SCENES[kind]()
     simulator = em.Simulator(scene)
@@ -91,6 +94,7 @@ def second(ventricle):
     return expand(ventricle, order=2)
 
 
+@pytest.mark.slow
 def test_second_derivatives_against_differences_of_sensitivities(ventricle, second):
     """On a ventricle, the pressure among its five parameters."""
     scene = ventricle.scene

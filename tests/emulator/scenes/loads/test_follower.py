@@ -55,6 +55,7 @@ def test_equal_to_the_cavity_where_the_rim_is_held():
     np.testing.assert_allclose(one, other, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_derivative_in_theta_through_the_unsymmetric_tangent():
     scene = pressed(pressure=0.3)
     simulator = em.Simulator(scene)
