@@ -36,12 +36,12 @@ class FacetRule:
     """Quadrature on a reference triangle; ``q`` points, ``a`` nodes of the facet.
 
     values : (q, a) shape functions.
-    slopes : (q, a, 2) derivatives of the shape functions along the two reference directions.
+    derivatives : (q, a, 2) derivatives of the shape functions along the two reference directions.
     weights : (q,) summing to 1/2, the reference triangle's area.
     """
 
     values: np.ndarray
-    slopes: np.ndarray
+    derivatives: np.ndarray
     weights: np.ndarray
 
 

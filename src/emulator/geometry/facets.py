@@ -20,14 +20,14 @@ from emulator.geometry.discretisation import FacetRule, facet_rule
 
 def area_vectors(x: jax.Array, rule: FacetRule) -> jax.Array:
     """``n`` at each quadrature point of a facet ``x`` (a, 3) mm, shape (q, 3) in mm2."""
-    slopes = jnp.einsum("qad,ai->qdi", rule.slopes, x)
-    return jnp.cross(slopes[:, 0], slopes[:, 1])
+    along = jnp.einsum("qad,ai->qdi", rule.derivatives, x)
+    return jnp.cross(along[:, 0], along[:, 1])
 
 
 def nodal_areas(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
     """Integral of each shape function over the facets ``corners`` (k, a, 3), (k, a) in mm2."""
-    slopes = np.einsum("qad,kai->kqdi", rule.slopes, corners)
-    area = np.linalg.norm(np.cross(slopes[:, :, 0], slopes[:, :, 1]), axis=-1)
+    along = np.einsum("qad,kai->kqdi", rule.derivatives, corners)
+    area = np.linalg.norm(np.cross(along[:, :, 0], along[:, :, 1]), axis=-1)
     return np.einsum("q,kq,qa->ka", rule.weights, area, rule.values)
 
 

@@ -66,8 +66,8 @@ class ElasticSupport(BoundaryCondition):
         facets = mesh.facet_set(self.facet_set)
         rule = facet_rule(mesh.order, 2 * mesh.order)  # the degree of |u|^2
         corners = mesh.nodes[facets]
-        slopes = np.einsum("qad,kai->kqdi", rule.slopes, corners)
-        normals = np.cross(slopes[:, :, 0], slopes[:, :, 1])  # (k, q, 3), length: area
+        along = np.einsum("qad,kai->kqdi", rule.derivatives, corners)
+        normals = np.cross(along[:, :, 0], along[:, :, 1])  # (k, q, 3), length: area
         areas = np.linalg.norm(normals, axis=-1)
         data = (rule.weights * areas, normals / areas[..., None])
 
