@@ -73,6 +73,7 @@ def test_the_demo_finds_the_truth_and_says_what_it_does_not_know(folder, capsys)
     assert len(picture) > 30_000
 
 
+@pytest.mark.slow
 def test_its_files_hold_both_observations(folder):
     scene = COARSE()
     tree = read_tree(folder / "posterior.nc")
@@ -98,6 +99,7 @@ def test_its_files_hold_both_observations(folder):
     assert np.std(gap) == pytest.approx(RUN.noise["displacement"], rel=4 / np.sqrt(2 * gap.size))
 
 
+@pytest.mark.slow
 def test_its_folder_is_read_back(folder):
     run, posterior = read_posterior(folder)
     assert run == RUN

@@ -47,6 +47,7 @@ def test_the_spheres_pressure_is_the_integral_of_radial_equilibrium(stretch):
     assert pressure_at(stretch) == pytest.approx(quad(slope, a, b)[0], rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_coarse_sphere():
     assert inner_stretch((3, 2), pressure_at(1.2)) == pytest.approx(1.2, rel=5e-3)
 
@@ -58,6 +59,7 @@ def test_a_coarse_membrane_does_not_lock():
     assert deflection(membrane(8, 0.4999, "P1")) < 0.6 * fine
 
 
+@pytest.mark.slow
 def test_lands_beam_on_a_coarse_mesh():
     scene = beam((8, 1, 4))
     solution = em.Simulator(scene).solve(jnp.array([2.0]))

@@ -105,6 +105,7 @@ def test_a_gradient_outside_jit_uses_the_cheap_factor(beam, monkeypatch):
     np.testing.assert_allclose(slope, jax.jit(jax.grad(squared))(beam.centre), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_sensitivities_where_cholesky_is_refused(ventricle):
     """Away from equilibrium the tangent may be indefinite; the equation still has to hold."""
     theta = ventricle.scene.centre

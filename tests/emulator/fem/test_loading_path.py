@@ -76,6 +76,7 @@ def routes(simulator, theta, start):
     return list(dict.fromkeys(seen)), state
 
 
+@pytest.mark.slow
 def test_from_rest_up_a_ramp_then_newton(ventricle_simulator, inside_jit):
     theta = ventricle_simulator.scene.centre
     seen, state = routes(ventricle_simulator, theta, ventricle_simulator.rest)
@@ -93,6 +94,7 @@ def test_jit_takes_the_iterations_that_python_takes(ventricle_simulator, inside_
     np.testing.assert_allclose(python.displacement, inside.displacement, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_warm_start_whose_way_is_not_convex_is_left_for_rest(ventricle_simulator, inside_jit):
     """A state balanced well enough to be tried, far off the loading path."""
     scene = ventricle_simulator.scene

@@ -26,7 +26,9 @@ def traction_beam():
     return em.scenes.traction_beam_guccione(cells=(12, 2, 2))
 
 
-@pytest.mark.parametrize("name", ["traction_beam", "ventricle"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("traction_beam", marks=pytest.mark.slow), "ventricle"]
+)
 def test_where_measures_are_those_of_the_displacement_it_is_newton(name, request):
     scene = request.getfixturevalue(name)
     system, theta = System(scene), scene.centre
@@ -59,6 +61,7 @@ def test_stress_and_tangent_of_a_point_whose_measures_are_others(ventricle):
     np.testing.assert_allclose(tangent, jax.hessian(model(xi(H)))(H), rtol=1e-10, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_equilibrium_is_a_fixed_point(ventricle):
     theta = ventricle.centre
     u = em.Simulator(ventricle)(theta)
@@ -107,7 +110,9 @@ def test_a_law_that_blows_up_on_the_way_is_stopped_short():
     np.testing.assert_allclose(fraction, 0.25, rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["traction_beam", "ventricle"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("traction_beam", marks=pytest.mark.slow), "ventricle"]
+)
 def test_it_ends_where_newton_does(name, request):
     scene = request.getfixturevalue(name)
     theta, options = scene.centre, em.NewtonOptions(stress_iterates=False)
@@ -130,7 +135,9 @@ def test_no_tangent_on_the_way_is_indefinite(ventricle, monkeypatch):
     assert simulator.solve(ventricle.centre).converged
 
 
-@pytest.mark.parametrize("how", ["refused", "crushed", "climbs", "endless", "nan"])
+@pytest.mark.parametrize(
+    "how", ["refused", "crushed", "climbs", pytest.param("endless", marks=pytest.mark.slow), "nan"]
+)
 def test_where_it_fails_newton_climbs_from_rest(ventricle, monkeypatch, how):
     simulator, theta = em.Simulator(ventricle), ventricle.centre
     expected = simulator(theta)

@@ -43,6 +43,7 @@ def test_consistent_volumes_give_the_force_and_tangent_of_the_energy(scene, stat
     np.testing.assert_allclose(product, expected, atol=1e-8 * float(jnp.abs(expected).max()))
 
 
+@pytest.mark.slow
 def test_a_step_makes_the_constraint_hold_to_first_order(scene, state):
     u, theta = state
     volumes = consistent(scene, u, theta)

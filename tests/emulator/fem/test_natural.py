@@ -65,6 +65,7 @@ def test_a_carried_force_falls_with_the_square_of_the_step(beam_scene):
     assert gaps[0] / gaps[1] == pytest.approx(100.0, rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_cantilever_of_land_is_reached_from_rest(beam_scene):
     solution = em.Simulator(beam_scene).solve(jnp.array([2.0]))
     assert solution.converged

@@ -23,13 +23,19 @@ COARSE = {
 }
 
 
+SHARED = (
+    "biventricle",
+    "left_ventricle_segments",
+    "traction_beam_guccione",
+    "traction_beam_holzapfel_ogden",
+)
+
+
 @pytest.mark.parametrize(
     "name",
     [
         # The others share their laws and loads.
-        pytest.param(
-            n, marks=pytest.mark.slow if n in ("biventricle", "left_ventricle_segments") else []
-        )
+        pytest.param(n, marks=pytest.mark.slow if n in SHARED else [])
         for n in sorted(COARSE)
     ],
 )

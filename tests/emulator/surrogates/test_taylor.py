@@ -66,7 +66,15 @@ def orders(simulator, series, directions, steps):
 
 @pytest.mark.parametrize(
     "kind",
-    [pytest.param(k, marks=pytest.mark.slow if k == "mean dilatation" else []) for k in SCENES],
+    [
+        pytest.param(
+            k,
+            marks=pytest.mark.slow
+            if k in ("mean dilatation", "follower pressure", "quadratic")
+            else [],
+        )
+        for k in SCENES
+    ],
 )
 def test_the_error_against_fem_is_of_one_order_more(kind):
     scene = SCENES[kind]()

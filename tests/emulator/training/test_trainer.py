@@ -357,6 +357,7 @@ def test_mechanics_on_a_quadratic_ventricle(tmp_path):
     assert report["err_u"]["median"] < 0.02 * report["max_u"]["median"]
 
 
+@pytest.mark.slow
 def test_a_network_on_a_quadratic_mesh(tmp_path):
     """Energy lowers from the centre's solution on."""
     linear = em.scenes.once_clamped_beam(cells=(2, 1, 1))
