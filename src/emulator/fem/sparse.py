@@ -83,7 +83,7 @@ class Pattern:
 
         For use inside ``jit``, where CHOLMOD's refusal cannot be caught: SciPy factorises the
         matrix by pivots on the diagonal, whose signs are those of the eigenvalues (Sylvester). It
-        takes about three times as long as a solve by UMFPACK.
+        costs a second factorisation (docs/experiments.md, "One equilibrium for every route").
         """
         return jax.pure_callback(
             self._pivots_positive,
