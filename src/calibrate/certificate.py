@@ -11,18 +11,15 @@ posterior standard deviations, decides whether reweighting is needed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from typing import Any, Literal
 
-import jax
 import numpy as np
 from arviz_stats.base import array_stats
 from tqdm import tqdm
 
+from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.posterior import Posterior
-from calibrate.statistical_model import Data, Model, NoiseValues
 from emulator.errors import InputError
 from emulator.fem import Simulator
 
@@ -162,9 +159,7 @@ def certify(
     InputError
         The simulator is for another scene, or too few draws are asked for.
     """
-    model, data = posterior.model, posterior.data
-    if simulator.scene.fingerprint != model.forward.scene.fingerprint:
-        raise InputError("certify: the simulator's scene is not the posterior's")
+    likelihood = FEMLikelihood(posterior.model, simulator)
     everything = posterior.draws()
     available = len(next(iter(everything.values())))
     draws = min(_DRAWS, available) if draws is None else draws
@@ -172,32 +167,11 @@ def certify(
         raise InputError(f"certify: {draws} draws asked for; give 25 to {available}")
     rows = np.linspace(0, available - 1, draws).astype(int)
     chosen = {name: values[rows] for name, values in everything.items()}
-    start, ratio = _compiled(model)
-    thetas = posterior.thetas()[rows]
     log_ratios = np.full(draws, -np.inf)
     for s in tqdm(range(draws), "FEM check", disable=not progress, unit="run"):
-        # Not under jit: there the solver cannot use CHOLMOD, which is faster.
-        solution = simulator.solve(thetas[s], start(thetas[s]))
-        if solution.converged:
-            noise = model.noise_values({name: values[s] for name, values in chosen.items()})
-            log_ratios[s] = ratio(thetas[s], solution.displacement, noise, data)
+        draw = {name: values[s] for name, values in chosen.items()}
+        found = likelihood(draw, posterior.data)
+        log_ratios[s] = found.fem - found.cheap
     # NumPy's maximum is NaN if any value is; Python's depends on their order.
     worst = float(np.max([row["r_hat"] for row in posterior.summary().values()]))
     return judge(log_ratios, chosen, r_hat=worst)
-
-
-@lru_cache(maxsize=4)
-def _compiled(model: Model) -> tuple[Callable, Callable]:
-    """The cheap map over all nodes and the log likelihood ratio, compiled once for each model.
-
-    The ratio takes FEM's displacement (n, 3) mm and is FEM's log likelihood less the cheap map's.
-    """
-
-    @jax.jit
-    def ratio(
-        theta: jax.Array, displacement: jax.Array, noise: NoiseValues, data: Data
-    ) -> jax.Array:
-        fem = model.log_likelihood(displacement[model.observe.nodes], noise, data)
-        return fem - model.log_likelihood(model.forward(theta), noise, data)
-
-    return jax.jit(model.full), ratio

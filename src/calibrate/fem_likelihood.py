@@ -1,0 +1,88 @@
+"""FEM's log likelihood at a draw of a posterior, beside the cheap map's.
+
+Whatever compares a posterior with FEM asks here: certificates, and samplers with FEM in a second
+stage. It is the only place that solves FEM for a draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.statistical_model import Data, Model
+from emulator.errors import InputError
+from emulator.fem import Simulator
+from emulator.fem.functional import volume_ratio
+
+
+class Likelihoods(NamedTuple):
+    """Log likelihoods of the data at one draw.
+
+    fem : with FEM's displacement; ``-inf`` where FEM did not converge.
+    cheap : with the model's forward map; ``-inf`` where it has no answer.
+    converged : whether FEM did.
+    smallest_J : smallest volume ratio det F in the body, by FEM; NaN where it did not converge.
+    """
+
+    fem: float
+    cheap: float
+    converged: bool
+    smallest_J: float
+
+
+@dataclass(frozen=True, eq=False)
+class FEMLikelihood:
+    """FEM's log likelihood under ``model``; each solve starts from the cheap map's prediction.
+
+    Raises
+    ------
+    InputError
+        The simulator is for another scene.
+    """
+
+    model: Model
+    simulator: Simulator
+
+    def __post_init__(self) -> None:
+        if self.simulator.scene.fingerprint != self.model.forward.scene.fingerprint:
+            raise InputError("the simulator's scene is not the posterior's")
+
+    def __call__(self, draw: Mapping[str, Any], data: Data) -> Likelihoods:
+        """Log likelihoods at ``draw``: a number for each of the model's ``names``."""
+        theta = jnp.array([draw[name] for name in self.model.forward.scene.parameter_names])
+        noise = self.model.noise_values(draw)
+        cheap = float(self._cheap(theta, noise, data))
+        # Not under jit: there the solver cannot use CHOLMOD, which is faster.
+        solution = self.simulator.solve(theta, self._start(theta))
+        if not bool(solution.converged):
+            return Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
+        fem, smallest = self._fem(solution.displacement, noise, data)
+        return Likelihoods(float(fem), cheap, converged=True, smallest_J=float(smallest))
+
+    @cached_property
+    def _start(self):  # noqa: ANN202 - a compiled program, private
+        return jax.jit(self.model.full)
+
+    @cached_property
+    def _cheap(self):  # noqa: ANN202
+        def cheap(theta, noise, data):  # noqa: ANN001, ANN202
+            prediction = self.model.forward.evaluate(theta)
+            value = self.model.log_likelihood(prediction.displacement, noise, data)
+            return jnp.where(prediction.valid, value, -jnp.inf)
+
+        return jax.jit(cheap)
+
+    @cached_property
+    def _fem(self):  # noqa: ANN202
+        def fem(displacement, noise, data):  # noqa: ANN001, ANN202
+            observed = displacement[self.model.observe.nodes]
+            value = self.model.log_likelihood(observed, noise, data)
+            return value, jnp.min(volume_ratio(self.simulator.scene, displacement))
+
+        return jax.jit(fem)
