@@ -8,6 +8,9 @@ only, which may be a row of its own. There may be a volume and no displacement.
 A netCDF file has a variable ``displacement`` with one row a point, and beside it either ``node`` or
 ``position`` (rows of x, y, z); and a number ``volume``, or ``volume:<facet set>``.
 
+Of a body in several load states, a CSV file has a column ``state`` with the state's name in every
+row, and a netCDF file variables such as ``volume@diastole``.
+
 Each kind of observation (:data:`calibrate.observations.KINDS`) names its own columns and variables.
 """
 
@@ -18,8 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.data_files import DataFile, open_data, write_csv, write_netcdf
+from calibrate.data_files import Block, DataFile, open_data, write_csv, write_netcdf
 from calibrate.observations import KINDS, Field, Observation, Observations, observations
+from calibrate.state_names import at, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
@@ -37,13 +41,15 @@ def read_data(scene: Scene, path: str | Path) -> tuple[Observations, dict[str, n
     file = open_data(path)
     parts: dict[str, Observation] = {}
     data: dict[str, np.ndarray] = {}
-    for name, (kind, fields) in _found(path, file).items():
-        arrays = file.arrays(fields)
-        try:
-            parts[name], data[name] = kind.from_arrays(scene, name, arrays)
-            parts[name].check(name, data[name])
-        except InputError as error:
-            raise InputError(f"data file {path}: {error}") from error
+    for state, rows in file.states().items():
+        for base, (kind, fields) in _found(path, rows).items():
+            name, arrays = at(base, state), rows.arrays(fields)
+            try:
+                parts[name], data[name] = kind.from_arrays(scene, base, arrays)
+                parts[name].check(name, data[name])
+            except InputError as error:
+                where = f", state '{state}'" if state else ""
+                raise InputError(f"data file {path}{where}: {error}") from error
     return Observations(parts), data
 
 
@@ -93,15 +99,16 @@ def write_data(
     """
     observe = observations(observe)
     data = observe.name(values, "data")
-    blocks = []
+    states: dict[str, list[Block]] = {state: [] for state in observe.states}
     for name, part in observe.parts.items():
-        if name not in part.names:
+        base, state = split(name)
+        if base not in part.names:
             raise InputError(
                 f"observation '{name}' does not fit in a data file; "
                 f"there it would be called {' or '.join(part.names)}"
             )
-        arrays = part.to_arrays(name, np.asarray(data[name]))
-        fields = part.layouts((name,))[name]
-        blocks.append([(field, arrays[field.variable]) for field in fields])
+        arrays = part.to_arrays(base, np.asarray(data[name]))
+        fields = part.layouts((base,))[base]
+        states[state].append([(field, arrays[field.variable]) for field in fields])
     write = write_netcdf if Path(path).suffix.lower() == ".nc" else write_csv
-    write(path, blocks)
+    write(path, states)

@@ -2,7 +2,8 @@
 
 A CSV file has one header line, and columns separated by commas, semicolons or tabs, whichever the
 header has; with the latter two, numbers may have decimal commas. Blanks around words, empty lines
-and lines that begin with ``#`` are ignored.
+and lines that begin with ``#`` are ignored. A column ``state`` names the load state of each row; in
+netCDF, variables are called ``name@state``.
 """
 
 from __future__ import annotations
@@ -12,14 +13,19 @@ import io
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import copy
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from calibrate.observations import Field
+from calibrate.state_names import at, split, states_of
 from emulator.errors import InputError
 from emulator.store import replacing, write_atomically
+
+STATE = "state"
+"""Column of a CSV file that names the load state of a row."""
 
 _TEXT = (".csv", ".tsv", ".txt")
 _SPREADSHEETS = (".xlsx", ".xls", ".ods")
@@ -34,6 +40,16 @@ class DataFile(ABC):
 
     words: Sequence[str]
     what: str
+
+    @abstractmethod
+    def states(self) -> Mapping[str, DataFile]:
+        """What it holds of each load state, by the state's name; one empty name if it names none.
+
+        Raises
+        ------
+        InputError
+            Some of it belongs to a state and some to none.
+        """
 
     @abstractmethod
     def needs(self, field: Field) -> tuple[str, ...]:
@@ -73,9 +89,30 @@ class CSVFile(DataFile):
         twice = [w for w in self.words if w and self.words.count(w) > 1]
         if twice:
             raise InputError(f"data file {path}: column '{twice[0]}' is there twice")
-        self.rows = [
-            self._row(k, row) for k, row in enumerate(cells[1:], 1) if any(row) or len(row) > 1
-        ]
+        self.rows = {
+            k: self._row(k, row) for k, row in enumerate(cells[1:], 1) if any(row) or len(row) > 1
+        }
+
+    def states(self) -> dict[str, CSVFile]:
+        """Rows of each state, by the word in the column ``state``."""
+        if STATE not in self.words:
+            return {"": self}
+        found: dict[str, CSVFile] = {}
+        for number, row in self.rows.items():
+            state = row[STATE]
+            if not state or "@" in state or "/" in state:
+                raise InputError(
+                    f"data file {self.path}: row {number}, column '{STATE}' is '{state}'; "
+                    "give every row the name of its load state, without @ and /"
+                )
+            if state not in found:
+                part = found[state] = copy(self)
+                part.words, part.rows = [w for w in self.words if w != STATE], {}
+            found[state].rows[number] = row
+        # A column that is empty in a state was not measured there.
+        for part in found.values():
+            part.words = [w for w in part.words if any(row[w] for row in part.rows.values())]
+        return found
 
     def _row(self, number: int, cells: list[str]) -> dict[str, str]:
         if any(cells[len(self.words) :]):
@@ -94,7 +131,7 @@ class CSVFile(DataFile):
     def arrays(self, fields: Sequence[Field]) -> dict[str, np.ndarray]:
         """Rows in which any of the fields has a value."""
         words = [word for field in fields for word in field.columns]
-        filled = [(k, row) for k, row in enumerate(self.rows, 1) if any(row[w] for w in words)]
+        filled = [(k, row) for k, row in self.rows.items() if any(row[w] for w in words)]
         found = {}
         for field in fields:
             numbers = [[self._number(k, row, w) for w in field.columns] for k, row in filled]
@@ -146,8 +183,19 @@ class NetCDFFile(DataFile):
             raise InputError(
                 f"data file {path} is neither CSV ({', '.join(_TEXT)}) nor readable netCDF"
             ) from error
-        self.path = path
+        self.path, self.state = path, ""
         self.words = list(map(str, self.data.variables))
+
+    def states(self) -> dict[str, NetCDFFile]:
+        """Variables of each state, by what follows ``@`` in their names."""
+        found: dict[str, NetCDFFile] = {}
+        # Coordinates without values of their own belong to no state.
+        own = [w for w in self.words if w not in self.data.dims]
+        for state in states_of(own, f"data file {self.path}"):
+            part = found[state] = copy(self)
+            part.state = state
+            part.words = [base for base, its in map(split, own) if its == state]
+        return found
 
     def needs(self, field: Field) -> tuple[str, ...]:
         """The field's variable."""
@@ -158,7 +206,7 @@ class NetCDFFile(DataFile):
         found = {}
         for name in (field.variable for field in fields):
             try:
-                found[name] = np.asarray(self.data[name], dtype=float)
+                found[name] = np.asarray(self.data[at(name, self.state)], dtype=float)
             except (TypeError, ValueError) as error:
                 raise InputError(
                     f"data file {self.path}: variable '{name}' does not hold numbers"
@@ -170,14 +218,29 @@ Block = Sequence[tuple[Field, np.ndarray]]
 """The fields of one observation with their arrays."""
 
 
-def write_csv(path: str | Path, blocks: Sequence[Block]) -> None:
-    """Columns of every block side by side; those of one number share a last row of their own."""
-    header = [word for block in blocks for field, _ in block for word in field.columns]
+def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
+    """Columns of every block side by side, load state after load state.
+
+    Blocks of one number share a row of their own, the last of their state.
+    """
+    every = [field for blocks in states.values() for block in blocks for field, _ in block]
+    header = list(dict.fromkeys(word for field in every for word in field.columns))
+    named = "" not in states
+    rows = [[STATE] * named + header]
+    for state, blocks in states.items():
+        rows += [[state] * named + cells for cells in _rows(header, blocks)]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_atomically(path, text.getvalue().encode())
+
+
+def _rows(header: list[str], blocks: Sequence[Block]) -> list[list[str]]:
+    """Rows of one load state, a cell for every word of the header."""
     rows: list[list[str]] = []
     single = [""] * len(header)
-    column = 0
     for block in blocks:
         for field, array in block:
+            column = header.index(field.columns[0])
             cells = np.asarray(array).reshape(-1, len(field.columns))
             for k, values in enumerate(cells.tolist() if np.ndim(array) else ()):
                 if k == len(rows):
@@ -185,19 +248,19 @@ def write_csv(path: str | Path, blocks: Sequence[Block]) -> None:
                 rows[k][column : column + len(values)] = map(repr, values)
             if not np.ndim(array):
                 single[column] = repr(float(array))
-            column += len(field.columns)
-    rows += [single] if any(single) else []
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([header, *rows])
-    write_atomically(path, text.getvalue().encode())
+    return [*rows, single] if any(single) else rows
 
 
-def write_netcdf(path: str | Path, blocks: Sequence[Block]) -> None:
-    """Every array a variable; arrays of as many rows as the block's first share a dimension."""
+def write_netcdf(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
+    """Every array a variable; arrays of as many rows as the block's first share a dimension.
+
+    In several load states, variables are called ``name@state``.
+    """
     variables = {}
-    for k, block in enumerate(blocks):
+    every = [(state, block) for state, blocks in states.items() for block in blocks]
+    for k, (state, block) in enumerate(every):
         for field, array in block:
             dims = [f"point_{k}", *(f"component_{n}" for n in np.shape(array)[1:])]
-            variables[field.variable] = (dims[: np.ndim(array)], np.asarray(array))
+            variables[at(field.variable, state)] = (dims[: np.ndim(array)], np.asarray(array))
     with replacing(path) as temporary:
         xr.Dataset(variables).to_netcdf(temporary, engine="h5netcdf")

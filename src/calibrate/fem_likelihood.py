@@ -24,9 +24,9 @@ from emulator.fem.functional import volume_ratio
 class Likelihoods(NamedTuple):
     """Log likelihoods of the data at one draw.
 
-    fem : with FEM's displacement; ``-inf`` where FEM did not converge.
+    fem : with FEM's displacement; ``-inf`` where FEM did not converge in a load state.
     cheap : with the model's forward map; ``-inf`` where it has no answer.
-    converged : whether FEM did.
+    converged : whether FEM did, in every load state.
     smallest_J : smallest volume ratio det F in the body, by FEM; NaN where it did not converge.
     """
 
@@ -38,7 +38,7 @@ class Likelihoods(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FEMLikelihood:
-    """FEM's log likelihood under ``model``; each solve starts from the cheap map's prediction.
+    """FEM's log likelihood under ``model``; solves start from the cheap map's prediction.
 
     Raises
     ------
@@ -55,14 +55,17 @@ class FEMLikelihood:
 
     def __call__(self, draw: Mapping[str, Any], data: Data) -> Likelihoods:
         """Log likelihoods at ``draw``: a number for each of the model's ``names``."""
-        theta = jnp.array([draw[name] for name in self.model.forward.scene.parameter_names])
+        thetas = self.model.states.thetas(draw)
         noise = self.model.noise_values(draw)
-        cheap = float(self._cheap(theta, noise, data))
-        # Not under jit: there the solver cannot use CHOLMOD, which is faster.
-        solution = self.simulator.solve(theta, self._start(theta))
-        if not bool(solution.converged):
-            return Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
-        fem, smallest = self._fem(solution.displacement, noise, data)
+        cheap = float(self._cheap(thetas, noise, data))
+        solved = []
+        for theta in thetas:
+            # Not under jit: there the solver cannot use CHOLMOD, which is faster.
+            solution = self.simulator.solve(theta, self._start(theta))
+            if not bool(solution.converged):
+                return Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
+            solved.append(solution.displacement)
+        fem, smallest = self._fem(jnp.stack(solved), thetas, noise, data)
         return Likelihoods(float(fem), cheap, converged=True, smallest_J=float(smallest))
 
     @cached_property
@@ -71,18 +74,19 @@ class FEMLikelihood:
 
     @cached_property
     def _cheap(self):  # noqa: ANN202
-        def cheap(theta, noise, data):  # noqa: ANN001, ANN202
-            prediction = self.model.forward.evaluate(theta)
-            value = self.model.log_likelihood(prediction.displacement, noise, data)
+        def cheap(thetas, noise, data):  # noqa: ANN001, ANN202
+            prediction = self.model.evaluate(thetas)
+            value = self.model.log_likelihood(prediction.displacement, thetas, noise, data)
             return jnp.where(prediction.valid, value, -jnp.inf)
 
         return jax.jit(cheap)
 
     @cached_property
     def _fem(self):  # noqa: ANN202
-        def fem(displacement, noise, data):  # noqa: ANN001, ANN202
-            observed = displacement[self.model.observe.nodes]
-            value = self.model.log_likelihood(observed, noise, data)
-            return value, jnp.min(volume_ratio(self.simulator.scene, displacement))
+        def fem(displacement, thetas, noise, data):  # noqa: ANN001, ANN202
+            observed = displacement[:, self.model.observe.nodes]
+            value = self.model.log_likelihood(observed, thetas, noise, data)
+            ratios = [volume_ratio(self.simulator.scene, u) for u in displacement]
+            return value, jnp.min(jnp.stack(ratios))
 
         return jax.jit(fem)

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from calibrate.posterior import Posterior
+from calibrate.state_names import split
 
 _PRIOR_DRAWS = 4096
 # Exponents are rounded to be readable; those that round to zero are left out.
@@ -35,11 +36,13 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     combinations : best known first, each with its ``exponents``, its relative sd ``known_to`` in
         the posterior and ``prior`` in the prior; empty where a parameter may be 0 or below.
     """
-    scene = posterior.model.forward.scene
-    names = scene.parameter_names
-    after = np.asarray(posterior.thetas())
-    before = np.asarray(posterior.model.prior_thetas(jax.random.key(0), _PRIOR_DRAWS))
-    log = np.array([parameter.scale == "log" for parameter in scene.parameters])
+    model = posterior.model
+    names, draws = model.states.unknowns, posterior.draws()
+    prior_draws = model.prior_draws(jax.random.key(0), _PRIOR_DRAWS)
+    after = np.stack([draws[name] for name in names], axis=1)
+    before = np.stack([np.asarray(prior_draws[name]) for name in names], axis=1)
+    scales = {parameter.name: parameter.scale for parameter in model.forward.scene.parameters}
+    log = np.array([scales[split(name)[0]] == "log" for name in names])
     x, prior = (_on_scale(thetas, log) for thetas in (after, before))
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
     correlation = np.atleast_2d(np.corrcoef(x, rowvar=False))

@@ -18,7 +18,7 @@ corner of the prior that no draw came near.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,6 @@ import numpy as np
 from calibrate.noise import Noise
 from calibrate.observations import Observation, Observations
 from emulator.errors import InputError
-from emulator.surrogates.protocol import ForwardMap
 
 _DRAWS = 32  # predictions at draws of the prior
 PRIOR_DRAWS = 4096  # whose extremes stand for the ends of a parameter's prior
@@ -36,28 +35,32 @@ _NOISE_SD = 5.0
 _OVERRULE = "check_scale=False or --no-unit-check overrules"
 
 
+Predict = Callable[[jax.Array], tuple[Mapping[str, jax.Array], jax.Array]]
+"""Maps values (q,) of the unknowns to predictions by observation and whether they are valid."""
+
+
 def check_magnitudes(
-    forward: ForwardMap,
+    predict: Predict,
     observe: Observations,
     noise: Mapping[str, Noise],
-    thetas: np.ndarray,
+    draws: np.ndarray,
     data: Mapping[str, np.ndarray],
 ) -> None:
     """Raise :class:`InputError` where ``data`` is far from every prediction.
 
-    ``thetas`` (c, p) are draws of the prior, ``PRIOR_DRAWS`` of them or so.
+    ``draws`` (c, q) of the unknowns' prior, ``PRIOR_DRAWS`` of them or so.
     """
-    predictions = predict_over_prior(forward, observe, thetas)
+    predictions = predict_over_prior(predict, observe, draws)
     for name, part in observe.parts.items():
         check_magnitude(name, part, data[name], predictions[name], noise[name].upper_sd)
 
 
 def predict_over_prior(
-    forward: ForwardMap, observe: Observations, thetas: np.ndarray
+    predict: Predict, observe: Observations, draws: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Predictions (s, ...) without noise at draws of the prior and at its ends, by observation.
 
-    The ends are taken one parameter at a time, and then together where each makes the prediction
+    The ends are taken one unknown at a time, and then together where each makes the prediction
     smaller, or larger.
 
     Raises
@@ -65,30 +68,25 @@ def predict_over_prior(
     InputError
         The forward map has no valid answer at any of them.
     """
-
-    @jax.jit
-    def one(theta: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-        prediction = forward.evaluate(theta)
-        return observe(prediction.displacement), prediction.valid
-
+    one = jax.jit(predict)
     found: dict[str, list[np.ndarray]] = {name: [] for name in observe.parts}
 
-    def sizes(theta: np.ndarray) -> dict[str, float]:
-        means, valid = one(jnp.asarray(theta))
+    def sizes(values: np.ndarray) -> dict[str, float]:
+        means, valid = one(jnp.asarray(values))
         if not bool(valid):
             return dict.fromkeys(found, np.nan)
         for name, mean in means.items():
             found[name].append(np.asarray(mean))
         return {name: _norm(np.asarray(mean)) for name, mean in means.items()}
 
-    middle, ends = np.median(thetas, axis=0), np.stack([thetas.min(axis=0), thetas.max(axis=0)])
-    for theta in thetas[:_DRAWS]:
-        sizes(theta)
+    middle, ends = np.median(draws, axis=0), np.stack([draws.min(axis=0), draws.max(axis=0)])
+    for values in draws[:_DRAWS]:
+        sizes(values)
     reached = {name: np.empty(ends.shape) for name in found}
     for end, k in np.ndindex(ends.shape):
-        theta = middle.copy()
-        theta[k] = ends[end, k]
-        for name, size in sizes(theta).items():
+        values = middle.copy()
+        values[k] = ends[end, k]
+        for name, size in sizes(values).items():
             reached[name][end, k] = size
     columns = np.arange(ends.shape[1])
     for by_end in reached.values():
@@ -97,8 +95,8 @@ def predict_over_prior(
         sizes(ends[1 - smaller, columns])
     if not all(found.values()):
         raise InputError(
-            f"forward map '{forward.kind}' has no valid answer at any of {_DRAWS} draws of "
-            "the prior; give a prior inside the range in which it answers"
+            f"the forward map has no valid answer at any of {_DRAWS} draws of the prior; "
+            "give a prior inside the range in which it answers"
         )
     return {name: np.stack(values) for name, values in found.items()}
 

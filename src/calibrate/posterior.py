@@ -11,7 +11,6 @@ from typing import Any
 import arviz_base
 import arviz_stats
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
@@ -41,10 +40,20 @@ class Posterior:
         """All draws by name, chains joined, each (s,)."""
         return {n: np.asarray(self.tree["posterior"][n]).reshape(-1) for n in self.model.names}
 
-    def thetas(self) -> jax.Array:
-        """All draws of theta, (s, p)."""
-        draws = self.draws()
-        return jnp.stack([draws[name] for name in self.model.forward.scene.parameter_names], axis=1)
+    def thetas(self, state: str | None = None) -> jax.Array:
+        """All draws of theta, (s, p), in load state ``state``, or in the only one.
+
+        Raises
+        ------
+        InputError
+            No such state, or several and none is named.
+        """
+        states = self.model.states.states
+        if state is None and len(states) > 1:
+            raise InputError(f"the posterior has several load states: {', '.join(states)}")
+        if state is not None and state not in states:
+            raise InputError(f"load state '{state}' is unknown; known: {', '.join(states)}")
+        return self.model.states.thetas(self.draws())[:, states.index(state or states[0])]
 
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
         """Per parameter: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
@@ -101,6 +110,7 @@ def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str,
         "noise": {name: noise.to_json() for name, noise in model.noise.items()},
         "prior": {name: describe_distribution(d) for name, d in model.prior.items()},
         "prior_cut": dict(model.prior_cut),
+        "load_states": model.states.to_json(),
         "sampler": sampler,
         "sampler_options": asdict(options),
         "seed": seed,

@@ -19,7 +19,9 @@ from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 from numpyro.distributions.transforms import AffineTransform, ComposeTransform, biject_to
 
+from calibrate.load_states import LoadStates
 from calibrate.priors import Prior, bisect, bounds, truncated
+from calibrate.state_names import split
 from emulator.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap
@@ -30,7 +32,9 @@ _DRAWS = 512  # from which the centre and the width of a prior are taken
 
 
 def fit_to(forward: ForwardMap, prior: Prior) -> tuple[Prior, dict[str, float]]:
-    """``prior``, cut where ``forward`` has no answer, and the mass cut off, by parameter.
+    """``prior``, cut where ``forward`` has no answer, and the mass cut off, by name.
+
+    A name is a parameter, or a parameter in a load state (:mod:`calibrate.state_names`).
 
     Raises
     ------
@@ -38,22 +42,38 @@ def fit_to(forward: ForwardMap, prior: Prior) -> tuple[Prior, dict[str, float]]:
         A prior with more than :data:`NEGLIGIBLE` of its mass where the map has no answer.
     """
     cut: dict[str, float] = {}
-    for k, parameter in enumerate(forward.scene.parameters):
-        distribution = prior[parameter.name]
+    for name, distribution in prior.items():
+        k = forward.scene.parameter_names.index(split(name)[0])
+        parameter = forward.scene.parameters[k]
         tails = dict(_tails(parameter, distribution))
         mass = sum(tails.values())
         if not tails or all(_answers(forward, k, value) for value in tails):
             continue
         if mass > NEGLIGIBLE:
             raise InputError(
-                f"prior of '{parameter.name}' has {_percent(mass)} of its mass outside "
+                f"prior of '{name}' has {_percent(mass)} of its mass outside "
                 f"{parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
                 + f", where forward map '{forward.kind}' has no answer: cut it yourself with "
                 "calibrate.priors.truncated(prior, scene), or use FEM or a scene of wider range"
             )
-        cut[parameter.name] = mass
+        cut[name] = mass
     inside = truncated(prior, forward.scene)
     return {name: inside[name] if name in cut else prior[name] for name in prior}, cut
+
+
+def check_known(forward: ForwardMap, states: LoadStates) -> None:
+    """:class:`InputError` where a known value lies outside the range in which the map answers."""
+    for row in states.entries:
+        for k, entry in enumerate(row):
+            parameter = forward.scene.parameters[k]
+            if isinstance(entry, str) or parameter.low <= entry <= parameter.high:
+                continue
+            if not _answers(forward, k, entry):
+                raise InputError(
+                    f"'{parameter.name}' is known to be {entry:g} {parameter.unit}".rstrip()
+                    + f"; forward map '{forward.kind}' answers from {parameter.low:g} to "
+                    f"{parameter.high:g}: use FEM or a scene of wider range"
+                )
 
 
 def _percent(mass: float) -> str:

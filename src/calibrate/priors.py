@@ -11,6 +11,7 @@ import numpyro.distributions as dist
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
+from calibrate.state_names import split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
@@ -76,20 +77,10 @@ def truncated(prior: Prior, scene: Scene) -> dict[str, dist.Distribution]:
     probably outside.
     """
     ranges = {p.name: (p.low, p.high) for p in scene.parameters}
-    return {name: _cut(d, *ranges[name]) for name, d in check_prior(scene, prior).items()}
-
-
-def check_prior(scene: Scene, prior: Prior) -> Prior:
-    """``prior``, or :class:`InputError` unless it names exactly the scene's parameters."""
     for name in prior:
-        if name not in scene.parameter_names:
-            raise InputError(
-                f"prior names '{name}'; scene '{scene.name}' has {', '.join(scene.parameter_names)}"
-            )
-    for name in scene.parameter_names:
-        if name not in prior:
-            raise InputError(f"prior has no distribution for parameter '{name}'")
-    return prior
+        if split(name)[0] not in ranges:
+            raise InputError(f"prior names '{name}'; scene '{scene.name}' has {', '.join(ranges)}")
+    return {name: _cut(d, *ranges[split(name)[0]]) for name, d in prior.items()}
 
 
 class Truncated(dist.Distribution):

@@ -1,11 +1,12 @@
 r"""The statistical model around a forward map.
 
-.. math:: y_j = \mathcal{O}_j\,u(\theta) + \varepsilon_j
+.. math:: y_{sj} = \mathcal{O}_j\,u(\theta_s) + \varepsilon_{sj}
 
-for each observation, with theta from its prior. The noise :math:`\varepsilon_j` of each observation
-has a distribution of its own (:mod:`calibrate.noise`), whose unknown numbers have priors too. The
-model does not know whether the forward map is the emulator, the emulator with a correction, a
-reduced model or FEM.
+for each observation j in each load state s, with the unknowns of :math:`\theta_s` from their priors
+(:mod:`calibrate.load_states`). The noise :math:`\varepsilon_{sj}` of each observation has a
+distribution of its own (:mod:`calibrate.noise`), whose unknown numbers have priors too. The model
+does not know whether the forward map is the emulator, the emulator with a correction, a reduced
+model or FEM.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +22,15 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 
+from calibrate.load_states import LoadStates, load_states
 from calibrate.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.noise import Noise
 from calibrate.observations import Observation, Observations, observations
-from calibrate.prior_range import fit_to, standardised
-from calibrate.priors import Prior, box_prior, check_prior
-from emulator.surrogates.protocol import ForwardMap
+from calibrate.prior_range import check_known, fit_to, standardised
+from calibrate.priors import Prior
+from calibrate.state_names import split
+from emulator.errors import InputError
+from emulator.surrogates.protocol import ForwardMap, Prediction
 
 Data = Mapping[str, jax.Array]
 """Data by the observation's name; each of the observation's shape and unit."""
@@ -42,10 +47,13 @@ class Model:
     ----------
     forward : map restricted to the observed nodes.
     full : the same map over all nodes.
-    observe : what of the displacement was measured, by name.
+    observe : what was measured, by name.
     noise : noise of each observation.
-    prior : one distribution a parameter.
-    prior_cut : parameter to the mass of its prior that was cut off (:mod:`calibrate.prior_range`).
+    noise_names : the name each observation's noise was given under; observations with one name
+        share its unknown numbers.
+    states : where theta comes from in each load state.
+    prior : one distribution an unknown of theta.
+    prior_cut : unknown to the mass of its prior that was cut off (:mod:`calibrate.prior_range`).
     check_scale : whether :meth:`check_data` refuses data far from every prediction.
     """
 
@@ -53,46 +61,55 @@ class Model:
     full: ForwardMap
     observe: Observations
     noise: Mapping[str, Noise]
+    noise_names: Mapping[str, str]
+    states: LoadStates
     prior: Prior
     prior_cut: Mapping[str, float] = field(default_factory=dict)
     check_scale: bool = True
 
-    @property
+    @cached_property
     def noise_sites(self) -> dict[str, dict[str, str]]:
         """Observation to the unknown numbers of its noise, each with its name in the posterior.
 
         ``noise_sd`` when one thing is observed, ``noise_sd_<observation>`` when several are.
         """
-        alone = len(self.noise) == 1
+        alone = len(set(self.noise_names.values())) == 1
         return {
-            name: {number: number if alone else f"{number}_{name}" for number in noise.priors}
+            name: {
+                number: number if alone else f"{number}_{self.noise_names[name]}"
+                for number in noise.priors
+            }
             for name, noise in self.noise.items()
+        }
+
+    @cached_property
+    def _noise_priors(self) -> dict[str, dist.Distribution]:
+        """Prior of every unknown number of the noises, by its name in the posterior."""
+        return {
+            site: self.noise[name].priors[number]
+            for name, sites in self.noise_sites.items()
+            for number, site in sites.items()
         }
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is inferred: theta's entries, then the unknown numbers of the noises."""
-        inferred = [site for sites in self.noise_sites.values() for site in sites.values()]
-        return (*self.forward.scene.parameter_names, *inferred)
+        """What is inferred: the unknowns of theta, then those of the noises."""
+        return (*self.states.unknowns, *self._noise_priors)
 
     @cached_property
     def _sampled_prior(self) -> dict[str, dist.Distribution]:
-        return {name: standardised(self.prior[name]) for name in self.forward.scene.parameter_names}
+        return {name: standardised(self.prior[name]) for name in self.states.unknowns}
 
     def __call__(self, data: jax.Array | Data | None = None) -> None:
         """The NumPyro program; ``data`` by name, or as it is when one thing is observed."""
-        theta = jnp.stack([numpyro.sample(name, d) for name, d in self._sampled_prior.items()])
-        prediction = self.forward.evaluate(theta)
+        draw = {name: numpyro.sample(name, d) for name, d in self._sampled_prior.items()}
+        thetas = self.states.thetas(draw)
+        prediction = self.evaluate(thetas)
         # Where the forward map has no answer, the density is zero, not NaN.
         numpyro.factor("valid", jnp.where(prediction.valid, 0.0, -jnp.inf))
-        values = {
-            name: {
-                number: numpyro.sample(site, self.noise[name].priors[number])
-                for number, site in sites.items()
-            }
-            for name, sites in self.noise_sites.items()
-        }
-        means = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0))
+        draw |= {name: numpyro.sample(name, d) for name, d in self._noise_priors.items()}
+        values = self.noise_values(draw)
+        means = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0), thetas)
         observed = None if data is None else self.observe.name(data, "data")
         for name, mean in means.items():
             numpyro.sample(
@@ -101,6 +118,23 @@ class Model:
                 obs=None if observed is None else observed[name],
             )
 
+    def evaluate(self, thetas: jax.Array) -> Prediction:
+        """Displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p), in one call.
+
+        It is valid where the forward map is valid in every state.
+        """
+        if len(thetas) == 1:
+            displacement, valid = self.forward.evaluate(thetas[0])
+            return Prediction(displacement[None], valid)
+        displacement, valid = jax.vmap(self.forward.evaluate)(thetas)
+        return Prediction(displacement, jnp.all(valid))
+
+    def predict(self, values: Mapping[str, Any]) -> tuple[dict[str, jax.Array], jax.Array]:
+        """Data without noise by observation, and its validity, from a value of each unknown."""
+        thetas = self.states.thetas(values)
+        prediction = self.evaluate(thetas)
+        return self.observe(prediction.displacement, thetas), prediction.valid
+
     def noise_values(self, draw: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
         """The inferred numbers of each observation's noise, from ``draw`` by the names there."""
         return {
@@ -108,21 +142,31 @@ class Model:
             for name, sites in self.noise_sites.items()
         }
 
-    def log_likelihood(self, displacement: jax.Array, values: NoiseValues, data: Data) -> jax.Array:
-        """Log density of ``data`` given the displacement (k, 3) of the observed nodes, shape ()."""
-        means = self.observe(displacement)
+    def log_likelihood(
+        self, displacement: jax.Array, thetas: jax.Array, values: NoiseValues, data: Data
+    ) -> jax.Array:
+        """Log density of ``data``, shape ().
+
+        Parameters
+        ----------
+        displacement : (S, k, 3) mm, of the observed nodes in each load state.
+        thetas : (S, p).
+        values : inferred numbers of the noises (:meth:`noise_values`).
+        """
+        means = self.observe(displacement, thetas)
         terms = [
             self.noise[name].distribution(mean, values[name]).log_prob(data[name])
             for name, mean in means.items()
         ]
         return sum(terms, jnp.zeros(()))
 
-    def prior_thetas(self, key: jax.Array, count: int) -> jax.Array:
-        """Theta (count, p) from the prior."""
-        names = self.forward.scene.parameter_names
-        keys = jax.random.split(key, len(names))
-        draws = [self.prior[n].sample(k, (count,)) for n, k in zip(names, keys, strict=True)]
-        return jnp.stack(draws, axis=1)
+    def prior_draws(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
+        """Draws (count,) from the prior of each unknown of theta."""
+        keys = jax.random.split(key, len(self.states.unknowns))
+        return {
+            name: self.prior[name].sample(k, (count,))
+            for name, k in zip(self.states.unknowns, keys, strict=True)
+        }
 
     def check_data(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
         """``data`` in float64 by name; :class:`InputError` on data that cannot be the model's."""
@@ -133,9 +177,13 @@ class Model:
         for name, values in named.items():
             self.observe.parts[name].check(name, values)
         if self.check_scale:
-            thetas = np.asarray(self.prior_thetas(jax.random.key(0), PRIOR_DRAWS))
-            check_magnitudes(self.forward, self.observe, self.noise, thetas, named)
+            draws = self.prior_draws(jax.random.key(0), PRIOR_DRAWS)
+            stacked = np.stack([np.asarray(draws[n]) for n in self.states.unknowns], axis=1)
+            check_magnitudes(self._predict_stacked, self.observe, self.noise, stacked, named)
         return {name: jnp.asarray(values) for name, values in named.items()}
+
+    def _predict_stacked(self, values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        return self.predict(dict(zip(self.states.unknowns, values, strict=True)))
 
 
 def model(
@@ -144,6 +192,7 @@ def model(
     noise: Noise | Mapping[str, Noise],
     prior: Prior | None = None,
     *,
+    known: Mapping[str, float] | None = None,
     check_scale: bool = True,
 ) -> Model:
     """The model of data observed through ``observe``.
@@ -151,8 +200,11 @@ def model(
     Parameters
     ----------
     observe : one observation, or several by name, e.g. ``{"displacement": ..., "volume": ...}``;
-        noise and data are then given by the same names.
-    prior : the scene's box by default.
+        noise and data are then given by the same names. ``volume@p8`` is the volume in the load
+        state ``p8``; a noise under ``volume`` is that of every state.
+    prior : of every parameter; the scene's box by default. In several load states, the loads'
+        parameters have one prior for each state, or separate ones under ``pressure@p8``.
+    known : parameters that are not inferred, by the same names.
     check_scale : ``False`` to take data however far from every prediction
         (:mod:`calibrate.magnitude`).
 
@@ -162,10 +214,26 @@ def model(
         A prior that does not fit the scene, or with more than a thousandth of its mass where the
         forward map has no answer (:mod:`calibrate.prior_range`).
     """
-    scene = forward.scene
     several = observations(observe)
-    noises = several.name(noise, "noise")
+    names, noises = _noises(several, noise)
     restricted = forward.at(several.nodes)
-    given = box_prior(scene) if prior is None else check_prior(scene, prior)
+    states, given = load_states(forward.scene, several.states, prior, known)
+    check_known(restricted, states)
     prior, cut = fit_to(restricted, given)
-    return Model(restricted, forward, several, noises, prior, cut, check_scale)
+    return Model(restricted, forward, several, noises, names, states, prior, cut, check_scale)
+
+
+def _noises(
+    observe: Observations, noise: Noise | Mapping[str, Noise]
+) -> tuple[dict[str, str], dict[str, Noise]]:
+    """The name each observation's noise was given under, and the noise."""
+    if not isinstance(noise, Mapping):
+        bases = list(dict.fromkeys(split(name)[0] for name in observe.parts))
+        if len(bases) > 1:
+            raise InputError(f"noise: give one for each of {', '.join(bases)}, by name")
+        noise = {bases[0]: noise}
+    found = observe.expand(noise, "noise")
+    for name in observe.parts:
+        if name not in found:
+            raise InputError(f"noise: nothing for '{name}'; observed: {', '.join(observe.parts)}")
+    return {k: source for k, (source, _) in found.items()}, {k: n for k, (_, n) in found.items()}

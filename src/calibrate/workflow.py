@@ -13,11 +13,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from calibrate.certificate import Certificate, certify
 from calibrate.data import read_data, write_data
 from calibrate.kept import check_forward, check_run
+from calibrate.load_states import known_thetas
 from calibrate.noise import GaussianNoise, Noise
 from calibrate.observations import (
     DISPLACEMENT,
@@ -27,6 +29,7 @@ from calibrate.observations import (
 )
 from calibrate.posterior import Posterior, read_tree, sample
 from calibrate.samplers import find_sampler
+from calibrate.state_names import split
 from calibrate.statistical_model import Model, model
 from emulator import schema
 from emulator.catalogue import find_scene
@@ -48,9 +51,13 @@ class Run:
 
     scene, root : a scene's name or file; the folder of the published data.
     data : a file, or ``synthetic``: FEM at ``truth`` plus noise.
-    truth : named parameters of synthetic data.
+    truth : parameters of synthetic data by name, ``parameter@state`` in one of several load states
+        (:mod:`calibrate.state_names`).
+    known : parameters that are not inferred, by the same names. They are those of synthetic data
+        too, unless ``truth`` says otherwise.
     observe : observations of synthetic data, joined by ``+``, e.g. ``landmarks:24+volume``; each
-        kind of :data:`calibrate.observations.KINDS` says which words ask for it.
+        kind of :data:`calibrate.observations.KINDS` says which words ask for it. They are made in
+        every load state that ``truth`` and ``known`` name; ``volume@diastole`` in one.
     noise : standard deviation by the observation's name, in its unit. A bare number belongs to a
         single observation, or to the displacements. What is not named has its kind's default.
     noise_scale : the same for the scale of the prior of a standard deviation that is to be
@@ -64,6 +71,7 @@ class Run:
     root: str | None = None
     data: str = "synthetic"
     truth: dict[str, float] = field(default_factory=dict)
+    known: dict[str, float] = field(default_factory=dict)
     observe: str = "nodes:20"
     noise: Mapping[str, float] | float = field(default_factory=dict)
     noise_scale: Mapping[str, float] | float = field(default_factory=dict)
@@ -90,7 +98,12 @@ class Run:
         """The run with every noise by name, the defaults filled in."""
         scales = _by_name(self.noise_scale, observe, "noise-scale")
         given = _by_name(self.noise, observe, "noise")
-        defaults = {name: part.default_noise.upper_sd for name, part in observe.parts.items()}
+        full = observe.expand(given, "noise")
+        defaults = {
+            split(name)[0]: part.default_noise.upper_sd
+            for name, part in observe.parts.items()
+            if name not in full
+        }
         return replace(self, noise={**defaults, **given}, noise_scale=scales)
 
     def noises(self, observe: Observations) -> dict[str, Noise]:
@@ -98,31 +111,32 @@ class Run:
         run = self.named(observe)
         assert isinstance(run.noise, Mapping)
         assert isinstance(run.noise_scale, Mapping)
+        inferred = observe.expand(run.noise_scale, "noise-scale")
         found: dict[str, Noise] = {}
-        for name in observe.parts:
-            scale = run.noise_scale.get(name)
-            found[name] = _gaussian(
-                name, observe, run.noise[name] if scale is None else None, scale
-            )
+        for name, (source, sd) in observe.expand(run.noise, "noise").items():
+            source, scale = inferred.get(name, (source, None))
+            found[source] = _gaussian(name, observe, sd if scale is None else None, scale)
         return found
 
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
         """Noise of each observation of synthetic data."""
-        return replace(self, noise_scale={}).noises(observe)
+        named = replace(self, noise_scale={}).noises(observe)
+        return {name: noise for name, (_, noise) in observe.expand(named, "noise").items()}
 
 
 def _by_name(
     given: Mapping[str, float] | float, observe: Observations, what: str
 ) -> dict[str, float]:
-    """Values by the observation's name; a bare one is a single observation's or displacements'."""
+    """Values by the observation's name; a bare one is a single observation's or displacements'.
+
+    A name without its load state stands for every state.
+    """
     if not isinstance(given, Mapping):
-        if len(observe.parts) > 1 and DISPLACEMENT in observe.parts:
-            return {DISPLACEMENT: given}
-        return observe.name(given, what)
-    for name in given:
-        if name not in observe.parts:
-            known = ", ".join(observe.parts)
-            raise InputError(f"{what}: '{name}' is not observed; observed: {known}")
+        bases = list(dict.fromkeys(split(name)[0] for name in observe.parts))
+        if len(bases) > 1 and DISPLACEMENT not in bases:
+            raise InputError(f"{what}: give one for each of {', '.join(bases)}, by name")
+        return {DISPLACEMENT if len(bases) > 1 else bases[0]: given}
+    observe.expand(given, what)
     return dict(given)
 
 
@@ -160,10 +174,13 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
     """Observations and data of a run by name, read from a file or made by FEM."""
     if run.data != "synthetic":
         return read_data(scene, run.data)
-    theta = scene.theta(**run.truth)
-    observe = parse_observation(scene, run.observe, run.seed)
+    values = {**run.known, **run.truth}
+    states = dict.fromkeys(state for _, state in map(split, values) if state)
+    observe = parse_observation(scene, run.observe, run.seed, tuple(states) or ("",))
+    thetas = known_thetas(scene, observe.states, values)
     noises = run.synthetic_noise(observe)
-    exact = observe(simulator_of(scene)(theta)[observe.nodes])
+    fields = [simulator_of(scene)(theta)[observe.nodes] for theta in thetas]
+    exact = observe(jnp.stack(fields), thetas)
     rng = np.random.default_rng([run.seed, 1])
     return observe, {
         name: np.asarray(exact[name]) + noises[name].simulate(rng, part.shape)
@@ -180,7 +197,11 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
     observe, data = make_data(run, scene)
     run, noises = run.named(observe), run.noises(observe)
     built = model(
-        build_forward(run, scene, progress=progress), observe, noises, check_scale=run.check_scale
+        build_forward(run, scene, progress=progress),
+        observe,
+        noises,
+        known=run.known,
+        check_scale=run.check_scale,
     )
     posterior = sample(
         built, data, sampler=run.sampler, options=options, seed=run.seed, progress=progress
@@ -221,7 +242,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
     noises = run.noises(observe)
     # Its data was checked when it was sampled, or the check was overruled.
-    built: Model = model(forward, observe, noises, check_scale=False)
+    built: Model = model(forward, observe, noises, known=run.known, check_scale=False)
     data = built.check_data({n: np.asarray(tree["observed_data"][n]) for n in observe.parts})
     return run, Posterior(tree, built, data)
 
@@ -239,8 +260,9 @@ def certify_and_keep(
 def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> dict[str, Any]:
     """The result as plain JSON: parameter table, diagnostics, verdict."""
     table = posterior.summary()
-    for name, value in run.truth.items() if run.data == "synthetic" else ():
-        table[name]["truth"] = value
+    for name, row in table.items() if run.data == "synthetic" else ():
+        if (value := run.truth.get(name, run.truth.get(split(name)[0]))) is not None:
+            row["truth"] = value
     result: dict[str, Any] = {
         "scene": run.scene,
         "forward": run.forward,

@@ -31,11 +31,11 @@ class Misfit:
             {"displacement": landmarks(scene, points), "volume": CavityVolume(scene)}
         )
         truth = scene.from_unit(jnp.full(len(scene.parameters), 0.4))
-        self.data = self.observe(forward.at(self.observe.nodes)(truth))
+        self.data = self.observe(forward.at(self.observe.nodes)(truth)[None], truth[None])
 
-    def __call__(self, displacement: jax.Array) -> jax.Array:
-        """The misfit of the displacement (k, 3) mm of the observed nodes."""
-        seen = self.observe(displacement)
+    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """The misfit of the displacement (k, 3) mm of the observed nodes, at ``theta`` (p,)."""
+        seen = self.observe(displacement[None], theta[None])
         moved = (seen["displacement"] - self.data["displacement"]) / NOISE_MM
         volume = (seen["volume"] - self.data["volume"]) / NOISE_ML
         return 0.5 * (jnp.sum(moved**2) + volume**2)
@@ -43,7 +43,7 @@ class Misfit:
     def of(self, forward: ForwardMap) -> Function:
         """Value and gradient in theta through ``forward``, compiled."""
         observed = forward.at(self.observe.nodes)
-        return jax.jit(jax.value_and_grad(lambda theta: self(observed(theta))))
+        return jax.jit(jax.value_and_grad(lambda theta: self(observed(theta), theta)))
 
 
 def fem_gradients(
@@ -66,7 +66,7 @@ def fem_gradients(
 
         def scalar(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
             solution = simulator.solve(theta, start)
-            return misfit(solution.displacement[nodes]), solution.converged
+            return misfit(solution.displacement[nodes], theta), solution.converged
 
         (value, converged), gradient = jax.value_and_grad(scalar, has_aux=True)(theta)
         assert converged

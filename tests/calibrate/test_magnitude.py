@@ -31,8 +31,10 @@ def exact(forward):
 
 
 def over_prior(model):
-    thetas = np.asarray(model.prior_thetas(jax.random.key(0), PRIOR_DRAWS))
-    return predict_over_prior(model.forward, model.observe, thetas)
+    draws = model.prior_draws(jax.random.key(0), PRIOR_DRAWS)
+    stacked = np.stack([np.asarray(draws[name]) for name in model.names[: len(draws)]], axis=1)
+    predict = lambda x: model.predict(dict(zip(draws, x, strict=True)))
+    return predict_over_prior(predict, model.observe, stacked)
 
 
 @pytest.mark.parametrize(
@@ -116,5 +118,5 @@ def test_a_map_without_any_answer_says_so(beam):
 
     forward = replace(linear_forward(beam), limit=10.0)
     model = cal.model(forward, cal.nodal_displacements(beam, NODES), cal.GaussianNoise(sd=0.2))
-    with pytest.raises(InputError, match="'linear' has no valid answer at any of 32 draws"):
+    with pytest.raises(InputError, match="the forward map has no valid answer at any of 32 draws"):
         model.check_data(np.ones((4, 3)))

@@ -31,7 +31,7 @@ class Length(Scalar):
     other_units: ClassVar = {"m": 1e3, "cm": 10.0}
     default_noise: ClassVar = cal.GaussianNoise(sd=0.1)
 
-    def __call__(self, displacement):
+    def __call__(self, displacement, theta):
         x = self.points + displacement
         return jnp.linalg.norm(x[..., 1, :] - x[..., 0, :], axis=-1)
 
@@ -58,7 +58,7 @@ def test_from_the_command_line_through_model_and_file_and_back(beam, tmp_path):
     assert list(observe.parts) == ["length:3,14", "displacement"]
     u = np.random.default_rng(0).normal(size=beam.mesh.nodes.shape)
     x = beam.mesh.nodes + u
-    seen = observe(jnp.asarray(u[observe.nodes]))
+    seen = observe(jnp.asarray(u[observe.nodes])[None], jnp.zeros((1, 2)))
     assert float(seen["length:3,14"]) == pytest.approx(np.linalg.norm(x[14] - x[3]), rel=1e-12)
     data = {name: np.asarray(value) for name, value in seen.items()}
     for file in ("d.csv", "d.nc"):
@@ -83,10 +83,11 @@ def test_in_a_model_with_a_noise_of_its_own(beam):
     observe = parse_observation(beam, "length:3,14")
     model = cal.model(forward, observe, cal.GaussianNoise(sd_scale=0.2))
     assert model.names == ("mu", "lam", "noise_sd")
-    value = observe(model.forward(jnp.array([70.0, 60.0])))["length:3,14"]
+    theta = jnp.array([[70.0, 60.0]])
+    value = model.predict({"mu": 70.0, "lam": 60.0})[0]["length:3,14"]
     checked = model.check_data(np.asarray(value))
     density = model.log_likelihood(
-        model.forward(jnp.array([70.0, 60.0])), {"length:3,14": {"noise_sd": 0.5}}, checked
+        model.forward(theta[0])[None], theta, {"length:3,14": {"noise_sd": 0.5}}, checked
     )
     assert float(density) == pytest.approx(-np.log(0.5 * np.sqrt(2.0 * np.pi)))
     with pytest.raises(InputError, match=r"length:3,14 is -1.0 mm; it must be above 0"):

@@ -15,6 +15,8 @@ from calibrate.observations import (
 )
 from emulator.errors import InputError
 
+NO_THETA = jnp.zeros(0)
+
 
 def test_nodes(beam):
     u = np.random.default_rng(0).normal(size=beam.mesh.nodes.shape)
@@ -24,7 +26,7 @@ def test_nodes(beam):
         ([4, 2], [4, 2]),
     ):
         observe = cal.nodal_displacements(beam, what)
-        np.testing.assert_array_equal(observe(jnp.asarray(u[observe.nodes])), u[index])
+        np.testing.assert_array_equal(observe(jnp.asarray(u[observe.nodes]), NO_THETA), u[index])
         np.testing.assert_array_equal(observe.points, beam.mesh.nodes[index])
 
 
@@ -34,7 +36,7 @@ def test_landmarks_are_exact_for_linear_fields(beam):
     observe = cal.landmarks(beam, points)
     u = beam.mesh.nodes @ H.T + [1.0, 2.0, 3.0]
     np.testing.assert_allclose(
-        observe(jnp.asarray(u[observe.nodes])), points @ H.T + [1, 2, 3], atol=1e-10
+        observe(jnp.asarray(u[observe.nodes]), NO_THETA), points @ H.T + [1, 2, 3], atol=1e-10
     )
     np.testing.assert_allclose(observe.weights.sum(axis=1), 1.0)
     assert observe.weights.min() > -1e-12
@@ -44,7 +46,7 @@ def test_landmarks_are_exact_for_linear_fields(beam):
 def test_a_landmark_on_a_node_is_that_node(beam):
     observe = cal.landmarks(beam, beam.mesh.nodes[[7]])
     u = np.random.default_rng(0).normal(size=beam.mesh.nodes.shape)
-    np.testing.assert_allclose(observe(jnp.asarray(u[observe.nodes])), u[[7]], atol=1e-9)
+    np.testing.assert_allclose(observe(jnp.asarray(u[observe.nodes]), NO_THETA), u[[7]], atol=1e-9)
 
 
 def test_measured_surface_points_are_on_the_surface_give_or_take(beam):
@@ -109,8 +111,10 @@ def test_a_cavity_volume_is_that_of_the_endocardium(ventricle):
     np.testing.assert_array_equal(observe.nodes, np.unique(ventricle.mesh.facet_set("endocardium")))
     # A uniform stretch by 1.1 about the centre: volume times 1.1 cubed.
     u = 0.1 * ventricle.mesh.nodes
-    rest = observe(jnp.zeros((len(observe.nodes), 3)))
-    assert observe(jnp.asarray(u[observe.nodes])) == pytest.approx(1.1**3 * float(rest), rel=1e-12)
+    rest = observe(jnp.zeros((len(observe.nodes), 3)), NO_THETA)
+    assert observe(jnp.asarray(u[observe.nodes]), NO_THETA) == pytest.approx(
+        1.1**3 * float(rest), rel=1e-12
+    )
 
 
 def test_several_observations_need_the_union_of_their_nodes(ventricle):
@@ -124,9 +128,11 @@ def test_several_observations_need_the_union_of_their_nodes(ventricle):
         np.sort(several.nodes), sorted({*parts["displacement"].nodes, *parts["volume"].nodes})
     )
     u = np.random.default_rng(0).normal(size=(2, *ventricle.mesh.nodes.shape))
-    seen = several(jnp.asarray(u[:, several.nodes]))
+    seen = several(jnp.asarray(u[:, None, several.nodes]), jnp.zeros((2, 1, 0)))
     for name, part in parts.items():
-        np.testing.assert_allclose(seen[name], part(jnp.asarray(u[:, part.nodes])), rtol=1e-13)
+        np.testing.assert_allclose(
+            seen[name], part(jnp.asarray(u[:, part.nodes]), NO_THETA), rtol=1e-13
+        )
     again = observations_from_json(ventricle, json.loads(json.dumps(several.to_json())))
     assert list(again.parts) == ["displacement", "volume"]
     np.testing.assert_array_equal(again.nodes, several.nodes)
@@ -152,9 +158,13 @@ def test_the_largest_part_is_a_slice_of_the_union(ventricle):
     def through(seen):
         return sum((jnp.sum(value**2) for value in seen.values()), jnp.zeros(()))
 
-    together = jax.vmap(jax.grad(lambda u: through(both(u[both.nodes]))))(fields)
+    together = jax.vmap(jax.grad(lambda u: through(both(u[None, both.nodes], NO_THETA[None]))))(
+        fields
+    )
     alone = [
-        jax.grad(lambda u: through({k: part(u[part.nodes]) for k, part in parts.items()}))(u)
+        jax.grad(
+            lambda u: through({k: part(u[part.nodes], NO_THETA) for k, part in parts.items()})
+        )(u)
         for u in fields
     ]
     np.testing.assert_allclose(together, jnp.stack(alone), rtol=1e-12, atol=1e-12)

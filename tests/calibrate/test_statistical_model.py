@@ -71,10 +71,10 @@ def test_the_density_of_two_observations_is_the_one_by_hand(ventricle, parts, da
     )
     likelihood = by_hand(ventricle, forward, parts, data, (0.5, 4.0))
     assert float(found) == pytest.approx(prior + likelihood, rel=1e-10)
-    seen = model.forward(jnp.array(list(THETA.values())))
-    assert float(model.log_likelihood(seen, model.noise_values({}), checked)) == pytest.approx(
-        likelihood, rel=1e-10
-    )
+    theta = jnp.array([list(THETA.values())])
+    seen = model.forward(theta[0])[None]
+    found = model.log_likelihood(seen, theta, model.noise_values({}), checked)
+    assert float(found) == pytest.approx(likelihood, rel=1e-10)
 
 
 def test_each_noise_may_be_known_or_inferred(ventricle, parts, data):

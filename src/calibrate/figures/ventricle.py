@@ -45,7 +45,8 @@ def ventricle_figure(
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35))
     _draw_body(left, posterior, fields)
     axes = right.subplots(2, 3)
-    prior = posterior.model.prior_thetas(jax.random.key(1), 400)
+    model = posterior.model
+    prior = model.states.thetas(model.prior_draws(jax.random.key(1), 400))[:, 0]
     for panel, parameter in zip(axes.flat, posterior.model.forward.scene.parameters, strict=False):
         _draw_marginal(panel, posterior, parameter, theta[parameter.name])
     _draw_volume(axes.flat[-1], posterior, np.asarray(truth), prior)
@@ -105,15 +106,14 @@ def _draw_volume(axes: Axes, posterior: Posterior, truth: np.ndarray, prior: jax
     """Predicted cavity volume, prior and posterior, against the measured one."""
     model = posterior.model
     volume = model.observe.parts["volume"]
-    predict = jax.jit(
-        lambda thetas: jax.lax.map(lambda t: model.observe(model.forward(t))["volume"], thetas)
-    )
+    wall = model.full.at(volume.nodes)
+    predict = jax.jit(lambda thetas: jax.lax.map(lambda theta: volume(wall(theta), theta), thetas))
     before, after = np.asarray(predict(prior)), np.asarray(predict(posterior.thetas()[::4]))
     measured, noise = float(posterior.data["volume"]), model.noise["volume"]
     axes.hist(after, 25, density=True, color=_POSTERIOR, alpha=0.75)
     for quantile in np.quantile(after, [0.05, 0.95]):
         axes.axvline(quantile, color=_POSTERIOR, lw=1, ls=":")
-    axes.axvline(float(volume(truth[volume.nodes])), color="black", lw=1.6)
+    axes.axvline(float(volume(truth[volume.nodes], prior[0])), color="black", lw=1.6)
     axes.axvline(measured, color=_DATA, lw=1.6, label="measured")
     if not noise.priors:
         sd = noise.upper_sd

@@ -40,7 +40,7 @@ class Landmarks(DisplacementPoints):
     kind: ClassVar[str] = "landmarks"
     usage: ClassVar[str] = "landmarks:N"
 
-    def __call__(self, displacement: jax.Array) -> jax.Array:
+    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Interpolated displacements (..., d, 3)."""
         values = displacement[..., self.members, :]
         return jnp.sum(values * self.weights[:, :, None], axis=-2)

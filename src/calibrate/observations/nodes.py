@@ -32,7 +32,7 @@ class NodalDisplacements(DisplacementPoints):
     kind: ClassVar[str] = "nodes"
     usage: ClassVar[str] = "nodes:N, all, a node set, node numbers like 3,14,15"
 
-    def __call__(self, displacement: jax.Array) -> jax.Array:
+    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """The displacements themselves."""
         return displacement
 

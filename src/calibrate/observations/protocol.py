@@ -1,4 +1,4 @@
-"""What an observation is: a function of the displacement that knows its own data, files and words.
+"""What an observation is: a function of displacement and theta that knows its data and its words.
 
 Everything the rest of the package needs to know of an observation is asked here. A new one is a
 file beside this one and a line in :mod:`calibrate.observations.registry`.
@@ -41,7 +41,7 @@ class Labels(NamedTuple):
 
 
 class Observation(Protocol):
-    """A function of the displacement of a few nodes.
+    """A function of the displacement of a few nodes, and of theta.
 
     Attributes
     ----------
@@ -74,8 +74,14 @@ class Observation(Protocol):
         """Noise assumed where none is given."""
         ...
 
-    def __call__(self, displacement: jax.Array) -> jax.Array:
-        """Data without noise (..., *shape) from the displacement of ``nodes`` (..., k, 3) mm."""
+    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """Data without noise (..., *shape), from one load state.
+
+        Parameters
+        ----------
+        displacement : (..., k, 3) mm, of ``nodes``.
+        theta : (..., p), in the order of the scene's ``parameter_names``.
+        """
         ...
 
     def check(self, name: str, values: np.ndarray) -> None:

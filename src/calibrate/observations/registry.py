@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from calibrate.observations.landmarks import Landmarks
@@ -10,6 +10,7 @@ from calibrate.observations.nodes import NodalDisplacements
 from calibrate.observations.protocol import Observation
 from calibrate.observations.several import Observations
 from calibrate.observations.volume import CavityVolume
+from calibrate.state_names import at, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
@@ -19,8 +20,12 @@ KINDS: dict[str, type[Observation]] = {
 }
 
 
-def parse_observation(scene: Scene, text: str, seed: int = 0) -> Observations:
+def parse_observation(
+    scene: Scene, text: str, seed: int = 0, states: Sequence[str] = ("",)
+) -> Observations:
     """What the words joined by ``+`` ask for, e.g. ``landmarks:24+volume``.
+
+    A word is asked for in each of ``states``; ``volume@diastole`` in that load state only.
 
     Raises
     ------
@@ -29,10 +34,12 @@ def parse_observation(scene: Scene, text: str, seed: int = 0) -> Observations:
     """
     parts: dict[str, Observation] = {}
     for word in text.split("+"):
-        name, part = _parse_word(scene, word, seed)
-        if name in parts:
-            raise InputError(f"observe '{text}': {name} is given twice; once is enough")
-        parts[name] = part
+        bare, own = split(word)
+        base, part = _parse_word(scene, bare, seed)
+        for state in (own,) if own else states:
+            if (name := at(base, state)) in parts:
+                raise InputError(f"observe '{text}': {name} is given twice; once is enough")
+            parts[name] = part
     return Observations(parts)
 
 

@@ -1,4 +1,4 @@
-"""Several observations of one displacement field, by name."""
+"""Several observations of one body, by name: in one load state, or in several."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ import jax
 import numpy as np
 
 from calibrate.observations.protocol import Observation
+from calibrate.state_names import split, states_of
 from emulator.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Observations made at once, by name; one forward map serves them all."""
+    """Observations by name; one forward map serves them all.
+
+    In a body with several load states each name says which one is meant, as in ``volume@diastole``
+    (:mod:`calibrate.load_states`).
+    """
 
     parts: Mapping[str, Observation]
 
@@ -28,6 +33,12 @@ class Observations:
         for name in self.parts:
             if not isinstance(name, str) or not name or "/" in name:
                 raise InputError(f"observation is called {name!r}; use a name without '/'")
+        self.states  # noqa: B018 - names that contradict each other are refused here
+
+    @cached_property
+    def states(self) -> tuple[str, ...]:
+        """The load states, (S,); one empty name where no observation names any."""
+        return states_of(self.parts)
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -58,11 +69,41 @@ class Observations:
         """Shape of each part's data."""
         return {name: part.shape for name, part in self.parts.items()}
 
-    def __call__(self, displacement: jax.Array) -> dict[str, jax.Array]:
-        """Data of each part without noise, from the displacement of ``nodes`` (..., k, 3) mm."""
-        return {
-            name: part(displacement[..., self._rows[name], :]) for name, part in self.parts.items()
-        }
+    def __call__(self, displacement: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
+        """Data of each part without noise.
+
+        Parameters
+        ----------
+        displacement : (..., S, k, 3) mm, of ``nodes`` in every load state.
+        thetas : (..., S, p), theta in every load state.
+        """
+        found = {}
+        for name, part in self.parts.items():
+            s = self.states.index(split(name)[1])
+            found[name] = part(displacement[..., s, self._rows[name], :], thetas[..., s, :])
+        return found
+
+    def expand[T](self, values: Mapping[str, T], what: str) -> dict[str, tuple[str, T]]:
+        """Values of the parts' names, from values by name or by name without its state.
+
+        ``{"volume": v}`` gives ``v`` to the volume of every load state. Each value comes with the
+        name it was given under; a part that ``values`` does not mention has none.
+
+        Raises
+        ------
+        InputError
+            A value without a part; the message begins with ``what``.
+        """
+        known = dict.fromkeys((*self.parts, *(split(name)[0] for name in self.parts)))
+        for name in values:
+            if name not in known:
+                raise InputError(f"{what}: '{name}' is not observed; observed: {', '.join(known)}")
+        found = {}
+        for name in self.parts:
+            source = name if name in values else split(name)[0]
+            if source in values:
+                found[name] = source, values[source]
+        return found
 
     def name[T](self, values: T | Mapping[str, T], what: str) -> dict[str, T]:
         """``values`` by the parts' names, in their order; a bare value belongs to a single part.

@@ -60,7 +60,7 @@ class CavityVolume(Scalar):
         """``volume`` and ``volume:<facet set>``."""
         return self.kind, f"{self.kind}:{self.facet_set}"
 
-    def __call__(self, displacement: jax.Array) -> jax.Array:
+    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Volume (...) in mL."""
         return self.cavity(displacement)
 

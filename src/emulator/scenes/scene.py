@@ -203,6 +203,12 @@ class Scene:
         return ParameterSpace(self.parameters)
 
     @property
+    def load_parameters(self) -> tuple[str, ...]:
+        """Parameters that the loads take; the others are the material's."""
+        taken = {quantity.name for load in self.loads for quantity in load.quantities}
+        return tuple(name for name in self.parameter_names if name in taken)
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the entries of theta, in order."""
         return self.space.names

@@ -21,7 +21,18 @@ def register(commands: Any) -> None:
         "--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm and mL"
     )
     parser.add_argument(
-        "--truth", nargs="+", default=[], metavar="NAME=VALUE", help="of synthetic data"
+        "--truth",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        help="of synthetic data; NAME@STATE=VALUE in one of several load states",
+    )
+    parser.add_argument(
+        "--known",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        help="parameters that are not inferred, e.g. pressure@p8=1.07",
     )
     parser.add_argument(
         "--observe",
@@ -102,6 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
         root=arguments.root and _absolute(arguments.root),
         data=_absolute(arguments.data, is_path=arguments.data != "synthetic"),
         truth=assignments(arguments.truth),
+        known=assignments(arguments.known),
         observe=arguments.observe,
         noise=noise_by_name(arguments.noise, "--noise"),
         noise_scale=noise_by_name(arguments.noise_scale, "--noise-scale"),
