@@ -25,6 +25,7 @@ def test_fem_reproduces_the_released_solutions(published, most):
     assert all(row.passed for row in rows.values())
 
 
+@pytest.mark.slow
 def test_a_wrong_reference_is_noticed(published, tmp_path, monkeypatch):
     import shutil
 

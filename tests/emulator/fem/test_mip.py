@@ -26,9 +26,8 @@ def traction_beam():
     return em.scenes.traction_beam_guccione(cells=(12, 2, 2))
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("traction_beam", marks=pytest.mark.slow), "ventricle"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["traction_beam", "ventricle"])
 def test_where_measures_are_those_of_the_displacement_it_is_newton(name, request):
     scene = request.getfixturevalue(name)
     system, theta = System(scene), scene.centre

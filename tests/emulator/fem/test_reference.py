@@ -58,6 +58,7 @@ def test_outside_the_box(hanging):
         sample_outside(hanging, 4, -1.0)
 
 
+@pytest.mark.slow
 def test_solves_that_fail_outside_are_counted(hanging, simulator, out_of_balance):
     class Brittle(em.Simulator):
         def solve(self, theta, start=None):

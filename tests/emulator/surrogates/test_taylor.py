@@ -70,7 +70,7 @@ def orders(simulator, series, directions, steps):
         pytest.param(
             k,
             marks=pytest.mark.slow
-            if k in ("mean dilatation", "follower pressure", "quadratic")
+            if k in ("a face moved", "follower pressure", "mean dilatation", "quadratic", "regions")
             else [],
         )
         for k in SCENES

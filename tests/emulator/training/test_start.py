@@ -77,6 +77,7 @@ def test_before_any_step_the_network_is_the_other_ones(other, own, start):
     assert np.abs(emulator(theta) - own(theta)).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_training_leaves_the_emulator_it_started_from(whole, start, beam):
     # A step consumes the weights it is given; these were a copy.
     same(start.network.weights, untrained(beam).network.weights)
@@ -84,6 +85,7 @@ def test_training_leaves_the_emulator_it_started_from(whole, start, beam):
     assert any((a != b).any() for a, b in zip(*pairs, strict=True))
 
 
+@pytest.mark.slow
 def test_where_a_training_started_is_recorded(whole, start, tmp_path):
     assert whole.record["start"] == {
         "scene": "once_clamped_beam",
@@ -94,7 +96,8 @@ def test_where_a_training_started_is_recorded(whole, start, tmp_path):
     assert load(tmp_path / "e").record["start"]["fingerprint"] == start.fingerprint
 
 
-@pytest.mark.parametrize("writes", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("writes", [1, 2])
 def test_a_started_run_killed_resumes_without_its_start(
     other, start, whole, tmp_path, monkeypatch, writes
 ):
@@ -146,6 +149,7 @@ def test_a_family_shares_one_network(beam, other, own, pretrained):
     assert pretrained[0].record["family"] == [beam.fingerprint, other.fingerprint]
 
 
+@pytest.mark.slow
 def test_a_family_takes_its_scenes_in_turn(beam, own, pretrained):
     problems = [prepare(beam, FAMILY, SMALL), own]
     weights = with_network_of(problems[0].emulator, problems[1].emulator).network.weights

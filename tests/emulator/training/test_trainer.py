@@ -30,7 +30,12 @@ def tests(beam, simulator):
 # Energy alone leaves the soft modes behind and takes longer.
 @pytest.mark.parametrize(
     ("objective", "factor"),
-    [("energy", 0.8), ("simulations", 0.5), ("gradients", 0.5), ("both", 0.5)],
+    [
+        ("energy", 0.8),
+        pytest.param("simulations", 0.5, marks=pytest.mark.slow),
+        pytest.param("gradients", 0.5, marks=pytest.mark.slow),
+        ("both", 0.5),
+    ],
 )
 def test_training_lowers_the_error(beam, tests, objective, factor, tmp_path):
     plan = Plan(objective=objective, steps=300, simulations=16, batch=8, learning_rate=3e-3)
@@ -270,7 +275,8 @@ def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
     assert " + ".join([chosen["on"], "discrepancy"]) == " + ".join(hybrid.parts)
 
 
-@pytest.mark.parametrize("writes", [pytest.param(3, marks=pytest.mark.slow), 5])
+@pytest.mark.slow
+@pytest.mark.parametrize("writes", [3, 5])
 def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatch, hybrid, writes):
     """After its modes are frozen, and while the discrepancy model is fitted."""
     write, kept = Writer.write, []

@@ -44,6 +44,7 @@ def test_tangent_is_the_derivative_of_the_force_and_not_symmetric(order):
     assert not np.allclose(blocks, blocks.transpose(0, 2, 1))
 
 
+@pytest.mark.slow
 def test_equal_to_the_cavity_where_the_rim_is_held():
     # The top face of a block held all round: its rim is held, so -p V is exact too.
     sides = tuple(em.Support(name) for name in ("left", "right", "front", "back"))
