@@ -83,7 +83,7 @@ class Model:
         }
 
     @cached_property
-    def _noise_priors(self) -> dict[str, dist.Distribution]:
+    def noise_priors(self) -> dict[str, dist.Distribution]:
         """Prior of every unknown number of the noises, by its name in the posterior."""
         return {
             site: self.noise[name].priors[number]
@@ -94,7 +94,7 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """What is inferred: the unknowns of theta, then those of the noises."""
-        return (*self.states.unknowns, *self._noise_priors)
+        return (*self.states.unknowns, *self.noise_priors)
 
     @cached_property
     def _sampled_prior(self) -> dict[str, dist.Distribution]:
@@ -107,7 +107,7 @@ class Model:
         prediction = self.evaluate(thetas)
         # Where the forward map has no answer, the density is zero, not NaN.
         numpyro.factor("valid", jnp.where(prediction.valid, 0.0, -jnp.inf))
-        draw |= {name: numpyro.sample(name, d) for name, d in self._noise_priors.items()}
+        draw |= {name: numpyro.sample(name, d) for name, d in self.noise_priors.items()}
         values = self.noise_values(draw)
         means = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0), thetas)
         observed = None if data is None else self.observe.name(data, "data")

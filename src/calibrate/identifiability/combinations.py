@@ -19,6 +19,7 @@ from scipy.linalg import eigh
 
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
+from calibrate.statistical_model import Model
 
 _PRIOR_DRAWS = 4096
 # Exponents are rounded to be readable; those that round to zero are left out.
@@ -38,42 +39,59 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     """
     model = posterior.model
     names, draws = model.states.unknowns, posterior.draws()
-    prior_draws = model.prior_draws(jax.random.key(0), _PRIOR_DRAWS)
     after = np.stack([draws[name] for name in names], axis=1)
-    before = np.stack([np.asarray(prior_draws[name]) for name in names], axis=1)
-    scales = {parameter.name: parameter.scale for parameter in model.forward.scene.parameters}
-    log = np.array([scales[split(name)[0]] == "log" for name in names])
+    before = prior_table(model)
+    log = on_log_scale(model)
     x, prior = (_on_scale(thetas, log) for thetas in (after, before))
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
     correlation = np.atleast_2d(np.corrcoef(x, rowvar=False))
     positive = bool((after > 0.0).all() and (before > 0.0).all())
+    covariances = [
+        np.atleast_2d(np.cov(np.log(t), rowvar=False)) for t in (after, before)
+    ] * positive
     return {
         "contraction": dict(zip(names, contraction.tolist(), strict=True)),
         "correlation": {
             first: {second: float(correlation[j, k]) for k, second in enumerate(names)}
             for j, first in enumerate(names)
         },
-        "combinations": _combinations(names, np.log(after), np.log(before)) if positive else [],
+        "combinations": combinations(names, *covariances) if positive else [],
     }
+
+
+def prior_table(model: Model, count: int = _PRIOR_DRAWS) -> np.ndarray:
+    """Draws (count, q) of the unknowns of theta from their prior."""
+    draws = model.prior_draws(jax.random.key(0), count)
+    return np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
+
+
+def on_log_scale(model: Model) -> np.ndarray:
+    """Whether each unknown of theta (q,) has a logarithmic scale in its scene."""
+    scales = {parameter.name: parameter.scale for parameter in model.forward.scene.parameters}
+    return np.array([scales[split(name)[0]] == "log" for name in model.states.unknowns])
 
 
 def _on_scale(thetas: np.ndarray, log: np.ndarray) -> np.ndarray:
     return np.where(log, np.log(np.where(log, thetas, 1.0)), thetas)
 
 
-def _combinations(
+def combinations(
     names: tuple[str, ...], after: np.ndarray, before: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Directions in log theta, from draws (s, p), the most contracted first."""
-    covariances = [np.atleast_2d(np.cov(x, rowvar=False)) for x in (after, before)]
-    _, directions = eigh(*covariances)  # eigenvalues ascend
-    prior_sd = before.std(axis=0)
+    """Products of powers, the most contracted first.
+
+    Parameters
+    ----------
+    after, before : (q, q) covariances of log theta, of the posterior and of the prior.
+    """
+    _, directions = eigh(after, before)  # eigenvalues ascend
+    prior_sd = np.sqrt(np.diagonal(before))
     found = []
     for w in directions.T:
         # The parameter that contributes most to its variance under the prior has exponent 1.
         leading = int(np.argmax(np.abs(w) * prior_sd))
         exponents = np.round(w / w[leading], _DIGITS) + 0.0
-        sds = [float((x @ exponents).std(ddof=1)) for x in (after, before)]
+        sds = [float(np.sqrt(exponents @ S @ exponents)) for S in (after, before)]
         kept = {n: float(e) for n, e in zip(names, exponents, strict=True) if e}
         found.append({"exponents": kept, "known_to": sds[0], "prior": sds[1]})
     return sorted(found, key=lambda entry: entry["known_to"] / entry["prior"])

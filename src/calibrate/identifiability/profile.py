@@ -1,0 +1,146 @@
+r"""Profile likelihoods: how well one unknown explains the data with all others at their best.
+
+.. math:: L_k(v) = \max_{\theta : \theta_k = v} \log p(y \mid \theta)
+          - \max_\theta \log p(y \mid \theta)
+
+No prior enters but its support, so that a flat profile says: the data alone does not determine
+:math:`\theta_k`, whatever the posterior's sd. The 95 % likelihood interval ends where :math:`L_k`
+falls below -1.92 (half the quantile 3.84 of chi-squared with one degree of freedom; Raue et al.
+2009).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro.distributions.transforms import biject_to
+from scipy.optimize import minimize
+
+from calibrate.posterior import Posterior
+from calibrate.priors import bounds
+from emulator.errors import InputError
+
+DROP_95 = 1.92
+_BOUND = 12.0  # of the unconstrained coordinate of an interval: within 1e-5 of its ends
+_WIDTH = 4.0  # posterior sd on each side of the median
+
+LogLikelihood = Callable[[jax.Array], jax.Array]
+"""Unconstrained coordinates (q,) to the log likelihood, ``-inf`` where there is no answer."""
+
+
+class Profile(NamedTuple):
+    """The profile of one unknown.
+
+    values : (v,), ascending. drop : (v,) log likelihood below its maximum, 0 at the best.
+    low, high : ends of the 95 % likelihood interval; infinite where the likelihood does not fall so
+        far within ``values``.
+    """
+
+    values: np.ndarray
+    drop: np.ndarray
+    low: float
+    high: float
+
+
+def profile_likelihood(posterior: Posterior, name: str, points: int = 21) -> Profile:
+    """The profile of the unknown ``name``, to four posterior sd on each side.
+
+    Raises
+    ------
+    InputError
+        No such unknown.
+    """
+    model = posterior.model
+    if name not in model.names:
+        raise InputError(f"profile: '{name}' is not inferred; inferred: {', '.join(model.names)}")
+    priors = {**model.prior, **model.noise_priors}
+    transforms = {n: biject_to(d.support) for n, d in priors.items()}
+    limits = [_BOUND if np.isfinite(bounds(priors[n])).all() else np.inf for n in model.names]
+    draws = posterior.draws()
+    z = np.stack([np.asarray(transforms[n].inv(draws[n])) for n in model.names], axis=1)
+    k = model.names.index(name)
+    grid = np.median(z[:, k]) + z[:, k].std() * np.linspace(-_WIDTH, _WIDTH, points)
+    grid = np.clip(grid, -limits[k], limits[k])
+
+    def log_likelihood(x: jax.Array) -> jax.Array:
+        draw = {n: transforms[n](value) for n, value in zip(model.names, x, strict=True)}
+        thetas = model.states.thetas(draw)
+        prediction = model.evaluate(thetas)
+        noise = model.noise_values(draw)
+        found = model.log_likelihood(prediction.displacement, thetas, noise, posterior.data)
+        return jnp.where(prediction.valid, found, -jnp.inf)
+
+    best = _profile(log_likelihood, z, k, grid, np.array(limits))
+    drop = best.max() - best
+    values = np.asarray(transforms[name](jnp.asarray(grid)))
+    return Profile(values, drop, *_interval(values, drop))
+
+
+def _profile(
+    log_likelihood: LogLikelihood, z: np.ndarray, k: int, grid: np.ndarray, limits: np.ndarray
+) -> np.ndarray:
+    """Largest log likelihood with coordinate ``k`` at each of ``grid``, from draws ``z`` (s, q).
+
+    Each maximisation starts from the draw nearest in that coordinate, and from the best of the
+    point before.
+    """
+    others = np.array([j for j in range(z.shape[1]) if j != k])
+
+    @jax.jit
+    @jax.value_and_grad
+    def objective(rest: jax.Array, value: jax.Array) -> jax.Array:
+        return -log_likelihood(jnp.zeros(z.shape[1]).at[k].set(value).at[others].set(rest))
+
+    def safe(rest: np.ndarray, value: float) -> tuple[float, np.ndarray]:
+        found, gradient = (np.asarray(part) for part in objective(jnp.asarray(rest), value))
+        fine = np.isfinite(found) and np.isfinite(gradient).all()
+        return (float(found), gradient) if fine else (1e10, np.zeros_like(rest))
+
+    best, last = [], None
+    for value in grid:
+        starts = [z[int(np.argmin(np.abs(z[:, k] - value))), others]]
+        starts += [] if last is None else [last]
+        box = list(zip(-limits[others], limits[others], strict=True))
+        found = [
+            minimize(safe, np.clip(s, *zip(*box, strict=True)), (value,), jac=True, bounds=box)
+            if len(others)
+            else _nothing_to_fit(safe, value)
+            for s in starts
+        ]
+        lowest = min(found, key=lambda result: result.fun)
+        best.append(-lowest.fun)
+        last = lowest.x
+    return np.array(best)
+
+
+class _Found(NamedTuple):
+    fun: float
+    x: np.ndarray
+
+
+def _nothing_to_fit(safe: Callable, value: float) -> _Found:
+    """With a single unknown, the likelihood itself."""
+    return _Found(safe(np.zeros(0), value)[0], np.zeros(0))
+
+
+def _interval(values: np.ndarray, drop: np.ndarray) -> tuple[float, float]:
+    """Where the drop crosses :data:`DROP_95` on each side of its least, by interpolation."""
+    best = int(np.argmin(drop))
+    below, above = drop[: best + 1][::-1], drop[best:]
+    return (
+        _crossing(values[: best + 1][::-1], below, -np.inf),
+        _crossing(values[best:], above, np.inf),
+    )
+
+
+def _crossing(values: np.ndarray, drop: np.ndarray, otherwise: float) -> float:
+    beyond = np.flatnonzero(drop > DROP_95)
+    if not beyond.size:
+        return otherwise
+    i = int(beyond[0])
+    share = (DROP_95 - drop[i - 1]) / (drop[i] - drop[i - 1])
+    return float(values[i - 1] + share * (values[i] - values[i - 1]))
