@@ -78,7 +78,7 @@ def stress_band(
 
 
 def stresses(scene: Scene, theta: jax.Array, axis: jax.Array, stretch: np.ndarray) -> jax.Array:
-    """Stress difference (n,) in kPa along ``axis`` (3,); the fibre is along x, the sheet along y."""
+    """Stress difference (n,) in kPa along ``axis`` (3,); fibres are along x, sheets along y."""
     energy, at = point_energy(scene, theta), _tissue(scene)
 
     def along(value: jax.Array) -> jax.Array:
