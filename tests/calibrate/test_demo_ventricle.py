@@ -94,7 +94,7 @@ def test_its_files_hold_both_observations(folder):
     V = float(cavity(u[cavity.nodes]))
     assert data["volume"] == pytest.approx(V, abs=4.0)
     gap = data["displacement"] - observe.parts["displacement"](
-        jnp.asarray(u[observe.parts["displacement"].nodes])
+        jnp.asarray(u[observe.parts["displacement"].nodes]), scene.theta(**RUN.truth)
     )
     assert np.std(gap) == pytest.approx(RUN.noise["displacement"], rel=4 / np.sqrt(2 * gap.size))
 
