@@ -27,6 +27,7 @@ from calibrate.observations import (
     observations_from_json,
     parse_observation,
 )
+from calibrate.observations.present import missing_values
 from calibrate.posterior import Posterior, read_tree, sample
 from calibrate.samplers import find_sampler
 from calibrate.state_names import split
@@ -271,6 +272,7 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "verdict": "not certified",
         "k_hat": None,
         "prior_cut": dict(posterior.model.prior_cut),
+        "missing": missing_values(posterior.model.observe),
         "draws": int(posterior.tree["posterior"].sizes["draw"]),
         "chains": int(posterior.tree["posterior"].sizes["chain"]),
     }

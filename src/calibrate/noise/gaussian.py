@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 
+from calibrate.noise.protocol import Sites
 from emulator.errors import InputError
 
 NOISE_SD = "noise_sd"
@@ -29,6 +30,7 @@ class GaussianNoise:
     sd_scale: float | None = None
 
     kind: ClassVar[str] = "gaussian"
+    usage: ClassVar[str] = "gaussian:sd=SD"
 
     def __post_init__(self) -> None:
         if (self.sd is None) == (self.sd_scale is None):
@@ -36,6 +38,14 @@ class GaussianNoise:
         value = self.sd if self.sd is not None else self.sd_scale
         if value is None or not 0.0 < value < float("inf"):
             raise InputError(f"noise: standard deviation is {value}; it must be above 0")
+
+    def at(self, sites: Sites | None) -> Self:
+        """Itself: independent noise does not know where."""
+        return self
+
+    def inferred(self, scale: float) -> Self:
+        """Gaussian noise of unknown sd."""
+        return type(self)(sd_scale=scale)
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:

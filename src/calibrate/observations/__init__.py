@@ -7,7 +7,7 @@ are listed in :data:`KINDS`.
 from calibrate.observations.landmarks import Landmarks, landmarks, spread_landmarks
 from calibrate.observations.nodes import NodalDisplacements, nodal_displacements, spread_nodes
 from calibrate.observations.points import DISPLACEMENT
-from calibrate.observations.protocol import Field, Labels, Observation
+from calibrate.observations.protocol import Field, Kind, Labels, Observation
 from calibrate.observations.registry import (
     KINDS,
     observation_from_json,
@@ -23,6 +23,7 @@ __all__ = [
     "KINDS",
     "CavityVolume",
     "Field",
+    "Kind",
     "Labels",
     "Landmarks",
     "NodalDisplacements",

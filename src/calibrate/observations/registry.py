@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from calibrate.observations.landmarks import Landmarks
 from calibrate.observations.nodes import NodalDisplacements
-from calibrate.observations.protocol import Observation
+from calibrate.observations.present import ENTRIES, Present
+from calibrate.observations.protocol import Kind, Observation
 from calibrate.observations.several import Observations
 from calibrate.observations.volume import CavityVolume
 from calibrate.state_names import at, split
@@ -15,7 +18,7 @@ from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
 # In this order they look for their columns in a file: `node` decides before `x,y,z`.
-KINDS: dict[str, type[Observation]] = {
+KINDS: dict[str, type[Kind]] = {
     kind.kind: kind for kind in (NodalDisplacements, Landmarks, CavityVolume)
 }
 
@@ -61,7 +64,8 @@ def observation_from_json(scene: Scene, description: Mapping[str, Any]) -> Obser
     kind = description.get("kind")
     if kind not in KINDS:
         raise InputError(f"observation kind '{kind}' is unknown; known: {', '.join(KINDS)}")
-    return KINDS[kind].from_json(scene, description)
+    whole = KINDS[kind].from_json(scene, description)
+    return Present(whole, np.asarray(description[ENTRIES])) if ENTRIES in description else whole
 
 
 def observations_from_json(

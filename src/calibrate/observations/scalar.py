@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from calibrate.noise.protocol import Sites
 from calibrate.observations.protocol import Field, Labels
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -23,6 +24,7 @@ class Scalar:
     kind: ClassVar[str]
     unit: ClassVar[str]
     shape: ClassVar[tuple[int, ...]] = ()
+    sites: ClassVar[Sites | None] = None
 
     @property
     @abstractmethod
@@ -35,14 +37,14 @@ class Scalar:
         """Name and observation of ``word``."""
 
     def check(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` unless ``values`` is one finite number above 0."""
+        """Raise :class:`InputError` unless ``values`` is one finite number above 0, or missing."""
         if values.shape != ():
             raise InputError(
                 f"data has shape {values.shape}; the observation expects () ({name}, {self.unit})"
             )
-        if not np.isfinite(values):
+        if np.isinf(values):
             raise InputError(f"data: {name} is {values}; it must be finite")
-        if not values > 0.0:
+        if values <= 0.0:
             raise InputError(f"data: {name} is {values} {self.unit}; it must be above 0")
 
     def labels(self, name: str) -> Labels:
