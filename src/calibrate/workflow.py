@@ -31,7 +31,7 @@ from calibrate.observations.present import missing_values
 from calibrate.posterior import Posterior, read_tree, sample
 from calibrate.samplers import find_sampler
 from calibrate.state_names import split
-from calibrate.statistical_model import Model, model
+from calibrate.statistical_model import Model, at_sites, model
 from emulator import schema
 from emulator.catalogue import find_scene
 from emulator.errors import InputError
@@ -122,7 +122,8 @@ class Run:
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
         """Noise of each observation of synthetic data."""
         named = replace(self, noise_scale={}).noises(observe)
-        return {name: noise for name, (_, noise) in observe.expand(named, "noise").items()}
+        each = {name: noise for name, (_, noise) in observe.expand(named, "noise").items()}
+        return at_sites(each, observe)
 
 
 def _by_name(

@@ -69,5 +69,5 @@ class Scale:
 
 def check_positive(what: str, value: object) -> None:
     """Raise :class:`InputError` unless ``value`` is a finite number above 0."""
-    if not isinstance(value, Real) or not 0.0 < value < float("inf"):
+    if not isinstance(value, Real) or not 0.0 < float(value) < float("inf"):
         raise InputError(f"noise: {what} is {value}; it must be above 0")

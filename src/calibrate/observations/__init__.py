@@ -15,7 +15,9 @@ from calibrate.observations.registry import (
     parse_observation,
 )
 from calibrate.observations.scalar import Scalar
+from calibrate.observations.segment_strain import SegmentStrain, segment_strains
 from calibrate.observations.several import Observations, observations
+from calibrate.observations.strain import Strain, strains
 from calibrate.observations.volume import CavityVolume
 
 __all__ = [
@@ -30,12 +32,16 @@ __all__ = [
     "Observation",
     "Observations",
     "Scalar",
+    "SegmentStrain",
+    "Strain",
     "landmarks",
     "nodal_displacements",
     "observation_from_json",
     "observations",
     "observations_from_json",
     "parse_observation",
+    "segment_strains",
     "spread_landmarks",
     "spread_nodes",
+    "strains",
 ]

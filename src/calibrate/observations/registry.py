@@ -11,7 +11,9 @@ from calibrate.observations.landmarks import Landmarks
 from calibrate.observations.nodes import NodalDisplacements
 from calibrate.observations.present import ENTRIES, Present
 from calibrate.observations.protocol import Kind, Observation
+from calibrate.observations.segment_strain import SegmentStrain
 from calibrate.observations.several import Observations
+from calibrate.observations.strain import Strain
 from calibrate.observations.volume import CavityVolume
 from calibrate.state_names import at, split
 from emulator.errors import InputError
@@ -19,7 +21,7 @@ from emulator.scenes.scene import Scene
 
 # In this order they look for their columns in a file: `node` decides before `x,y,z`.
 KINDS: dict[str, type[Kind]] = {
-    kind.kind: kind for kind in (NodalDisplacements, Landmarks, CavityVolume)
+    kind.kind: kind for kind in (NodalDisplacements, Landmarks, Strain, SegmentStrain, CavityVolume)
 }
 
 
