@@ -5,7 +5,9 @@ are listed in :data:`KINDS`.
 """
 
 from calibrate.observations.landmarks import Landmarks, landmarks, spread_landmarks
+from calibrate.observations.length import Length, length
 from calibrate.observations.nodes import NodalDisplacements, nodal_displacements, spread_nodes
+from calibrate.observations.parameter import MeasuredParameter
 from calibrate.observations.points import DISPLACEMENT
 from calibrate.observations.protocol import Field, Kind, Labels, Observation
 from calibrate.observations.registry import (
@@ -28,6 +30,8 @@ __all__ = [
     "Kind",
     "Labels",
     "Landmarks",
+    "Length",
+    "MeasuredParameter",
     "NodalDisplacements",
     "Observation",
     "Observations",
@@ -35,6 +39,7 @@ __all__ = [
     "SegmentStrain",
     "Strain",
     "landmarks",
+    "length",
     "nodal_displacements",
     "observation_from_json",
     "observations",

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from calibrate.observations.landmarks import Landmarks
+from calibrate.observations.length import Length
 from calibrate.observations.nodes import NodalDisplacements
+from calibrate.observations.parameter import MeasuredParameter
 from calibrate.observations.present import ENTRIES, Present
 from calibrate.observations.protocol import Kind, Observation
 from calibrate.observations.segment_strain import SegmentStrain
@@ -21,7 +23,16 @@ from emulator.scenes.scene import Scene
 
 # In this order they look for their columns in a file: `node` decides before `x,y,z`.
 KINDS: dict[str, type[Kind]] = {
-    kind.kind: kind for kind in (NodalDisplacements, Landmarks, Strain, SegmentStrain, CavityVolume)
+    kind.kind: kind
+    for kind in (
+        NodalDisplacements,
+        Landmarks,
+        Strain,
+        SegmentStrain,
+        CavityVolume,
+        Length,
+        MeasuredParameter,
+    )
 }
 
 

@@ -17,14 +17,19 @@ from emulator.scenes.scene import Scene
 class Scalar:
     """One number above 0, in a column or variable called as on the command line.
 
-    A subclass gives ``nodes``, ``__call__``, ``default_noise``, ``names`` (the last of which
-    :meth:`parse` understands) and ``parse``.
+    A subclass gives ``unit``, ``nodes``, ``__call__``, ``default_noise``, ``parse`` and ``names``,
+    the last of which ``parse`` understands.
     """
 
     kind: ClassVar[str]
-    unit: ClassVar[str]
+    usage: ClassVar[str]
     shape: ClassVar[tuple[int, ...]] = ()
     sites: ClassVar[Sites | None] = None
+
+    @property
+    @abstractmethod
+    def unit(self) -> str:
+        """Unit of the number."""
 
     @property
     @abstractmethod
@@ -38,14 +43,17 @@ class Scalar:
 
     def check(self, name: str, values: np.ndarray) -> None:
         """Raise :class:`InputError` unless ``values`` is one finite number above 0, or missing."""
+        self._check_number(name, values)
+        if values <= 0.0:
+            raise InputError(f"data: {name} is {values} {self.unit}; it must be above 0")
+
+    def _check_number(self, name: str, values: np.ndarray) -> None:
         if values.shape != ():
             raise InputError(
                 f"data has shape {values.shape}; the observation expects () ({name}, {self.unit})"
             )
         if np.isinf(values):
             raise InputError(f"data: {name} is {values}; it must be finite")
-        if values <= 0.0:
-            raise InputError(f"data: {name} is {values} {self.unit}; it must be above 0")
 
     def labels(self, name: str) -> Labels:
         """None: a number has no dimensions."""
@@ -71,7 +79,8 @@ class Scalar:
     ) -> tuple[Self, np.ndarray]:
         """Observation and data from the one array called ``name``."""
         if arrays[name].size != 1:
-            raise InputError(f"{name} has {arrays[name].size} values; give one, in {cls.unit}")
+            found = cls._of(scene, name)
+            raise InputError(f"{name} has {arrays[name].size} values; give one, in {found.unit}")
         return cls._of(scene, name), arrays[name].reshape(())
 
     def to_arrays(self, name: str, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -84,5 +93,3 @@ class Scalar:
         if found is None:
             raise InputError(f"'{word}' is no {cls.kind}; write {cls.usage}")
         return found[1]
-
-    usage: ClassVar[str]
