@@ -134,7 +134,9 @@ def test_noise_of_a_run_in_words_and_json():
         (inferred,) = {"noise_sd", "noise_scale"} & set(noise.inferred(0.7).priors)
         prior = noise.inferred(0.7).priors[inferred]
         assert float(prior.scale) == 0.7
-    assert with_discrepancy(cal.GaussianNoise(0.2), 1.0, 20.0) == DiscrepancyNoise(1.0, 20.0, 0.2)
+    assert with_discrepancy(
+        cal.GaussianNoise(0.2), {"scale": 1.0, "length": 20.0}
+    ) == DiscrepancyNoise(1.0, 20.0, 0.2)
     bound = CorrelatedNoise(15.0, 0.1, spatial_sd=0.2).at(Sites.of(POINTS, 3))
     assert "sites" not in bound.to_json()
 
@@ -155,7 +157,8 @@ def test_noise_of_a_run_in_words_and_json():
         ),
         (lambda: CorrelatedNoise(1.0, 1.0, spatial_sd=1.0).at(None), "has no place of its own"),
         (lambda: DiscrepancyNoise(0.0, 1.0, 1.0), "standard deviation is 0.0"),
-        (lambda: with_discrepancy(StudentTNoise(4, 1.0), 1.0, 1.0), "not to student_t noise"),
+        (lambda: with_discrepancy(StudentTNoise(4, 1.0), {}), "not to student_t noise"),
+        (lambda: with_discrepancy(cal.GaussianNoise(1.0), {"scale": 1.0}), "'length' is missing"),
         (lambda: parse_noise("loud"), "'loud' is neither a number nor a noise; give gaussian:sd"),
         (lambda: parse_noise("student_t:scale=1"), "student_t: 'dof' is missing; it takes dof"),
         (lambda: parse_noise("student_t:dof=4,sd=1"), "student_t: 'sd' is unknown; it takes dof"),

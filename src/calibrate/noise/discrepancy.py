@@ -113,17 +113,22 @@ class DiscrepancyNoise:
         return restore(cls, description)
 
 
-def with_discrepancy(noise: Noise, scale: float, length: float) -> DiscrepancyNoise:
-    """``noise`` and a discrepancy; :class:`InputError` unless it is independent and Gaussian.
+def with_discrepancy(noise: Noise, options: Mapping[str, Any]) -> DiscrepancyNoise:
+    """``noise`` and a discrepancy.
 
     Parameters
     ----------
-    scale : of the half-normal prior of the discrepancy's sd, in the observation's unit.
-    length : correlation length of the discrepancy, mm.
+    noise : independent Gaussian noise.
+    options : ``scale``, ``length`` and perhaps ``kernel`` of a :class:`DiscrepancyNoise`.
+
+    Raises
+    ------
+    InputError
+        Noise of another kind, or options that are wrong.
     """
     given = noise.to_json()
     if given["kind"] != GaussianNoise.kind:
         raise InputError(
             f"a discrepancy adds to {GaussianNoise.kind} noise, not to {given['kind']} noise"
         )
-    return DiscrepancyNoise(scale, length, given["sd"], given["sd_scale"])
+    return DiscrepancyNoise.from_json({**given, **options})
