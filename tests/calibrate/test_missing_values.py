@@ -5,9 +5,11 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 import calibrate as cal
 from calibrate.data import read_data, write_data
+from calibrate.noise import CorrelatedNoise
 from calibrate.observations import observations, observations_from_json, spread_landmarks
 from calibrate.observations.present import Present, leave_out_missing, missing_values
 from emulator.errors import InputError
@@ -48,6 +50,51 @@ def test_the_density_is_that_of_the_values_that_are_there(model, data):
     )
     assert float(found) == pytest.approx(by_hand, rel=1e-12)
     assert missing_values(reduced.observe) == {"displacement": 4}
+
+
+def test_correlated_noise_loses_the_rows_and_columns_of_what_is_missing(model, data):
+    """Against SciPy's marginal of the whole covariance, which is made by loops."""
+    noise = CorrelatedNoise(30.0, sd=0.2, spatial_sd=0.7)
+    whole = cal.model(model.full, model.observe, noise)
+    reduced, kept = whole.given(data)
+    X = model.observe.parts["displacement"].points
+    s = np.sqrt(3.0) * np.linalg.norm(X[:, None] - X, axis=-1) / 30.0
+    C = np.kron(0.49 * (1.0 + s) * np.exp(-s), np.eye(3)) + 0.04 * np.eye(12)
+    there = ~np.isnan(data).ravel()
+    mean = np.asarray(predicted(model)).ravel()[there]
+    expected = stats.multivariate_normal.logpdf(data.ravel()[there], mean, C[there][:, there])
+    found = reduced.log_likelihood(
+        reduced.forward(THETA)[None], THETA[None], reduced.noise_values({}), kept
+    )
+    assert float(found) == pytest.approx(expected, rel=1e-10)
+    complete = data.copy()
+    complete[np.isnan(data)] = np.asarray(predicted(model))[np.isnan(data)]
+    _, all_there = whole.given(complete)
+    filled = whole.log_likelihood(
+        whole.forward(THETA)[None], THETA[None], whole.noise_values({}), all_there
+    )
+    assert abs(float(filled) - expected) > 0.5  # filling the gaps would say something else
+
+
+def test_gaps_of_one_load_state(ventricle):
+    points = spread_landmarks(ventricle, 3, seed=0)
+    part = cal.landmarks(ventricle, points)
+    names = ("displacement@low", "displacement@high")
+    forward = linear_forward(ventricle, size=1.0)
+    model = cal.model(forward, dict.fromkeys(names, part), cal.GaussianNoise(sd_scale=1.0))
+    draw = {name: jnp.asarray(0.5) for name in model.states.unknowns}
+    data = {name: np.array(value) for name, value in model.predict(draw)[0].items()}
+    data["displacement@high"][0, 1] = np.nan
+    reduced, kept = model.given(data)
+    assert {name: values.shape for name, values in kept.items()} == dict(
+        zip(names, ((3, 3), (8,)), strict=True)
+    )
+    assert missing_values(reduced.observe) == {"displacement@high": 1}
+    assert reduced.names == model.names
+    numbers = reduced.noise_values({**draw, "noise_sd": jnp.asarray(0.5)})
+    thetas = reduced.states.thetas(draw)
+    found = reduced.log_likelihood(reduced.evaluate(thetas).displacement, thetas, numbers, kept)
+    assert float(found) == pytest.approx(-17 * np.log(0.5 * np.sqrt(2.0 * np.pi)))
 
 
 def test_complete_data_leave_the_model_as_it_is(model, data):

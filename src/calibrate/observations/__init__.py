@@ -20,6 +20,12 @@ from calibrate.observations.scalar import Scalar
 from calibrate.observations.segment_strain import SegmentStrain, segment_strains
 from calibrate.observations.several import Observations, observations
 from calibrate.observations.strain import Strain, strains
+from calibrate.observations.surface import (
+    SurfacePoints,
+    spread_on_surface,
+    surface_distances,
+    surface_points,
+)
 from calibrate.observations.volume import CavityVolume
 
 __all__ = [
@@ -38,6 +44,7 @@ __all__ = [
     "Scalar",
     "SegmentStrain",
     "Strain",
+    "SurfacePoints",
     "landmarks",
     "length",
     "nodal_displacements",
@@ -48,5 +55,8 @@ __all__ = [
     "segment_strains",
     "spread_landmarks",
     "spread_nodes",
+    "spread_on_surface",
     "strains",
+    "surface_distances",
+    "surface_points",
 ]

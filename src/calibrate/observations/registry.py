@@ -16,6 +16,7 @@ from calibrate.observations.protocol import Kind, Observation
 from calibrate.observations.segment_strain import SegmentStrain
 from calibrate.observations.several import Observations
 from calibrate.observations.strain import Strain
+from calibrate.observations.surface import SurfacePoints
 from calibrate.observations.volume import CavityVolume
 from calibrate.state_names import at, split
 from emulator.errors import InputError
@@ -29,6 +30,7 @@ KINDS: dict[str, type[Kind]] = {
         Landmarks,
         Strain,
         SegmentStrain,
+        SurfacePoints,
         CavityVolume,
         Length,
         MeasuredParameter,
