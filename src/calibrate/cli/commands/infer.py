@@ -39,7 +39,8 @@ def register(commands: Any) -> None:
         default="nodes:20",
         metavar="WHAT",
         help="of synthetic data, e.g. nodes:N, landmarks:N, all, a node set, 3,14,15, volume, "
-        "volume:FACETSET; several joined by +, as in landmarks:24+volume",
+        "volume:FACETSET, surface:FACETSET:N, strain:fibre:N, segment_strain:circumferential, "
+        "length:A:B, parameter:NAME; several joined by +, as in landmarks:24+volume",
     )
     _add_noise(parser)
     add_forward(parser)
