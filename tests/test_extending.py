@@ -54,12 +54,14 @@ def test_the_scene_of_the_guide_is_solved(written):
     assert written["solution"].displacement[:, 2].min() < -0.1
 
 
-def test_the_observation_of_the_guide_is_a_length(written):
-    emulator, truth = written["emulator"], written["truth"]
-    x = emulator.scene.mesh.nodes + np.asarray(emulator(truth))
-    length = float(written["data"]["length:12,300"])
-    assert length == pytest.approx(np.linalg.norm(x[300] - x[12]), rel=1e-12)
-    assert written["model"].noise["length:12,300"].sd == 0.1
+def test_the_observation_of_the_guide_is_an_area(written):
+    emulator = written["emulator"]
+    x = emulator.scene.mesh.nodes + np.asarray(emulator(emulator.scene.theta(mu=73.0, lam=61.0)))
+    sides = [np.linalg.norm(x[i] - x[j]) for i, j in ((12, 300), (300, 380), (380, 12))]
+    half = 0.5 * sum(sides)  # Heron's formula
+    area = np.sqrt(half * np.prod([half - side for side in sides]))
+    assert float(written["data"]["area:12,300,380"]) == pytest.approx(area, rel=1e-9)
+    assert written["model"].noise["area:12,300,380"].sd == 5.0
 
 
 def test_the_sampler_of_the_guide_finds_the_truth(written):

@@ -10,8 +10,17 @@ from numpyro import distributions as _distributions  # noqa: F401
 
 import emulator
 from calibrate.certificate import Certificate, certify
-from calibrate.noise import GaussianNoise
-from calibrate.observations import CavityVolume, landmarks, nodal_displacements
+from calibrate.noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
+from calibrate.observations import (
+    CavityVolume,
+    MeasuredParameter,
+    landmarks,
+    length,
+    nodal_displacements,
+    segment_strains,
+    strains,
+    surface_points,
+)
 from calibrate.posterior import Posterior, sample
 from calibrate.priors import box_prior, log_normal, truncated, truncated_normal
 from calibrate.samplers import NUTSOptions
@@ -22,17 +31,25 @@ __version__ = emulator.__version__
 __all__ = [
     "CavityVolume",
     "Certificate",
+    "CorrelatedNoise",
+    "DiscrepancyNoise",
     "GaussianNoise",
+    "MeasuredParameter",
     "Model",
     "NUTSOptions",
     "Posterior",
+    "StudentTNoise",
     "box_prior",
     "certify",
     "landmarks",
+    "length",
     "log_normal",
     "model",
     "nodal_displacements",
     "sample",
+    "segment_strains",
+    "strains",
+    "surface_points",
     "truncated",
     "truncated_normal",
 ]

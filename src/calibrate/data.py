@@ -3,7 +3,8 @@
 A CSV file has the columns ``node,ux,uy,uz`` (nodes of the mesh) or ``x,y,z,ux,uy,uz`` (material
 points of the reference body), all lengths in mm. The volume of a cavity is one more column,
 ``volume`` (mL; ``volume:<facet set>`` where the scene has several cavities), filled in one row
-only, which may be a row of its own. There may be a volume and no displacement.
+only, which may be a row of its own. There may be a volume and no displacement. A missing value is
+an empty cell, ``NA`` or ``nan``; it is read as NaN.
 
 A netCDF file has a variable ``displacement`` with one row a point, and beside it either ``node`` or
 ``position`` (rows of x, y, z); and a number ``volume``, or ``volume:<facet set>``.
@@ -16,13 +17,14 @@ Each kind of observation (:data:`calibrate.observations.KINDS`) names its own co
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from calibrate.data_files import Block, DataFile, open_data, write_csv, write_netcdf
-from calibrate.observations import KINDS, Field, Observation, Observations, observations
+from calibrate.observations import KINDS, Field, Kind, Observation, Observations, observations
+from calibrate.observations.present import check_some
 from calibrate.state_names import at, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -34,28 +36,44 @@ def read_data(scene: Scene, path: str | Path) -> tuple[Observations, dict[str, n
     Raises
     ------
     InputError
-        Missing or malformed file, a value that is not finite, an unknown node, a point outside, an
-        unknown cavity.
+        Missing or malformed file, a place that is not finite, an infinite value, an unknown node, a
+        point outside, an unknown cavity.
     """
     path = Path(path)
     file = open_data(path)
     parts: dict[str, Observation] = {}
     data: dict[str, np.ndarray] = {}
     for state, rows in file.states().items():
-        for base, (kind, fields) in _found(path, rows).items():
-            name, arrays = at(base, state), rows.arrays(fields)
+        layouts = _found(path, rows)
+        for base, (kind, fields) in layouts.items():
+            others = _others_there(fields, [f for _, f in layouts.values()])
+            name, arrays = at(base, state), rows.arrays(fields, others)
             try:
                 parts[name], data[name] = kind.from_arrays(scene, base, arrays)
                 parts[name].check(name, data[name])
+                check_some(base, data[name])
             except InputError as error:
                 where = f", state '{state}'" if state else ""
                 raise InputError(f"data file {path}{where}: {error}") from error
     return Observations(parts), data
 
 
-def _found(path: Path, file: DataFile) -> dict[str, tuple[type[Observation], tuple[Field, ...]]]:
+def _others_there(fields: Sequence[Field], every: Iterable[Sequence[Field]]) -> set[str]:
+    """Columns measured by other observations that share columns of places with ``fields``."""
+    places = {word for field in fields if field.where for word in field.columns}
+    return {
+        word
+        for others in every
+        if others != fields and places & {w for field in others for w in field.columns}
+        for field in others
+        if not field.where
+        for word in field.columns
+    }
+
+
+def _found(path: Path, file: DataFile) -> dict[str, tuple[type[Kind], tuple[Field, ...]]]:
     """Kind and fields of each observation that the file has all columns of, by name."""
-    found: dict[str, tuple[type[Observation], tuple[Field, ...]]] = {}
+    found: dict[str, tuple[type[Kind], tuple[Field, ...]]] = {}
     partly: list[list[str]] = []
     used: set[str] = set()
     for kind in KINDS.values():
@@ -108,7 +126,7 @@ def write_data(
                 f"there it would be called {' or '.join(part.names)}"
             )
         arrays = part.to_arrays(base, np.asarray(data[name]))
-        fields = part.layouts((base,))[base]
+        fields = KINDS[part.to_json()["kind"]].layouts((base, *arrays))[base]
         states[state].append([(field, arrays[field.variable]) for field in fields])
     write = write_netcdf if Path(path).suffix.lower() == ".nc" else write_csv
     write(path, states)

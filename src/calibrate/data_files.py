@@ -2,8 +2,9 @@
 
 A CSV file has one header line, and columns separated by commas, semicolons or tabs, whichever the
 header has; with the latter two, numbers may have decimal commas. Blanks around words, empty lines
-and lines that begin with ``#`` are ignored. A column ``state`` names the load state of each row; in
-netCDF, variables are called ``name@state``.
+and lines that begin with ``#`` are ignored. A measured value that is missing is an empty cell,
+``NA`` or ``nan``, and NaN in netCDF; nodes and positions may not be missing. A column ``state``
+names the load state of each row; in netCDF, variables are called ``name@state``.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import csv
 import io
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from pathlib import Path
 
@@ -29,6 +30,7 @@ STATE = "state"
 
 _TEXT = (".csv", ".tsv", ".txt")
 _SPREADSHEETS = (".xlsx", ".xls", ".ods")
+_MISSING = ("", "na", "n/a", "nan")
 
 
 class DataFile(ABC):
@@ -56,8 +58,14 @@ class DataFile(ABC):
         """Words that hold ``field`` in a file of this kind."""
 
     @abstractmethod
-    def arrays(self, fields: Sequence[Field]) -> dict[str, np.ndarray]:
-        """Arrays of numbers by variable; every word they need is there."""
+    def arrays(
+        self, fields: Sequence[Field], others: Collection[str] = ()
+    ) -> dict[str, np.ndarray]:
+        """Arrays of numbers by variable, NaN where a measured value is missing.
+
+        ``fields`` are an observation's, and the file has every word that they need. ``others`` are
+        what other observations measured at the same places: rows with a value there are theirs.
+        """
 
 
 def open_data(path: Path) -> DataFile:
@@ -128,19 +136,29 @@ class CSVFile(DataFile):
         """The field's columns."""
         return field.columns
 
-    def arrays(self, fields: Sequence[Field]) -> dict[str, np.ndarray]:
-        """Rows in which any of the fields has a value."""
-        words = [word for field in fields for word in field.columns]
-        filled = [(k, row) for k, row in self.rows.items() if any(row[w] for w in words)]
+    def arrays(
+        self, fields: Sequence[Field], others: Collection[str] = ()
+    ) -> dict[str, np.ndarray]:
+        """Rows in which any of the fields has a value, less those of other observations."""
+        measured = [word for field in fields if not field.where for word in field.columns]
+        places = [word for field in fields if field.where for word in field.columns]
+        filled = [
+            (k, row)
+            for k, row in self.rows.items()
+            if any(row[w] for w in measured)
+            or (any(row[w] for w in places) and not any(row[w] for w in others))
+        ]
         found = {}
         for field in fields:
-            numbers = [[self._number(k, row, w) for w in field.columns] for k, row in filled]
+            numbers = [[self._number(k, row, w, field) for w in field.columns] for k, row in filled]
             array = np.array(numbers, dtype=float).reshape(len(filled), len(field.columns))
             found[field.variable] = array[:, 0] if len(field.columns) == 1 else array
         return found
 
-    def _number(self, number: int, row: Mapping[str, str], word: str) -> float:
+    def _number(self, number: int, row: Mapping[str, str], word: str, field: Field) -> float:
         text = row[word]
+        if not field.where and text.lower() in _MISSING:
+            return np.nan
         if self.decimal_comma and "." not in text:
             text = text.replace(",", ".")
         try:
@@ -201,7 +219,9 @@ class NetCDFFile(DataFile):
         """The field's variable."""
         return (field.variable,)
 
-    def arrays(self, fields: Sequence[Field]) -> dict[str, np.ndarray]:
+    def arrays(
+        self, fields: Sequence[Field], others: Collection[str] = ()
+    ) -> dict[str, np.ndarray]:
         """The variables as numbers."""
         found = {}
         for name in (field.variable for field in fields):
@@ -221,34 +241,42 @@ Block = Sequence[tuple[Field, np.ndarray]]
 def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
     """Columns of every block side by side, load state after load state.
 
-    Blocks of one number share a row of their own, the last of their state.
+    Blocks of one number share a row of their own, the last of their state. A block that shares a
+    column with an earlier one, such as ``x``, has rows of its own below.
     """
     every = [field for blocks in states.values() for block in blocks for field, _ in block]
     header = list(dict.fromkeys(word for field in every for word in field.columns))
     named = "" not in states
-    rows = [[STATE] * named + header]
-    for state, blocks in states.items():
-        rows += [[state] * named + cells for cells in _rows(header, blocks)]
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    writer = csv.DictWriter(text, [STATE] * named + header, lineterminator="\n")
+    writer.writeheader()
+    for state, blocks in states.items():
+        writer.writerows({**({STATE: state} if named else {}), **row} for row in _rows(blocks))
     write_atomically(path, text.getvalue().encode())
 
 
-def _rows(header: list[str], blocks: Sequence[Block]) -> list[list[str]]:
-    """Rows of one load state, a cell for every word of the header."""
-    rows: list[list[str]] = []
-    single = [""] * len(header)
+def _rows(blocks: Sequence[Block]) -> list[dict[str, str]]:
+    """Rows of one load state: cells by column."""
+    rows: list[dict[str, str]] = []
+    single: dict[str, str] = {}
+    used: set[str] = set()
     for block in blocks:
+        words = [word for field, _ in block for word in field.columns]
+        start = len(rows) if used & set(words) else 0
+        used.update(words)
         for field, array in block:
-            column = header.index(field.columns[0])
-            cells = np.asarray(array).reshape(-1, len(field.columns))
-            for k, values in enumerate(cells.tolist() if np.ndim(array) else ()):
-                if k == len(rows):
-                    rows.append([""] * len(header))
-                rows[k][column : column + len(values)] = map(repr, values)
             if not np.ndim(array):
-                single[column] = repr(float(array))
-    return [*rows, single] if any(single) else rows
+                single[field.columns[0]] = _cell(float(array))
+                continue
+            cells = np.asarray(array).reshape(-1, len(field.columns)).tolist()
+            rows += [{} for _ in range(start + len(cells) - len(rows))]
+            for row, values in zip(rows[start:], cells, strict=False):
+                row.update(zip(field.columns, map(_cell, values), strict=True))
+    return [*rows, single] if single else rows
+
+
+def _cell(value: float) -> str:
+    return "NA" if np.isnan(value) else repr(value)
 
 
 def write_netcdf(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:

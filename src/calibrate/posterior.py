@@ -16,6 +16,7 @@ import numpyro.distributions as dist
 import xarray as xr
 
 from calibrate.observations import Observations
+from calibrate.observations.present import missing_values
 from calibrate.provenance import versions
 from calibrate.samplers import check_options, density_of, find_sampler, named_draws, r_hat
 from calibrate.statistical_model import Data, Model
@@ -107,6 +108,7 @@ def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str,
         "forward": model.forward.kind,
         "forward_fingerprint": model.full.fingerprint,
         "observe": model.observe.to_json(),
+        "missing": missing_values(model.observe),
         "noise": {name: noise.to_json() for name, noise in model.noise.items()},
         "prior": {name: describe_distribution(d) for name, d in model.prior.items()},
         "prior_cut": dict(model.prior_cut),
@@ -149,18 +151,19 @@ def sample(
     """Draw from the posterior of ``model`` given ``data``.
 
     With several observations, ``data`` maps their names to values: displacements (d, 3) in mm, a
-    volume in mL. ``sampler`` is a name of :data:`calibrate.samplers.SAMPLERS`; ``options`` is an
-    instance of that sampler's options, ``None`` for its defaults.
+    volume in mL. Missing values are NaN and left out. ``sampler`` is a name of
+    :data:`calibrate.samplers.SAMPLERS`; ``options`` is an instance of that sampler's options,
+    ``None`` for its defaults.
 
     Raises
     ------
     InputError
-        Unknown sampler, options of another sampler, data of the wrong shape or with values that
-        are not finite.
+        Unknown sampler, options of another sampler, data of the wrong shape, with infinite values
+        or of which all values are missing.
     """
     chosen = find_sampler(sampler)
     options = check_options(chosen, options)
-    checked = model.check_data(data)
+    model, checked = model.given(data)
     z, stats = chosen.sample(density_of(model), checked, options, seed, progress=progress)
     tree = _tree(model, checked, named_draws(model, checked, z), stats)
     tree.attrs.update(

@@ -12,7 +12,7 @@ model or FEM.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,7 @@ from calibrate.load_states import LoadStates, load_states
 from calibrate.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.noise import Noise
 from calibrate.observations import Observation, Observations, observations
+from calibrate.observations.present import leave_out_missing, missing_values
 from calibrate.prior_range import check_known, fit_to, standardised
 from calibrate.priors import Prior
 from calibrate.state_names import split
@@ -168,22 +169,62 @@ class Model:
             for name, k in zip(self.states.unknowns, keys, strict=True)
         }
 
+    def given(
+        self, data: np.ndarray | Mapping[str, np.ndarray]
+    ) -> tuple[Model, dict[str, jax.Array]]:
+        """The model of the values that are not missing, and these, checked.
+
+        Missing values are NaN (:mod:`calibrate.observations.present`).
+
+        Raises
+        ------
+        InputError
+            As :meth:`check_data`, or every value of an observation is missing.
+        """
+        observe, kept = leave_out_missing(self.observe, self._fitting(data))
+        if not missing_values(observe):
+            return self, self.check_data(kept)
+        reduced = replace(self, observe=observe, noise=at_sites(self.noise, observe))
+        return reduced, reduced.check_data(kept)
+
     def check_data(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
         """``data`` in float64 by name; :class:`InputError` on data that cannot be the model's."""
-        named = {
-            name: np.asarray(values, dtype=float)
-            for name, values in self.observe.name(data, "data").items()
-        }
+        named = self._fitting(data)
         for name, values in named.items():
-            self.observe.parts[name].check(name, values)
+            if np.isnan(values).any():
+                raise InputError(
+                    f"data: {int(np.isnan(values).sum())} of {values.size} values of {name} are "
+                    "missing (NaN); Model.given leaves them out"
+                )
         if self.check_scale:
             draws = self.prior_draws(jax.random.key(0), PRIOR_DRAWS)
             stacked = np.stack([np.asarray(draws[n]) for n in self.states.unknowns], axis=1)
             check_magnitudes(self._predict_stacked, self.observe, self.noise, stacked, named)
         return {name: jnp.asarray(values) for name, values in named.items()}
 
+    def _fitting(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """``data`` in float64 by name, of the right shapes; NaN where missing."""
+        named = {
+            name: np.asarray(values, dtype=float)
+            for name, values in self.observe.name(data, "data").items()
+        }
+        for name, values in named.items():
+            self.observe.parts[name].check(name, values)
+        return named
+
     def _predict_stacked(self, values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         return self.predict(dict(zip(self.states.unknowns, values, strict=True)))
+
+
+def at_sites(noise: Mapping[str, Noise], observe: Observations) -> dict[str, Noise]:
+    """Each noise at the sites of its observation; :class:`InputError` names the observation."""
+    found = {}
+    for name, part in observe.parts.items():
+        try:
+            found[name] = noise[name].at(part.sites)
+        except InputError as error:
+            raise InputError(f"noise of {name}: {error}") from error
+    return found
 
 
 def model(
@@ -211,11 +252,13 @@ def model(
     Raises
     ------
     InputError
-        A prior that does not fit the scene, or with more than a thousandth of its mass where the
-        forward map has no answer (:mod:`calibrate.prior_range`).
+        Noise that does not fit its observation, a prior that does not fit the scene, or one with
+        more than a thousandth of its mass where the forward map has no answer
+        (:mod:`calibrate.prior_range`).
     """
     several = observations(observe)
     names, noises = _noises(several, noise)
+    noises = at_sites(noises, several)
     restricted = forward.at(several.nodes)
     states, given = load_states(forward.scene, several.states, prior, known)
     check_known(restricted, states)

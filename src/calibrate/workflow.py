@@ -20,17 +20,18 @@ from calibrate.certificate import Certificate, certify
 from calibrate.data import read_data, write_data
 from calibrate.kept import check_forward, check_run
 from calibrate.load_states import known_thetas
-from calibrate.noise import GaussianNoise, Noise
+from calibrate.noise import Noise, noise_of, with_discrepancy
 from calibrate.observations import (
     DISPLACEMENT,
     Observations,
     observations_from_json,
     parse_observation,
 )
+from calibrate.observations.present import missing_values
 from calibrate.posterior import Posterior, read_tree, sample
 from calibrate.samplers import find_sampler
 from calibrate.state_names import split
-from calibrate.statistical_model import Model, model
+from calibrate.statistical_model import Model, at_sites, model
 from emulator import schema
 from emulator.catalogue import find_scene
 from emulator.errors import InputError
@@ -58,10 +59,14 @@ class Run:
     observe : observations of synthetic data, joined by ``+``, e.g. ``landmarks:24+volume``; each
         kind of :data:`calibrate.observations.KINDS` says which words ask for it. They are made in
         every load state that ``truth`` and ``known`` name; ``volume@diastole`` in one.
-    noise : standard deviation by the observation's name, in its unit. A bare number belongs to a
-        single observation, or to the displacements. What is not named has its kind's default.
+    noise : standard deviation by the observation's name, in its unit, or a kind of
+        :data:`calibrate.noise.KINDS` with its options, ``{"kind": "student_t", "dof": 4, "scale":
+        0.2}``. A bare number belongs to a single observation, or to the displacements. What is not
+        named has its kind's default.
     noise_scale : the same for the scale of the prior of a standard deviation that is to be
         inferred; synthetic data then still has the one of ``noise``.
+    discrepancy : discrepancy of the model (:mod:`calibrate.noise.discrepancy`) by the
+        observation's name, e.g. ``{"scale": 0.5, "length": 20.0}``; synthetic data has none.
     check_scale : refuse data that is far from every prediction (:mod:`calibrate.magnitude`).
     forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
         options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
@@ -73,8 +78,9 @@ class Run:
     truth: dict[str, float] = field(default_factory=dict)
     known: dict[str, float] = field(default_factory=dict)
     observe: str = "nodes:20"
-    noise: Mapping[str, float] | float = field(default_factory=dict)
+    noise: Mapping[str, float | dict[str, Any]] | float = field(default_factory=dict)
     noise_scale: Mapping[str, float] | float = field(default_factory=dict)
+    discrepancy: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     check_scale: bool = True
     forward: str = "emulator"
     emulator: str | None = None
@@ -112,21 +118,24 @@ class Run:
         assert isinstance(run.noise, Mapping)
         assert isinstance(run.noise_scale, Mapping)
         inferred = observe.expand(run.noise_scale, "noise-scale")
+        wrong = observe.expand(run.discrepancy, "discrepancy")
         found: dict[str, Noise] = {}
-        for name, (source, sd) in observe.expand(run.noise, "noise").items():
+        for name, (source, given) in observe.expand(run.noise, "noise").items():
             source, scale = inferred.get(name, (source, None))
-            found[source] = _gaussian(name, observe, sd if scale is None else None, scale)
+            source, discrepancy = wrong.get(name, (source, None))
+            found[source] = _noise(name, observe, given, scale, discrepancy)
         return found
 
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
         """Noise of each observation of synthetic data."""
-        named = replace(self, noise_scale={}).noises(observe)
-        return {name: noise for name, (_, noise) in observe.expand(named, "noise").items()}
+        named = replace(self, noise_scale={}, discrepancy={}).noises(observe)
+        each = {name: noise for name, (_, noise) in observe.expand(named, "noise").items()}
+        return at_sites(each, observe)
 
 
-def _by_name(
-    given: Mapping[str, float] | float, observe: Observations, what: str
-) -> dict[str, float]:
+def _by_name[T](
+    given: Mapping[str, T] | float, observe: Observations, what: str
+) -> dict[str, T | float]:
     """Values by the observation's name; a bare one is a single observation's or displacements'.
 
     A name without its load state stands for every state.
@@ -140,9 +149,17 @@ def _by_name(
     return dict(given)
 
 
-def _gaussian(name: str, observe: Observations, sd: float | None, scale: float | None) -> Noise:
+def _noise(
+    name: str,
+    observe: Observations,
+    given: float | Mapping[str, Any],
+    scale: float | None,
+    discrepancy: Mapping[str, Any] | None,
+) -> Noise:
     try:
-        return GaussianNoise(sd, scale)
+        noise = noise_of(given)
+        noise = noise if scale is None else noise.inferred(scale)
+        return noise if discrepancy is None else with_discrepancy(noise, discrepancy)
     except InputError as error:
         raise InputError(f"{name} ({observe.parts[name].unit}): {error}") from error
 
@@ -271,6 +288,7 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "verdict": "not certified",
         "k_hat": None,
         "prior_cut": dict(posterior.model.prior_cut),
+        "missing": missing_values(posterior.model.observe),
         "draws": int(posterior.tree["posterior"].sizes["draw"]),
         "chains": int(posterior.tree["posterior"].sizes["chain"]),
     }

@@ -45,15 +45,17 @@ def test_netcdf(beam, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("node,ux,uy,uz\n3,0,0,nan\n", "row 1 has a displacement that is not finite"),
+        ("node,ux,uy,uz\n3,0,0,inf\n", "row 1 has a displacement that is not finite"),
+        ("node,ux,uy,uz\n3,,NA,nan\n", "every value of displacement is missing"),
+        ("node,ux,uy,uz\n,0,0,1\n", "row 1, column 'node' is empty"),
+        ("node,ux,uy,uz\nNA,0,0,1\n", "row 1, column 'node' is 'NA', not a number"),
         ("node,ux,uy,uz\n3,0,0,0\n400,0,0,0\n", "node 400 is unknown"),
         ("node,ux,uy,uz\n3,0,0,x\n", "row 1, column 'uz' is 'x', not a number"),
-        ("node,ux,uy,uz\n3,0,0\n", "row 1, column 'uz' is empty"),
         ("node,ux,uy\n3,0,0\n", "column 'uz' is missing"),
         ("node,ux,uy,uz\n3.5,0,0,0\n", "nodes must be whole numbers"),
         ("x,y,z,ux,uy,uz\n500,0,0,0,0,0\n", "lies outside the body"),
         ("x,y,z,ux,uy,uz\n5,nan,0,0,0,0\n", "row 1 has a position that is not finite"),
-        ("", "no data; expected columns node,ux,uy,uz or x,y,z,ux,uy,uz or volume"),
+        ("", "no data; expected columns node,ux,uy,uz or x,y,z,ux,uy,uz or .* or volume"),
     ],
 )
 def test_one_line_for_every_mistake(beam, tmp_path, text, message):
@@ -125,7 +127,8 @@ def test_a_volume_in_netcdf(ventricle, points, tmp_path):
         ("node,ux,uy,uz,volume\n3,0,0,0,\n", "volume has 0 values"),
         ("volume\nmuch\n", "row 1, column 'volume' is 'much', not a number"),
         ("volume\n-120\n", "volume is -120.0 mL; it must be above 0"),
-        ("volume\nnan\n", "volume is nan; it must be finite"),
+        ("volume\nnan\n", "every value of volume is missing"),
+        ("volume\ninf\n", "volume is inf; it must be finite"),
         ("volume:atrium\n120\n", "facet set 'atrium' is not in the mesh"),
         ("ux,uy,uz,volume\n0,0,0,1\n", "column 'node' is missing"),
     ],

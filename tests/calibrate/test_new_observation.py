@@ -18,26 +18,27 @@ from linear_support import linear_forward
 
 
 @dataclass(frozen=True, eq=False)
-class Length(Scalar):
-    """Distance in mm between two nodes, asked for as ``length:3,14``."""
+class Area(Scalar):
+    """Area in mm2 between three nodes, asked for as ``area:3,14,20``."""
 
     nodes: np.ndarray
     points: np.ndarray
 
-    kind: ClassVar = "length"
-    usage: ClassVar = "length:NODE,NODE"
-    quantity: ClassVar = "length"
-    unit: ClassVar = "mm"
-    other_units: ClassVar = {"m": 1e3, "cm": 10.0}
+    kind: ClassVar = "area"
+    usage: ClassVar = "area:NODE,NODE,NODE"
+    quantity: ClassVar = "area"
+    unit: ClassVar = "mm2"
+    other_units: ClassVar = {"m2": 1e6, "cm2": 100.0}
     default_noise: ClassVar = cal.GaussianNoise(sd=0.1)
 
     def __call__(self, displacement, theta):
         x = self.points + displacement
-        return jnp.linalg.norm(x[..., 1, :] - x[..., 0, :], axis=-1)
+        sides = x[..., 1:, :] - x[..., :1, :]
+        return 0.5 * jnp.linalg.norm(jnp.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
 
     @property
     def names(self):
-        return (f"length:{self.nodes[0]},{self.nodes[1]}",)
+        return (f"area:{','.join(map(str, self.nodes))}",)
 
     @classmethod
     def parse(cls, scene, word, seed):
@@ -50,16 +51,18 @@ class Length(Scalar):
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
-    monkeypatch.setitem(KINDS, "length", Length)  # the one line
+    monkeypatch.setitem(KINDS, "area", Area)  # the one line
 
 
 def test_from_the_command_line_through_model_and_file_and_back(beam, tmp_path):
-    observe = parse_observation(beam, "length:3,14+nodes:5", seed=1)
-    assert list(observe.parts) == ["length:3,14", "displacement"]
+    observe = parse_observation(beam, "area:3,14,20+nodes:5", seed=1)
+    assert list(observe.parts) == ["area:3,14,20", "displacement"]
     u = np.random.default_rng(0).normal(size=beam.mesh.nodes.shape)
     x = beam.mesh.nodes + u
     seen = observe(jnp.asarray(u[observe.nodes])[None], jnp.zeros((1, 2)))
-    assert float(seen["length:3,14"]) == pytest.approx(np.linalg.norm(x[14] - x[3]), rel=1e-12)
+    assert float(seen["area:3,14,20"]) == pytest.approx(
+        0.5 * np.linalg.norm(np.cross(x[14] - x[3], x[20] - x[3])), rel=1e-12
+    )
     data = {name: np.asarray(value) for name, value in seen.items()}
     for file in ("d.csv", "d.nc"):
         write_data(tmp_path / file, observe, data)
@@ -69,40 +72,40 @@ def test_from_the_command_line_through_model_and_file_and_back(beam, tmp_path):
             np.testing.assert_array_equal(values[name], data[name])
     again = observations_from_json(beam, observe.to_json())
     np.testing.assert_array_equal(again.nodes, observe.nodes)
-    # Labels in the DataTree: the length has no dimensions, the displacements keep theirs.
+    # Labels in the DataTree: the area has no dimensions, the displacements keep theirs.
     constants, dims, coords = _labels(observe)
     tree = arviz_base.from_dict(
         {"observed_data": data, "constant_data": constants}, dims=dims, coords=coords
     )
-    assert tree["observed_data"]["length:3,14"].shape == ()
+    assert tree["observed_data"]["area:3,14,20"].shape == ()
     assert tree["observed_data"]["displacement"].dims == ("point", "component")
 
 
 def test_in_a_model_with_a_noise_of_its_own(beam):
     forward = linear_forward(beam)
-    observe = parse_observation(beam, "length:3,14")
+    observe = parse_observation(beam, "area:3,14,20")
     model = cal.model(forward, observe, cal.GaussianNoise(sd_scale=0.2))
     assert model.names == ("mu", "lam", "noise_sd")
     theta = jnp.array([[70.0, 60.0]])
-    value = model.predict({"mu": 70.0, "lam": 60.0})[0]["length:3,14"]
+    value = model.predict({"mu": 70.0, "lam": 60.0})[0]["area:3,14,20"]
     checked = model.check_data(np.asarray(value))
     density = model.log_likelihood(
-        model.forward(theta[0])[None], theta, {"length:3,14": {"noise_sd": 0.5}}, checked
+        model.forward(theta[0])[None], theta, {"area:3,14,20": {"noise_sd": 0.5}}, checked
     )
     assert float(density) == pytest.approx(-np.log(0.5 * np.sqrt(2.0 * np.pi)))
-    with pytest.raises(InputError, match=r"length:3,14 is -1.0 mm; it must be above 0"):
+    with pytest.raises(InputError, match=r"area:3,14,20 is -1.0 mm2; it must be above 0"):
         model.check_data(-1.0)
-    with pytest.raises(InputError, match=r"m instead of mm\? multiply by 1000"):
-        model.check_data(1e-3 * np.asarray(value))
+    with pytest.raises(InputError, match=r"cm2 instead of mm2\? multiply by 100"):
+        model.check_data(1e-2 * np.asarray(value))
 
 
 def test_in_a_run(beam):
     run = Run(
-        "once_clamped_beam", observe="length:3,14", noise=0.3, truth={"mu": 70.0, "lam": 60.0}
+        "once_clamped_beam", observe="area:3,14,20", noise=0.3, truth={"mu": 70.0, "lam": 60.0}
     )
     observe, data = make_data(run, beam)
-    assert run.named(observe).noise == {"length:3,14": 0.3}
-    assert Run("once_clamped_beam").named(observe).noise == {"length:3,14": 0.1}
-    assert data["length:3,14"].shape == ()
-    with pytest.raises(InputError, match="observe 'lengths': give nodes:N.*length:NODE,NODE"):
-        parse_observation(beam, "lengths")
+    assert run.named(observe).noise == {"area:3,14,20": 0.3}
+    assert Run("once_clamped_beam").named(observe).noise == {"area:3,14,20": 0.1}
+    assert data["area:3,14,20"].shape == ()
+    with pytest.raises(InputError, match="observe 'areas': give nodes:N.*area:NODE,NODE,NODE"):
+        parse_observation(beam, "areas")

@@ -1,4 +1,6 @@
 import json
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +8,9 @@ import numpy as np
 import pytest
 
 import calibrate as cal
+from calibrate.noise import KINDS as NOISES
 from calibrate.observations import (
+    KINDS,
     observation_from_json,
     observations,
     observations_from_json,
@@ -186,3 +190,11 @@ def test_names_of_observations_are_checked(ventricle):
         several.name({"x": 1.0}, "data")
     with pytest.raises(InputError, match="facet set 'atrium' is not in the mesh"):
         cal.CavityVolume(ventricle, "atrium")
+
+
+def test_the_guide_names_every_kind():
+    text = (Path(__file__).parents[2] / "docs" / "observations.md").read_text(encoding="utf-8")
+    for kind in (*KINDS.values(), *NOISES.values()):
+        assert f"`{kind.kind}" in text, kind.kind
+        for option in re.findall(r"(\w+)=", kind.usage):
+            assert f"`{option}`" in text, option

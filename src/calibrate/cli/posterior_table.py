@@ -26,6 +26,8 @@ def summary(report: dict[str, Any]) -> str:
     )
     for name, mass in report.get("prior_cut", {}).items():
         lines.append(f"prior of {name} cut to its range: {100.0 * mass:.2g} % of its mass")
+    for name, count in report.get("missing", {}).items():
+        lines.append(f"missing values of {name} left out: {count}")
     if "certificate" not in report:
         lines.append("not checked against FEM yet: calibrate certify")
     else:

@@ -1,7 +1,22 @@
 """Measurement noise, one kind a file; the kinds are listed in :data:`KINDS`."""
 
+from calibrate.noise.correlated import CorrelatedNoise
+from calibrate.noise.discrepancy import DiscrepancyNoise, with_discrepancy
 from calibrate.noise.gaussian import GaussianNoise
-from calibrate.noise.protocol import Noise
-from calibrate.noise.registry import KINDS, noise_from_json
+from calibrate.noise.protocol import Noise, Sites
+from calibrate.noise.registry import KINDS, noise_from_json, noise_of, parse_noise
+from calibrate.noise.student_t import StudentTNoise
 
-__all__ = ["KINDS", "GaussianNoise", "Noise", "noise_from_json"]
+__all__ = [
+    "KINDS",
+    "CorrelatedNoise",
+    "DiscrepancyNoise",
+    "GaussianNoise",
+    "Noise",
+    "Sites",
+    "StudentTNoise",
+    "noise_from_json",
+    "noise_of",
+    "parse_noise",
+    "with_discrepancy",
+]

@@ -10,9 +10,16 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 
-from emulator.errors import InputError
+from calibrate.noise.description import describe, restore
+from calibrate.noise.protocol import Sites
+from calibrate.noise.scale import Scale
 
 NOISE_SD = "noise_sd"
+
+
+def independent_sd(sd: float | None, sd_scale: float | None) -> Scale:
+    """The standard deviation of independent Gaussian noise, ``noise_sd`` where it is unknown."""
+    return Scale(NOISE_SD, ("sd", "sd_scale"), sd, sd_scale)
 
 
 @dataclass(frozen=True)
@@ -29,40 +36,46 @@ class GaussianNoise:
     sd_scale: float | None = None
 
     kind: ClassVar[str] = "gaussian"
+    usage: ClassVar[str] = "gaussian:sd=SD"
 
     def __post_init__(self) -> None:
-        if (self.sd is None) == (self.sd_scale is None):
-            raise InputError("noise: give either sd (known) or sd_scale (of its prior)")
-        value = self.sd if self.sd is not None else self.sd_scale
-        if value is None or not 0.0 < value < float("inf"):
-            raise InputError(f"noise: standard deviation is {value}; it must be above 0")
+        self._scale  # noqa: B018 - values that cannot be are refused here
+
+    @property
+    def _scale(self) -> Scale:
+        return independent_sd(self.sd, self.sd_scale)
+
+    def at(self, sites: Sites | None) -> Self:
+        """Itself: independent noise is the same everywhere."""
+        return self
+
+    def inferred(self, scale: float) -> Self:
+        """Gaussian noise of unknown sd."""
+        return type(self)(sd_scale=scale)
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:
         """``noise_sd`` with its half-normal prior, where it is not known."""
-        return {} if self.sd_scale is None else {NOISE_SD: dist.HalfNormal(self.sd_scale)}
+        return self._scale.priors
 
     @property
     def upper_sd(self) -> float:
         """The sd, or the 99.7 % quantile of its half-normal prior."""
-        return self.sd if self.sd is not None else 3.0 * (self.sd_scale or 0.0)
+        return self._scale.upper
 
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
         """Independent normals around ``mean``."""
-        sd = values[NOISE_SD] if self.sd is None else self.sd
-        return dist.Normal(mean, sd).to_event(mean.ndim)
+        return dist.Normal(mean, self._scale.value(values)).to_event(mean.ndim)
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Noise of data of this shape; :class:`InputError` where the sd is not known."""
-        if self.sd is None:
-            raise InputError("noise: to make data, give its standard deviation")
-        return rng.normal(0.0, self.sd, shape)
+        return rng.normal(0.0, self._scale.needed(), shape)
 
     def to_json(self) -> dict[str, Any]:
         """Kind and the constructor's arguments."""
-        return {"kind": self.kind, "sd": self.sd, "sd_scale": self.sd_scale}
+        return describe(self)
 
     @classmethod
     def from_json(cls, description: Mapping[str, Any]) -> Self:
         """The noise that :meth:`to_json` described."""
-        return cls(description["sd"], description["sd_scale"])
+        return restore(cls, description)

@@ -3,11 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import jax
 import numpy as np
 import numpyro.distributions as dist
+
+
+class Sites(NamedTuple):
+    """Where each number of an observation's data was measured, the data's axes raveled.
+
+    positions : (e, 3) mm in the reference body.
+    component : (e,) which component of a vector or tensor it is; components do not correlate.
+    """
+
+    positions: np.ndarray
+    component: np.ndarray
+
+    @classmethod
+    def of(cls, positions: np.ndarray, components: int) -> Sites:
+        """Sites of data (d, components) measured at ``positions`` (d, 3)."""
+        count = len(positions)
+        return cls(np.repeat(positions, components, axis=0), np.tile(np.arange(components), count))
 
 
 class Noise(Protocol):
@@ -16,9 +33,25 @@ class Noise(Protocol):
     Attributes
     ----------
     kind : its name in the registry and in JSON.
+    usage : its options on the command line, for help and errors.
     """
 
     kind: ClassVar[str]
+    usage: ClassVar[str]
+
+    def at(self, sites: Sites | None) -> Self:
+        """The noise of data measured at ``sites``.
+
+        Raises
+        ------
+        InputError
+            Noise that correlates in space, for data that has no one place.
+        """
+        ...
+
+    def inferred(self, scale: float) -> Self:
+        """The noise with its sd unknown, under a half-normal prior of this scale."""
+        ...
 
     @property
     def priors(self) -> Mapping[str, dist.Distribution]:
@@ -27,7 +60,11 @@ class Noise(Protocol):
 
     @property
     def upper_sd(self) -> float:
-        """Standard deviation, or the largest that its prior makes plausible."""
+        """Largest standard deviation of any combination of the data whose weights have norm 1.
+
+        The sd itself for independent noise. Where it is unknown, the largest that its prior makes
+        plausible.
+        """
         ...
 
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:

@@ -5,11 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from calibrate.noise.correlated import CorrelatedNoise
+from calibrate.noise.discrepancy import DiscrepancyNoise
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise
+from calibrate.noise.student_t import StudentTNoise
 from emulator.errors import InputError
 
-KINDS: dict[str, type[Noise]] = {kind.kind: kind for kind in (GaussianNoise,)}
+KINDS: dict[str, type[Noise]] = {
+    kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise, DiscrepancyNoise)
+}
 
 
 def noise_from_json(description: Mapping[str, Any]) -> Noise:
@@ -18,3 +23,40 @@ def noise_from_json(description: Mapping[str, Any]) -> Noise:
     if kind not in KINDS:
         raise InputError(f"noise kind '{kind}' is unknown; known: {', '.join(KINDS)}")
     return KINDS[kind].from_json(description)
+
+
+def noise_of(given: float | Mapping[str, Any]) -> Noise:
+    """The noise that a run names: Gaussian of a known sd, or a kind with its options."""
+    return noise_from_json(given) if isinstance(given, Mapping) else GaussianNoise(given)
+
+
+def parse_noise(text: str) -> float | dict[str, Any]:
+    """What ``0.2`` or ``student_t:dof=4,scale=0.2`` asks for; :func:`noise_of` makes it.
+
+    Raises
+    ------
+    InputError
+        Neither a number nor a kind with options that it takes.
+    """
+    kind, _, options = text.partition(":")
+    if kind not in KINDS:
+        try:
+            return float(text)
+        except ValueError as error:
+            usage = ", ".join(kind.usage for kind in KINDS.values())
+            raise InputError(f"'{text}' is neither a number nor a noise; give {usage}") from error
+    description: dict[str, Any] = {"kind": kind}
+    for option in options.split(",") if options else ():
+        name, equals, value = option.partition("=")
+        if not equals:
+            raise InputError(f"'{text}': '{option}' is not option=value; give {KINDS[kind].usage}")
+        description[name] = _number(value)
+    noise_of(description)  # refuses what the kind does not take
+    return description
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

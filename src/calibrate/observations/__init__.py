@@ -5,9 +5,11 @@ are listed in :data:`KINDS`.
 """
 
 from calibrate.observations.landmarks import Landmarks, landmarks, spread_landmarks
+from calibrate.observations.length import Length, length
 from calibrate.observations.nodes import NodalDisplacements, nodal_displacements, spread_nodes
+from calibrate.observations.parameter import MeasuredParameter
 from calibrate.observations.points import DISPLACEMENT
-from calibrate.observations.protocol import Field, Labels, Observation
+from calibrate.observations.protocol import Field, Kind, Labels, Observation
 from calibrate.observations.registry import (
     KINDS,
     observation_from_json,
@@ -15,7 +17,15 @@ from calibrate.observations.registry import (
     parse_observation,
 )
 from calibrate.observations.scalar import Scalar
+from calibrate.observations.segment_strain import SegmentStrain, segment_strains
 from calibrate.observations.several import Observations, observations
+from calibrate.observations.strain import Strain, strains
+from calibrate.observations.surface import (
+    SurfacePoints,
+    spread_on_surface,
+    surface_distances,
+    surface_points,
+)
 from calibrate.observations.volume import CavityVolume
 
 __all__ = [
@@ -23,18 +33,30 @@ __all__ = [
     "KINDS",
     "CavityVolume",
     "Field",
+    "Kind",
     "Labels",
     "Landmarks",
+    "Length",
+    "MeasuredParameter",
     "NodalDisplacements",
     "Observation",
     "Observations",
     "Scalar",
+    "SegmentStrain",
+    "Strain",
+    "SurfacePoints",
     "landmarks",
+    "length",
     "nodal_displacements",
     "observation_from_json",
     "observations",
     "observations_from_json",
     "parse_observation",
+    "segment_strains",
     "spread_landmarks",
     "spread_nodes",
+    "spread_on_surface",
+    "strains",
+    "surface_distances",
+    "surface_points",
 ]

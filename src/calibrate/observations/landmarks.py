@@ -65,7 +65,7 @@ class Landmarks(DisplacementPoints):
     @classmethod
     def layouts(cls, words: Collection[str]) -> dict[str, tuple[Field, ...]]:
         """Reference positions and displacements."""
-        return {DISPLACEMENT: (Field("position", ("x", "y", "z")), DISPLACEMENT_FIELD)}
+        return {DISPLACEMENT: (Field("position", ("x", "y", "z"), where=True), DISPLACEMENT_FIELD)}
 
     @classmethod
     def from_arrays(

@@ -29,6 +29,21 @@ def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     InputError
         A point further outside than a thousandth of the body's size.
     """
+    elements, inside = _find(mesh, points)
+    return elements, shape_values(mesh.order, inside)
+
+
+def locate_gradients(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`locate`, with the shape functions' reference gradients (d, 4 or 10, 3), 1/mm."""
+    elements, inside = _find(mesh, points)
+    _, slopes = _tabulate(mesh.order, inside)
+    jacobian = np.einsum("dai,daj->dij", mesh.nodes[mesh.elements[elements]], slopes)
+    # NumPy, no batched LAPACK of JAX's.
+    return elements, np.einsum("daj,dji->dai", slopes, np.linalg.inv(jacobian))
+
+
+def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Element (d,) of each point and its barycentric coordinates there, (d, 4)."""
     straight = MeshTet(mesh.nodes.T.copy(), mesh.corners.T.copy(), sort_t=False, validate=False)
     finder, nodes = straight.element_finder(), mesh.nodes[mesh.elements]
     elements, coordinates = [], []
@@ -42,7 +57,7 @@ def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             found, inside = _nearest(mesh, k, point)
         elements.append(int(found[0]))
         coordinates.append(inside[0])
-    return np.array(elements), shape_values(mesh.order, np.array(coordinates))
+    return np.array(elements), np.array(coordinates)
 
 
 def shape_values(order: int, barycentric: np.ndarray) -> np.ndarray:

@@ -62,7 +62,7 @@ class NodalDisplacements(DisplacementPoints):
     @classmethod
     def layouts(cls, words: Collection[str]) -> dict[str, tuple[Field, ...]]:
         """Node numbers and displacements."""
-        return {DISPLACEMENT: (Field("node", ("node",)), DISPLACEMENT_FIELD)}
+        return {DISPLACEMENT: (Field("node", ("node",), where=True), DISPLACEMENT_FIELD)}
 
     @classmethod
     def from_arrays(

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from calibrate.noise.gaussian import GaussianNoise
+from calibrate.noise.protocol import Sites
 from calibrate.observations.protocol import Field, Labels
 from emulator.errors import InputError
 
@@ -34,16 +35,14 @@ class DisplacementPoints:
         """(d, 3)."""
         return self.points.shape
 
+    @property
+    def sites(self) -> Sites:
+        """The points, for each component."""
+        return Sites.of(self.points, 3)
+
     def check(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` unless ``values`` is (d, 3) and finite."""
-        if values.shape != self.shape:
-            raise InputError(
-                f"data has shape {values.shape}; the observation expects {self.shape}"
-                f" ({name}, {self.unit})"
-            )
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-            raise InputError(f"data: row {row} has a value that is not finite; remove that point")
+        """Raise :class:`InputError` unless ``values`` is (d, 3), each finite or missing."""
+        check_values(name, values, self.shape, self.unit)
 
     def labels(self, name: str) -> Labels:
         """Points and components; the reference positions as a constant."""
@@ -57,17 +56,36 @@ class DisplacementPoints:
         )
 
 
-def check_table(where: np.ndarray, displacement: np.ndarray) -> None:
-    """Raise :class:`InputError` on points (d,) or (d, 3) or displacements that cannot be used."""
-    if displacement.ndim != 2 or displacement.shape[1] != 3 or not len(displacement):
-        raise InputError(f"displacements have shape {displacement.shape}; expected (d, 3)")
-    if len(where) != len(displacement):
-        raise InputError(f"{len(where)} points have {len(displacement)} displacements")
-    for what, array in (("position", where), ("displacement", displacement)):
-        bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+def check_values(name: str, values: np.ndarray, shape: tuple[int, ...], unit: str) -> None:
+    """Raise :class:`InputError` unless ``values`` has this ``shape``, each finite or missing."""
+    if values.shape != shape:
+        raise InputError(
+            f"data has shape {values.shape}; the observation expects {shape} ({name}, {unit})"
+        )
+    infinite = np.isinf(values).reshape(len(values), -1).any(axis=1)
+    if infinite.any():
+        raise InputError(f"data: {name}, row {int(np.argmax(infinite))} has an infinite value")
+
+
+def check_table(where: np.ndarray, values: np.ndarray, what: str = "displacement") -> None:
+    """Raise :class:`InputError` on a table of no use.
+
+    Parameters
+    ----------
+    where : (d,) or (d, 3), finite.
+    values : (d, k), k being 3 for displacements; each finite or, where missing, NaN.
+    what : is measured, for errors.
+    """
+    wrong = values.ndim != 2 or not len(values)
+    if wrong or (what == "displacement" and values.shape[1] != 3):
+        raise InputError(f"{what}s have shape {values.shape}; expected (d, 3)")
+    if len(where) != len(values):
+        raise InputError(f"{len(where)} points have {len(values)} {what}s")
+    unknown = ~np.isfinite(where.reshape(len(where), -1))
+    for word, bad in (("position", unknown), (what, np.isinf(values))):
         if bad.any():
-            row = int(np.flatnonzero(bad)[0])
-            raise InputError(f"row {row + 1} has a {what} that is not finite; repair it")
+            row = int(np.argmax(bad.any(axis=1)))
+            raise InputError(f"row {row + 1} has a {word} that is not finite; repair it")
 
 
 def count_of(word: str, kind: str) -> int | None:

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 import jax
 import numpy as np
 
-from calibrate.noise.protocol import Noise
+from calibrate.noise.protocol import Noise, Sites
 from emulator.scenes.scene import Scene
 
 
@@ -21,10 +21,12 @@ class Field(NamedTuple):
 
     variable : its name in netCDF.
     columns : its columns in CSV; an array of one column has shape (rows,), of k columns (rows, k).
+    where : whether it says where was measured, not what. What was measured may be missing.
     """
 
     variable: str
     columns: tuple[str, ...]
+    where: bool = False
 
 
 class Labels(NamedTuple):
@@ -41,24 +43,24 @@ class Labels(NamedTuple):
 
 
 class Observation(Protocol):
-    """A function of the displacement of a few nodes, and of theta.
-
-    Attributes
-    ----------
-    kind : its name in the registry, in JSON and on the command line.
-    usage : the words that ask for it on the command line, for help and errors.
-    quantity : what is measured, such as ``displacement``.
-    unit : of the data.
-    other_units : units the data may be in by mistake, each with the factor that converts it.
-    """
-
-    kind: ClassVar[str]
-    usage: ClassVar[str]
-    quantity: ClassVar[str]
-    unit: ClassVar[str]
-    other_units: ClassVar[Mapping[str, float]]
+    """A function of the displacement of a few nodes, and of theta."""
 
     # ---- the measurement --------------------------------------------------------------------
+    @property
+    def quantity(self) -> str:
+        """What is measured, such as ``displacement``."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Unit of the data; ``1`` where it has none."""
+        ...
+
+    @property
+    def other_units(self) -> Mapping[str, float]:
+        """Units the data may be in by mistake, each with the factor that converts it."""
+        ...
+
     @property
     def nodes(self) -> np.ndarray:
         """Nodes a forward map must return, (k,)."""
@@ -74,6 +76,11 @@ class Observation(Protocol):
         """Noise assumed where none is given."""
         ...
 
+    @property
+    def sites(self) -> Sites | None:
+        """Where each number of the data was measured; ``None`` for what has no one place."""
+        ...
+
     def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Data without noise (..., *shape), from one load state.
 
@@ -85,7 +92,10 @@ class Observation(Protocol):
         ...
 
     def check(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` on data of a wrong shape or with values that cannot be."""
+        """Raise :class:`InputError` on data of a wrong shape or with values that cannot be.
+
+        NaN marks a missing value and passes.
+        """
         ...
 
     # ---- its names, labels and JSON ---------------------------------------------------------
@@ -99,8 +109,25 @@ class Observation(Protocol):
         ...
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON from which :meth:`from_json` makes it again; ``kind`` is its kind."""
+        """Plain JSON from which :meth:`Kind.from_json` makes it again; ``kind`` is its kind."""
         ...
+
+    def to_arrays(self, name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+        """The arrays of its kind's layout, by variable."""
+        ...
+
+
+class Kind(Observation, Protocol):
+    """A kind of observation: what its registry needs to make one from words, JSON and files.
+
+    Attributes
+    ----------
+    kind : its name in the registry, in JSON and on the command line.
+    usage : the words that ask for it on the command line, for help and errors.
+    """
+
+    kind: ClassVar[str]
+    usage: ClassVar[str]
 
     @classmethod
     def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
@@ -115,12 +142,12 @@ class Observation(Protocol):
         """
         ...
 
-    # ---- its data in files ------------------------------------------------------------------
     @classmethod
     def layouts(cls, words: Collection[str]) -> dict[str, tuple[Field, ...]]:
         """Arrays that would hold an observation of this kind, by the observation's name.
 
-        ``words`` are the columns or variables of a file, of which some may be missing.
+        ``words`` are the columns or variables of a file, of which some may be missing, or the
+        observation's name with the variables of :meth:`to_arrays`.
         """
         ...
 
@@ -128,9 +155,5 @@ class Observation(Protocol):
     def from_arrays(
         cls, scene: Scene, name: str, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
-        """Observation and data from the arrays of its layout, by variable."""
-        ...
-
-    def to_arrays(self, name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-        """The arrays of its layout; inverse of :meth:`from_arrays`."""
+        """Observation and data from the arrays of its layout; inverse of :meth:`to_arrays`."""
         ...

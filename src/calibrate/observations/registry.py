@@ -5,18 +5,36 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from calibrate.observations.landmarks import Landmarks
+from calibrate.observations.length import Length
 from calibrate.observations.nodes import NodalDisplacements
-from calibrate.observations.protocol import Observation
+from calibrate.observations.parameter import MeasuredParameter
+from calibrate.observations.present import ENTRIES, Present
+from calibrate.observations.protocol import Kind, Observation
+from calibrate.observations.segment_strain import SegmentStrain
 from calibrate.observations.several import Observations
+from calibrate.observations.strain import Strain
+from calibrate.observations.surface import SurfacePoints
 from calibrate.observations.volume import CavityVolume
 from calibrate.state_names import at, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
 # In this order they look for their columns in a file: `node` decides before `x,y,z`.
-KINDS: dict[str, type[Observation]] = {
-    kind.kind: kind for kind in (NodalDisplacements, Landmarks, CavityVolume)
+KINDS: dict[str, type[Kind]] = {
+    kind.kind: kind
+    for kind in (
+        NodalDisplacements,
+        Landmarks,
+        Strain,
+        SegmentStrain,
+        SurfacePoints,
+        CavityVolume,
+        Length,
+        MeasuredParameter,
+    )
 }
 
 
@@ -61,7 +79,8 @@ def observation_from_json(scene: Scene, description: Mapping[str, Any]) -> Obser
     kind = description.get("kind")
     if kind not in KINDS:
         raise InputError(f"observation kind '{kind}' is unknown; known: {', '.join(KINDS)}")
-    return KINDS[kind].from_json(scene, description)
+    whole = KINDS[kind].from_json(scene, description)
+    return Present(whole, np.asarray(description[ENTRIES])) if ENTRIES in description else whole
 
 
 def observations_from_json(

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from calibrate.noise.protocol import Sites
 from calibrate.observations.protocol import Field, Labels
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -16,13 +17,19 @@ from emulator.scenes.scene import Scene
 class Scalar:
     """One number above 0, in a column or variable called as on the command line.
 
-    A subclass gives ``nodes``, ``__call__``, ``default_noise``, ``names`` (the last of which
-    :meth:`parse` understands) and ``parse``.
+    A subclass gives ``unit``, ``nodes``, ``__call__``, ``default_noise``, ``parse`` and ``names``,
+    the last of which ``parse`` understands.
     """
 
     kind: ClassVar[str]
-    unit: ClassVar[str]
+    usage: ClassVar[str]
     shape: ClassVar[tuple[int, ...]] = ()
+    sites: ClassVar[Sites | None] = None
+
+    @property
+    @abstractmethod
+    def unit(self) -> str:
+        """Unit of the number."""
 
     @property
     @abstractmethod
@@ -35,15 +42,18 @@ class Scalar:
         """Name and observation of ``word``."""
 
     def check(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` unless ``values`` is one finite number above 0."""
+        """Raise :class:`InputError` unless ``values`` is one finite number above 0, or missing."""
+        self._check_number(name, values)
+        if values <= 0.0:
+            raise InputError(f"data: {name} is {values} {self.unit}; it must be above 0")
+
+    def _check_number(self, name: str, values: np.ndarray) -> None:
         if values.shape != ():
             raise InputError(
                 f"data has shape {values.shape}; the observation expects () ({name}, {self.unit})"
             )
-        if not np.isfinite(values):
+        if np.isinf(values):
             raise InputError(f"data: {name} is {values}; it must be finite")
-        if not values > 0.0:
-            raise InputError(f"data: {name} is {values} {self.unit}; it must be above 0")
 
     def labels(self, name: str) -> Labels:
         """None: a number has no dimensions."""
@@ -69,7 +79,8 @@ class Scalar:
     ) -> tuple[Self, np.ndarray]:
         """Observation and data from the one array called ``name``."""
         if arrays[name].size != 1:
-            raise InputError(f"{name} has {arrays[name].size} values; give one, in {cls.unit}")
+            found = cls._of(scene, name)
+            raise InputError(f"{name} has {arrays[name].size} values; give one, in {found.unit}")
         return cls._of(scene, name), arrays[name].reshape(())
 
     def to_arrays(self, name: str, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -82,5 +93,3 @@ class Scalar:
         if found is None:
             raise InputError(f"'{word}' is no {cls.kind}; write {cls.usage}")
         return found[1]
-
-    usage: ClassVar[str]

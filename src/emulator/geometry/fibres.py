@@ -125,22 +125,28 @@ def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Dept
 def turned(wall: Depth, angles: Angles, axis: Axis) -> Directions:
     """Directions in a wall of known depth, by the rule in the module docstring.
 
-    Where the transmural direction is along the axis, as at the apex, no direction is
-    circumferential; an arbitrary one across the axis is taken.
+    The axis may have any length.
     """
     k = np.asarray(axis, dtype=float)
     if k.shape != (3,) or not np.isfinite(k).all() or not k.any():
         raise InputError(f"fibres: axis {axis}; expected three numbers, not all zero")
     if len(angles) != 2 or not np.isfinite(angles).all():
         raise InputError(f"fibres: angles {angles}; expected two numbers in degrees")
-    n, k = wall.normal, k / np.linalg.norm(k)
-    across = np.cross(k, n)
-    on_axis = np.linalg.norm(across, axis=1) < 1e-8
-    any_way = np.cross(n, np.eye(3)[np.argmin(np.abs(k))])
-    c = _unit(np.where(on_axis[:, None], any_way, across))
+    n, c = wall.normal, circumferential(wall.normal, k / np.linalg.norm(k))
     first, last = np.radians(angles)
     alpha = (first + wall.value * (last - first))[:, None]
     return Directions(np.cos(alpha) * c + np.sin(alpha) * np.cross(n, c), n)
+
+
+def circumferential(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Unit vectors (m, 3) around ``axis`` (3,) of length 1, across the ``normals`` (m, 3).
+
+    Where a normal is along the axis, as at the apex, an arbitrary direction across it.
+    """
+    across = np.cross(axis, normals)
+    on_axis = np.linalg.norm(across, axis=1) < 1e-8
+    any_way = np.cross(normals, np.eye(3)[np.argmin(np.abs(axis))])
+    return _unit(np.where(on_axis[:, None], any_way, across))
 
 
 def _nodes(mesh: Mesh, names: tuple[str, ...]) -> np.ndarray:

@@ -224,7 +224,8 @@ def test_bad_calls(capsys, monkeypatch, tmp_path, words, message):
     ("words", "message"),
     [
         (["--data", "missing.csv"], "missing.csv does not exist"),
-        (["--data", "nan.csv"], "row 2 has a displacement that is not finite"),
+        (["--data", "inf.csv"], "row 2 has a displacement that is not finite"),
+        (["--data", "gone.csv"], "gone.csv: data: every value of displacement is missing"),
         (["--data", "node.csv"], "node 4000 is unknown"),
         (["--data", "book.xlsx"], "book.xlsx is a spreadsheet; save it as CSV"),
         (["--data", "metres.csv"], "m instead of mm? multiply by 1000"),
@@ -241,6 +242,23 @@ def test_bad_calls(capsys, monkeypatch, tmp_path, words, message):
         (
             ["--truth", "mu=73", "lam=61", "--noise-scale", "displacement=0"],
             "displacement (mm): noise: standard deviation is 0.0",
+        ),
+        *(
+            (["--truth", "mu=73", "lam=61", "--noise", noise], message)
+            for noise, message in (
+                ("student_t:dof=4", "'student_t:dof=4' needs a name, as in displacement=student_t"),
+                ("displacement=pink:sd=1", "'pink:sd=1' is neither a number nor a noise; give gau"),
+                ("displacement=student_t:dof=4", "noise: give either scale (known) or prior_scale"),
+                ("displacement=correlated:length=0,sd=1,spatial_sd=1", "length (mm) is 0.0; it"),
+            )
+        ),
+        *(
+            (["--truth", "mu=73", "lam=61", "--discrepancy", word], message)
+            for word, message in (
+                ("displacement=1", "--discrepancy: 'displacement=1' is wrong; write it as in disp"),
+                ("volume=1:20", "discrepancy: 'volume' is not observed; observed: displacement"),
+                ("displacement=1:-20", "correlation length (mm) is -20.0; it must be above 0"),
+            )
         ),
         (["--truth", "mu=73"], "no value for parameter 'lam'"),
         (["--truth", "mu=73", "lam=10"], "parameter 'lam' is 10 kPa"),
@@ -265,7 +283,8 @@ def test_bad_calls(capsys, monkeypatch, tmp_path, words, message):
 )
 def test_bad_inference_leaves_nothing_behind(capsys, monkeypatch, tmp_path, words, message):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "nan.csv").write_text("node,ux,uy,uz\n30,0,0,0\n31,0,nan,0\n")
+    (tmp_path / "inf.csv").write_text("node,ux,uy,uz\n30,0,0,0\n31,0,inf,0\n")
+    (tmp_path / "gone.csv").write_text("node,ux,uy,uz\n30,NA,,nan\n")
     (tmp_path / "node.csv").write_text("node,ux,uy,uz\n4000,0,0,0\n")
     (tmp_path / "book.xlsx").write_bytes(b"PK")
     # The free end sags by 10 to 20 mm.

@@ -8,9 +8,9 @@ from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments, emit, show_progress
 from calibrate.cli.forward import add_forward, forward_options
+from calibrate.cli.noise_words import discrepancy_words, noise_scale_words, noise_words
 from calibrate.cli.posterior_table import summary
 from calibrate.samplers import SAMPLERS
-from emulator.errors import InputError
 
 
 def register(commands: Any) -> None:
@@ -39,7 +39,8 @@ def register(commands: Any) -> None:
         default="nodes:20",
         metavar="WHAT",
         help="of synthetic data, e.g. nodes:N, landmarks:N, all, a node set, 3,14,15, volume, "
-        "volume:FACETSET; several joined by +, as in landmarks:24+volume",
+        "volume:FACETSET, surface:FACETSET:N, strain:fibre:N, segment_strain:circumferential, "
+        "length:A:B, parameter:NAME; several joined by +, as in landmarks:24+volume",
     )
     _add_noise(parser)
     add_forward(parser)
@@ -67,7 +68,9 @@ def _add_noise(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="[NAME=]SD",
         help="standard deviation by observation, e.g. volume=1.0 displacement=0.2, mL and mm; a "
-        "bare number is a single observation's or the displacements' (default 0.2 mm, 1 mL)",
+        "bare number is a single observation's or the displacements' (default 0.2 mm, 1 mL). Other "
+        "noise by its name, e.g. displacement=student_t:dof=4,scale=0.2 or "
+        "displacement=correlated:length=15,sd=0.1,spatial_sd=0.2 (length in mm)",
     )
     parser.add_argument(
         "--noise-scale",
@@ -77,28 +80,18 @@ def _add_noise(parser: argparse.ArgumentParser) -> None:
         help="infer the noise: scale of the half-normal prior of its standard deviation",
     )
     parser.add_argument(
+        "--discrepancy",
+        nargs="+",
+        default=[],
+        metavar="NAME=SCALE:LENGTH",
+        help="let the model be wrong, e.g. displacement=0.5:20: scale of the half-normal prior of "
+        "the discrepancy's standard deviation, in the data's unit, and its correlation length, mm",
+    )
+    parser.add_argument(
         "--no-unit-check",
         action="store_true",
         help="take data however far from every prediction (m for mm, mm3 for mL, zero)",
     )
-
-
-def noise_by_name(words: list[str], option: str) -> dict[str, float] | float:
-    """Numbers by the observation's name, from ``name=number`` words and bare numbers.
-
-    A single bare number is returned as it is: which observation it belongs to depends on the data.
-    Beside named numbers, a bare one is the displacements'.
-    """
-    bare = [word for word in words if "=" not in word]
-    if len(bare) > 1:
-        raise InputError(f"{option}: '{bare[1]}' needs a name, as in volume={bare[1]}")
-    try:
-        if bare and len(words) == 1:
-            return float(bare[0])
-        return assignments([w if "=" in w else f"displacement={w}" for w in words], "volume=1.0")
-    except ValueError as error:
-        text = error if isinstance(error, InputError) else f"'{bare[0]}' is not a number"
-        raise InputError(f"{option}: {text}") from error
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -115,8 +108,9 @@ def run(arguments: argparse.Namespace) -> int:
         truth=assignments(arguments.truth),
         known=assignments(arguments.known),
         observe=arguments.observe,
-        noise=noise_by_name(arguments.noise, "--noise"),
-        noise_scale=noise_by_name(arguments.noise_scale, "--noise-scale"),
+        noise=noise_words(arguments.noise),
+        noise_scale=noise_scale_words(arguments.noise_scale),
+        discrepancy=discrepancy_words(arguments.discrepancy),
         check_scale=not arguments.no_unit_check,
         forward=arguments.forward,
         emulator=_emulator(arguments.emulator),

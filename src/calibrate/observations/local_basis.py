@@ -1,0 +1,79 @@
+r"""Local directions in which strains are measured.
+
+In a ventricle's wall the transmural direction :math:`n` (:mod:`emulator.geometry.fibres`) and the
+axis :math:`k` from apex to base give
+
+.. math:: r = n, \qquad c = k \times n / |k \times n|, \qquad l = n \times c ,
+
+radial (out of the cavity), circumferential and longitudinal (towards the base): the cardiac
+coordinates of tagged images. The fibre :math:`f` is the scene's, and the cross-fibre direction
+:math:`n \times f / |n \times f|` lies in the wall's tangent plane, across the fibre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.fibres import circumferential, depth
+from emulator.scenes.cavities import ENDOCARDIUM
+from emulator.scenes.scene import Scene
+
+EPICARDIUM = "epicardium"
+AXIS = np.array([0.0, 0.0, 1.0])  # from apex to base, as in the built-in ventricles
+
+COMPONENTS = {
+    "fibre": "E_fibre",
+    "cross_fibre": "E_cross",
+    "circumferential": "E_circ",
+    "longitudinal": "E_long",
+    "radial": "E_rad",
+}
+"""Directions of the basis, and the name of the strain along each in files."""
+
+
+def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
+    """Unit vectors (m, c, 3) along ``components`` at every element's centroid.
+
+    Raises
+    ------
+    InputError
+        An unknown component or one that is given twice; fibre directions of a scene without
+        fibres; others of a scene without a wall.
+    """
+    for name in components:
+        if name not in COMPONENTS:
+            raise InputError(f"strain along '{name}' is unknown; known: {', '.join(COMPONENTS)}")
+        if list(components).count(name) > 1:
+            raise InputError(f"strain along '{name}' is observed twice; once is enough")
+        if "fibre" in name and scene.fibres is None:
+            raise InputError(f"strain along '{name}': scene '{scene.name}' has no fibres")
+    if not components:
+        raise InputError(f"strain: name one component or more of {', '.join(COMPONENTS)}")
+    if tuple(components) == ("fibre",):  # needs no wall
+        return np.asarray(scene.fibres)[:, None]
+    basis = _basis(scene)
+    return np.stack([basis[name] for name in components], axis=1)
+
+
+def _basis(scene: Scene) -> dict[str, np.ndarray]:
+    """Every direction that the scene has, (m, 3) each."""
+    for name in (ENDOCARDIUM, EPICARDIUM):
+        if name not in scene.mesh.facet_sets:
+            known = ", ".join(sorted(scene.mesh.facet_sets)) or "none"
+            raise InputError(
+                f"strain in wall directions needs facet sets {ENDOCARDIUM} and {EPICARDIUM}; "
+                f"scene '{scene.name}' has {known}"
+            )
+    n = depth(scene.mesh, (ENDOCARDIUM,), (EPICARDIUM,)).normal
+    c = circumferential(n, AXIS)
+    basis = {"circumferential": c, "longitudinal": np.cross(n, c), "radial": n}
+    if scene.fibres is not None:
+        across = np.cross(n, scene.fibres)
+        length = np.linalg.norm(across, axis=1, keepdims=True)
+        if not length.min() > 1e-6:
+            raise InputError("strain: a fibre runs through the wall; it has no cross-fibre")
+        basis |= {"fibre": scene.fibres, "cross_fibre": across / length}
+    return basis
