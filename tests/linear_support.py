@@ -4,7 +4,9 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 
+import calibrate as cal
 from emulator.surrogates.protocol import Prediction, all_nodes, fingerprint_of
 
 
@@ -48,3 +50,20 @@ def closed_form(forward, nodes, data, sd, mean, prior_sd):
     precision = A.T @ A / sd**2 + np.diag(1.0 / prior_sd**2)
     covariance = np.linalg.inv(precision)
     return covariance @ (A.T @ y / sd**2 + mean / prior_sd**2), covariance
+
+
+PRIOR_MEAN, PRIOR_SD = np.array([70.0, 75.0]), np.array([5.0, 8.0])
+
+
+def linear_problem(scene, forward=None):
+    """A linear-Gaussian model of three displacements of a scene, and data: (model, data)."""
+    forward = linear_forward(scene) if forward is None else forward
+    prior = {
+        name: dist.Normal(m, s)
+        for name, m, s in zip(scene.parameter_names, PRIOR_MEAN, PRIOR_SD, strict=True)
+    }
+    observe = cal.nodal_displacements(scene, [3, 11, 20])
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), prior)
+    noise = 0.1 * np.random.default_rng(0).normal(size=(3, 3))
+    exact = linear_forward(scene).at(observe.nodes)(jnp.array([72.0, 68.0]))
+    return model, np.asarray(exact) + noise

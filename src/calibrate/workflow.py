@@ -43,6 +43,7 @@ from emulator.surrogates.protocol import ForwardMap
 
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
 FORWARD = "forward.safetensors"
+SAMPLING = "sampling.safetensors"  # of a run under way, or killed
 
 
 @dataclass(frozen=True)
@@ -189,10 +190,12 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
 
 
 def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
-    """Sample the posterior of a run; with ``folder``, keep run, data and posterior there."""
-    options = find_sampler(run.sampler).options(
-        warmup=run.warmup, draws=run.draws, chains=run.chains
-    )
+    """Sample the posterior of a run; with ``folder``, keep run, data and posterior there.
+
+    A run into ``folder`` that was killed while sampling goes on where it was.
+    """
+    sampler = find_sampler(run.sampler)
+    options = sampler.options.sized(warmup=run.warmup, draws=run.draws, chains=run.chains)
     scene = find_scene(run.scene, run.root)
     observe, data = make_data(run, scene)
     run, noises = run.named(observe), run.noises(observe)
@@ -204,7 +207,14 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         check_scale=run.check_scale,
     )
     posterior = sample(
-        built, data, sampler=run.sampler, options=options, seed=run.seed, progress=progress
+        built,
+        data,
+        sampler=run.sampler,
+        options=options,
+        seed=run.seed,
+        progress=progress,
+        simulator=simulator_of(scene) if sampler.solves_fem else None,
+        checkpoint=None if folder is None else Path(folder) / SAMPLING,
     )
     if folder is not None:
         folder = Path(folder)

@@ -3,7 +3,7 @@
 from calibrate.samplers.blackjax_nuts import BlackJAXNUTSOptions
 from calibrate.samplers.density import density_of, named_draws
 from calibrate.samplers.nuts import NUTSOptions
-from calibrate.samplers.protocol import Draws, Kernel, Sampler
+from calibrate.samplers.protocol import Context, Draws, Kernel, Sampler
 from calibrate.samplers.registry import SAMPLERS, check_options, find_sampler
 from calibrate.samplers.run import ChainSampler
 from calibrate.samplers.stopping import r_hat
@@ -12,6 +12,7 @@ __all__ = [
     "SAMPLERS",
     "BlackJAXNUTSOptions",
     "ChainSampler",
+    "Context",
     "Draws",
     "Kernel",
     "NUTSOptions",

@@ -33,7 +33,7 @@ def problem(beam):
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_a_linear_gaussian_posterior_is_the_known_one(name, problem, beam):
     forward, observe, model, data = problem
-    options = find_sampler(name).options(warmup=400, draws=1000)
+    options = find_sampler(name).options.sized(warmup=400, draws=1000, chains=4)
     posterior = cal.sample(model, data, sampler=name, options=options, seed=1)
     mean, covariance = closed_form(forward, observe.nodes, data, 0.1, PRIOR_MEAN, PRIOR_SD)
     draws, table = posterior.draws(), posterior.summary()
