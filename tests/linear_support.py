@@ -1,6 +1,7 @@
 """A forward map linear in theta, whose posterior is known in closed form."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +42,19 @@ def linear_forward(scene, seed=0, size=0.01, bias=0.0) -> LinearForward:
     count = len(scene.mesh.nodes)
     matrix = size * rng.normal(size=(count, 3, len(scene.parameters)))
     return LinearForward(scene, all_nodes(scene), matrix, np.full((count, 3), bias))
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFEM:
+    """Stands in for a simulator: its solutions are those of ``forward``; above ``limit`` it fails."""
+
+    scene: object
+    forward: LinearForward
+    limit: float = np.inf
+
+    def solve(self, theta, start=None):
+        converged = bool(jnp.all(theta < self.limit))
+        return SimpleNamespace(converged=converged, displacement=self.forward(theta))
 
 
 def closed_form(forward, nodes, data, sd, mean, prior_sd):

@@ -120,4 +120,4 @@ def _write_units(tree: xr.DataTree, model: Model) -> None:
                 tree[group][name].attrs["units"] = unit or "1"
     if "constant_data" in tree:  # reference positions
         for constant in tree["constant_data"].data_vars:
-            tree["constant_data"][constant].attrs["units"] = "mm"
+            tree["constant_data"][str(constant)].attrs["units"] = "mm"

@@ -1,6 +1,7 @@
 """Samplers behind one protocol: ``protocol`` says what they give, ``registry`` finds them."""
 
 from calibrate.samplers.blackjax_nuts import BlackJAXNUTSOptions
+from calibrate.samplers.delayed_acceptance import DelayedAcceptanceOptions
 from calibrate.samplers.density import density_of, named_draws
 from calibrate.samplers.nuts import NUTSOptions
 from calibrate.samplers.protocol import Context, Draws, Kernel, Sampler
@@ -13,6 +14,7 @@ __all__ = [
     "BlackJAXNUTSOptions",
     "ChainSampler",
     "Context",
+    "DelayedAcceptanceOptions",
     "Draws",
     "Kernel",
     "NUTSOptions",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from calibrate.samplers.blackjax_nuts import BLACKJAX_NUTS
+from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Sampler
 from emulator.errors import InputError
@@ -12,6 +13,7 @@ from emulator.errors import InputError
 _ALL: tuple[Sampler, ...] = (
     NUTS,
     BLACKJAX_NUTS,
+    DELAYED_ACCEPTANCE,
 )
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 

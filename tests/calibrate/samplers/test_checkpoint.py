@@ -10,7 +10,7 @@ import calibrate as cal
 from calibrate.samplers import SAMPLERS
 from calibrate.samplers.checkpoint import Checkpoint
 from emulator.errors import InputError
-from linear_support import linear_problem
+from linear_support import LinearFEM, linear_problem
 
 
 class Killed(Exception):
@@ -38,7 +38,9 @@ def problem(beam):
 
 def run(problem, name, **more):
     model, data = problem
-    options = SAMPLERS[name].options.sized(warmup=60, draws=120, chains=2)
+    draws = 20 if SAMPLERS[name].solves_fem else 120
+    options = SAMPLERS[name].options.sized(warmup=60, draws=draws, chains=2)
+    more["simulator"] = LinearFEM(model.full.scene, model.full)
     return cal.sample(model, data, sampler=name, options=options, seed=5, predictions=False, **more)
 
 
