@@ -10,6 +10,7 @@ from numpyro import distributions as dist
 
 import calibrate as cal
 from calibrate import predictions
+from calibrate.samplers import SMCOptions
 from linear_support import linear_forward, linear_problem
 
 GROUPS = {
@@ -31,9 +32,15 @@ def posterior(beam):
 
 
 @pytest.fixture(scope="module")
-def saved(posterior, tmp_path_factory):
+def particles(posterior):
+    model, data = posterior.model, posterior.data
+    return cal.sample(model, data, sampler="smc", options=SMCOptions(draws=300, chains=2))
+
+
+@pytest.fixture(scope="module", params=["posterior", "particles"])
+def saved(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("saved") / "posterior.nc"
-    posterior.save(path)
+    request.getfixturevalue(request.param).save(path)
     with xr.open_datatree(path, engine="h5netcdf") as tree:
         return tree.load()
 

@@ -7,6 +7,7 @@ from calibrate.samplers.nuts import NUTSOptions
 from calibrate.samplers.protocol import Context, Draws, Kernel, Sampler
 from calibrate.samplers.registry import SAMPLERS, check_options, find_sampler
 from calibrate.samplers.run import ChainSampler
+from calibrate.samplers.smc import SMCOptions
 from calibrate.samplers.stopping import r_hat
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Draws",
     "Kernel",
     "NUTSOptions",
+    "SMCOptions",
     "Sampler",
     "check_options",
     "density_of",

@@ -47,12 +47,15 @@ def density_of(model: Model) -> Density:
     example = {name: np.zeros(shape) for name, shape in model.observe.shapes.items()}
     info = initialize_model(jax.random.key(0), model, model_args=(example,), dynamic_args=True)
     flat, unravel = ravel_pytree(info.param_info.z)
+    sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(example)
+    # By name: the Jacobian of a coordinate is a site too, and counts as observed.
+    hidden = [name for name, site in sites.items() if _observed(site)]
 
     def log_density(z: jax.Array, data: Data) -> jax.Array:
         return -info.potential_fn(data)(unravel(z))
 
     def log_prior(z: jax.Array) -> jax.Array:
-        unobserved = handlers.block(model, hide_fn=_observed)
+        unobserved = handlers.block(model, hide=hidden)
         return -potential_energy(unobserved, (example,), {}, unravel(z))
 
     def log_likelihood(z: jax.Array, data: Data) -> jax.Array:

@@ -8,12 +8,14 @@ from calibrate.samplers.blackjax_nuts import BLACKJAX_NUTS
 from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Sampler
+from calibrate.samplers.smc import SMC
 from emulator.errors import InputError
 
 _ALL: tuple[Sampler, ...] = (
     NUTS,
     BLACKJAX_NUTS,
     DELAYED_ACCEPTANCE,
+    SMC,
 )
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
