@@ -6,6 +6,7 @@ from typing import Any
 
 from calibrate.samplers.blackjax_nuts import BLACKJAX_NUTS
 from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE
+from calibrate.samplers.mclmc import MCLMC
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Sampler
 from calibrate.samplers.smc import SMC
@@ -14,6 +15,7 @@ from emulator.errors import InputError
 _ALL: tuple[Sampler, ...] = (
     NUTS,
     BLACKJAX_NUTS,
+    MCLMC,
     DELAYED_ACCEPTANCE,
     SMC,
 )
