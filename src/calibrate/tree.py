@@ -15,6 +15,7 @@ import xarray as xr
 
 from calibrate import predictions
 from calibrate.noise.gaussian import NOISE_SD
+from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
 
 
@@ -102,7 +103,8 @@ def _labels(
 
 def units_of(model: Model) -> dict[str, str]:
     """Units by the names of parameters, observations and standard deviations of noise."""
-    units = {parameter.name: parameter.unit for parameter in model.forward.scene.parameters}
+    parameters = {p.name: p.unit for p in model.forward.scene.parameters}
+    units = {name: parameters[split(name)[0]] for name in model.states.unknowns}
     for name, part in model.observe.parts.items():
         units[name] = part.unit
         site = model.noise_sites[name].get(NOISE_SD)
