@@ -15,6 +15,7 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
+from calibrate.diagnosis import diagnose
 from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.provenance import versions
 from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws, r_hat
@@ -85,6 +86,16 @@ class Posterior:
         """Number of divergent transitions; 0 for samplers that have none."""
         statistics = self.tree["sample_stats"]
         return int(statistics["diverging"].sum()) if "diverging" in statistics else 0
+
+    def warnings(self) -> list[str]:
+        """What is wrong with the run and what to do, a sentence each; empty where nothing is."""
+        groups = [self.tree[name].to_dataset() for name in ("posterior", "sample_stats")]
+        draws, statistics = (
+            {str(name): np.asarray(values) for name, values in group.data_vars.items()}
+            for group in groups
+        )
+        attributes = {str(name): value for name, value in self.tree.attrs.items()}
+        return diagnose(draws, statistics, self.summary(), attributes)
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""
@@ -212,4 +223,6 @@ def _identity(made: Mapping[str, Any], data: Data) -> dict[str, str]:
     for name in sorted(data):
         digest.update(name.encode() + np.asarray(data[name]).tobytes())
     described = {name: json.dumps(value) for name, value in made.items() if name != "scene"}
-    return {**described, "data": digest.hexdigest()[:16]}
+    # What a user changes most comes first: the first difference is named.
+    first = {name: described.pop(name) for name in ("sampler", "seed", "sampler_options")}
+    return {**first, **described, "data": digest.hexdigest()[:16]}

@@ -260,7 +260,18 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
 def certify_and_keep(
     posterior: Posterior, folder: str | Path, *, draws: int | None = None, progress: bool = False
 ) -> Certificate:
-    """Check a posterior against FEM and write certificate.json."""
+    """Check a posterior against FEM and write certificate.json.
+
+    Raises
+    ------
+    InputError
+        FEM has decided on the draws already: weighting them by FEM once more would be wrong.
+    """
+    if find_sampler(posterior.tree.attrs["sampler"]).solves_fem:
+        raise InputError(
+            f"the posterior of sampler '{posterior.tree.attrs['sampler']}' is FEM's already; it "
+            "needs no certificate"
+        )
     simulator = simulator_of(posterior.model.forward.scene)
     certificate = certify(posterior, simulator, draws=draws, progress=progress)
     write_json(Path(folder) / CERTIFICATE, certificate.to_json())
@@ -283,7 +294,14 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "prior_cut": dict(posterior.model.prior_cut),
         "draws": int(posterior.tree["posterior"].sizes["draw"]),
         "chains": int(posterior.tree["posterior"].sizes["chain"]),
+        "warnings": posterior.warnings(),
     }
+    if "fem_solves" in posterior.tree.attrs:
+        result["fem_solves"] = int(posterior.tree.attrs["fem_solves"])
+        result["verdict"] = "decided by FEM"
+    if "log_evidence" in posterior.tree.attrs:
+        result["log_evidence"] = posterior.tree.attrs["log_evidence"]
+        result["log_evidence_error"] = posterior.tree.attrs.get("log_evidence_error")
     if certificate is not None:
         result.update(verdict=certificate.verdict, k_hat=certificate.k_hat)
         result["certificate"] = certificate.to_json()

@@ -21,6 +21,7 @@ from emulator.errors import InputError
 from emulator.store import named_leaves, read_arrays, save_arrays
 
 FORMAT = "1"  # of the states; a file of another format is refused
+_LONG = 60  # characters of a value that a message leaves out
 
 
 class Checkpoint:
@@ -84,11 +85,13 @@ class Checkpoint:
     def _check(self, metadata: Mapping[str, str]) -> None:
         kept = json.loads(metadata.get("identity", "{}"))
         for name in self.identity | kept:
-            if kept.get(name) != self.identity.get(name):
+            was, now = kept.get(name), self.identity.get(name)
+            if was != now:
+                short = max(len(str(was)), len(str(now))) < _LONG
                 raise InputError(
                     f"checkpoint {self.path} belongs to another run: its {name} is "
-                    f"{kept.get(name)}, not {self.identity.get(name)}; repeat that run, or remove "
-                    "the file"
+                    + (f"{was}, not {now}" if short else "another")
+                    + "; repeat that run, or remove the file"
                 )
 
 

@@ -47,6 +47,7 @@ class DelayedAcceptanceOptions(ChainOptions):
     """
 
     draws: int = 250
+    rounds: int = 4
     transitions: int = 4
     discarded: int = 20
     target_accept: float = 0.85
@@ -78,6 +79,7 @@ class _State(NamedTuple):
     map_: transport.TransportMap
     place: _Place
     count: Any  # draws made, the discarded ones included
+    solves: Any  # FEM's, those of starts and discarded draws included
     draws: Draws
 
 
@@ -111,6 +113,8 @@ class DelayedAcceptance:
     ) -> Draws:
         """Draw from FEM's posterior in rounds, until the chains agree.
 
+        The attribute ``fem_solves`` counts all solves; the statistic those of the draws kept.
+
         Raises
         ------
         InputError
@@ -126,7 +130,7 @@ class DelayedAcceptance:
                 draws = run.draw(rounds * options.draws)
                 if converged(draws.z, options.r_hat, options.ess):
                     break
-        return draws
+        return draws._replace(attributes={"fem_solves": run.solves})
 
 
 class _Run:
@@ -146,7 +150,8 @@ class _Run:
         self.programs = compile_chains(BLACKJAX_NUTS, density, options.cheap())
         start_key, self.key = jax.random.split(jax.random.key(seed))
         state = self.checkpoint.restore(self._template) or self._begin(start_key)
-        self.map_, self.place, self.count = state.map_, state.place, int(state.count)
+        self.map_, self.place = state.map_, state.place
+        self.count, self.solves = int(state.count), int(state.solves)
         self.parts = [state.draws]
         bar.update(self.count)
 
@@ -177,12 +182,13 @@ class _Run:
         self.map_ = cheap.map_
         proposed, _ = self._propose(cheap.states)
         place = proposed._replace(log_w=self._log_w(proposed.z, np.full(len(proposed.z), True)))
-        return _State(self.map_, place, 0, self._no_draws())
+        return _State(self.map_, place, 0, len(proposed.z), self._no_draws())
 
     def _step(self) -> Draws:
         """One draw of each chain, (chains, 1)."""
         proposed, cheap = self._propose(self.place.states)
         moved = (proposed.z != self.place.z).any(axis=1)
+        self.solves += int(moved.sum())
         log_w = np.where(moved, self._log_w(proposed.z, moved), self.place.log_w)
         # Where FEM fails the weight is 0: never accepted, and left at the first chance.
         with np.errstate(invalid="ignore", over="ignore"):
@@ -235,7 +241,7 @@ class _Run:
         return Draws(np.zeros((chains, 0, self.density.dimension)), statistics)
 
     def _state(self) -> _State:
-        return _State(self.map_, self.place, self.count, join(self.parts))
+        return _State(self.map_, self.place, self.count, self.solves, join(self.parts))
 
     def _template(self) -> _State:
         map_ = transport.identity(self.density.dimension)
@@ -243,7 +249,8 @@ class _Run:
         states, _ = jax.eval_shape(self.programs.start, keys, self.data, map_)
         number = np.zeros(())
         place = _Place(states, number, number, number)
-        return _State(map_, place, np.zeros((), int), self._no_draws())
+        count = np.zeros((), int)
+        return _State(map_, place, count, count, self._no_draws())
 
 
 def _choose(accepted: np.ndarray, proposed: _Place, current: _Place) -> _Place:

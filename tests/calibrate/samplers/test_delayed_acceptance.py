@@ -68,13 +68,14 @@ def test_statistics_count_fem_solves_and_acceptance(beam, biased):
             solved.append(np.asarray(theta))
             return super().solve(theta, start)
 
-    options = replace(OPTIONS, draws=50, chains=2)
+    options = replace(OPTIONS, draws=50)
     call = {"sampler": "delayed_acceptance", "options": options, "seed": 1}
     posterior = cal.sample(model, data, simulator=Counted(beam, exact), **call)
     statistics = posterior.tree["sample_stats"]
     counted = int(statistics["fem_solves"].sum())
     # Those of the start and of the discarded draws come on top.
-    assert counted <= 2 * 50 <= len(solved) <= 2 * (1 + 20 + 50)
+    assert counted <= 4 * 50 <= len(solved) <= 4 * (1 + 20 + 50)
+    assert posterior.tree.attrs["fem_solves"] == len(solved)
     draws = posterior.tree["posterior"]["mu"].values
     moved = np.diff(draws, axis=1) != 0
     np.testing.assert_array_equal(statistics["accepted"].values[:, 1:], moved)
@@ -85,10 +86,10 @@ def test_statistics_count_fem_solves_and_acceptance(beam, biased):
     assert float(right.tree["sample_stats"]["log_w"].max()) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_where_fem_fails_there_are_no_draws(beam):
-    model, data = linear_problem(beam)
-    fem = LinearFEM(beam, model.full, limit=72.0)
-    options = replace(OPTIONS, draws=50, chains=2)
+def test_where_fem_fails_there_are_no_draws(beam, biased):
+    exact, model, data = biased
+    fem = LinearFEM(beam, exact, limit=72.0)
+    options = replace(OPTIONS, draws=50)
     call = {"sampler": "delayed_acceptance", "options": options}
     posterior = cal.sample(model, data, simulator=fem, **call)
     assert max(values.max() for values in posterior.draws().values()) < 72.0

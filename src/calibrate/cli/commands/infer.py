@@ -9,7 +9,7 @@ from typing import Any
 from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments, emit, show_progress
 from calibrate.cli.forward import add_forward, forward_options
 from calibrate.cli.posterior_table import summary
-from calibrate.samplers import SAMPLERS
+from calibrate.samplers import SAMPLERS, find_sampler
 from emulator.errors import InputError
 
 
@@ -129,7 +129,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     posterior = run_inference(plan, folder, progress=progress)
     certificate = None
-    if not arguments.no_certify:
+    if not (arguments.no_certify or find_sampler(plan.sampler).solves_fem):
         certificate = certify_and_keep(posterior, folder, progress=progress)
     result = report(plan, posterior, certificate)
     text = f"{summary(result)}\nwritten to {arguments.out}"
