@@ -10,6 +10,7 @@ import numpy as np
 _LARGEST_R_HAT = 1.01  # Vehtari et al. (2021)
 _SMALLEST_ESS = 400.0
 _LARGEST_K = 0.7  # Vehtari et al. (2024)
+_LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
 _MARKED = 0.5  # of a standard deviation
 
@@ -33,7 +34,7 @@ def diagnose(
         _disagreement(summary),
         _too_few(summary),
         _rejections(statistics.get("accepted")),
-        _approximation(attributes.get("pareto_k")),
+        _approximation(attributes.get("pareto_k"), attributes.get("importance_efficiency")),
     ]
     return [sentence for sentence in found if sentence]
 
@@ -100,10 +101,13 @@ def _rejections(accepted: np.ndarray | None) -> str:
     )
 
 
-def _approximation(pareto_k: float | None) -> str:
-    if pareto_k is None or pareto_k <= _LARGEST_K:
+def _approximation(pareto_k: float | None, efficiency: float | None) -> str:
+    if pareto_k is None or efficiency is None:
+        return ""
+    if pareto_k <= _LARGEST_K and efficiency >= _LOWEST_EFFICIENCY:
         return ""
     return (
-        f"the Gaussian approximation is poor, Pareto k {pareto_k:.2f} above {_LARGEST_K}: use a "
-        "sampler, such as nuts"
+        f"the Gaussian approximation is poor, Pareto k {pareto_k:.2f} (at most {_LARGEST_K}) and "
+        f"{100.0 * efficiency:.2g} % of the draws effective (at least "
+        f"{100.0 * _LOWEST_EFFICIENCY:.0f} %): use a sampler, such as nuts"
     )

@@ -40,7 +40,14 @@ def test_divergences_are_placed():
         ({"row": {"r_hat": np.nan}}, "R-hat of mu is not a number"),
         ({"row": {"ess_tail": 90.0}}, "90 effective draws of mu, fewer than 400"),
         ({"statistics": {"accepted": np.eye(50)}}, "FEM took 2 % of the proposals only"),
-        ({"attributes": {"pareto_k": 0.9}}, "the Gaussian approximation is poor, Pareto k 0.90"),
+        (
+            {"attributes": {"pareto_k": 0.9, "importance_efficiency": 0.8}},
+            "the Gaussian approximation is poor, Pareto k 0.90",
+        ),
+        (
+            {"attributes": {"pareto_k": 0.1, "importance_efficiency": 0.05}},
+            "the Gaussian approximation is poor, Pareto k 0.10 (at most 0.7) and 5 % of",
+        ),
     ],
 )
 def test_each_fault_has_its_sentence(change, message):

@@ -3,6 +3,7 @@
 from calibrate.samplers.blackjax_nuts import BlackJAXNUTSOptions
 from calibrate.samplers.delayed_acceptance import DelayedAcceptanceOptions
 from calibrate.samplers.density import density_of, named_draws
+from calibrate.samplers.laplace import LaplaceOptions
 from calibrate.samplers.mclmc import MCLMCOptions
 from calibrate.samplers.nuts import NUTSOptions
 from calibrate.samplers.protocol import Context, Draws, Kernel, Sampler
@@ -19,6 +20,7 @@ __all__ = [
     "DelayedAcceptanceOptions",
     "Draws",
     "Kernel",
+    "LaplaceOptions",
     "MCLMCOptions",
     "NUTSOptions",
     "SMCOptions",

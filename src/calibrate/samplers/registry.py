@@ -6,6 +6,7 @@ from typing import Any
 
 from calibrate.samplers.blackjax_nuts import BLACKJAX_NUTS
 from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE
+from calibrate.samplers.laplace import LAPLACE
 from calibrate.samplers.mclmc import MCLMC
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Sampler
@@ -18,6 +19,7 @@ _ALL: tuple[Sampler, ...] = (
     MCLMC,
     DELAYED_ACCEPTANCE,
     SMC,
+    LAPLACE,
 )
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
