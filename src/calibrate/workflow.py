@@ -28,7 +28,7 @@ from calibrate.observations import (
     parse_observation,
 )
 from calibrate.posterior import Posterior, read_tree, sample
-from calibrate.samplers import find_sampler
+from calibrate.samplers import find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, model
 from emulator import schema
@@ -66,6 +66,8 @@ class Run:
     check_scale : refuse data that is far from every prediction (:mod:`calibrate.magnitude`).
     forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
         options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
+    sampler, sampler_options : a name of :data:`calibrate.samplers.SAMPLERS`, and its options by
+        name, e.g. ``{"target_accept": 0.95}``.
     """
 
     scene: str
@@ -81,6 +83,7 @@ class Run:
     emulator: str | None = None
     forward_options: dict[str, Any] = field(default_factory=dict)
     sampler: str = "nuts"
+    sampler_options: dict[str, Any] = field(default_factory=dict)
     warmup: int = 500
     draws: int = 1000
     chains: int = 4
@@ -195,7 +198,8 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
     A run into ``folder`` that was killed while sampling goes on where it was.
     """
     sampler = find_sampler(run.sampler)
-    options = sampler.options.sized(warmup=run.warmup, draws=run.draws, chains=run.chains)
+    length = {"warmup": run.warmup, "draws": run.draws, "chains": run.chains}
+    options = options_from(sampler, run.sampler_options, **length)
     scene = find_scene(run.scene, run.root)
     observe, data = make_data(run, scene)
     run, noises = run.named(observe), run.noises(observe)

@@ -7,7 +7,7 @@ from calibrate.samplers.laplace import LaplaceOptions
 from calibrate.samplers.mclmc import MCLMCOptions
 from calibrate.samplers.nuts import NUTSOptions
 from calibrate.samplers.protocol import Context, Draws, Kernel, Sampler
-from calibrate.samplers.registry import SAMPLERS, check_options, find_sampler
+from calibrate.samplers.registry import SAMPLERS, check_options, find_sampler, options_from
 from calibrate.samplers.run import ChainSampler
 from calibrate.samplers.smc import SMCOptions
 from calibrate.samplers.stopping import r_hat
@@ -29,5 +29,6 @@ __all__ = [
     "density_of",
     "find_sampler",
     "named_draws",
+    "options_from",
     "r_hat",
 ]

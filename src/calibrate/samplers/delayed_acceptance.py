@@ -13,6 +13,10 @@ which takes one FEM solve a proposal and leaves FEM's posterior invariant, howev
 map is: a wrong one only lowers the acceptance rate. This is the second stage of Christen and Fox
 (2005); a first stage of several transitions is the surrogate transition method of Liu (2001,
 Sec. 9.4.3) and the subchains of Lykkegaard et al. (2023).
+
+Where the cheap posterior has lighter tails than FEM's, :math:`w` has no bound and chains stick
+there. So the cheap likelihood is raised to a power below 1, :math:`\pi^* \propto p\,L^{*\beta}` and
+:math:`w = L / L^{*\beta}`.
 """
 
 from __future__ import annotations
@@ -28,7 +32,7 @@ from tqdm import tqdm
 from calibrate.samplers import transport
 from calibrate.samplers.blackjax_nuts import BLACKJAX_NUTS, BlackJAXNUTSOptions
 from calibrate.samplers.checkpoint import Checkpoint
-from calibrate.samplers.density import Density
+from calibrate.samplers.density import Density, tempered
 from calibrate.samplers.options import ChainOptions, check_counts, check_target_accept
 from calibrate.samplers.protocol import Context, Draws
 from calibrate.samplers.run import Chains, compile_chains, join
@@ -42,6 +46,7 @@ class DelayedAcceptanceOptions(ChainOptions):
     """Length of a run; ``warmup`` is the cheap sampler's, ``draws`` are decided by FEM.
 
     transitions : of the cheap sampler between two FEM solves.
+    power : of the cheap likelihood in proposals, in (0, 1].
     discarded : first draws of each chain that are not kept: chains start from the cheap posterior.
     target_accept : acceptance rate in (0, 1) that the cheap sampler's step size adapts to.
     """
@@ -49,6 +54,7 @@ class DelayedAcceptanceOptions(ChainOptions):
     draws: int = 250
     rounds: int = 4
     transitions: int = 4
+    power: float = 0.8
     discarded: int = 20
     target_accept: float = 0.85
 
@@ -58,6 +64,8 @@ class DelayedAcceptanceOptions(ChainOptions):
         super().__post_init__()
         check_counts(self, "transitions", "discarded")
         check_target_accept(self.label, self.target_accept)
+        if not 0.0 < self.power <= 1.0:
+            raise InputError(f"{self.label}: power is {self.power}; give one in (0, 1]")
 
     def cheap(self) -> BlackJAXNUTSOptions:
         """Options of the cheap sampler; its pilot run is as long as its warm-up."""
@@ -147,7 +155,8 @@ class _Run:
     ) -> None:
         self.density, self.data, self.options, self.bar = density, data, options, bar
         self.fem, self.checkpoint = context.fem, context.checkpoint
-        self.programs = compile_chains(BLACKJAX_NUTS, density, options.cheap())
+        self.wide = tempered(density, options.power)
+        self.programs = compile_chains(BLACKJAX_NUTS, self.wide, options.cheap())
         start_key, self.key = jax.random.split(jax.random.key(seed))
         state = self.checkpoint.restore(self._template) or self._begin(start_key)
         self.map_, self.place = state.map_, state.place
@@ -176,7 +185,7 @@ class _Run:
         """
         with tqdm(disable=True, total=0) as bar:
             cheap = Chains(
-                BLACKJAX_NUTS, self.density, self.data, self.options.cheap(), Checkpoint(), bar
+                BLACKJAX_NUTS, self.wide, self.data, self.options.cheap(), Checkpoint(), bar
             )
             cheap.start_straightened(*jax.random.split(key))
         self.map_ = cheap.map_
@@ -216,13 +225,13 @@ class _Run:
         return _Place(states, z[:, -1], statistics["lp"][:, -1], None), statistics
 
     def _log_w(self, z: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """FEM's less the cheap log likelihood (chains,), where wanted; ``-inf`` elsewhere."""
+        """FEM's less the tempered log likelihood (chains,), where wanted; ``-inf`` elsewhere."""
         assert self.fem is not None
         named = jax.tree.map(np.asarray, self.density.constrain(self.data, jnp.asarray(z)))
         log_w = np.full(len(z), -np.inf)
         for k in np.flatnonzero(wanted):
             found = self.fem({name: values[k] for name, values in named.items()}, self.data)
-            ratio = found.fem - found.cheap
+            ratio = found.fem - self.options.power * found.cheap
             log_w[k] = ratio if np.isfinite(ratio) else -np.inf
         return log_w
 

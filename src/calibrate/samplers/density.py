@@ -81,6 +81,18 @@ def density_of(model: Model) -> Density:
     )
 
 
+@lru_cache(maxsize=4)
+def tempered(density: Density, power: float) -> Density:
+    """``density`` with its likelihood to a power in (0, 1]: a wider posterior below 1."""
+    if power == 1.0:
+        return density
+
+    def log_density(z: jax.Array, data: Data) -> jax.Array:
+        return density.log_prior(z) + power * density.log_likelihood(z, data)
+
+    return density._replace(log_density=log_density)
+
+
 def trace_of(model: Model, draw: dict[str, jax.Array], data: Data) -> dict[str, Any]:
     """The model's sites at ``draw`` (a number by name) and ``data``, as NumPyro traces them."""
     return handlers.trace(handlers.substitute(model, data=draw)).get_trace(data)

@@ -7,6 +7,8 @@ from typing import Any, ClassVar, Self
 
 from emulator.errors import InputError
 
+RANDOM, PATHFINDER = "random", "pathfinder"
+
 
 @dataclass(frozen=True)
 class ChainOptions:
@@ -17,6 +19,8 @@ class ChainOptions:
     chains : independent chains.
     rounds : largest number of rounds; another one begins while R-hat or ESS miss their limits.
     r_hat, ess : largest R-hat and smallest bulk and tail ESS of any parameter to stop at.
+    start : of the chains: ``random``, within two units of the centre, or ``pathfinder``
+        (:mod:`calibrate.samplers.pathfinder`).
     """
 
     warmup: int = 500
@@ -25,6 +29,7 @@ class ChainOptions:
     rounds: int = 8
     r_hat: float = 1.008
     ess: float = 400.0
+    start: str = RANDOM
 
     label: ClassVar[str] = "chains"
 
@@ -35,6 +40,10 @@ class ChainOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "warmup", "draws", "chains", "rounds")
+        if self.start not in (RANDOM, PATHFINDER):
+            raise InputError(
+                f"{self.label}: start is '{self.start}'; it is {RANDOM} or {PATHFINDER}"
+            )
         if not self.r_hat > 1.0:
             raise InputError(f"{self.label}: r_hat is {self.r_hat}; it must be above 1")
         if not self.ess >= 0.0:

@@ -23,7 +23,8 @@ from tqdm import tqdm
 from calibrate.samplers import transport
 from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.density import Density
-from calibrate.samplers.options import ChainOptions
+from calibrate.samplers.options import PATHFINDER, ChainOptions
+from calibrate.samplers.pathfinder import pathfinder_start
 from calibrate.samplers.protocol import Context, Draws, Kernel
 from calibrate.samplers.stopping import converged
 from calibrate.statistical_model import Data
@@ -106,7 +107,14 @@ def compile_chains(sampler: ChainSampler, density: Density, options: ChainOption
         here, onwards = jax.random.split(key)
         shape = (_CANDIDATES, density.dimension)
         candidates = jax.random.uniform(here, shape, float, -2.0, 2.0)
-        heights = jax.lax.map(lambda zeta: log_density(zeta, data, map_), candidates)
+
+        def height(zeta: jax.Array) -> jax.Array:
+            return log_density(zeta, data, map_)
+
+        heights = jax.lax.map(height, candidates)
+        if options.start == PATHFINDER:
+            zeta = pathfinder_start(jax.random.fold_in(here, 1), height, candidates, heights)
+            return kernel.init(onwards, zeta, data, map_), height(zeta)
         first = jnp.argmax(jnp.isfinite(heights))
         return kernel.init(onwards, candidates[first], data, map_), heights[first]
 

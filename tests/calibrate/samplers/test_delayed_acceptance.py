@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.samplers import DelayedAcceptanceOptions
+from calibrate.samplers import DelayedAcceptanceOptions, density_of
 from calibrate.samplers.delayed_acceptance import _choose, _Place
+from calibrate.samplers.density import tempered
 from emulator.errors import InputError, SolverError
 from linear_support import (
     PRIOR_MEAN,
@@ -68,7 +69,7 @@ def test_statistics_count_fem_solves_and_acceptance(beam, biased):
             solved.append(np.asarray(theta))
             return super().solve(theta, start)
 
-    options = replace(OPTIONS, draws=50)
+    options = replace(OPTIONS, draws=50, power=1.0)
     call = {"sampler": "delayed_acceptance", "options": options, "seed": 1}
     posterior = cal.sample(model, data, simulator=Counted(beam, exact), **call)
     statistics = posterior.tree["sample_stats"]
@@ -84,6 +85,19 @@ def test_statistics_count_fem_solves_and_acceptance(beam, biased):
     assert float(right.tree["sample_stats"]["acceptance_rate"].min()) == pytest.approx(1.0)
     assert 0.2 < float(statistics["acceptance_rate"].mean()) < 0.95
     assert float(right.tree["sample_stats"]["log_w"].max()) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_power_below_one_widens_proposals(beam, biased):
+    _, model, data = biased
+    density = density_of(model)
+    checked, z = model.check_data(data), jnp.array([0.4, -0.3])
+    wide = tempered(density, 0.5)
+    expected = density.log_prior(z) + 0.5 * density.log_likelihood(z, checked)
+    assert float(wide.log_density(z, checked)) == pytest.approx(float(expected))
+    assert tempered(density, 1.0) is density
+    assert tempered(density, 0.5) is wide  # or its programs would be compiled again
+    with pytest.raises(InputError, match="delayed acceptance: power is 0.0; give one in"):
+        DelayedAcceptanceOptions(power=0.0)
 
 
 def test_where_fem_fails_there_are_no_draws(beam, biased):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,13 @@ def register(commands: Any) -> None:
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
     )
     parser.add_argument("--sampler", choices=tuple(SAMPLERS), default="nuts")
+    parser.add_argument(
+        "--sampler-options",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        help="e.g. target_accept=0.95, start=pathfinder; an unknown name lists those there are",
+    )
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--warmup", type=int, default=500)
     parser.add_argument("--chains", type=int, default=4)
@@ -101,6 +109,22 @@ def noise_by_name(words: list[str], option: str) -> dict[str, float] | float:
         raise InputError(f"{option}: {text}") from error
 
 
+def sampler_options(words: list[str]) -> dict[str, Any]:
+    """Options by name; a value is a whole number, a number or a word, as it reads."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not (name and equals and text):
+            raise InputError(
+                f"--sampler-options: '{word}' is not NAME=VALUE, as target_accept=0.95"
+            )
+        found[name] = text
+        for kind in (float, int):  # the last that reads it
+            with suppress(ValueError):
+                found[name] = kind(text)
+    return found
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Sample and keep a posterior."""
     from calibrate.workflow import Run, certify_and_keep, report
@@ -122,6 +146,7 @@ def run(arguments: argparse.Namespace) -> int:
         emulator=_emulator(arguments.emulator),
         forward_options=forward_options(arguments),
         sampler=arguments.sampler,
+        sampler_options=sampler_options(arguments.sampler_options),
         warmup=arguments.warmup,
         draws=arguments.draws,
         chains=arguments.chains,
