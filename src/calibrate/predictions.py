@@ -38,7 +38,7 @@ class Prior(NamedTuple):
     data: dict[str, np.ndarray]
 
 
-def log_likelihood(model: Model, draws: Draws, data: Data) -> dict[str, np.ndarray]:
+def log_likelihood(model: Model, draws: Draws, data: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Log likelihood of each datum at each draw, (chains, draws, *shape), by observation.
 
     An observation whose data depend on each other given theta has one number a draw instead,

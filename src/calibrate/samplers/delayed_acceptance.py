@@ -46,7 +46,8 @@ class DelayedAcceptanceOptions(ChainOptions):
     """Length of a run; ``warmup`` is the cheap sampler's, ``draws`` are decided by FEM.
 
     transitions : of the cheap sampler between two FEM solves.
-    power : of the cheap likelihood in proposals, in (0, 1].
+    power : of the cheap likelihood in proposals, in (0, 1]. At 0.8 a perfect map keeps three
+        quarters of its effective draws in 5 dimensions and half in 17; a poor one gains.
     discarded : first draws of each chain that are not kept: chains start from the cheap posterior.
     target_accept : acceptance rate in (0, 1) that the cheap sampler's step size adapts to.
     """

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
+from calibrate.cli.commands.infer import sampler_options
 from calibrate.posterior import read_tree
 from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.workflow import SAMPLING
@@ -56,3 +57,23 @@ def test_delayed_acceptance_goes_on_after_a_kill(capsys, monkeypatch, tmp_path):
     # FEM's weights must not be applied twice.
     assert main(["certify", str(whole)]) == 2
     assert "is FEM's already; it needs no certificate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["leapfrogs=3"], "sampler 'nuts' has no option 'leapfrogs'; it has warmup, draws"),
+        (["rounds=2.5"], "sampler 'nuts': rounds is 2.5; give one like 8"),
+        (["target_accept"], "--sampler-options: 'target_accept' is not NAME=VALUE"),
+        (["target_accept=2"], "NUTS: target_accept is 2; give one in (0, 1)"),
+    ],
+)
+def test_options_that_cannot_be(words, message, capsys, tmp_path):
+    call = ["infer", "once_clamped_beam", "--truth", "mu=73", "lam=61", "--out", str(tmp_path)]
+    assert main([*call, "--sampler-options", *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_options_reach_the_sampler():
+    words = ["target_accept=0.95", "rounds=2", "start=pathfinder"]
+    assert sampler_options(words) == {"target_accept": 0.95, "rounds": 2, "start": "pathfinder"}
