@@ -1,10 +1,13 @@
 """A forward map linear in theta, whose posterior is known in closed form."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 
+import calibrate as cal
 from emulator.surrogates.protocol import Prediction, all_nodes, fingerprint_of
 
 
@@ -41,6 +44,19 @@ def linear_forward(scene, seed=0, size=0.01, bias=0.0) -> LinearForward:
     return LinearForward(scene, all_nodes(scene), matrix, np.full((count, 3), bias))
 
 
+@dataclass(frozen=True, eq=False)
+class LinearFEM:
+    """Stands in for a simulator: its solutions are those of ``forward``; above ``limit`` it fails."""
+
+    scene: object
+    forward: LinearForward
+    limit: float = np.inf
+
+    def solve(self, theta, start=None):
+        converged = bool(jnp.all(theta < self.limit))
+        return SimpleNamespace(converged=converged, displacement=self.forward(theta))
+
+
 def closed_form(forward, nodes, data, sd, mean, prior_sd):
     """Mean and covariance of theta given data under a Gaussian prior."""
     A = forward.matrix[nodes].reshape(-1, len(mean))
@@ -48,3 +64,20 @@ def closed_form(forward, nodes, data, sd, mean, prior_sd):
     precision = A.T @ A / sd**2 + np.diag(1.0 / prior_sd**2)
     covariance = np.linalg.inv(precision)
     return covariance @ (A.T @ y / sd**2 + mean / prior_sd**2), covariance
+
+
+PRIOR_MEAN, PRIOR_SD = np.array([70.0, 75.0]), np.array([5.0, 8.0])
+
+
+def linear_problem(scene, forward=None):
+    """A linear-Gaussian model of three displacements of a scene, and data: (model, data)."""
+    forward = linear_forward(scene) if forward is None else forward
+    prior = {
+        name: dist.Normal(m, s)
+        for name, m, s in zip(scene.parameter_names, PRIOR_MEAN, PRIOR_SD, strict=True)
+    }
+    observe = cal.nodal_displacements(scene, [3, 11, 20])
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), prior)
+    noise = 0.1 * np.random.default_rng(0).normal(size=(3, 3))
+    exact = linear_forward(scene).at(observe.nodes)(jnp.array([72.0, 68.0]))
+    return model, np.asarray(exact) + noise

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import arviz_base
 import arviz_stats
 import jax
 import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
-from calibrate.observations import Observations
+from calibrate.diagnosis import diagnose
+from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.observations.present import missing_values
 from calibrate.provenance import versions
-from calibrate.samplers import check_options, density_of, find_sampler, named_draws, r_hat
+from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws, r_hat
+from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
+from calibrate.tree import make_tree
 from emulator.errors import InputError
+from emulator.fem import Simulator
 from emulator.store import replacing
 
 
@@ -28,8 +33,10 @@ from emulator.store import replacing
 class Posterior:
     """Draws, with the model and the data they came from.
 
-    tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; attributes
-        hold the provenance.
+    tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; with
+        predictions also log_likelihood (of each datum at each draw), posterior_predictive, prior
+        and prior_predictive (at about 500 draws). Variables have units; attributes hold the
+        provenance.
     model, data : what the posterior was conditioned on; data by the observation's name.
     """
 
@@ -77,8 +84,19 @@ class Posterior:
 
     @property
     def divergences(self) -> int:
-        """Number of divergent transitions."""
-        return int(self.tree["sample_stats"]["diverging"].sum())
+        """Number of divergent transitions; 0 for samplers that have none."""
+        statistics = self.tree["sample_stats"]
+        return int(statistics["diverging"].sum()) if "diverging" in statistics else 0
+
+    def warnings(self) -> list[str]:
+        """What is wrong with the run and what to do, a sentence each; empty where nothing is."""
+        groups = [self.tree[name].to_dataset() for name in ("posterior", "sample_stats")]
+        draws, statistics = (
+            {str(name): np.asarray(values) for name, values in group.data_vars.items()}
+            for group in groups
+        )
+        attributes = {str(name): value for name, value in self.tree.attrs.items()}
+        return diagnose(draws, statistics, self.summary(), attributes)
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""
@@ -147,6 +165,9 @@ def sample(
     options: Any | None = None,
     seed: int = 0,
     progress: bool = False,
+    predictions: bool = True,
+    simulator: Simulator | None = None,
+    checkpoint: str | Path | None = None,
 ) -> Posterior:
     """Draw from the posterior of ``model`` given ``data``.
 
@@ -155,52 +176,57 @@ def sample(
     :data:`calibrate.samplers.SAMPLERS`; ``options`` is an instance of that sampler's options,
     ``None`` for its defaults.
 
+    Parameters
+    ----------
+    predictions : whether the DataTree gets log likelihoods and replicated data.
+    simulator : FEM, for samplers that solve it in a second stage.
+    checkpoint : a file that the run's state is kept in every few seconds. If the run is killed, the
+        same call goes on from there to the same draws; the file is removed when they are complete.
+
     Raises
     ------
     InputError
         Unknown sampler, options of another sampler, data of the wrong shape, with infinite values
-        or of which all values are missing.
+        or of which all values are missing, a sampler that needs a simulator and has none, a
+        checkpoint of another run.
     """
     chosen = find_sampler(sampler)
     options = check_options(chosen, options)
     model, checked = model.given(data)
-    z, stats = chosen.sample(density_of(model), checked, options, seed, progress=progress)
-    tree = _tree(model, checked, named_draws(model, checked, z), stats)
-    tree.attrs.update(
-        {
-            key: value if isinstance(value, str | int) else json.dumps(value)
-            for key, value in provenance(model, seed, sampler, options).items()
-        }
-    )
+    fem = _fem_likelihood(chosen, model, simulator)
+    made = provenance(model, seed, sampler, options)
+    kept = Checkpoint(checkpoint, _identity(made, checked))
+    context = Context(progress, kept, fem)
+    found = chosen.sample(density_of(model), checked, options, seed, context)
+    rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
+    draws = named_draws(model, checked, found.z)
+    tree = make_tree(model, checked, draws, found.statistics, rng_key)
+    for name, value in {**made, **found.attributes}.items():
+        tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
+    kept.remove()
     return Posterior(tree, model, checked)
 
 
-def _tree(
-    model: Model,
-    data: Data,
-    draws: Mapping[str, np.ndarray],
-    stats: Mapping[str, np.ndarray],
-) -> xr.DataTree:
-    constants, dims, coords = _labels(model.observe)
-    groups: dict[str, Any] = {
-        "posterior": dict(draws),
-        "sample_stats": dict(stats),
-        "observed_data": {name: np.asarray(values) for name, values in data.items()},
-        **({"constant_data": constants} if constants else {}),
-    }
-    return arviz_base.from_dict(groups, dims=dims, coords=coords)
+_PREDICTIONS = 0x9E3779B9  # keeps the keys of replicated data apart from the sampler's
 
 
-def _labels(
-    observe: Observations,
-) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
-    """Constants, dimensions and coordinates of all observations."""
-    constants: dict[str, np.ndarray] = {}
-    dims: dict[str, list[str]] = {}
-    coords: dict[str, Any] = {}
-    for name, part in observe.parts.items():
-        labels = part.labels(name)
-        constants.update(labels.constants)
-        dims.update(labels.dims)
-        coords.update(labels.coords)
-    return constants, dims, coords
+def _fem_likelihood(
+    sampler: Sampler, model: Model, simulator: Simulator | None
+) -> FEMLikelihood | None:
+    if simulator is None and sampler.solves_fem:
+        raise InputError(
+            f"sampler '{sampler.name}' solves FEM in its second stage: give simulator=..., of the "
+            "posterior's scene"
+        )
+    return None if simulator is None else FEMLikelihood(model, simulator)
+
+
+def _identity(made: Mapping[str, Any], data: Data) -> dict[str, str]:
+    """What a run is of, by name: provenance without places, and a hash of the data."""
+    digest = hashlib.sha256()
+    for name in sorted(data):
+        digest.update(name.encode() + np.asarray(data[name]).tobytes())
+    described = {name: json.dumps(value) for name, value in made.items() if name != "scene"}
+    # What a user changes most comes first: the first difference is named.
+    first = {name: described.pop(name) for name in ("sampler", "seed", "sampler_options")}
+    return {**first, **described, "data": digest.hexdigest()[:16]}

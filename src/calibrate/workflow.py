@@ -29,7 +29,7 @@ from calibrate.observations import (
 )
 from calibrate.observations.present import missing_values
 from calibrate.posterior import Posterior, read_tree, sample
-from calibrate.samplers import find_sampler
+from calibrate.samplers import find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, at_sites, model
 from emulator import schema
@@ -44,6 +44,7 @@ from emulator.surrogates.protocol import ForwardMap
 
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
 FORWARD = "forward.safetensors"
+SAMPLING = "sampling.safetensors"  # of a run under way, or killed
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,8 @@ class Run:
     check_scale : refuse data that is far from every prediction (:mod:`calibrate.magnitude`).
     forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
         options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
+    sampler, sampler_options : a name of :data:`calibrate.samplers.SAMPLERS`, and its options by
+        name, e.g. ``{"target_accept": 0.95}``.
     """
 
     scene: str
@@ -86,6 +89,7 @@ class Run:
     emulator: str | None = None
     forward_options: dict[str, Any] = field(default_factory=dict)
     sampler: str = "nuts"
+    sampler_options: dict[str, Any] = field(default_factory=dict)
     warmup: int = 500
     draws: int = 1000
     chains: int = 4
@@ -206,10 +210,13 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
 
 
 def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
-    """Sample the posterior of a run; with ``folder``, keep run, data and posterior there."""
-    options = find_sampler(run.sampler).options(
-        warmup=run.warmup, draws=run.draws, chains=run.chains
-    )
+    """Sample the posterior of a run; with ``folder``, keep run, data and posterior there.
+
+    A run into ``folder`` that was killed while sampling goes on where it was.
+    """
+    sampler = find_sampler(run.sampler)
+    length = {"warmup": run.warmup, "draws": run.draws, "chains": run.chains}
+    options = options_from(sampler, run.sampler_options, **length)
     scene = find_scene(run.scene, run.root)
     observe, data = make_data(run, scene)
     run, noises = run.named(observe), run.noises(observe)
@@ -221,7 +228,14 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         check_scale=run.check_scale,
     )
     posterior = sample(
-        built, data, sampler=run.sampler, options=options, seed=run.seed, progress=progress
+        built,
+        data,
+        sampler=run.sampler,
+        options=options,
+        seed=run.seed,
+        progress=progress,
+        simulator=simulator_of(scene) if sampler.solves_fem else None,
+        checkpoint=None if folder is None else Path(folder) / SAMPLING,
     )
     if folder is not None:
         folder = Path(folder)
@@ -267,7 +281,18 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
 def certify_and_keep(
     posterior: Posterior, folder: str | Path, *, draws: int | None = None, progress: bool = False
 ) -> Certificate:
-    """Check a posterior against FEM and write certificate.json."""
+    """Check a posterior against FEM and write certificate.json.
+
+    Raises
+    ------
+    InputError
+        FEM has decided on the draws already: weighting them by FEM once more would be wrong.
+    """
+    if find_sampler(posterior.tree.attrs["sampler"]).solves_fem:
+        raise InputError(
+            f"the posterior of sampler '{posterior.tree.attrs['sampler']}' is FEM's already; it "
+            "needs no certificate"
+        )
     simulator = simulator_of(posterior.model.forward.scene)
     certificate = certify(posterior, simulator, draws=draws, progress=progress)
     write_json(Path(folder) / CERTIFICATE, certificate.to_json())
@@ -291,7 +316,14 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "missing": missing_values(posterior.model.observe),
         "draws": int(posterior.tree["posterior"].sizes["draw"]),
         "chains": int(posterior.tree["posterior"].sizes["chain"]),
+        "warnings": posterior.warnings(),
     }
+    if "fem_solves" in posterior.tree.attrs:
+        result["fem_solves"] = int(posterior.tree.attrs["fem_solves"])
+        result["verdict"] = "decided by FEM"
+    if "log_evidence" in posterior.tree.attrs:
+        result["log_evidence"] = posterior.tree.attrs["log_evidence"]
+        result["log_evidence_error"] = posterior.tree.attrs.get("log_evidence_error")
     if certificate is not None:
         result.update(verdict=certificate.verdict, k_hat=certificate.k_hat)
         result["certificate"] = certificate.to_json()

@@ -28,7 +28,16 @@ def summary(report: dict[str, Any]) -> str:
         lines.append(f"prior of {name} cut to its range: {100.0 * mass:.2g} % of its mass")
     for name, count in report.get("missing", {}).items():
         lines.append(f"missing values of {name} left out: {count}")
-    if "certificate" not in report:
+    lines += report.get("warnings", [])
+    if "log_evidence" in report:
+        error = report["log_evidence_error"]
+        known = "" if error is None else f" +- {error:.2g}"
+        lines.append(f"log evidence {report['log_evidence']:.2f}{known}")
+    if "fem_solves" in report:
+        lines.append(
+            f"FEM decided on every draw, in {report['fem_solves']} solves: no certificate is needed"
+        )
+    elif "certificate" not in report:
         lines.append("not checked against FEM yet: calibrate certify")
     else:
         c = report["certificate"]

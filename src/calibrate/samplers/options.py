@@ -1,11 +1,13 @@
-"""Settings that all Markov-chain samplers share."""
+"""Settings that samplers share."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 from emulator.errors import InputError
+
+RANDOM, PATHFINDER = "random", "pathfinder"
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,8 @@ class ChainOptions:
     chains : independent chains.
     rounds : largest number of rounds; another one begins while R-hat or ESS miss their limits.
     r_hat, ess : largest R-hat and smallest bulk and tail ESS of any parameter to stop at.
+    start : of the chains: ``random``, within two units of the centre, or ``pathfinder``
+        (:mod:`calibrate.samplers.pathfinder`).
     """
 
     warmup: int = 500
@@ -25,19 +29,34 @@ class ChainOptions:
     rounds: int = 8
     r_hat: float = 1.008
     ess: float = 400.0
+    start: str = RANDOM
 
     label: ClassVar[str] = "chains"
 
+    @classmethod
+    def sized(cls, *, warmup: int, draws: int, chains: int) -> Self:
+        """Options of a run of this length, all else by default."""
+        return cls(warmup=warmup, draws=draws, chains=chains)
+
     def __post_init__(self) -> None:
-        for name in ("warmup", "draws", "chains", "rounds"):
-            if getattr(self, name) < 1:
-                raise InputError(
-                    f"{self.label}: {name} is {getattr(self, name)}; it must be 1 or more"
-                )
+        check_counts(self, "warmup", "draws", "chains", "rounds")
+        if self.start not in (RANDOM, PATHFINDER):
+            raise InputError(
+                f"{self.label}: start is '{self.start}'; it is {RANDOM} or {PATHFINDER}"
+            )
         if not self.r_hat > 1.0:
             raise InputError(f"{self.label}: r_hat is {self.r_hat}; it must be above 1")
         if not self.ess >= 0.0:
             raise InputError(f"{self.label}: ess is {self.ess}; it must be 0 or more")
+
+
+def check_counts(options: Any, *names: str) -> None:
+    """:class:`InputError` unless each of these settings is 1 or more."""
+    for name in names:
+        if getattr(options, name) < 1:
+            raise InputError(
+                f"{options.label}: {name} is {getattr(options, name)}; it must be 1 or more"
+            )
 
 
 def check_target_accept(label: str, value: float) -> None:

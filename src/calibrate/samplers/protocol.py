@@ -13,6 +13,8 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
+from calibrate.fem_likelihood import FEMLikelihood
+from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.density import Density
 from calibrate.statistical_model import Data
 
@@ -21,10 +23,27 @@ Statistics = Mapping[str, Any]
 
 
 class Draws(NamedTuple):
-    """Draws ``z`` (chains, draws, p) in unconstrained coordinates; statistics (chains, draws)."""
+    """Draws ``z`` (chains, draws, p) in unconstrained coordinates; statistics (chains, draws).
+
+    attributes : facts of the whole run, plain JSON, e.g. ``log_evidence``.
+    """
 
     z: Any
     statistics: Statistics
+    attributes: Mapping[str, Any] = {}
+
+
+class Context(NamedTuple):
+    """What a run is given besides its density.
+
+    progress : whether to show it.
+    checkpoint : where the run's state is kept, and found again after a kill.
+    fem : FEM's log likelihood, for samplers with FEM in a second stage.
+    """
+
+    progress: bool = False
+    checkpoint: Checkpoint = Checkpoint()
+    fem: FEMLikelihood | None = None
 
 
 class Sampler(Protocol):
@@ -33,6 +52,7 @@ class Sampler(Protocol):
     name : as in the registry and on the command line.
     options : frozen dataclass of its settings; its defaults are the sampler's.
     statistics : names of the statistics that come with every draw.
+    solves_fem : whether it needs FEM's likelihood (:attr:`Context.fem`).
     """
 
     @property
@@ -44,8 +64,16 @@ class Sampler(Protocol):
     @property
     def statistics(self) -> tuple[str, ...]: ...  # noqa: D102
 
+    @property
+    def solves_fem(self) -> bool: ...  # noqa: D102
+
     def sample(
-        self, density: Density, data: Data, options: Any, seed: int, *, progress: bool
+        self,
+        density: Density,
+        data: Data,
+        options: Any,
+        seed: int,
+        context: Context = Context(),
     ) -> Draws:
         """Draw from ``density`` given ``data``."""
         ...

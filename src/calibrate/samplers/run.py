@@ -1,4 +1,4 @@
-"""Markov chains of any kernel: starting points, warm-up, pilot, rounds and progress.
+"""Markov chains of any kernel: starting points, warm-up, pilot, rounds, progress, checkpoint.
 
 A pilot run straightens the posterior (:mod:`calibrate.samplers.transport`); the draws returned are
 from a second run with fresh starting points. Both use the same compiled program.
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,15 +21,18 @@ import numpy as np
 from tqdm import tqdm
 
 from calibrate.samplers import transport
+from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.density import Density
-from calibrate.samplers.options import ChainOptions
-from calibrate.samplers.protocol import Draws, Kernel
+from calibrate.samplers.options import PATHFINDER, ChainOptions
+from calibrate.samplers.pathfinder import pathfinder_start
+from calibrate.samplers.protocol import Context, Draws, Kernel
 from calibrate.samplers.stopping import converged
 from calibrate.statistical_model import Data
 from emulator.errors import SolverError
 
 _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
+_PILOT, _FINAL = 0, 1  # runs
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,15 @@ class ChainSampler:
     kernel: Callable[[Callable[..., jax.Array], Any], Kernel]
     adapts_in_steps: bool = True
 
+    solves_fem: ClassVar[bool] = False
+
     def sample(
-        self, density: Density, data: Data, options: Any, seed: int, *, progress: bool = False
+        self,
+        density: Density,
+        data: Data,
+        options: Any,
+        seed: int,
+        context: Context = Context(),
     ) -> Draws:
         """Run rounds until the chains agree.
 
@@ -59,34 +69,33 @@ class ChainSampler:
         SolverError
             No starting point with a finite density was found.
         """
-        programs = _compile(self, density, options)
         pilot_key, key = jax.random.split(jax.random.key(seed))
-        map_ = transport.identity(density.dimension)
-        # A single coordinate has no other one to depend on: no pilot.
-        runs = 2 if density.dimension > 1 else 1
-        total = runs * (options.warmup + options.draws)
-        with tqdm(total=total, desc=self.name, disable=not progress) as bar:
-            if runs == 2:
-                pilot = _Chains(self, programs, data, map_, pilot_key, options, bar)
-                z = pilot.advance(options.draws).z
-                map_ = transport.fit(z.reshape(-1, density.dimension))
-            chains = _Chains(self, programs, data, map_, key, options, bar)
-            draws = chains.advance(options.draws)
-            for _ in range(options.rounds - 1):
+        with tqdm(desc=self.name, total=0, disable=not context.progress) as bar:
+            chains = Chains(self, density, data, options, context.checkpoint, bar)
+            if not chains.resume():
+                chains.start_straightened(pilot_key, key)
+            elif chains.run == _PILOT:
+                chains.straighten(key)
+            for rounds in range(1, options.rounds + 1):
+                draws = chains.draw(rounds * options.draws)
                 if converged(draws.z, options.r_hat, options.ess):
                     break
-                bar.total += options.draws
-                draws = _join([draws, chains.advance(options.draws)])
         return draws
 
 
-class _Programs(NamedTuple):
-    start: Callable[..., Any]  # (keys, data, map) -> states, their log densities
-    advance: Callable[..., Any]  # (states, data, map, count=) -> states, Draws
+class Programs(NamedTuple):
+    """Compiled functions of all chains.
+
+    start : (keys, data, map) -> states, their log densities.
+    advance : (states, data, map, count=) -> states, :class:`Draws`.
+    """
+
+    start: Callable[..., Any]
+    advance: Callable[..., Any]
 
 
 @lru_cache(maxsize=4)
-def _compile(sampler: ChainSampler, density: Density, options: ChainOptions) -> _Programs:
+def compile_chains(sampler: ChainSampler, density: Density, options: ChainOptions) -> Programs:
     """The programs of one density in straightened coordinates; data and map are arguments."""
 
     def log_density(zeta: jax.Array, data: Data, map_: transport.TransportMap) -> jax.Array:
@@ -98,7 +107,14 @@ def _compile(sampler: ChainSampler, density: Density, options: ChainOptions) -> 
         here, onwards = jax.random.split(key)
         shape = (_CANDIDATES, density.dimension)
         candidates = jax.random.uniform(here, shape, float, -2.0, 2.0)
-        heights = jax.lax.map(lambda zeta: log_density(zeta, data, map_), candidates)
+
+        def height(zeta: jax.Array) -> jax.Array:
+            return log_density(zeta, data, map_)
+
+        heights = jax.lax.map(height, candidates)
+        if options.start == PATHFINDER:
+            zeta = pathfinder_start(jax.random.fold_in(here, 1), height, candidates, heights)
+            return kernel.init(onwards, zeta, data, map_), height(zeta)
         first = jnp.argmax(jnp.isfinite(heights))
         return kernel.init(onwards, candidates[first], data, map_), heights[first]
 
@@ -115,42 +131,117 @@ def _compile(sampler: ChainSampler, density: Density, options: ChainOptions) -> 
     def advance_all(states: Any, data: Data, map_: transport.TransportMap, count: int) -> Any:
         return jax.lax.map(partial(advance, data=data, map_=map_, count=count), states)
 
-    return _Programs(jax.jit(start_all), jax.jit(advance_all, static_argnames="count"))
+    return Programs(jax.jit(start_all), jax.jit(advance_all, static_argnames="count"))
 
 
-class _Chains:
-    """Chains under way: their states, and the data and map they run on."""
+class _State(NamedTuple):
+    """All that a run goes on from."""
+
+    run: Any  # _PILOT or _FINAL
+    warmed: Any  # iterations of warm-up done
+    map_: transport.TransportMap
+    states: Any
+    draws: Draws
+
+
+class Chains:
+    """Chains under way: a pilot run, then the final one on the map fitted to it."""
 
     def __init__(
         self,
         sampler: ChainSampler,
-        programs: _Programs,
+        density: Density,
         data: Data,
-        map_: transport.TransportMap,
-        key: jax.Array,
         options: ChainOptions,
+        checkpoint: Checkpoint,
         bar: tqdm,
     ) -> None:
-        self.programs, self.arguments, self.bar = programs, (data, map_), bar
-        keys = jax.random.split(key, options.chains)
-        self.states, heights = programs.start(keys, *self.arguments)
+        self.sampler, self.density, self.data, self.options = sampler, density, data, options
+        self.checkpoint, self.bar = checkpoint, bar
+        self.programs = compile_chains(sampler, density, options)
+        self._warmup = options.warmup if sampler.adapts_in_steps else 0
+        self._parts: list[Draws] = []
+        self._plan = self._warmup + options.draws  # iterations of a run, in one round
+
+    def start_straightened(self, pilot_key: jax.Array, key: jax.Array) -> None:
+        """A pilot run, and the start of the final one.
+
+        A single coordinate has no other one to depend on: no pilot.
+        """
+        identity = transport.identity(self.density.dimension)
+        if self.density.dimension == 1:
+            self._start(_FINAL, identity, key)
+        else:
+            self._start(_PILOT, identity, pilot_key)
+            self.straighten(key)
+
+    def straighten(self, key: jax.Array) -> None:
+        """The rest of the pilot run, and the start of the final one."""
+        z = self.draw(self.options.draws).z
+        self._start(_FINAL, transport.fit(z.reshape(-1, self.density.dimension)), key)
+
+    def draw(self, total: int) -> Draws:
+        """The first ``total`` kept iterations of this run."""
+        while self.warmed < self._warmup:
+            self.warmed += self._advance(self._warmup - self.warmed)[1]
+            self.checkpoint.keep(self._state)
+        while self._kept < total:
+            draws, count = self._advance(total - self._kept)
+            self._parts.append(draws)
+            self._kept += count
+            self.checkpoint.keep(self._state)
+        return jax.tree.map(lambda array: array[:, :total], join(self._parts))
+
+    def resume(self) -> bool:
+        """Go on from the checkpoint; ``False`` where there is none."""
+        state = self.checkpoint.restore(self._template)
+        if state is None:
+            return False
+        self.run, self.warmed = int(state.run), int(state.warmed)
+        self.map_, self.states = state.map_, state.states
+        self._parts, self._kept = [state.draws], state.draws.z.shape[1]
+        self._show((self.run == _FINAL and self.density.dimension > 1) * self._plan)
+        self._show(self.warmed + self._kept)
+        return True
+
+    def _start(self, run: int, map_: transport.TransportMap, key: jax.Array) -> None:
+        keys = jax.random.split(key, self.options.chains)
+        self.states, heights = self.programs.start(keys, self.data, map_)
         if not np.isfinite(heights).all():
             raise SolverError("the posterior density is zero wherever a chain could start")
-        if sampler.adapts_in_steps:
-            self.advance(options.warmup)
-        else:
-            bar.update(options.warmup)
+        self.run, self.map_, self.warmed = run, map_, 0
+        self._parts, self._kept = [], 0
 
-    def advance(self, total: int) -> Draws:
-        """The next ``total`` iterations."""
-        parts = []
-        for done in range(0, total, _CHUNK):
-            count = min(_CHUNK, total - done)
-            self.states, draws = self.programs.advance(self.states, *self.arguments, count=count)
-            parts.append(jax.tree.map(np.asarray, draws))
-            self.bar.update(count)
-        return _join(parts)
+    def _advance(self, wanted: int) -> tuple[Draws, int]:
+        count = min(_CHUNK, wanted)
+        self.states, draws = self.programs.advance(self.states, self.data, self.map_, count=count)
+        self._show(count)
+        return jax.tree.map(np.asarray, draws), count
+
+    def _show(self, count: int) -> None:
+        runs = 1 if self.density.dimension == 1 else 2
+        self.bar.total = max(self.bar.total, runs * self._plan, self.bar.n + count)
+        self.bar.update(count)
+
+    def _state(self) -> _State:
+        # While they warm up, chains have no draws, but their names and shapes are known.
+        draws = join(self._parts) if self._parts else jax.tree.map(_none, self._template().draws)
+        return _State(self.run, self.warmed, self.map_, self.states, draws)
+
+    def _template(self) -> _State:
+        number = jax.ShapeDtypeStruct((), int)
+        map_ = transport.identity(self.density.dimension)
+        keys = jax.random.split(jax.random.key(0), self.options.chains)
+        states, _ = jax.eval_shape(self.programs.start, keys, self.data, map_)
+        advance = partial(self.programs.advance, count=1)
+        _, draws = jax.eval_shape(advance, states, self.data, map_)
+        return _State(number, number, map_, states, draws)
 
 
-def _join(parts: list[Draws]) -> Draws:
+def _none(draws: jax.ShapeDtypeStruct) -> np.ndarray:
+    return np.zeros((draws.shape[0], 0, *draws.shape[2:]), draws.dtype)
+
+
+def join(parts: list[Draws]) -> Draws:
+    """Draws one after the other."""
     return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *parts)

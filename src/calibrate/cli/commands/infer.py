@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments,
 from calibrate.cli.forward import add_forward, forward_options
 from calibrate.cli.noise_words import discrepancy_words, noise_scale_words, noise_words
 from calibrate.cli.posterior_table import summary
-from calibrate.samplers import SAMPLERS
+from calibrate.samplers import SAMPLERS, find_sampler
+from emulator.errors import InputError
 
 
 def register(commands: Any) -> None:
@@ -48,6 +50,13 @@ def register(commands: Any) -> None:
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
     )
     parser.add_argument("--sampler", choices=tuple(SAMPLERS), default="nuts")
+    parser.add_argument(
+        "--sampler-options",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        help="e.g. target_accept=0.95, start=pathfinder; an unknown name lists those there are",
+    )
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--warmup", type=int, default=500)
     parser.add_argument("--chains", type=int, default=4)
@@ -94,6 +103,22 @@ def _add_noise(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def sampler_options(words: list[str]) -> dict[str, Any]:
+    """Options by name; a value is a whole number, a number or a word, as it reads."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not (name and equals and text):
+            raise InputError(
+                f"--sampler-options: '{word}' is not NAME=VALUE, as target_accept=0.95"
+            )
+        found[name] = text
+        for kind in (float, int):  # the last that reads it
+            with suppress(ValueError):
+                found[name] = kind(text)
+    return found
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Sample and keep a posterior."""
     from calibrate.workflow import Run, certify_and_keep, report
@@ -116,6 +141,7 @@ def run(arguments: argparse.Namespace) -> int:
         emulator=_emulator(arguments.emulator),
         forward_options=forward_options(arguments),
         sampler=arguments.sampler,
+        sampler_options=sampler_options(arguments.sampler_options),
         warmup=arguments.warmup,
         draws=arguments.draws,
         chains=arguments.chains,
@@ -123,7 +149,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     posterior = run_inference(plan, folder, progress=progress)
     certificate = None
-    if not arguments.no_certify:
+    if not (arguments.no_certify or find_sampler(plan.sampler).solves_fem):
         certificate = certify_and_keep(posterior, folder, progress=progress)
     result = report(plan, posterior, certificate)
     text = f"{summary(result)}\nwritten to {arguments.out}"

@@ -1,0 +1,113 @@
+"""What is wrong with a run, in words: divergences, chains that disagree, too few draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+_LARGEST_R_HAT = 1.01  # Vehtari et al. (2021)
+_SMALLEST_ESS = 400.0
+_LARGEST_K = 0.7  # Vehtari et al. (2024)
+_LOWEST_EFFICIENCY = 0.2
+_LOWEST_ACCEPTANCE = 0.1
+_MARKED = 0.5  # of a standard deviation
+
+
+def diagnose(
+    draws: Mapping[str, np.ndarray],
+    statistics: Mapping[str, np.ndarray],
+    summary: Mapping[str, Mapping[str, float]],
+    attributes: Mapping[str, Any],
+) -> list[str]:
+    """One sentence for each thing that is wrong, with what to do; empty where nothing is.
+
+    Parameters
+    ----------
+    draws, statistics : (chains, draws) by name.
+    summary : of each parameter, with ``r_hat``, ``ess_bulk`` and ``ess_tail``.
+    attributes : of the run, e.g. ``pareto_k``.
+    """
+    found = [
+        _divergences(draws, statistics.get("diverging")),
+        _disagreement(summary),
+        _too_few(summary),
+        _rejections(statistics.get("accepted")),
+        _approximation(attributes.get("pareto_k"), attributes.get("importance_efficiency")),
+    ]
+    return [sentence for sentence in found if sentence]
+
+
+def _divergences(draws: Mapping[str, np.ndarray], diverging: np.ndarray | None) -> str:
+    if diverging is None or not np.any(diverging):
+        return ""
+    diverging = np.asarray(diverging, bool)
+    count, share = int(diverging.sum()), 100.0 * diverging.mean()
+    places = [where for name, v in draws.items() if (where := _where(name, v, diverging))]
+    return (
+        f"{count} divergent transitions of {diverging.size} ({share:.2g} %)"
+        + (f", mostly at {' and '.join(places)}" if places else ", spread over the whole posterior")
+        + ": the posterior is too sharp or too curved there for the step size, and its part beyond "
+        "may be missing. Raise target_accept towards 1, give more warm-up, or use a prior that "
+        "leaves out what cannot be"
+    )
+
+
+def _where(name: str, values: np.ndarray, diverging: np.ndarray) -> str:
+    """``low mu (51.2 to 53.4)`` where divergences gather at one side of a parameter."""
+    values, inside = np.asarray(values), np.asarray(values)[diverging]
+    shift = (np.median(inside) - np.median(values)) / max(float(values.std()), 1e-300)
+    if abs(shift) < _MARKED:
+        return ""
+    low, high = np.quantile(inside, [0.05, 0.95])
+    return f"{'low' if shift < 0 else 'high'} {name} ({low:.4g} to {high:.4g})"
+
+
+def _disagreement(summary: Mapping[str, Mapping[str, float]]) -> str:
+    name = max(summary, key=lambda n: _worse(summary[n]["r_hat"]))
+    worst = summary[name]["r_hat"]
+    if worst <= _LARGEST_R_HAT:
+        return ""
+    if not np.isfinite(worst):
+        return f"R-hat of {name} is not a number: too few draws, or draws that do not vary"
+    return (
+        f"the chains disagree about {name}, R-hat {worst:.3f}: run longer; if it stays, there are "
+        "several modes or a long ridge, for which sampler smc is made"
+    )
+
+
+def _worse(r_hat: float) -> float:
+    return r_hat if np.isfinite(r_hat) else np.inf
+
+
+def _too_few(summary: Mapping[str, Mapping[str, float]]) -> str:
+    sizes = {n: min(row["ess_bulk"], row["ess_tail"]) for n, row in summary.items()}
+    name = min(sizes, key=lambda n: sizes[n])
+    if sizes[name] >= _SMALLEST_ESS:
+        return ""
+    return (
+        f"{sizes[name]:.0f} effective draws of {name}, fewer than {_SMALLEST_ESS:.0f}: quantiles "
+        "are uncertain; take more draws"
+    )
+
+
+def _rejections(accepted: np.ndarray | None) -> str:
+    if accepted is None or (rate := float(np.mean(accepted))) >= _LOWEST_ACCEPTANCE:
+        return ""
+    return (
+        f"FEM took {100.0 * rate:.2g} % of the proposals only: the forward map is far from FEM "
+        "here; train it longer, or use forward map 'corrected'"
+    )
+
+
+def _approximation(pareto_k: float | None, efficiency: float | None) -> str:
+    if pareto_k is None or efficiency is None:
+        return ""
+    if pareto_k <= _LARGEST_K and efficiency >= _LOWEST_EFFICIENCY:
+        return ""
+    return (
+        f"the Gaussian approximation is poor, Pareto k {pareto_k:.2f} (at most {_LARGEST_K}) and "
+        f"{100.0 * efficiency:.2g} % of the draws effective (at least "
+        f"{100.0 * _LOWEST_EFFICIENCY:.0f} %): use a sampler, such as nuts"
+    )

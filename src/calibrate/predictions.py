@@ -1,0 +1,128 @@
+r"""What a model predicts at draws: replicated data, and the log likelihood of each datum.
+
+Replicates :math:`y^\text{rep} \sim p(y \mid \theta_s)` are drawn at draws of the posterior and of
+the prior. The log likelihood :math:`\log p(y_i \mid \theta_s)` of every datum at every draw is what
+leave-one-out cross-validation needs (Vehtari, Gelman and Gabry 2017). All are read off the
+NumPyro program, so they follow any observation and noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from numpyro import handlers
+
+from calibrate.samplers.density import sum_log_likelihood, trace_of
+from calibrate.statistical_model import Data, Model
+
+REPLICATES = 500  # draws of the posterior, and of the prior, that data is replicated at
+
+Draws = Mapping[str, Any]
+"""Draws by the model's names, each (chains, draws)."""
+
+
+class Prior(NamedTuple):
+    """Draws of the prior where the forward map has an answer, and data replicated there.
+
+    draws : by the model's names, each (s,).
+    data : by the observation's name, each (s, *shape).
+    """
+
+    draws: dict[str, np.ndarray]
+    data: dict[str, np.ndarray]
+
+
+def log_likelihood(model: Model, draws: Draws, data: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Log likelihood of each datum at each draw, (chains, draws, *shape), by observation.
+
+    An observation whose data depend on each other given theta has one number a draw instead,
+    (chains, draws).
+    """
+    return _unflat(_programs(model).log_likelihood(_flat(draws), data), draws)
+
+
+def replicates(model: Model, draws: Draws, rng_key: jax.Array) -> dict[str, np.ndarray]:
+    """Data replicated at each draw, (chains, draws, *shape), by the observation's name."""
+    flat = _flat(draws)
+    keys = jax.random.split(rng_key, len(next(iter(flat.values()))))
+    return _unflat(_programs(model).replicate(flat, keys), draws)
+
+
+def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
+    """Up to ``count`` draws of the prior, and data replicated there.
+
+    A tenth more is drawn; draws where the forward map has no answer are left out.
+    """
+    keys = jax.random.split(rng_key, count + count // 10)
+    draws, data, valid = jax.tree.map(np.asarray, _programs(model).prior(keys))
+    rows = np.flatnonzero(valid)[:count]
+    return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))
+
+
+def spread(draws: Draws, count: int = REPLICATES) -> tuple[np.ndarray, Draws]:
+    """At most about ``count`` draws, evenly spaced along the chains: their indices and values."""
+    chains, length = next(iter(draws.values())).shape
+    kept = min(length, -(-count // chains))
+    rows = np.linspace(0, length - 1, kept).astype(int)
+    return rows, {name: np.asarray(values)[:, rows] for name, values in draws.items()}
+
+
+class _Programs(NamedTuple):
+    log_likelihood: Callable[..., Any]  # (draws by name (s,), data) -> by observation (s, *shape)
+    replicate: Callable[..., Any]  # (draws by name (s,), keys (s,)) -> by observation (s, *shape)
+    prior: Callable[..., Any]  # (keys (s,)) -> draws, data, whether valid (s,)
+
+
+@lru_cache(maxsize=4)
+def _programs(model: Model) -> _Programs:
+    def log_likelihood(draw: dict[str, jax.Array], data: Data) -> dict[str, jax.Array]:
+        trace = trace_of(model, draw, data)
+        return {name: _pointwise(trace[_site(name)]) for name in model.observe.parts}
+
+    def replicated(trace: dict[str, Any]) -> dict[str, jax.Array]:
+        return {name: trace[_site(name)]["value"] for name in model.observe.parts}
+
+    def replicate(draw: dict[str, jax.Array], rng_key: jax.Array) -> dict[str, jax.Array]:
+        seeded = handlers.substitute(handlers.seed(model, rng_key), data=draw)
+        return replicated(handlers.trace(seeded).get_trace())
+
+    def prior(rng_key: jax.Array) -> Any:
+        trace = handlers.trace(handlers.seed(model, rng_key)).get_trace()
+        draw = {name: trace[name]["value"] for name in model.names}
+        # Without data, the only thing observed is that the forward map has an answer.
+        return draw, replicated(trace), jnp.isfinite(sum_log_likelihood(trace))
+
+    # One draw after the other: maps that solve gain nothing from being vectorised.
+    return _Programs(
+        jax.jit(lambda draws, data: jax.lax.map(lambda d: log_likelihood(d, data), draws)),
+        jax.jit(lambda draws, keys: jax.lax.map(lambda pair: replicate(*pair), (draws, keys))),
+        jax.jit(lambda keys: jax.lax.map(prior, keys)),
+    )
+
+
+def _site(name: str) -> str:
+    return f"observed_{name}"
+
+
+def _pointwise(site: dict[str, Any]) -> jax.Array:
+    """Log density of each datum, or of all where they are not independent."""
+    distribution, value = site["fn"], site["value"]
+    while isinstance(distribution, dist.Independent):
+        distribution = distribution.base_dist
+    each = distribution.log_prob(value)
+    return each if each.shape == jnp.shape(value) else jnp.sum(each)
+
+
+def _flat(draws: Draws) -> dict[str, jax.Array]:
+    return {name: jnp.asarray(values).reshape(-1) for name, values in draws.items()}
+
+
+def _unflat(values: Any, draws: Draws) -> dict[str, np.ndarray]:
+    shape = next(iter(draws.values())).shape
+    return {name: np.asarray(v).reshape(*shape, *v.shape[1:]) for name, v in values.items()}

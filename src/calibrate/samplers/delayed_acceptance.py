@@ -1,0 +1,278 @@
+r"""Delayed acceptance: proposals by a cheap posterior's own sampler, decided by FEM.
+
+Let :math:`\pi^*(z) \propto p(z)\,L^*(z)` be the posterior with the cheap forward map and
+:math:`\pi(z) \propto p(z)\,L(z)` FEM's. A few No-U-Turn transitions, with fixed step size and
+metric, lead from :math:`z` to :math:`z'`. Each is reversible with respect to :math:`\pi^*`, and so
+is their composition with itself: :math:`\pi^*(z)\,q(z, z') = \pi^*(z')\,q(z', z)`. As a proposal
+for :math:`\pi` it is therefore accepted with probability
+
+.. math:: \alpha(z, z') = \min\!\left(1, \frac{\pi(z')\,q(z', z)}{\pi(z)\,q(z, z')}\right)
+          = \min\!\left(1, \frac{w(z')}{w(z)}\right), \qquad w = \frac{L}{L^*}
+
+which takes one FEM solve a proposal and leaves FEM's posterior invariant, however wrong the cheap
+map is: a wrong one only lowers the acceptance rate. This is the second stage of Christen and Fox
+(2005); a first stage of several transitions is the surrogate transition method of Liu (2001,
+Sec. 9.4.3) and the subchains of Lykkegaard et al. (2023).
+
+Where the cheap posterior has lighter tails than FEM's, :math:`w` has no bound and chains stick
+there. So the cheap likelihood is raised to a power below 1, :math:`\pi^* \propto p\,L^{*\beta}` and
+:math:`w = L / L^{*\beta}`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from calibrate.samplers import transport
+from calibrate.samplers.blackjax_nuts import BLACKJAX_NUTS, BlackJAXNUTSOptions
+from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.samplers.density import Density, tempered
+from calibrate.samplers.options import ChainOptions, check_counts, check_target_accept
+from calibrate.samplers.protocol import Context, Draws
+from calibrate.samplers.run import Chains, compile_chains, join
+from calibrate.samplers.stopping import converged
+from calibrate.statistical_model import Data
+from emulator.errors import InputError, SolverError
+
+
+@dataclass(frozen=True)
+class DelayedAcceptanceOptions(ChainOptions):
+    """Length of a run; ``warmup`` is the cheap sampler's, ``draws`` are decided by FEM.
+
+    transitions : of the cheap sampler between two FEM solves.
+    power : of the cheap likelihood in proposals, in (0, 1]. At 0.8 a perfect map keeps three
+        quarters of its effective draws in 5 dimensions and half in 17; a poor one gains.
+    discarded : first draws of each chain that are not kept: chains start from the cheap posterior.
+    target_accept : acceptance rate in (0, 1) that the cheap sampler's step size adapts to.
+    """
+
+    draws: int = 250
+    rounds: int = 4
+    transitions: int = 4
+    power: float = 0.8
+    discarded: int = 20
+    target_accept: float = 0.85
+
+    label: ClassVar[str] = "delayed acceptance"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_counts(self, "transitions", "discarded")
+        check_target_accept(self.label, self.target_accept)
+        if not 0.0 < self.power <= 1.0:
+            raise InputError(f"{self.label}: power is {self.power}; give one in (0, 1]")
+
+    def cheap(self) -> BlackJAXNUTSOptions:
+        """Options of the cheap sampler; its pilot run is as long as its warm-up."""
+        return BlackJAXNUTSOptions(self.warmup, self.warmup, self.chains, 1, 2.0, 0.0)
+
+
+class _Place(NamedTuple):
+    """Where the chains are; arrays (chains, ...)."""
+
+    states: Any  # of the cheap sampler
+    z: Any
+    cheap_lp: Any
+    log_w: Any
+
+
+class _State(NamedTuple):
+    """All that a run goes on from."""
+
+    map_: transport.TransportMap
+    place: _Place
+    count: Any  # draws made, the discarded ones included
+    solves: Any  # FEM's, those of starts and discarded draws included
+    draws: Draws
+
+
+_STATISTICS = {
+    "acceptance_rate": float,
+    "accepted": bool,
+    "fem_solves": int,
+    "log_w": float,
+    "lp": float,
+    "n_steps": int,
+    "diverging": bool,
+}
+
+
+@dataclass(frozen=True)
+class DelayedAcceptance:
+    """The sampler; see :class:`~calibrate.samplers.protocol.Sampler`."""
+
+    name: str = "delayed_acceptance"
+    options: type[DelayedAcceptanceOptions] = DelayedAcceptanceOptions
+    statistics: tuple[str, ...] = tuple(_STATISTICS)
+    solves_fem: bool = True
+
+    def sample(
+        self,
+        density: Density,
+        data: Data,
+        options: DelayedAcceptanceOptions,
+        seed: int,
+        context: Context = Context(),
+    ) -> Draws:
+        """Draw from FEM's posterior in rounds, until the chains agree.
+
+        The attribute ``fem_solves`` counts all solves; the statistic those of the draws kept.
+
+        Raises
+        ------
+        InputError
+            There is no FEM likelihood in ``context``.
+        SolverError
+            FEM converged at none of a chain's first proposals.
+        """
+        if context.fem is None:
+            raise InputError(f"{options.label}: there is no FEM likelihood to decide by")
+        with tqdm(desc=self.name, total=0, disable=not context.progress, unit="draw") as bar:
+            run = _Run(density, data, options, seed, context, bar)
+            for rounds in range(1, options.rounds + 1):
+                draws = run.draw(rounds * options.draws)
+                if converged(draws.z, options.r_hat, options.ess):
+                    break
+        return draws._replace(attributes={"fem_solves": run.solves})
+
+
+class _Run:
+    """Chains under way."""
+
+    def __init__(
+        self,
+        density: Density,
+        data: Data,
+        options: DelayedAcceptanceOptions,
+        seed: int,
+        context: Context,
+        bar: tqdm,
+    ) -> None:
+        self.density, self.data, self.options, self.bar = density, data, options, bar
+        self.fem, self.checkpoint = context.fem, context.checkpoint
+        self.wide = tempered(density, options.power)
+        self.programs = compile_chains(BLACKJAX_NUTS, self.wide, options.cheap())
+        start_key, self.key = jax.random.split(jax.random.key(seed))
+        state = self.checkpoint.restore(self._template) or self._begin(start_key)
+        self.map_, self.place = state.map_, state.place
+        self.count, self.solves = int(state.count), int(state.solves)
+        self.parts = [state.draws]
+        bar.update(self.count)
+
+    def draw(self, total: int) -> Draws:
+        """The first ``total`` kept draws of each chain."""
+        last = self.bar.total = self.options.discarded + total
+        while self.count < last:
+            draws = self._step()
+            self.count += 1
+            if self.count > self.options.discarded:
+                self.parts.append(draws)
+            elif self.count == self.options.discarded:
+                self._check_start()
+            self.bar.update()
+            self.checkpoint.keep(self._state)
+        return jax.tree.map(lambda array: array[:, :total], join(self.parts))
+
+    def _begin(self, key: jax.Array) -> _State:
+        """Chains at draws of the cheap posterior.
+
+        A killed run does this part again, or it is already beyond it: it solves no FEM.
+        """
+        with tqdm(disable=True, total=0) as bar:
+            cheap = Chains(
+                BLACKJAX_NUTS, self.wide, self.data, self.options.cheap(), Checkpoint(), bar
+            )
+            cheap.start_straightened(*jax.random.split(key))
+        self.map_ = cheap.map_
+        proposed, _ = self._propose(cheap.states)
+        place = proposed._replace(log_w=self._log_w(proposed.z, np.full(len(proposed.z), True)))
+        return _State(self.map_, place, 0, len(proposed.z), self._no_draws())
+
+    def _step(self) -> Draws:
+        """One draw of each chain, (chains, 1)."""
+        proposed, cheap = self._propose(self.place.states)
+        moved = (proposed.z != self.place.z).any(axis=1)
+        self.solves += int(moved.sum())
+        log_w = np.where(moved, self._log_w(proposed.z, moved), self.place.log_w)
+        # Where FEM fails the weight is 0: never accepted, and left at the first chance.
+        with np.errstate(invalid="ignore", over="ignore"):
+            probability = np.nan_to_num(np.exp(np.minimum(log_w - self.place.log_w, 0.0)), nan=0.0)
+        key = jax.random.fold_in(self.key, self.count)
+        accepted = np.asarray(jax.random.uniform(key, probability.shape)) < probability
+        self.place = _choose(accepted, proposed._replace(log_w=log_w), self.place)
+        statistics = {
+            "acceptance_rate": probability,
+            "accepted": accepted & moved,
+            "fem_solves": moved.astype(int),
+            "log_w": self.place.log_w,
+            "lp": self.place.cheap_lp + self.place.log_w,
+            "n_steps": cheap["n_steps"].sum(axis=1),
+            "diverging": cheap["diverging"].any(axis=1),
+        }
+        return jax.tree.map(lambda array: array[:, None], Draws(self.place.z, statistics))
+
+    def _propose(self, states: Any) -> tuple[_Place, dict[str, np.ndarray]]:
+        """Where the cheap sampler leads, without weights; its statistics (chains, transitions)."""
+        states, draws = self.programs.advance(
+            states, self.data, self.map_, count=self.options.transitions
+        )
+        z, statistics = jax.tree.map(np.asarray, (draws.z, draws.statistics))
+        return _Place(states, z[:, -1], statistics["lp"][:, -1], None), statistics
+
+    def _log_w(self, z: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """FEM's less the tempered log likelihood (chains,), where wanted; ``-inf`` elsewhere."""
+        assert self.fem is not None
+        named = jax.tree.map(np.asarray, self.density.constrain(self.data, jnp.asarray(z)))
+        log_w = np.full(len(z), -np.inf)
+        for k in np.flatnonzero(wanted):
+            found = self.fem({name: values[k] for name, values in named.items()}, self.data)
+            ratio = found.fem - self.options.power * found.cheap
+            log_w[k] = ratio if np.isfinite(ratio) else -np.inf
+        return log_w
+
+    def _check_start(self) -> None:
+        if not np.isfinite(self.place.log_w).all():
+            raise SolverError(
+                f"FEM converged at none of a chain's first {self.count + 1} proposals: the cheap "
+                "map leads to where FEM has no solution"
+            )
+
+    def _no_draws(self) -> Draws:
+        chains = self.options.chains
+        statistics: dict[str, Any] = {
+            name: np.zeros((chains, 0), kind) for name, kind in _STATISTICS.items()
+        }
+        return Draws(np.zeros((chains, 0, self.density.dimension)), statistics)
+
+    def _state(self) -> _State:
+        return _State(self.map_, self.place, self.count, self.solves, join(self.parts))
+
+    def _template(self) -> _State:
+        map_ = transport.identity(self.density.dimension)
+        keys = jax.random.split(jax.random.key(0), self.options.chains)
+        states, _ = jax.eval_shape(self.programs.start, keys, self.data, map_)
+        number = np.zeros(())
+        place = _Place(states, number, number, number)
+        count = np.zeros((), int)
+        return _State(map_, place, count, count, self._no_draws())
+
+
+def _choose(accepted: np.ndarray, proposed: _Place, current: _Place) -> _Place:
+    """The proposed place of each chain where accepted; random keys go on either way."""
+    current = current._replace(states=current.states._replace(rng_key=proposed.states.rng_key))
+
+    def chosen(new: Any, old: Any) -> Any:
+        return jnp.where(accepted.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+
+    states = jax.tree.map(chosen, proposed.states, current.states)
+    rest = jax.tree.map(lambda new, old: np.asarray(chosen(new, old)), proposed[1:], current[1:])
+    return _Place(states, *rest)
+
+
+DELAYED_ACCEPTANCE = DelayedAcceptance()

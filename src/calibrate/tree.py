@@ -1,0 +1,125 @@
+"""The DataTree of a posterior: draws, statistics, data and predictions, with labels and units.
+
+Groups have ArviZ's names, so that ArviZ works on the saved file as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import arviz_base
+import jax
+import numpy as np
+import xarray as xr
+
+from calibrate import predictions
+from calibrate.noise.gaussian import NOISE_SD
+from calibrate.state_names import split
+from calibrate.statistical_model import Data, Model
+
+
+def make_tree(
+    model: Model,
+    data: Data,
+    draws: Mapping[str, np.ndarray],
+    statistics: Mapping[str, np.ndarray],
+    rng_key: jax.Array | None,
+) -> xr.DataTree:
+    """Draws and statistics (chains, draws) by name, with all that follows from them.
+
+    Parameters
+    ----------
+    rng_key : for replicated data; ``None`` leaves out the predictions (``log_likelihood``,
+        ``posterior_predictive``, ``prior``, ``prior_predictive``).
+    """
+    constants, dims, coords = _labels(model)
+    groups: dict[str, Any] = {
+        "posterior": dict(draws),
+        "sample_stats": dict(statistics),
+        "observed_data": {name: np.asarray(values) for name, values in data.items()},
+        **({"constant_data": constants} if constants else {}),
+    }
+    rows = np.arange(0)
+    if rng_key is not None:
+        rows, more = _predictions(model, data, draws, rng_key)
+        groups.update(more)
+    likelihood = groups.pop("log_likelihood", None)
+    tree = arviz_base.from_dict(groups, dims=dims, coords=coords)
+    if likelihood is not None:
+        tree["log_likelihood"] = xr.DataTree(_likelihood(likelihood, data, dims, coords))
+        replicated = tree["posterior_predictive"].to_dataset()
+        tree["posterior_predictive"] = xr.DataTree(replicated.assign_coords(draw=rows))
+    _write_units(tree, model)
+    return tree
+
+
+def _predictions(
+    model: Model, data: Data, draws: Mapping[str, np.ndarray], rng_key: jax.Array
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """The groups of predictions, and which draws of each chain data was replicated at."""
+    posterior_key, prior_key = jax.random.split(rng_key)
+    rows, some = predictions.spread(draws)
+    prior = predictions.prior_replicates(model, prior_key)
+    groups = {
+        "log_likelihood": predictions.log_likelihood(model, draws, data),
+        "posterior_predictive": predictions.replicates(model, some, posterior_key),
+        "prior": {name: values[None] for name, values in prior.draws.items()},
+        "prior_predictive": {name: values[None] for name, values in prior.data.items()},
+    }
+    return rows, groups
+
+
+def _likelihood(
+    values: Mapping[str, np.ndarray],
+    data: Data,
+    dims: Mapping[str, list[str]],
+    coords: Mapping[str, Any],
+) -> xr.Dataset:
+    """Dependent data have one number a draw and not the data's dimensions."""
+    pointwise: dict[Any, Any] = {
+        n: dims[n] for n in values if n in dims and values[n].ndim == data[n].ndim + 2
+    }
+    used = {name for names in pointwise.values() for name in names}
+    return arviz_base.dict_to_dataset(
+        dict(values), dims=pointwise, coords={n: c for n, c in coords.items() if n in used}
+    )
+
+
+def _labels(
+    model: Model,
+) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
+    """Constants, dimensions and coordinates of all observations."""
+    constants: dict[str, np.ndarray] = {}
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {}
+    for name, part in model.observe.parts.items():
+        labels = part.labels(name)
+        constants.update(labels.constants)
+        dims.update(labels.dims)
+        coords.update(labels.coords)
+    return constants, dims, coords
+
+
+def units_of(model: Model) -> dict[str, str]:
+    """Units by the names of parameters, observations and standard deviations of noise."""
+    parameters = {p.name: p.unit for p in model.forward.scene.parameters}
+    units = {name: parameters[split(name)[0]] for name in model.states.unknowns}
+    for name, part in model.observe.parts.items():
+        units[name] = part.unit
+        site = model.noise_sites[name].get(NOISE_SD)
+        units |= {} if site is None else {site: part.unit}
+    return units
+
+
+_WITH_UNITS = ("posterior", "prior", "posterior_predictive", "prior_predictive", "observed_data")
+
+
+def _write_units(tree: xr.DataTree, model: Model) -> None:
+    for group in _WITH_UNITS:
+        for name, unit in units_of(model).items():
+            if group in tree and name in tree[group].data_vars:
+                tree[group][name].attrs["units"] = unit or "1"
+    if "constant_data" in tree:  # reference positions
+        for constant in tree["constant_data"].data_vars:
+            tree["constant_data"][str(constant)].attrs["units"] = "mm"

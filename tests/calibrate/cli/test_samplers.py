@@ -1,0 +1,79 @@
+"""Samplers by command line: FEM in the second stage, and going on after a kill."""
+
+import json
+
+import numpy as np
+import pytest
+
+from calibrate.cli import main
+from calibrate.cli.commands.infer import sampler_options
+from calibrate.posterior import read_tree
+from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.workflow import SAMPLING
+
+
+class Killed(Exception):
+    pass
+
+
+def words(folder, *more):
+    return [
+        "infer", "once_clamped_beam", "--truth", "mu=73", "lam=61", "--sampler",
+        "delayed_acceptance", "--warmup", "50", "--draws", "15", "--chains", "2",
+        "--out", str(folder), "--json", *more,
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_delayed_acceptance_goes_on_after_a_kill(capsys, monkeypatch, tmp_path):
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    keep = Checkpoint.keep
+
+    def kept(self, state):
+        self.every = 0.0
+        keep(self, state)
+        if self.path is not None and state().count == 30:
+            raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoint, "keep", kept)
+        with pytest.raises(Killed):
+            main(words(killed))
+    assert [path.name for path in killed.iterdir()] == [SAMPLING]
+    capsys.readouterr()
+    # Another run does not take it for its own, nor overwrite it.
+    assert main(words(killed, "--seed", "4")) == 2
+    assert "belongs to another run: its seed is 0, not 4" in capsys.readouterr().err
+    assert main(words(killed)) == main(words(whole)) == 0
+    lines = capsys.readouterr().out
+    result = json.loads(lines[lines.index("}\n{") + 2 :])
+    assert result["verdict"] == "decided by FEM"
+    assert 2 * 15 < result["fem_solves"] <= 2 * (1 + 20 + 4 * 15)
+    assert any("effective draws" in sentence for sentence in result["warnings"])
+    assert not (killed / SAMPLING).exists()
+    first, second = (read_tree(folder / "posterior.nc")["posterior"] for folder in (killed, whole))
+    for name in ("mu", "lam"):
+        np.testing.assert_array_equal(first[name], second[name])
+    # FEM's weights must not be applied twice.
+    assert main(["certify", str(whole)]) == 2
+    assert "is FEM's already; it needs no certificate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["leapfrogs=3"], "sampler 'nuts' has no option 'leapfrogs'; it has warmup, draws"),
+        (["rounds=2.5"], "sampler 'nuts': rounds is 2.5; give one like 8"),
+        (["target_accept"], "--sampler-options: 'target_accept' is not NAME=VALUE"),
+        (["target_accept=2"], "NUTS: target_accept is 2; give one in (0, 1)"),
+    ],
+)
+def test_options_that_cannot_be(words, message, capsys, tmp_path):
+    call = ["infer", "once_clamped_beam", "--truth", "mu=73", "lam=61", "--out", str(tmp_path)]
+    assert main([*call, "--sampler-options", *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_options_reach_the_sampler():
+    words = ["target_accept=0.95", "rounds=2", "start=pathfinder"]
+    assert sampler_options(words) == {"target_accept": 0.95, "rounds": 2, "start": "pathfinder"}

@@ -1,0 +1,85 @@
+"""The Laplace approximation: exact for a Gaussian posterior, and honest about others."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+
+import calibrate as cal
+from calibrate.samplers import LaplaceOptions
+from calibrate.samplers.laplace import efficiency, pareto_k
+from emulator.errors import SolverError
+from linear_support import LinearForward, linear_forward, linear_problem
+
+
+@dataclass(frozen=True, eq=False)
+class Bent(LinearForward):
+    """Only a curved combination of the two parameters is seen."""
+
+    def __call__(self, theta):
+        x, y = (theta[0] - 75.0) / 5.0, (theta[1] - 75.0) / 5.0
+        return jnp.ones((len(self.nodes), 3)) * (y - x**2)
+
+
+def bent(beam):
+    forward = Bent(**vars(linear_forward(beam)))
+    prior = {name: dist.Normal(75.0, 10.0) for name in beam.parameter_names}
+    observe = cal.nodal_displacements(beam, [3])
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.05), prior, check_scale=False)
+    return model, np.zeros((1, 3))
+
+
+def test_of_a_gaussian_posterior_it_is_exact(beam):
+    model, data = linear_problem(beam)
+    posterior = cal.sample(model, data, sampler="laplace", options=LaplaceOptions(draws=500))
+    ratios = posterior.tree["sample_stats"]["log_ratio"].values
+    assert np.ptp(ratios) < 1e-5
+    assert posterior.tree.attrs["pareto_k"] == 0.0
+    assert posterior.tree.attrs["approximation"] == "gaussian"
+    assert posterior.warnings() == []
+
+
+def test_the_ratio_of_a_gaussian_is_its_evidence(beam):
+    """log p(z, y) - log q(z) is log p(y) where q is the posterior: SMC's estimate of it."""
+    model, data = linear_problem(beam)
+    laplace = cal.sample(model, data, sampler="laplace", options=LaplaceOptions(draws=50))
+    smc = cal.sample(model, data, sampler="smc", seed=3)
+    error = smc.tree.attrs["log_evidence_error"]
+    found = float(laplace.tree["sample_stats"]["log_ratio"].mean())
+    assert found == pytest.approx(smc.tree.attrs["log_evidence"], abs=5.8 * error)
+
+
+def test_of_a_bent_posterior_it_says_that_it_is_wrong(beam):
+    model, data = bent(beam)
+    posterior = cal.sample(model, data, sampler="laplace", options=LaplaceOptions(draws=500))
+    # Too wide where the posterior bends away: no heavy tail, but hardly a draw that counts.
+    assert posterior.tree.attrs["importance_efficiency"] < 0.2
+    assert any("the Gaussian approximation is poor" in line for line in posterior.warnings())
+
+
+def test_a_mode_between_walls_is_refused(beam):
+    """A likelihood that grows to where the map ends has no mode before it."""
+    from dataclasses import replace
+
+    forward = replace(linear_forward(beam), limit=75.0)
+    prior = {name: dist.Uniform(60.0, 80.0) for name in beam.parameter_names}
+    observe = cal.nodal_displacements(beam, [3])
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.001), prior, check_scale=False)
+    truth = np.asarray(replace(forward, limit=np.inf).at(observe.nodes)(jnp.array([79.0, 79.0])))
+    with pytest.raises(SolverError, match="the optimiser stopped .* sd from a mode"):
+        cal.sample(model, truth, sampler="laplace")
+
+
+def test_the_efficiency_of_two_weights():
+    # (1 + 3)^2 / (2 (1 + 9))
+    assert efficiency(np.log([1.0, 3.0]) - 700.0) == pytest.approx(0.8)
+
+
+def test_pareto_k_of_known_tails():
+    rng = np.random.default_rng(0)
+    assert pareto_k(np.zeros(100)) == 0.0
+    for shape in (0.3, 0.9):
+        ratios = np.log(rng.pareto(1.0 / shape, size=20_000) + 1.0)
+        assert pareto_k(ratios) == pytest.approx(shape, abs=0.15)
