@@ -53,8 +53,12 @@ class Samples:
 
     def __call__(self, displacement: jax.Array) -> jax.Array:
         """Strains (..., s, c) from the displacement (..., k, 3) mm of ``nodes``."""
-        along = jnp.einsum("sca,...sai->...sci", self.slopes, displacement[..., self.members, :])
-        return jnp.sum((self.directions + 0.5 * along) * along, axis=-1)
+        # Points come last, so that the loops over them are vectorised.
+        u = jnp.moveaxis(displacement, -1, -2)[..., self.members.T]  # (..., 3, a, s)
+        slopes = np.moveaxis(self.slopes, 0, -1)[:, None]  # (c, 1, a, s)
+        directions = np.moveaxis(self.directions, 0, -1)  # (c, 3, s)
+        along = jnp.sum(slopes * u[..., None, :, :, :], axis=-2)  # (..., c, 3, s)
+        return jnp.moveaxis(jnp.sum((directions + 0.5 * along) * along, axis=-2), -1, -2)
 
 
 class Strains:
