@@ -25,7 +25,8 @@ class Likelihoods(NamedTuple):
     """Log likelihoods of the data at one draw.
 
     fem : with FEM's displacement; ``-inf`` where FEM did not converge in a load state.
-    cheap : with the model's forward map; ``-inf`` where it has no answer.
+    cheap : with the model's forward map and its error, where the model allows for one; ``-inf``
+        where the map has no answer.
     converged : whether FEM did, in every load state.
     smallest_J : smallest volume ratio det F in the body, by FEM; NaN where it did not converge.
     """
@@ -57,7 +58,7 @@ class FEMLikelihood:
         """Log likelihoods at ``draw``: a number for each of the model's ``names``."""
         thetas = self.model.states.thetas(draw)
         noise = self.model.noise_values(draw)
-        cheap = float(self._cheap(thetas, noise, data))
+        cheap = float(self._cheap(dict(draw), data))
         solved = []
         for theta in thetas:
             # Not under jit: there the solver cannot use CHOLMOD, which is faster.
@@ -74,12 +75,7 @@ class FEMLikelihood:
 
     @cached_property
     def _cheap(self):  # noqa: ANN202
-        def cheap(thetas, noise, data):  # noqa: ANN001, ANN202
-            prediction = self.model.evaluate(thetas)
-            value = self.model.log_likelihood(prediction.displacement, thetas, noise, data)
-            return jnp.where(prediction.valid, value, -jnp.inf)
-
-        return jax.jit(cheap)
+        return jax.jit(self.model.map_log_likelihood)
 
     @cached_property
     def _fem(self):  # noqa: ANN202

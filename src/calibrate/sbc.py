@@ -249,4 +249,5 @@ def _log_likelihoods(
     table = {name: np.reshape(draws[name], (1, -1)) for name in model.names}
     terms = predictions.log_likelihood(model, table, data)
     length = table[model.names[0]].shape[1]
-    return sum(v.reshape(length, -1).sum(axis=1) for v in terms.values()).reshape(shape)
+    rows = [v.reshape(length, -1).sum(axis=1) for v in terms.values()]
+    return np.sum(rows, axis=0).reshape(shape)

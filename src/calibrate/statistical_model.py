@@ -22,6 +22,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 
+from calibrate.approximation_error import ApproximationError
 from calibrate.load_states import LoadStates, load_states
 from calibrate.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.noise import Noise
@@ -54,6 +55,7 @@ class Model:
         share its unknown numbers.
     states : where theta comes from in each load state.
     prior : one distribution an unknown of theta.
+    error : the forward map's own error, where the likelihood allows for it.
     prior_cut : unknown to the mass of its prior that was cut off (:mod:`calibrate.prior_range`).
     check_scale : whether :meth:`check_data` refuses data far from every prediction.
     """
@@ -65,6 +67,7 @@ class Model:
     noise_names: Mapping[str, str]
     states: LoadStates
     prior: Prior
+    error: ApproximationError | None = None
     prior_cut: Mapping[str, float] = field(default_factory=dict)
     check_scale: bool = True
 
@@ -112,6 +115,11 @@ class Model:
         values = self.noise_values(draw)
         means = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0), thetas)
         observed = None if data is None else self.observe.name(data, "data")
+        if self.error is not None:
+            if observed is None:
+                means = self.error.draw(numpyro.prng_key(), self._stacked(draw), means)
+            else:
+                numpyro.factor("approximation_error", self._error_ratio(draw, means, observed))
         for name, mean in means.items():
             numpyro.sample(
                 f"observed_{name}",
@@ -161,6 +169,27 @@ class Model:
         ]
         return sum(terms, jnp.zeros(()))
 
+    def map_log_likelihood(self, draw: Mapping[str, Any], data: Data) -> jax.Array:
+        """Log density of ``data``, (), with the forward map and what is allowed for its error.
+
+        ``-inf`` where the map has no answer. ``draw`` has a number for each of ``names``.
+        """
+        thetas = self.states.thetas(draw)
+        displacement, valid = self.evaluate(thetas)
+        displacement = jnp.where(valid, displacement, 0.0)
+        found = self.log_likelihood(displacement, thetas, self.noise_values(draw), data)
+        if self.error is not None:
+            found += self._error_ratio(draw, self.observe(displacement, thetas), data)
+        return jnp.where(valid, found, -jnp.inf)
+
+    def _error_ratio(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
+        assert self.error is not None
+        residual = {name: data[name] - mean for name, mean in means.items()}
+        return self.error.log_ratio(self._stacked(draw), residual)
+
+    def _stacked(self, draw: Mapping[str, Any]) -> jax.Array:
+        return jnp.stack([jnp.asarray(draw[name], float) for name in self.states.unknowns])
+
     def prior_draws(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
         """Draws (count,) from the prior of each unknown of theta."""
         keys = jax.random.split(key, len(self.states.unknowns))
@@ -184,6 +213,11 @@ class Model:
         observe, kept = leave_out_missing(self.observe, self._fitting(data))
         if not missing_values(observe):
             return self, self.check_data(kept)
+        if self.error is not None:
+            raise InputError(
+                "the forward map's error was learned for data without missing values; learn it for "
+                "Model.given's model"
+            )
         reduced = replace(self, observe=observe, noise=at_sites(self.noise, observe))
         return reduced, reduced.check_data(kept)
 
@@ -263,7 +297,7 @@ def model(
     states, given = load_states(forward.scene, several.states, prior, known)
     check_known(restricted, states)
     prior, cut = fit_to(restricted, given)
-    return Model(restricted, forward, several, noises, names, states, prior, cut, check_scale)
+    return Model(restricted, forward, several, noises, names, states, prior, None, cut, check_scale)
 
 
 def _noises(

@@ -15,6 +15,7 @@ import xarray as xr
 
 from calibrate import predictions
 from calibrate.noise.gaussian import NOISE_SD
+from calibrate.observations import Observations
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
 
@@ -33,7 +34,7 @@ def make_tree(
     rng_key : for replicated data; ``None`` leaves out the predictions (``log_likelihood``,
         ``posterior_predictive``, ``prior``, ``prior_predictive``).
     """
-    constants, dims, coords = _labels(model)
+    constants, dims, coords = labels_of(model.observe)
     groups: dict[str, Any] = {
         "posterior": dict(draws),
         "sample_stats": dict(statistics),
@@ -86,14 +87,14 @@ def _likelihood(
     )
 
 
-def _labels(
-    model: Model,
+def labels_of(
+    observe: Observations,
 ) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
     """Constants, dimensions and coordinates of all observations."""
     constants: dict[str, np.ndarray] = {}
     dims: dict[str, list[str]] = {}
     coords: dict[str, Any] = {}
-    for name, part in model.observe.parts.items():
+    for name, part in observe.parts.items():
         labels = part.labels(name)
         constants.update(labels.constants)
         dims.update(labels.dims)

@@ -11,7 +11,7 @@ import pytest
 import calibrate as cal
 from calibrate.data import read_data, write_data
 from calibrate.observations import KINDS, Scalar, observations_from_json, parse_observation
-from calibrate.posterior import _labels
+from calibrate.tree import labels_of
 from calibrate.workflow import Run, make_data
 from emulator.errors import InputError
 from linear_support import linear_forward
@@ -73,7 +73,7 @@ def test_from_the_command_line_through_model_and_file_and_back(beam, tmp_path):
     again = observations_from_json(beam, observe.to_json())
     np.testing.assert_array_equal(again.nodes, observe.nodes)
     # Labels in the DataTree: the area has no dimensions, the displacements keep theirs.
-    constants, dims, coords = _labels(observe)
+    constants, dims, coords = labels_of(observe)
     tree = arviz_base.from_dict(
         {"observed_data": data, "constant_data": constants}, dims=dims, coords=coords
     )

@@ -25,7 +25,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from calibrate.identifiability.combinations import combinations, prior_table
-from calibrate.noise import Noise
+from calibrate.noise.information import information_about_means
 from calibrate.observations import Observations
 from calibrate.statistical_model import Model
 from emulator.errors import InputError
@@ -113,17 +113,3 @@ def sensitivities(
         return means, J, valid
 
     return jax.jit(both)
-
-
-def information_about_means(
-    noise: Mapping[str, Noise], means: Mapping[str, jax.Array]
-) -> jax.Array:
-    """Information (d, d) of known noises about the data's means, in ``ravel_pytree``'s order."""
-    flat, unravel = ravel_pytree(means)
-
-    def log_density(moved: jax.Array) -> jax.Array:
-        at = unravel(moved)
-        terms = [noise[n].distribution(at[n], {}).log_prob(means[n]) for n in means]
-        return sum(terms, jnp.zeros(()))
-
-    return -jax.hessian(log_density)(flat)

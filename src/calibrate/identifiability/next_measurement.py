@@ -19,8 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.identifiability.fisher import information_about_means, sensitivities
+from calibrate.identifiability.fisher import sensitivities
 from calibrate.noise import Noise
+from calibrate.noise.information import information_about_means
 from calibrate.observations import Observation, Observations
 from calibrate.posterior import Posterior
 

@@ -68,11 +68,7 @@ def profile_likelihood(posterior: Posterior, name: str, points: int = 21) -> Pro
 
     def log_likelihood(x: jax.Array) -> jax.Array:
         draw = {n: transforms[n](value) for n, value in zip(model.names, x, strict=True)}
-        thetas = model.states.thetas(draw)
-        prediction = model.evaluate(thetas)
-        noise = model.noise_values(draw)
-        found = model.log_likelihood(prediction.displacement, thetas, noise, posterior.data)
-        return jnp.where(prediction.valid, found, -jnp.inf)
+        return model.map_log_likelihood(draw, posterior.data)
 
     best = _profile(log_likelihood, z, k, grid, np.array(limits))
     drop = best.max() - best
@@ -104,9 +100,10 @@ def _profile(
     for value in grid:
         starts = [z[int(np.argmin(np.abs(z[:, k] - value))), others]]
         starts += [] if last is None else [last]
-        box = list(zip(-limits[others], limits[others], strict=True))
+        low, high = -limits[others], limits[others]
+        box = list(zip(low, high, strict=True))
         found = [
-            minimize(safe, np.clip(s, *zip(*box, strict=True)), (value,), jac=True, bounds=box)
+            minimize(safe, np.clip(s, low, high), (value,), jac=True, bounds=box)
             if len(others)
             else _nothing_to_fit(safe, value)
             for s in starts

@@ -47,6 +47,7 @@ class CorrelatedNoise:
     sites: Sites | None = field(default=None, compare=False, repr=False)
 
     kind: ClassVar[str] = "correlated"
+    gaussian: ClassVar[bool] = True
     usage: ClassVar[str] = "correlated:length=MM,sd=SD,spatial_sd=SD"
 
     def __post_init__(self) -> None:

@@ -55,6 +55,7 @@ class DiscrepancyNoise:
     sites: Sites | None = field(default=None, compare=False, repr=False)
 
     kind: ClassVar[str] = "discrepancy"
+    gaussian: ClassVar[bool] = True
     usage: ClassVar[str] = "discrepancy:scale=SCALE,length=MM,sd=SD"
 
     def __post_init__(self) -> None:

@@ -36,6 +36,7 @@ class GaussianNoise:
     sd_scale: float | None = None
 
     kind: ClassVar[str] = "gaussian"
+    gaussian: ClassVar[bool] = True
     usage: ClassVar[str] = "gaussian:sd=SD"
 
     def __post_init__(self) -> None:

@@ -33,10 +33,12 @@ class Noise(Protocol):
     Attributes
     ----------
     kind : its name in the registry and in JSON.
+    gaussian : whether it is Gaussian where all its numbers are known.
     usage : its options on the command line, for help and errors.
     """
 
     kind: ClassVar[str]
+    gaussian: ClassVar[bool]
     usage: ClassVar[str]
 
     def at(self, sites: Sites | None) -> Self:

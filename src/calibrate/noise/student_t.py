@@ -45,6 +45,7 @@ class StudentTNoise:
     prior_scale: float | None = None
 
     kind: ClassVar[str] = "student_t"
+    gaussian: ClassVar[bool] = False
     usage: ClassVar[str] = "student_t:dof=DOF,scale=SCALE"
 
     def __post_init__(self) -> None:
