@@ -34,6 +34,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from emulator.surrogates.protocol import fingerprint_of
+
 _MODES = 12
 _WIDTHS = np.geomspace(0.05, 2.0, 12)  # of the kernel, in standardised unknowns
 
@@ -82,6 +84,11 @@ class ApproximationError:
         variance = self.size(unknowns) ** 2
         b, inflated = self.weights @ flat, 1.0 + variance * self.strength
         return 0.5 * jnp.sum(variance * b**2 / inflated - jnp.log(inflated))
+
+    @property
+    def fingerprint(self) -> str:
+        """Short hash of all it consists of."""
+        return fingerprint_of(*self.arrays().values())
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All it consists of, by name."""

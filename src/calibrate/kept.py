@@ -13,7 +13,9 @@ from typing import Any
 
 import xarray as xr
 
+from calibrate.approximation_error import ApproximationError
 from emulator.errors import InputError
+from emulator.store import read_arrays
 from emulator.surrogates.protocol import ForwardMap
 
 # Paths of scene and emulator may change when a folder moves; their fingerprints may not.
@@ -49,3 +51,23 @@ def check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
             f"{path} was made with another {forward.kind} map (fingerprint {made_with}; it is "
             f"{forward.fingerprint} now); infer again"
         )
+
+
+def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ApproximationError:
+    """The forward map's error kept in ``file``, with which the posterior was sampled.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged or of another posterior.
+    """
+    if not file.is_file():
+        raise InputError(f"{file}, the forward map's error of the posterior beside it, is missing")
+    arrays, _ = read_arrays(file)
+    try:
+        error = ApproximationError.restore(arrays)
+    except KeyError as missing:
+        raise InputError(f"{file}: array {missing} is missing; infer again") from missing
+    if tree.attrs.get("forward_error") != error.fingerprint:
+        raise InputError(f"{path} was sampled with another error than {file} holds; infer again")
+    return error

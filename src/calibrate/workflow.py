@@ -18,7 +18,8 @@ import numpy as np
 
 from calibrate.certificate import Certificate, certify
 from calibrate.data import read_data, write_data
-from calibrate.kept import check_forward, check_run
+from calibrate.kept import check_forward, check_run, restore_error
+from calibrate.learned_error import with_error
 from calibrate.load_states import known_thetas
 from calibrate.noise import Noise, noise_of, with_discrepancy
 from calibrate.observations import (
@@ -37,13 +38,13 @@ from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
-from emulator.store import write_json
+from emulator.store import save_arrays, write_json
 from emulator.surrogates import registry
 from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.protocol import ForwardMap
 
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
-FORWARD = "forward.safetensors"
+FORWARD, ERROR = "forward.safetensors", "error.safetensors"
 SAMPLING = "sampling.safetensors"  # of a run under way, or killed
 
 
@@ -71,6 +72,8 @@ class Run:
     check_scale : refuse data that is far from every prediction (:mod:`calibrate.magnitude`).
     forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
         options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
+    error_runs : FEM runs from which the forward map's own error is learned, so that the likelihood
+        allows for it (:mod:`calibrate.approximation_error`); 0 takes the map as exact.
     sampler, sampler_options : a name of :data:`calibrate.samplers.SAMPLERS`, and its options by
         name, e.g. ``{"target_accept": 0.95}``.
     """
@@ -88,6 +91,7 @@ class Run:
     forward: str = "emulator"
     emulator: str | None = None
     forward_options: dict[str, Any] = field(default_factory=dict)
+    error_runs: int = 0
     sampler: str = "nuts"
     sampler_options: dict[str, Any] = field(default_factory=dict)
     warmup: int = 500
@@ -101,6 +105,8 @@ class Run:
         for name in ("warmup", "draws", "chains"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be 1 or more")
+        if self.error_runs < 0:
+            raise InputError(f"error_runs is {self.error_runs}; it must be 0 or more")
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be 0 or more")
 
@@ -227,9 +233,15 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         known=run.known,
         check_scale=run.check_scale,
     )
+    kept: Mapping[str, Any] = data
+    if run.error_runs:
+        built, kept = built.given(data)
+        built = with_error(
+            built, simulator_of(scene), run.error_runs, seed=run.seed, progress=progress
+        )
     posterior = sample(
         built,
-        data,
+        kept,
         sampler=run.sampler,
         options=options,
         seed=run.seed,
@@ -241,11 +253,13 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         folder = Path(folder)
         # An earlier result is removed first and the posterior is written last: a run that is killed
         # leaves no posterior, rather than one beside the certificate of another.
-        for name in (CERTIFICATE, POSTERIOR, FORWARD):
+        for name in (CERTIFICATE, POSTERIOR, FORWARD, ERROR):
             (folder / name).unlink(missing_ok=True)
         write_data(folder / DATA, observe, data)
         write_json(folder / RUN, asdict(run))
         registry.keep_forward(posterior.model.full, folder / FORWARD)
+        if posterior.model.error is not None:
+            save_arrays(folder / ERROR, posterior.model.error.arrays(), {})
         posterior.tree.attrs["run"] = json.dumps(asdict(run))
         posterior.save(folder / POSTERIOR)
     return posterior
@@ -274,6 +288,9 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     noises = run.noises(observe)
     # Its data was checked when it was sampled, or the check was overruled.
     built: Model = model(forward, observe, noises, known=run.known, check_scale=False)
+    if run.error_runs:
+        error = restore_error(path, tree, folder / ERROR)
+        built = replace(built, error=error)
     data = built.check_data({n: np.asarray(tree["observed_data"][n]) for n in observe.parts})
     return run, Posterior(tree, built, data)
 

@@ -49,6 +49,14 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
     )
+    parser.add_argument(
+        "--error-runs",
+        type=int,
+        default=0,
+        metavar="N",
+        help="FEM runs (8 or more) from which the forward map's own error is learned, so that a "
+        "poor map widens the posterior instead of moving it",
+    )
     parser.add_argument("--sampler", choices=tuple(SAMPLERS), default="nuts")
     parser.add_argument(
         "--sampler-options",
@@ -140,6 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
         forward=arguments.forward,
         emulator=_emulator(arguments.emulator),
         forward_options=forward_options(arguments),
+        error_runs=arguments.error_runs,
         sampler=arguments.sampler,
         sampler_options=sampler_options(arguments.sampler_options),
         warmup=arguments.warmup,
