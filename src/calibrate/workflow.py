@@ -21,7 +21,7 @@ from calibrate.data import read_data, write_data
 from calibrate.kept import check_forward, check_run, restore_error
 from calibrate.learned_error import with_error
 from calibrate.load_states import known_thetas
-from calibrate.noise import Noise, noise_of, with_discrepancy
+from calibrate.noise import Noise, noise_of, scaled, with_discrepancy
 from calibrate.observations import (
     DISPLACEMENT,
     Observations,
@@ -40,6 +40,7 @@ from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
 from emulator.store import save_arrays, write_json
 from emulator.surrogates import registry
+from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.protocol import ForwardMap
 
@@ -201,10 +202,8 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
     """Observations and data of a run by name, read from a file or made by FEM."""
     if run.data != "synthetic":
         return read_data(scene, run.data)
-    values = {**run.known, **run.truth}
-    states = dict.fromkeys(state for _, state in map(split, values) if state)
-    observe = parse_observation(scene, run.observe, run.seed, tuple(states) or ("",))
-    thetas = known_thetas(scene, observe.states, values)
+    observe = observed(run, scene)
+    thetas = known_thetas(scene, observe.states, {**run.known, **run.truth})
     noises = run.synthetic_noise(observe)
     fields = [simulator_of(scene)(theta)[observe.nodes] for theta in thetas]
     exact = observe(jnp.stack(fields), thetas)
@@ -213,6 +212,50 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
         name: np.asarray(exact[name]) + noises[name].simulate(rng, part.shape)
         for name, part in observe.parts.items()
     }
+
+
+def observed(run: Run, scene: Scene) -> Observations:
+    """What a run observes, without making or reading its data if it is synthetic."""
+    if run.data != "synthetic":
+        return read_data(scene, run.data)[0]
+    states = dict.fromkeys(state for _, state in map(split, {**run.known, **run.truth}) if state)
+    return parse_observation(scene, run.observe, run.seed, tuple(states) or ("",))
+
+
+def build_model(run: Run, scene: Scene, observe: Observations, *, progress: bool = False) -> Model:
+    """The statistical model of a run, before its data."""
+    forward = build_forward(run, scene, progress=progress)
+    noises = run.noises(observe)
+    return model(forward, observe, noises, known=run.known, check_scale=run.check_scale)
+
+
+def model_before_data(run: Run, *, progress: bool = False) -> Model:
+    """The statistical model of a run that has no data yet."""
+    scene = find_scene(run.scene, run.root)
+    observe = observed(run, scene)
+    return build_model(run.named(observe), scene, observe, progress=progress)
+
+
+def truth_of(model: Model, *, by_fem: bool = False, noise: float = 1.0) -> Model:
+    """The model that makes data for ``model`` to be checked with.
+
+    Parameters
+    ----------
+    by_fem : with FEM as its forward map.
+    noise : times the model's sd.
+
+    Raises
+    ------
+    InputError
+        Noise other than Gaussian of known sd is to be changed.
+    """
+    truth = model
+    if by_fem:
+        whole = fem_forward(simulator_of(model.forward.scene), model.full)
+        truth = replace(truth, full=whole, forward=whole.at(model.observe.nodes), error=None)
+    if noise != 1.0:
+        truth = replace(truth, noise={n: scaled(each, noise) for n, each in truth.noise.items()})
+    return truth
 
 
 def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
@@ -225,14 +268,8 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
     options = options_from(sampler, run.sampler_options, **length)
     scene = find_scene(run.scene, run.root)
     observe, data = make_data(run, scene)
-    run, noises = run.named(observe), run.noises(observe)
-    built = model(
-        build_forward(run, scene, progress=progress),
-        observe,
-        noises,
-        known=run.known,
-        check_scale=run.check_scale,
-    )
+    run = run.named(observe)
+    built = build_model(run, scene, observe, progress=progress)
     kept: Mapping[str, Any] = data
     if run.error_runs:
         built, kept = built.given(data)

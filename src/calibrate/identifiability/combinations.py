@@ -115,12 +115,16 @@ def in_words(found: dict[str, Any], *, pairs: float = 0.7, best: int = 2) -> str
         if abs(found["correlation"][first][second]) >= pairs
     ]
     lines.append(f"only known together: {', '.join(together) or 'none'}")
-    for entry in found["combinations"][:best]:
-        lines.append(
-            f"known best: {_product(entry['exponents'])} to {100 * entry['known_to']:.2g} % "
-            f"(prior {100 * entry['prior']:.2g} %)"
-        )
-    return "\n".join(lines)
+    return "\n".join([*lines, *products_in_words(found["combinations"], best)])
+
+
+def products_in_words(combinations: list[dict[str, Any]], best: int) -> list[str]:
+    """The ``best`` combinations, a line each."""
+    return [
+        f"known best: {_product(entry['exponents'])} to {100 * entry['known_to']:.2g} % "
+        f"(prior {100 * entry['prior']:.2g} %)"
+        for entry in combinations[:best]
+    ]
 
 
 def _product(exponents: dict[str, float]) -> str:
