@@ -9,7 +9,7 @@ from calibrate.data import read_data, write_data
 from calibrate.noise import CorrelatedNoise
 from calibrate.observations import (
     MeasuredParameter,
-    length,
+    length_between,
     observations,
     observations_from_json,
     parse_observation,
@@ -36,12 +36,12 @@ def test_lengths_between_all_sorts_of_landmarks(ventricle):
         ("3", "14", x[:, 14] - x[:, 3]),
         (",".join(map(repr, inside.tolist())), "3", moved - x[:, 3]),
     ):
-        found = seen(length(ventricle, first, second), u)
+        found = seen(length_between(ventricle, first, second), u)
         np.testing.assert_allclose(found, np.linalg.norm(expected, axis=-1), rtol=1e-9)
 
 
 def test_rigid_motions_keep_a_length_and_stretches_stretch_it(ventricle):
-    observe = length(ventricle, "base", "apex_epicardium")
+    observe = length_between(ventricle, "base", "apex_epicardium")
     at_rest = float(seen(observe, np.zeros_like(ventricle.mesh.nodes)))
     turned = ventricle.mesh.nodes[:, [1, 2, 0]] + [1.0, 2.0, 3.0]
     assert float(seen(observe, turned - ventricle.mesh.nodes)) == pytest.approx(at_rest)

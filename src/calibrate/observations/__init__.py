@@ -5,7 +5,7 @@ are listed in :data:`KINDS`.
 """
 
 from calibrate.observations.landmarks import Landmarks, landmarks, spread_landmarks
-from calibrate.observations.length import Length, length
+from calibrate.observations.length import Length, length_between
 from calibrate.observations.nodes import NodalDisplacements, nodal_displacements, spread_nodes
 from calibrate.observations.parameter import MeasuredParameter
 from calibrate.observations.points import DISPLACEMENT
@@ -46,7 +46,7 @@ __all__ = [
     "Strain",
     "SurfacePoints",
     "landmarks",
-    "length",
+    "length_between",
     "nodal_displacements",
     "observation_from_json",
     "observations",

@@ -82,7 +82,7 @@ class Length(Scalar):
         return cls(word, nodes, weights, ends)
 
 
-def length(scene: Scene, first: str, second: str) -> Length:
+def length_between(scene: Scene, first: str, second: str) -> Length:
     """Observe the distance between two landmarks.
 
     Parameters
