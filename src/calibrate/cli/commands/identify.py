@@ -89,7 +89,8 @@ def run_after(arguments: argparse.Namespace) -> int:
             for name, c in gains.items()
         ]
         names = next(iter(gains.values())).sd
-        lines.append(table(("measure next", "bits", *(f"sd of {n} falls" for n in names)), rows))
+        lines.append("expected information gain, and by how much each sd would fall:")
+        lines.append(table(("measure next", "bits", *names), rows))
         found["next"] = {name: c._asdict() for name, c in gains.items()}
     emit(found, as_json=arguments.json, text="\n".join(lines))
     return DONE
