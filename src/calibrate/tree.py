@@ -14,7 +14,6 @@ import numpy as np
 import xarray as xr
 
 from calibrate import predictions
-from calibrate.noise.gaussian import NOISE_SD
 from calibrate.observations import Observations
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
@@ -103,13 +102,13 @@ def labels_of(
 
 
 def units_of(model: Model) -> dict[str, str]:
-    """Units by the names of parameters, observations and standard deviations of noise."""
+    """Units by the names of parameters, observations and unknown numbers of noise."""
     parameters = {p.name: p.unit for p in model.forward.scene.parameters}
     units = {name: parameters[split(name)[0]] for name in model.states.unknowns}
     for name, part in model.observe.parts.items():
         units[name] = part.unit
-        site = model.noise_sites[name].get(NOISE_SD)
-        units |= {} if site is None else {site: part.unit}
+        # The unknown numbers of every noise are standard deviations and the like.
+        units |= dict.fromkeys(model.noise_sites[name].values(), part.unit)
     return units
 
 

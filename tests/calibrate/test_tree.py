@@ -10,6 +10,7 @@ from numpyro import distributions as dist
 
 import calibrate as cal
 from calibrate import predictions
+from calibrate.noise import CorrelatedNoise
 from calibrate.samplers import SMCOptions
 from linear_support import linear_forward, linear_problem
 
@@ -134,3 +135,20 @@ def test_dependent_data_have_one_log_likelihood_a_draw():
     assert predictions._pointwise(site).shape == ()
     site = {"fn": dist.Normal(jnp.zeros(3), 1.0).to_event(1), "value": jnp.ones(3)}
     assert predictions._pointwise(site).shape == (3,)
+
+
+def test_correlated_noise_and_missing_values_have_their_groups(beam):
+    forward = linear_forward(beam)
+    observe = cal.nodal_displacements(beam, [3, 11, 20])
+    noise = CorrelatedNoise(length=20.0, sd=0.1, spatial_sd_scale=0.1)
+    model = cal.model(forward, observe, noise)
+    data = np.array(forward.at(observe.nodes)(jnp.array([72.0, 68.0])))
+    data[1, 2] = np.nan
+    options = cal.NUTSOptions(50, 60, chains=1, rounds=1)
+    tree = cal.sample(model, data, options=options).tree
+    assert tree["log_likelihood"]["displacement"].dims == ("chain", "draw")
+    assert tree["posterior"]["spatial_sd"].attrs["units"] == "mm"
+    for group in set(tree.children):
+        for name, values in tree[group].data_vars.items():
+            if group != "constant_data" and values.dtype.kind == "f":
+                assert np.isfinite(values.values).all(), (group, name)
