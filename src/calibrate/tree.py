@@ -18,6 +18,8 @@ from calibrate.observations import Observations
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
 
+_OF_DATA = ("log_likelihood", "posterior_predictive", "prior_predictive")
+
 
 def make_tree(
     model: Model,
@@ -34,15 +36,20 @@ def make_tree(
         ``posterior_predictive``, ``prior``, ``prior_predictive``).
     """
     constants, dims, coords = labels_of(model.observe)
+    # ArviZ wants a dimension of every observation: a single number gets one of length 1.
+    single = [name for name, values in data.items() if np.ndim(values) == 0]
+    dims |= {name: [f"{name}_number"] for name in single}
     groups: dict[str, Any] = {
         "posterior": dict(draws),
         "sample_stats": dict(statistics),
-        "observed_data": {name: np.asarray(values) for name, values in data.items()},
+        "observed_data": {name: np.atleast_1d(values) for name, values in data.items()},
         **({"constant_data": constants} if constants else {}),
     }
     rows = np.arange(0)
     if rng_key is not None:
         rows, more = _predictions(model, data, draws, rng_key)
+        for group in _OF_DATA:
+            more[group] |= {name: more[group][name][..., None] for name in single}
         groups.update(more)
     likelihood = groups.pop("log_likelihood", None)
     tree = arviz_base.from_dict(groups, dims=dims, coords=coords)
@@ -77,8 +84,9 @@ def _likelihood(
     coords: Mapping[str, Any],
 ) -> xr.Dataset:
     """Dependent data have one number a draw and not the data's dimensions."""
+    full = {name: np.atleast_1d(values).ndim + 2 for name, values in data.items()}
     pointwise: dict[Any, Any] = {
-        n: dims[n] for n in values if n in dims and values[n].ndim == data[n].ndim + 2
+        name: dims[name] for name in values if name in dims and values[name].ndim == full[name]
     }
     used = {name for names in pointwise.values() for name in names}
     return arviz_base.dict_to_dataset(

@@ -328,7 +328,10 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     if run.error_runs:
         error = restore_error(path, tree, folder / ERROR)
         built = replace(built, error=error)
-    data = built.check_data({n: np.asarray(tree["observed_data"][n]) for n in observe.parts})
+    kept = tree["observed_data"]
+    data = built.check_data(
+        {n: np.asarray(kept[n]).reshape(part.shape) for n, part in observe.parts.items()}
+    )
     return run, Posterior(tree, built, data)
 
 

@@ -152,3 +152,17 @@ def test_correlated_noise_and_missing_values_have_their_groups(beam):
         for name, values in tree[group].data_vars.items():
             if group != "constant_data" and values.dtype.kind == "f":
                 assert np.isfinite(values.values).all(), (group, name)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_single_number_is_plotted_too(ventricle):
+    mpl.use("Agg")
+    forward = linear_forward(ventricle, size=1.0)
+    noise = cal.GaussianNoise(sd=4.0)
+    model = cal.model(forward, cal.CavityVolume(ventricle), noise, check_scale=False)
+    options = cal.NUTSOptions(50, 60, chains=1, rounds=1)
+    tree = cal.sample(model, {"volume": 120.0}, options=options).tree
+    assert tree["observed_data"]["volume"].dims == ("volume_number",)
+    assert tree["log_likelihood"]["volume"].dims == ("chain", "draw", "volume_number")
+    az.plot_ppc_dist(tree)
+    assert np.isfinite(az.loo(tree).elpd)
