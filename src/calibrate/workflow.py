@@ -21,7 +21,7 @@ from calibrate.data import read_data, write_data
 from calibrate.kept import check_forward, check_run, restore_error
 from calibrate.learned_error import with_error
 from calibrate.load_states import known_thetas
-from calibrate.noise import Noise, noise_of, scaled, with_discrepancy
+from calibrate.noise import Noise, noise_of, with_discrepancy
 from calibrate.observations import (
     DISPLACEMENT,
     Observations,
@@ -236,26 +236,10 @@ def model_before_data(run: Run, *, progress: bool = False) -> Model:
     return build_model(run.named(observe), scene, observe, progress=progress)
 
 
-def truth_of(model: Model, *, by_fem: bool = False, noise: float = 1.0) -> Model:
-    """The model that makes data for ``model`` to be checked with.
-
-    Parameters
-    ----------
-    by_fem : with FEM as its forward map.
-    noise : times the model's sd.
-
-    Raises
-    ------
-    InputError
-        Noise other than Gaussian of known sd is to be changed.
-    """
-    truth = model
-    if by_fem:
-        whole = fem_forward(simulator_of(model.forward.scene), model.full)
-        truth = replace(truth, full=whole, forward=whole.at(model.observe.nodes), error=None)
-    if noise != 1.0:
-        truth = replace(truth, noise={n: scaled(each, noise) for n, each in truth.noise.items()})
-    return truth
+def by_fem(model: Model) -> Model:
+    """``model`` with FEM as its forward map, to make the data it is checked with."""
+    whole = fem_forward(simulator_of(model.forward.scene), model.full)
+    return replace(model, full=whole, forward=whole.at(model.observe.nodes), error=None)
 
 
 def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:

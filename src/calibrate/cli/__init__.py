@@ -1,6 +1,6 @@
 """The command line: ``calibrate <command>``.
 
-Exit codes: 0 done, 1 ran but failed its check, 2 bad input with one clear line.
+Exit codes: 0 done, 1 ran but its result may not be used, 2 bad input with one clear line.
 """
 
 from __future__ import annotations

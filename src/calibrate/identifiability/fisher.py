@@ -96,7 +96,8 @@ def sensitivities(
     names, known = model.states.unknowns, model.states.states
     for state in observe.states:
         if state not in known:
-            raise InputError(f"load state '{state}' is unknown; known: {', '.join(known)}")
+            given = f"load state '{state}' is unknown" if state else "no load state is named"
+            raise InputError(f"{given}; known: {', '.join(filter(None, known)) or 'none'}")
     rows = np.array([known.index(state) for state in observe.states])
     forward = model.full.at(observe.nodes)
 

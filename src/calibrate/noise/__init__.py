@@ -2,7 +2,7 @@
 
 from calibrate.noise.correlated import CorrelatedNoise
 from calibrate.noise.discrepancy import DiscrepancyNoise, with_discrepancy
-from calibrate.noise.gaussian import GaussianNoise, scaled
+from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise, Sites
 from calibrate.noise.registry import KINDS, noise_from_json, noise_of, parse_noise
 from calibrate.noise.student_t import StudentTNoise
@@ -18,6 +18,5 @@ __all__ = [
     "noise_from_json",
     "noise_of",
     "parse_noise",
-    "scaled",
     "with_discrepancy",
 ]

@@ -11,9 +11,8 @@ import numpy as np
 import numpyro.distributions as dist
 
 from calibrate.noise.description import describe, restore
-from calibrate.noise.protocol import Noise, Sites
+from calibrate.noise.protocol import Sites
 from calibrate.noise.scale import Scale
-from emulator.errors import InputError
 
 NOISE_SD = "noise_sd"
 
@@ -21,13 +20,6 @@ NOISE_SD = "noise_sd"
 def independent_sd(sd: float | None, sd_scale: float | None) -> Scale:
     """The standard deviation of independent Gaussian noise, ``noise_sd`` where it is unknown."""
     return Scale(NOISE_SD, ("sd", "sd_scale"), sd, sd_scale)
-
-
-def scaled(noise: Noise, factor: float) -> GaussianNoise:
-    """Gaussian noise of known sd with its sd times ``factor``; :class:`InputError` for others."""
-    if not isinstance(noise, GaussianNoise) or noise.sd is None:
-        raise InputError("noise: only Gaussian noise of known sd can be scaled")
-    return GaussianNoise(sd=factor * noise.sd)
 
 
 @dataclass(frozen=True)

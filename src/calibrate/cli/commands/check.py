@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress, table
 from calibrate.cli.model_words import add_model, model_of
+from calibrate.cli.noise_words import noise_words
 
 
 def register(commands: Any) -> None:
@@ -26,17 +28,16 @@ def register(commands: Any) -> None:
         kind.set_defaults(run=run)
     sbc.add_argument("--replicates", type=int, default=200, metavar="N", help="data sets")
     sbc.add_argument(
-        "--data-by",
-        choices=("map", "fem"),
-        default="map",
-        help="what makes the data: the forward map itself, or FEM, which tests the map too",
+        "--fem-data",
+        action="store_true",
+        help="data made by FEM instead of the forward map itself: tests the map too",
     )
     sbc.add_argument(
         "--true-noise",
-        type=float,
-        default=1.0,
-        metavar="FACTOR",
-        help="data with noise so many times the model's: the check must then fail",
+        nargs="+",
+        default=[],
+        metavar="[NAME=]SD",
+        help="noise of the data, as for --noise, where it is not the model's: the check must fail",
     )
     sbc.add_argument("--warmup", type=int, default=200)
     sbc.add_argument("--draws", type=int, default=250)
@@ -48,13 +49,17 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     from calibrate.figures.calibration import draw
     from calibrate.samplers import NUTSOptions
     from calibrate.sbc import sbc
-    from calibrate.workflow import Run, model_before_data, truth_of
+    from calibrate.workflow import Run, by_fem, model_before_data
     from emulator.store import check_folder, write_json
 
     folder, progress = check_folder(arguments.out), show_progress(arguments)
     run = Run(**model_of(arguments), seed=arguments.seed)
     model = model_before_data(run, progress=progress)
-    truth = truth_of(model, by_fem=arguments.data_by == "fem", noise=arguments.true_noise)
+    truth = model
+    if arguments.true_noise:
+        truth = model_before_data(replace(run, noise=noise_words(arguments.true_noise)))
+    if arguments.fem_data:
+        truth = by_fem(truth)
     options = NUTSOptions(arguments.warmup, arguments.draws, arguments.chains, rounds=1)
     found = sbc(
         model,

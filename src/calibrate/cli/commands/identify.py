@@ -79,9 +79,9 @@ def run_after(arguments: argparse.Namespace) -> int:
         found[f"profile {name}"] = [profile.low, profile.high]
     scene = posterior.model.forward.scene
     candidates = {}
-    for word in arguments.next:
-        for name, part in parse_observation(scene, word, run.seed).parts.items():
-            candidates[word if name not in candidates else name] = (part, part.default_noise)
+    for word in [each for words in arguments.next for each in words.split("+")]:
+        (part,) = parse_observation(scene, word, run.seed).parts.values()
+        candidates[word] = (part, part.default_noise)
     if candidates:
         gains = next_measurement(posterior, candidates)
         rows = [
