@@ -9,7 +9,7 @@ its posterior; :func:`certify` checks it against FEM.
 from numpyro import distributions as _distributions  # noqa: F401
 
 import emulator
-from calibrate.certificate import Certificate, certify
+from calibrate.certificate import Certificate, certify, reweight
 from calibrate.noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from calibrate.observations import (
     CavityVolume,
@@ -46,6 +46,7 @@ __all__ = [
     "log_normal",
     "model",
     "nodal_displacements",
+    "reweight",
     "sample",
     "segment_strains",
     "strains",

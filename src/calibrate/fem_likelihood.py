@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -29,12 +30,17 @@ class Likelihoods(NamedTuple):
         where the map has no answer.
     converged : whether FEM did, in every load state.
     smallest_J : smallest volume ratio det F in the body, by FEM; NaN where it did not converge.
+    means : FEM's data without noise, by the observation's name; empty where it did not converge.
+    stable : whether FEM's equilibrium is a minimum of the energy; ``None`` where that was not asked
+        for, FEM did not converge or the scene has no energy.
     """
 
     fem: float
     cheap: float
     converged: bool
     smallest_J: float
+    means: Mapping[str, jax.Array] = MappingProxyType({})
+    stable: bool | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +60,13 @@ class FEMLikelihood:
         if self.simulator.scene.fingerprint != self.model.forward.scene.fingerprint:
             raise InputError("the simulator's scene is not the posterior's")
 
-    def __call__(self, draw: Mapping[str, Any], data: Data) -> Likelihoods:
-        """Log likelihoods at ``draw``: a number for each of the model's ``names``."""
+    def __call__(
+        self, draw: Mapping[str, Any], data: Data, *, stability: bool = False
+    ) -> Likelihoods:
+        """Log likelihoods at ``draw``: a number for each of the model's ``names``.
+
+        ``stability`` asks for ``stable`` as well, at the cost of one more factorisation a state.
+        """
         thetas = self.model.states.thetas(draw)
         noise = self.model.noise_values(draw)
         cheap = float(self._cheap(dict(draw), data))
@@ -66,8 +77,17 @@ class FEMLikelihood:
             if not bool(solution.converged):
                 return Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
             solved.append(solution.displacement)
-        fem, smallest = self._fem(jnp.stack(solved), thetas, noise, data)
-        return Likelihoods(float(fem), cheap, converged=True, smallest_J=float(smallest))
+        fem, means, smallest = self._fem(jnp.stack(solved), thetas, noise, data)
+        stable = self._stable(solved, thetas) if stability else None
+        return Likelihoods(float(fem), cheap, True, float(smallest), means, stable)
+
+    def _stable(self, solved: list[jax.Array], thetas: jax.Array) -> bool | None:
+        """Whether every load state's equilibrium is a minimum of the energy, where there is one."""
+        if self.simulator.system.forces:
+            return None
+        return all(
+            self.simulator.is_stable(u, theta) for u, theta in zip(solved, thetas, strict=True)
+        )
 
     @cached_property
     def _start(self):  # noqa: ANN202 - a compiled program, private
@@ -83,6 +103,6 @@ class FEMLikelihood:
             observed = displacement[:, self.model.observe.nodes]
             value = self.model.log_likelihood(observed, thetas, noise, data)
             ratios = [volume_ratio(self.simulator.scene, u) for u in displacement]
-            return value, jnp.min(jnp.stack(ratios))
+            return value, self.model.observe(observed, thetas), jnp.min(jnp.stack(ratios))
 
         return jax.jit(fem)

@@ -11,12 +11,14 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.certificate import Certificate, certify
+from calibrate.certificate import Certificate, examine
+from calibrate.certificate.reweight import keeps, reweighted
 from calibrate.data import read_data, write_data
 from calibrate.kept import check_forward, check_run, restore_error
 from calibrate.learned_error import with_error
@@ -320,14 +322,22 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
 
 
 def certify_and_keep(
-    posterior: Posterior, folder: str | Path, *, draws: int | None = None, progress: bool = False
+    posterior: Posterior,
+    folder: str | Path,
+    *,
+    draws: int | None = None,
+    reweight_to: str | Path | None = None,
+    progress: bool = False,
 ) -> Certificate:
     """Check a posterior against FEM and write certificate.json.
+
+    With ``reweight_to``, the reweighted posterior is kept in that folder, ready to be certified in
+    its turn, where the verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
 
     Raises
     ------
     InputError
-        FEM has decided on the draws already: weighting them by FEM once more would be wrong.
+        FEM has decided on the draws already.
     """
     if find_sampler(posterior.tree.attrs["sampler"]).solves_fem:
         raise InputError(
@@ -335,9 +345,22 @@ def certify_and_keep(
             "needs no certificate"
         )
     simulator = simulator_of(posterior.model.forward.scene)
-    certificate = certify(posterior, simulator, draws=draws, progress=progress)
-    write_json(Path(folder) / CERTIFICATE, certificate.to_json())
-    return certificate
+    check = examine(posterior, simulator, draws=draws, progress=progress)
+    write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
+    if reweight_to is not None and keeps(check.certificate):
+        _keep_reweighted(reweighted(check), Path(folder), Path(reweight_to))
+    return check.certificate
+
+
+def _keep_reweighted(posterior: Posterior, source: Path, target: Path) -> None:
+    """``posterior`` beside copies of the run, data and map it is from."""
+    target.mkdir(parents=True, exist_ok=True)
+    for name in (CERTIFICATE, POSTERIOR, FORWARD, ERROR):
+        (target / name).unlink(missing_ok=True)
+    for name in (RUN, DATA, FORWARD, ERROR):
+        if (source / name).exists():
+            copyfile(source / name, target / name)
+    posterior.save(target / POSTERIOR)
 
 
 def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> dict[str, Any]:

@@ -13,20 +13,28 @@ def register(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser("certify", help="check a posterior against FEM")
     parser.add_argument("folder", metavar="DIR", help="written by calibrate infer")
-    parser.add_argument("--draws", type=int, help="FEM runs (default 200, or all draws)")
+    parser.add_argument("--draws", type=int, help="FEM runs (default 200)")
+    parser.add_argument(
+        "--reweight", metavar="DIR2", help="write FEM's posterior, reweighted from the check, there"
+    )
     add_json(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Check a kept posterior against FEM."""
+    """Check a kept posterior against FEM; a kept reweighted posterior is a success too."""
     from calibrate.workflow import certify_and_keep, read_posterior, report
 
     progress = show_progress(arguments)
     plan, posterior = read_posterior(arguments.folder)
     certificate = certify_and_keep(
-        posterior, arguments.folder, draws=arguments.draws, progress=progress
+        posterior,
+        arguments.folder,
+        draws=arguments.draws,
+        reweight_to=arguments.reweight,
+        progress=progress,
     )
     result = report(plan, posterior, certificate)
     emit(result, as_json=arguments.json, text=summary(result))
-    return DONE if certificate.verdict == "accepted" else FAILED
+    kept = arguments.reweight is not None and certificate.verdict == "reweight"
+    return DONE if kept or certificate.verdict == "accepted" else FAILED

@@ -1,0 +1,164 @@
+r"""A check against FEM with a fixed number of solves.
+
+1. **Train.** FEM at draws of the posterior, evenly spaced, and at draws of the prior. What the map
+   misses there is learned (:mod:`calibrate.certificate.correction`); a pool of cheap points follows
+   the corrected map's posterior wherever it leads (:mod:`calibrate.certificate.pool`), and a few
+   more runs go there.
+2. **Test.** The other half of the runs are fresh points :math:`z_j` of the pool, drawn with
+   probabilities :math:`a_j` that mix the corrected posterior, the map's and the whole pool
+   (defensive mixture; Hesterberg 1995). A moment under FEM is the corrected map's over the pool,
+   plus what FEM changes of it at these points (a control variate; Owen and Zhou 2000):
+
+   .. math:: \hat\theta_\text{FEM} = \hat\theta_\text{pool} +
+       \hat\theta\{\pi_\text{FEM} / (q a)\} - \hat\theta\{\pi_\text{corrected} / (q a)\}
+
+Given the first half, the second is independent draws from a known density: the errors are
+honest however good or bad the correction is, and small where it is good.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from calibrate.certificate.correction import Correction
+from calibrate.certificate.estimates import (
+    Tests,
+    figures_of,
+    physics_of,
+    sampling_of,
+    tail_of,
+)
+from calibrate.certificate.evidence import Evidence
+from calibrate.certificate.misfit import DRAWS, misfits
+from calibrate.certificate.pool import Pool, corrected_again, polish, search, tempered
+from calibrate.certificate.predictive import Predictive
+from calibrate.certificate.runs import Runs, Solver, correction_from, joined
+from calibrate.certificate.verdict import Certificate, judge
+from calibrate.fem_likelihood import FEMLikelihood
+from calibrate.posterior import Posterior
+from emulator.errors import InputError
+from emulator.fem import Simulator
+
+_FEM_RUNS = 200
+_FEWEST = 25
+# Shares of the runs that train the correction; the others test it.
+_AT_DRAWS, _AT_PRIOR, _ADAPTIVE = 0.25, 0.15, 0.1
+# Shares of the test points: from the corrected posterior, the map's, and the whole pool.
+_CORRECTED, _MAP, _POOL = 0.6, 0.2, 0.2
+_STABILITY = 20  # draws at which the tangent's sign is asked for
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """A certificate and what it was made from.
+
+    posterior : that was checked. pool : cheap points; ``pool.corrected`` are their weights under
+    the corrected map. tests : FEM runs that tested it.
+    """
+
+    certificate: Certificate
+    posterior: Posterior
+    predictive: Predictive
+    pool: Pool
+    tests: Tests
+
+
+def examine(
+    posterior: Posterior,
+    simulator: Simulator,
+    *,
+    draws: int | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Check:
+    """Check ``posterior`` with ``draws`` FEM runs, 200 by default.
+
+    Raises
+    ------
+    InputError
+        The simulator is for another scene, or too few runs are asked for.
+    """
+    count = _FEM_RUNS if draws is None else draws
+    if count < _FEWEST:
+        raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
+    predictive = Predictive(posterior.model, posterior.data)
+    likelihood = FEMLikelihood(posterior.model, simulator)
+    rng = np.random.default_rng(seed)
+    z = predictive.unconstrain(posterior.draws())
+    with tqdm(total=count, desc="FEM check", disable=not progress, unit="run") as bar:
+        solver = Solver(predictive, likelihood, bar)
+        at_draws, training, correction, pool = _train(solver, z, count, rng)
+        tests = _test(solver, pool, count - len(training.z), rng)
+    chosen = pool.z[resampled(pool, DRAWS, rng)]
+    draws_changes, corrected_changes, mean, sd = figures_of(posterior, predictive, pool, tests)
+    evidence = Evidence(
+        draws_changes,
+        corrected_changes,
+        mean,
+        sd,
+        sampling_of(posterior),
+        physics_of(at_draws, training, tests, pool),
+        tail_of(pool, tests),
+        misfits(predictive, correction, chosen, _key(rng)),
+    )
+    return Check(judge(evidence), posterior, predictive, pool, tests)
+
+
+def certify(
+    posterior: Posterior,
+    simulator: Simulator,
+    *,
+    draws: int | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Certificate:
+    """The certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200)."""
+    check = examine(posterior, simulator, draws=draws, seed=seed, progress=progress)
+    return check.certificate
+
+
+def _train(
+    solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[Runs, Runs, Correction, Pool]:
+    """Runs at the posterior's draws, all training runs, the correction they say, and its pool."""
+    predictive = solver.predictive
+    rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
+    at_draws = solver(z[rows], stability=_STABILITY)
+    prior = predictive.prior_draws(_key(rng), max(round(_AT_PRIOR * count), 4))
+    runs = joined([at_draws, solver(prior)])
+    pool = search(predictive, correction_from(runs, predictive, count), z, rng)
+    extra = max(round(_ADAPTIVE * count), 2)
+    chances = tempered(pool.log_corrected, min(20.0 * extra, 0.5 * len(pool.z)))
+    if chances.any():
+        chosen = pool.z[rng.choice(len(pool.z), size=extra, p=chances)]
+        runs = joined([runs, solver(chosen)])
+    correction = correction_from(runs, predictive, count)
+    pool = polish(corrected_again(pool, predictive, correction), predictive, correction, rng)
+    return at_draws, runs, correction, pool
+
+
+def _test(solver: Solver, pool: Pool, count: int, rng: np.random.Generator) -> Tests:
+    """FEM at fresh points of the pool, with the log density they were drawn from."""
+    even = np.full(len(pool.z), 1.0 / len(pool.z))
+    chances = _CORRECTED * pool.corrected + _MAP * pool.cheap + _POOL * even
+    chances = chances / chances.sum()
+    rows = rng.choice(len(chances), size=count, p=chances)
+    return Tests(solver(pool.z[rows]), rows, pool.log_mixture[rows] + np.log(chances[rows]))
+
+
+def resampled(pool: Pool, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Rows (count,) of the pool as draws of the corrected map's posterior, in random order.
+
+    Systematic resampling: each row comes as often as its weight says, up to one.
+    """
+    edges = np.cumsum(pool.corrected)
+    at = (np.arange(count) + rng.uniform()) / count * edges[-1]
+    return rng.permutation(np.minimum(np.searchsorted(edges, at), len(edges) - 1))
+
+
+def _key(rng: np.random.Generator) -> jax.Array:
+    return jax.random.key(int(rng.integers(2**31)))

@@ -1,0 +1,141 @@
+"""The figures of a certificate, estimated from the pool and the FEM runs that test it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from arviz_stats.base import array_stats
+
+from calibrate.certificate.evidence import Changes, Figure, Physics, Sampling, Tail
+from calibrate.certificate.moments import jackknife, moments
+from calibrate.certificate.pool import Pool, effective, normalised
+from calibrate.certificate.predictive import Predictive
+from calibrate.certificate.runs import Runs
+from calibrate.posterior import Posterior
+
+# Log weights closer together than this are equal to 0.1 %: their tail has no shape to fit.
+_EQUAL_WEIGHTS = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Tests:
+    """FEM at points of the pool: ``rows`` (n,), drawn from the log density ``log_drawn`` (n,)."""
+
+    runs: Runs
+    rows: np.ndarray
+    log_drawn: np.ndarray
+
+    def log_fem(self, pool: Pool) -> np.ndarray:
+        """Log weights (n,) of FEM's posterior."""
+        return pool.at.prior[self.rows] + self.runs.fem - self.log_drawn
+
+    def log_corrected(self, pool: Pool) -> np.ndarray:
+        """Log weights (n,) of the corrected map's posterior."""
+        return pool.at.prior[self.rows] + pool.at.corrected[self.rows] - self.log_drawn
+
+
+def figures_of(
+    posterior: Posterior, predictive: Predictive, pool: Pool, tests: Tests
+) -> tuple[Changes, Changes, dict[str, Figure], dict[str, Figure]]:
+    """What FEM changes of the draws and of the corrected posterior; its means and sds."""
+    names = posterior.model.names
+    drawn = posterior.draws()
+    draws = np.stack([drawn[name] for name in names], axis=1)
+    here = predictive.constrain(pool.z)
+    x = np.stack([here[name] for name in names], axis=1)
+    corrected = pool.corrected
+    by_fem, by_map = normalised(tests.log_fem(pool)), normalised(tests.log_corrected(pool))
+
+    def change(used: np.ndarray) -> np.ndarray:
+        at = x[tests.rows]
+        return moments(at, by_fem * used) - moments(at, by_map * used)
+
+    base, base_error = jackknife(lambda used: moments(x, corrected * used), len(x))
+    step, step_error = jackknife(change, len(tests.rows))
+    found, error = base + step, np.hypot(base_error, step_error)
+    plain = moments(draws, np.ones(len(draws)))
+    p = len(names)
+    mean = _named(names, found[:p], error[:p])
+    sd_found = np.exp(found[p : 2 * p])
+    sd = _named(names, sd_found, sd_found * error[p : 2 * p])
+    of_draws = _changes(names, found - plain, error, np.exp(plain[p : 2 * p]))
+    of_corrected = _changes(names, step, step_error, np.exp(base[p : 2 * p]))
+    return of_draws, of_corrected, mean, sd
+
+
+def _changes(names: tuple[str, ...], d: np.ndarray, e: np.ndarray, sd: np.ndarray) -> Changes:
+    """Changes ``d`` of moments and their errors, with means in ``sd`` (p,)."""
+    p = len(names)
+    pairs = tuple(f"{a} and {b}" for a, b in combinations(names, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return Changes(
+            _named(names, d[:p] / sd, e[:p] / sd),
+            _named(names, d[p : 2 * p], e[p : 2 * p]),
+            _named(pairs, d[2 * p :], e[2 * p :]),
+        )
+
+
+def _named(names: tuple[str, ...], values: np.ndarray, errors: np.ndarray) -> dict[str, Figure]:
+    return {n: Figure(float(v), float(e)) for n, v, e in zip(names, values, errors, strict=True)}
+
+
+def sampling_of(posterior: Posterior) -> Sampling:
+    """The draws as draws; NumPy's maximum is NaN if any value is, unlike Python's."""
+    rows = posterior.summary().values()
+    sizes = posterior.tree["posterior"].sizes
+    return Sampling(
+        float(np.max([row["r_hat"] for row in rows])),
+        float(np.min([row["ess_bulk"] for row in rows])),
+        float(np.min([row["ess_tail"] for row in rows])),
+        posterior.divergences,
+        int(sizes["chain"] * sizes["draw"]),
+        vary=all(np.ptp(values) > 0.0 for values in posterior.draws().values()),
+    )
+
+
+def physics_of(at_draws: Runs, training: Runs, tests: Tests, pool: Pool) -> Physics:
+    """How FEM fared: failures count by the posterior mass they stand for."""
+    fails = int((~training.converged).sum() + (~tests.runs.converged).sum())
+    share = normalised(tests.log_corrected(pool)) * len(tests.rows)
+    lost = float((~at_draws.converged).sum() + share[~tests.runs.converged].sum())
+    asked = [s for s in at_draws.stable if s is not None]
+    finite = at_draws.smallest_J[np.isfinite(at_draws.smallest_J)]
+    return Physics(
+        len(training.z) + len(tests.rows),
+        fails,
+        lost / (len(at_draws.z) + len(tests.rows)),
+        float(finite.min()) if finite.size else float("nan"),
+        sum(not s for s in asked),
+        len(asked),
+    )
+
+
+def tail_of(pool: Pool, tests: Tests) -> Tail:
+    """Tail of FEM's weights, and how irregularly FEM and the corrected map differ."""
+    log_fem, log_map = tests.log_fem(pool), tests.log_corrected(pool)
+    threshold = float(min(1.0 - 1.0 / np.log10(len(log_fem)), 0.7))  # Vehtari et al. 2024, Eq. 13
+    weights = normalised(log_fem)
+    both = np.isfinite(log_fem) & np.isfinite(log_map)
+    if not both.any():
+        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, effective(pool.corrected))
+    share = normalised(np.where(both, log_map, -np.inf))[both]
+    ratio = (log_fem - log_map)[both]
+    spread = float(np.sqrt(share @ (ratio - share @ ratio) ** 2))
+    return Tail(
+        _k_hat(log_fem[np.isfinite(log_fem)]),
+        threshold,
+        effective(weights),
+        float(weights.max() * len(weights)),
+        spread,
+        effective(pool.corrected),
+    )
+
+
+def _k_hat(log_weights: np.ndarray) -> float:
+    """Pareto shape of the weights' tail."""
+    if np.ptp(log_weights) < _EQUAL_WEIGHTS:
+        return 0.0
+    # ArviZ takes log likelihoods and negates them (docs/experiments.md, "A sign").
+    return float(array_stats.psislw(-(log_weights - log_weights.max()))[1])

@@ -1,0 +1,139 @@
+"""What a verdict rests on: figures, each with its Monte Carlo error, and their limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.certificate.misfit import Misfit
+
+# At a shift of 0.25 sd a 90 % interval still covers 88.9 %.
+LARGEST_SHIFT = 0.25
+LARGEST_LOG_SD = float(np.log(1.2))
+LARGEST_CORRELATION_CHANGE = 0.2
+# Weights of FEM runs of which none exceeds this multiple of their mean have no tail that matters:
+# proposals cover the prior, so that the ratios are bounded (docs/experiments.md, "When k-hat cries
+# wolf").
+NO_TAIL = 6.0
+_ERRORS = 2.0  # of Monte Carlo that a figure must keep from its limit
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number and its Monte Carlo error."""
+
+    value: float
+    error: float
+
+    def within(self, limit: float) -> bool | None:
+        """Whether its size is below ``limit``; ``None`` where its error leaves that open."""
+        if not np.isfinite([self.value, self.error]).all():
+            return None
+        if abs(self.value) + _ERRORS * self.error <= limit:
+            return True
+        return False if abs(self.value) - _ERRORS * self.error > limit else None
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What FEM changes of a posterior, by parameter.
+
+    shift : of the mean, in sd of the draws. log_sd : of the sd. correlation : of each pair.
+    """
+
+    shift: dict[str, Figure]
+    log_sd: dict[str, Figure]
+    correlation: dict[str, Figure]
+
+    def judged(self) -> list[tuple[str, Figure, float]]:
+        """Every figure in words, with its limit."""
+        return [
+            *((f"mean of {n} moves by {f.value:+.2f} sd", f, LARGEST_SHIFT)
+              for n, f in self.shift.items()),
+            *((f"sd of {n} changes by a factor of {np.exp(f.value):.2f}", f, LARGEST_LOG_SD)
+              for n, f in self.log_sd.items()),
+            *((f"correlation of {n} changes by {f.value:+.2f}", f, LARGEST_CORRELATION_CHANGE)
+              for n, f in self.correlation.items()),
+        ]  # fmt: skip
+
+    def within(self) -> bool | None:
+        """Whether all are within their limits; ``None`` where that is open."""
+        return _all(figure.within(limit) for _, figure, limit in self.judged())
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The draws as draws: largest R-hat, smallest ESS, divergent transitions, their number."""
+
+    r_hat: float
+    ess_bulk: float
+    ess_tail: float
+    divergences: int
+    transitions: int
+    vary: bool = True
+
+
+@dataclass(frozen=True)
+class Physics:
+    """FEM at the checked points.
+
+    runs, failed : solved, and not converged anywhere; failed_mass : of FEM's posterior.
+    smallest_J : smallest det F in the body at a draw. unstable : draws at saddles, of ``asked``.
+    """
+
+    runs: int
+    failed: int
+    failed_mass: float
+    smallest_J: float
+    unstable: int
+    asked: int
+
+
+@dataclass(frozen=True)
+class Tail:
+    """How far FEM can be trusted to weigh the corrected map.
+
+    k_hat, k_threshold : Pareto shape of the weights of FEM runs, and the largest one allowed.
+    ess : their effective number. largest : largest weight over the mean one.
+    spread : sd of the log ratio of FEM's likelihood over the corrected map's.
+    pool : effective points under the corrected map.
+    """
+
+    k_hat: float
+    k_threshold: float
+    ess: float
+    largest: float
+    spread: float
+    pool: float
+
+    @property
+    def heavy(self) -> bool:
+        """Whether errors cannot be trusted."""
+        return not (self.k_hat < self.k_threshold or self.largest < NO_TAIL)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All a verdict rests on.
+
+    draws, corrected : what FEM changes of the draws, and of the corrected map's posterior.
+    mean, sd : of each parameter, by FEM.
+    """
+
+    draws: Changes
+    corrected: Changes
+    mean: dict[str, Figure]
+    sd: dict[str, Figure]
+    sampling: Sampling
+    physics: Physics
+    tail: Tail
+    misfit: dict[str, Misfit]
+
+
+def _all(answers: Iterable[bool | None]) -> bool | None:
+    answers = list(answers)
+    if False in answers:
+        return False
+    return None if None in answers else True

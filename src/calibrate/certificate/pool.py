@@ -1,0 +1,189 @@
+r"""Many points, cheaply: draws of several proposals weighted as draws of their mixture.
+
+With :math:`n_c` points from proposal :math:`q_c`, every point is weighted by the mixture they all
+come from (the balance heuristic; Veach and Guibas 1995, Elvira et al. 2019),
+
+.. math:: w_i \propto \frac{\pi(z_i)}{q(z_i)}, \qquad q = \sum_c \frac{n_c}{M} q_c
+
+so that no weight is large where any proposal is at home. Proposals follow the draws of a posterior,
+look beyond them, and come from the prior. From the prior they also move to the posterior by
+themselves: each round puts kernels around points resampled with weights :math:`w^\beta`, with
+:math:`\beta` rising to 1 as fast as the weights' effective number allows (nonlinear population
+Monte Carlo; Koblents and Miguez 2015). So a mode is found that no draw ever visited.
+
+Everything here asks the map and its correction, not FEM.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import logsumexp
+
+from calibrate.certificate.correction import Correction
+from calibrate.certificate.predictive import Evaluated, Predictive
+from calibrate.certificate.proposals import Kernels, around
+
+NEAR, NEAR_WIDTHS, NEAR_FREEDOM = 1024, (0.15, 0.5), 5.0
+WIDE, WIDE_WIDTHS, WIDE_FREEDOM = 512, (2.0,), 3.0
+PRIOR = 1024
+STEP, STEP_WIDTHS, SEARCH_ROUNDS, POLISH_ROUNDS = 512, (0.15, 0.5), 8, 4
+_TEMPERED_ESS = 0.15  # of the points, for the next round's kernels
+ENOUGH = 1000.0  # effective points at which the pool is good
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Points (s, p) with their log densities.
+
+    proposals, counts : kernels and how many points each gave; the first ``priors`` points are the
+        prior's.
+    log_kernels : of each proposal at each point, (c, s).
+    at : log prior and likelihoods of the points, (s,) each.
+    """
+
+    z: np.ndarray
+    at: Evaluated
+    priors: int
+    proposals: tuple[Kernels, ...] = ()
+    counts: tuple[int, ...] = ()
+    log_kernels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def log_mixture(self) -> np.ndarray:
+        """Log density (s,) of the mixture all points come from."""
+        shares = np.log(np.array([self.priors, *self.counts]) / len(self.z))
+        components = np.vstack([self.at.prior, *self.log_kernels])
+        return logsumexp(components + shares[:, None], axis=0)
+
+    @property
+    def log_corrected(self) -> np.ndarray:
+        """Log weights (s,) of the posterior with the corrected map, up to a constant."""
+        return self.at.prior + self.at.corrected - self.log_mixture
+
+    @property
+    def log_cheap(self) -> np.ndarray:
+        """Log weights (s,) of the posterior with the map as it is, up to a constant."""
+        return self.at.prior + self.at.cheap - self.log_mixture
+
+    @property
+    def corrected(self) -> np.ndarray:
+        """Weights (s,) of sum 1 of the posterior with the corrected map."""
+        return normalised(self.log_corrected)
+
+    @property
+    def cheap(self) -> np.ndarray:
+        """Weights (s,) of sum 1 of the posterior with the map as it is."""
+        return normalised(self.log_cheap)
+
+
+def normalised(log_weights: np.ndarray) -> np.ndarray:
+    """Weights of sum 1; zeros where no log weight is finite."""
+    largest = np.max(log_weights)
+    if not np.isfinite(largest):
+        return np.zeros_like(log_weights)
+    weights = np.exp(log_weights - largest)
+    return weights / weights.sum()
+
+
+def effective(weights: np.ndarray) -> float:
+    """Effective number of points (Kish), 0 where all weights are."""
+    square = float(np.sum(weights**2))
+    return 1.0 / square if square > 0.0 else 0.0
+
+
+def _effective(log_weights: np.ndarray) -> float:
+    return effective(normalised(log_weights))
+
+
+def tempered(log_weights: np.ndarray, least: float) -> np.ndarray:
+    """Weights to the largest power up to 1 that leaves ``least`` effective points, of sum 1."""
+    alive = np.isfinite(log_weights)
+    if effective(normalised(log_weights)) >= least or alive.sum() <= least:
+        return normalised(log_weights)
+    log = log_weights[alive] - log_weights[alive].max()
+
+    def gap(power: float) -> float:
+        return effective(normalised(power * log)) - least
+
+    result = np.zeros_like(log_weights)
+    result[alive] = normalised(brentq(gap, 0.0, 1.0, xtol=1e-12) * log)
+    return result
+
+
+def search(
+    predictive: Predictive, correction: Correction, draws: np.ndarray, rng: np.random.Generator
+) -> Pool:
+    """A pool that knows the draws (s, p) of z, what is beyond them, and what the prior leads to."""
+    key = jax.random.key(int(rng.integers(2**31)))
+    z = predictive.prior_draws(key, PRIOR)
+    pool = Pool(z, predictive.evaluate(z, correction), PRIOR, (), (), np.zeros((0, PRIOR)))
+    for _ in range(SEARCH_ROUNDS):
+        if effective(pool.corrected) >= _TEMPERED_ESS * len(pool.z):
+            break
+        pool = _step(pool, predictive, correction, pool.log_corrected, rng)
+    near = around(draws, NEAR_WIDTHS, NEAR_FREEDOM, rng)
+    pool = extend(pool, predictive, correction, near, NEAR // len(near), rng)
+    wide = around(draws, WIDE_WIDTHS, WIDE_FREEDOM, rng)
+    pool = extend(pool, predictive, correction, wide, WIDE, rng)
+    return polish(pool, predictive, correction, rng)
+
+
+def polish(
+    pool: Pool, predictive: Predictive, correction: Correction, rng: np.random.Generator
+) -> Pool:
+    """More points until both posteriors, corrected and not, have :data:`ENOUGH` effective ones."""
+    for _ in range(POLISH_ROUNDS):
+        poorest = min((pool.log_corrected, pool.log_cheap), key=_effective)
+        if _effective(poorest) >= ENOUGH:
+            break
+        pool = _step(pool, predictive, correction, poorest, rng)
+    return pool
+
+
+def _step(
+    pool: Pool,
+    predictive: Predictive,
+    correction: Correction,
+    log_weights: np.ndarray,
+    rng: np.random.Generator,
+) -> Pool:
+    """``pool`` with kernels around points resampled with tempered weights."""
+    chances = tempered(log_weights, _TEMPERED_ESS * len(pool.z))
+    if not chances.any():
+        return pool
+    chosen = pool.z[rng.choice(len(pool.z), size=1024, p=chances)]
+    kernels = around(chosen, STEP_WIDTHS, NEAR_FREEDOM, rng)
+    return extend(pool, predictive, correction, kernels, STEP // len(kernels), rng)
+
+
+def extend(
+    pool: Pool,
+    predictive: Predictive,
+    correction: Correction,
+    proposals: list[Kernels],
+    count: int,
+    rng: np.random.Generator,
+) -> Pool:
+    """``pool`` with ``count`` points from each of ``proposals``."""
+    z = np.concatenate([q.sample(rng, count) for q in proposals])
+    new = predictive.evaluate(z, correction)
+    everything = np.concatenate([pool.z, z])
+    before = np.array([q.log_density(z) for q in pool.proposals]).reshape(-1, len(z))
+    log_kernels = np.vstack(
+        [
+            np.hstack([pool.log_kernels, before]),
+            *(q.log_density(everything)[None] for q in proposals),
+        ]
+    )
+    at = Evaluated(*(np.concatenate(both) for both in zip(pool.at, new, strict=True)))
+    counts = (*pool.counts, *[count] * len(proposals))
+    return Pool(everything, at, pool.priors, (*pool.proposals, *proposals), counts, log_kernels)
+
+
+def corrected_again(pool: Pool, predictive: Predictive, correction: Correction) -> Pool:
+    """``pool`` under another correction."""
+    return replace(pool, at=predictive.evaluate(pool.z, correction))

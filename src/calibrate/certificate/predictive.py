@@ -1,0 +1,223 @@
+r"""Densities of a posterior at any point of unconstrained coordinates, with and without correction.
+
+A certificate asks for the posterior where no draw is. In coordinates :math:`z` (NumPyro's, see
+:mod:`calibrate.samplers.density`) the log density is the sum of
+
+.. math:: \log p(z) + \log p(y \mid g(\theta(z)) + d(\theta(z)))
+
+the prior with its Jacobian and the likelihood of the forward map's data without noise, :math:`g`,
+plus a correction :math:`d` (:mod:`calibrate.certificate.correction`). The map alone has
+:math:`d = 0`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from numpyro import handlers
+from numpyro.infer.util import initialize_model, unconstrain_fn
+
+from calibrate.certificate.correction import Correction, correct
+from calibrate.state_names import split
+from calibrate.statistical_model import Data, Model
+
+_BLOCK = 256  # points evaluated by one call of a program, so that it is compiled for one shape
+_BATCH = 32  # of them side by side
+_FARTHEST = 40.0  # |z| at which a bounded parameter is its bound in double precision
+_WIDTH_DRAWS = 512  # of the prior, from which the scale of theta's features is taken
+
+
+class Evaluated(NamedTuple):
+    """Log densities at points (s, p): each (s,), ``-inf`` where there is none.
+
+    prior : of z, its Jacobian included.
+    cheap, corrected : likelihoods of the map, and of the map with its correction.
+    """
+
+    prior: np.ndarray
+    cheap: np.ndarray
+    corrected: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Predictive:
+    """Prior, likelihoods and predictions of a model given its data, at points z (s, p)."""
+
+    model: Model
+    data: Data
+
+    @cached_property
+    def _prior_program(self) -> Any:
+        """The model without its data: only what is inferred is left.
+
+        Sites are hidden by name: the Jacobians that NumPyro adds count as observed, too.
+        """
+        seeded = handlers.seed(self.model, jax.random.key(0))
+        sites = handlers.trace(seeded).get_trace(self.data)
+        hidden = [n for n, s in sites.items() if s["type"] == "sample" and s["is_observed"]]
+        return handlers.block(self.model, hide=hidden)
+
+    @cached_property
+    def _info(self) -> Any:
+        return initialize_model(
+            jax.random.key(0), self._prior_program, model_args=(self.data,), dynamic_args=True
+        )
+
+    @cached_property
+    def _unravel(self) -> Any:
+        return ravel_pytree(self._info.param_info.z)[1]
+
+    @property
+    def dimension(self) -> int:
+        """Number of unconstrained coordinates."""
+        return int(ravel_pytree(self._info.param_info.z)[0].size)
+
+    def constrain(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Draws by name, each (s,)."""
+        return {name: values for name, values in self._in_blocks(self._constrain_block, z).items()}
+
+    def unconstrain(self, draws: Mapping[str, np.ndarray]) -> np.ndarray:
+        """z (s, p) of draws by name; a draw on a bound of its parameter is moved inside."""
+        z = self._unconstrain({name: jnp.asarray(draws[name]) for name in self.model.names})
+        return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)
+
+    def prior_draws(self, rng_key: jax.Array, count: int) -> np.ndarray:
+        """Points (count, p) from the prior."""
+        return self.unconstrain(self._prior_draws(jax.random.split(rng_key, count)))
+
+    def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
+        """Log densities at points (s, p)."""
+        return self._in_blocks(lambda block: self._evaluate_block(block, correction), z)
+
+    def means(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The map's data without noise, flat (s, m), and whether it has an answer (s,)."""
+        return self._in_blocks(self._means_block, z)
+
+    def corrected_means(self, z: np.ndarray, correction: Correction) -> np.ndarray:
+        """The corrected map's data without noise, flat (s, m)."""
+        features, means = self.features(z), self.means(z)[0]
+        return means + np.asarray(jax.vmap(lambda x: correct(correction, x))(features))
+
+    def features(self, z: np.ndarray) -> np.ndarray:
+        """Unknowns of theta (s, q) on their parameters' scales, standardised by the prior."""
+        draws = self.constrain(z)
+        return np.asarray(self._features({n: jnp.asarray(v) for n, v in draws.items()}))
+
+    @cached_property
+    def scales(self) -> np.ndarray:
+        """Noise level of each of the flat data, (m,), in its unit."""
+        levels = {
+            name: np.full(part.shape, self.model.noise[name].upper_sd)
+            for name, part in self.model.observe.parts.items()
+        }
+        return np.asarray(ravel_pytree(levels)[0])
+
+    # ---- programs -----------------------------------------------------------------------------
+    @cached_property
+    def _scale_of_features(self) -> tuple[np.ndarray, np.ndarray]:
+        draws = self.model.prior_draws(jax.random.key(0), _WIDTH_DRAWS)
+        x = np.asarray(self._on_scales(draws))
+        return x.mean(axis=0), x.std(axis=0)
+
+    def _on_scales(self, draws: Mapping[str, jax.Array]) -> jax.Array:
+        """Unknowns of theta (..., q), as logarithms where their parameter's scale is ``log``."""
+        scales = {p.name: p.scale for p in self.model.forward.scene.parameters}
+        columns = [
+            jnp.log(draws[name]) if scales[split(name)[0]] == "log" else draws[name]
+            for name in self.model.states.unknowns
+        ]
+        return jnp.stack(columns, axis=-1)
+
+    def _features(self, draws: Mapping[str, jax.Array]) -> jax.Array:
+        centre, width = self._scale_of_features
+        return (self._on_scales(draws) - centre) / width
+
+    def _constrain(self, z: jax.Array) -> dict[str, jax.Array]:
+        return self._info.postprocess_fn(self.data)(self._unravel(z))
+
+    def _means(self, draws: Mapping[str, jax.Array]) -> tuple[dict[str, jax.Array], jax.Array]:
+        means, valid = self.model.predict(draws)
+        return {name: jnp.where(valid, mean, 0.0) for name, mean in means.items()}, valid
+
+    def log_likelihood(
+        self, means: Mapping[str, jax.Array], draws: Mapping[str, jax.Array]
+    ) -> jax.Array:
+        """Log density of the data given its means by name, shape ()."""
+        terms = [d.log_prob(self.data[n]) for n, d in self.distributions(means, draws).items()]
+        return sum(terms, jnp.zeros(()))
+
+    def distributions(
+        self, means: Mapping[str, jax.Array], draws: Mapping[str, jax.Array]
+    ) -> dict[str, Any]:
+        """Distribution of each observation's data, by name, at one draw."""
+        values = self.model.noise_values(draws)
+        return {
+            name: self.model.noise[name].distribution(mean, values[name])
+            for name, mean in means.items()
+        }
+
+    def _evaluate(self, z: jax.Array, correction: Correction) -> Evaluated:
+        draws = self._constrain(z)
+        means, valid = self._means(draws)
+        flat, unravel = ravel_pytree(means)
+        moved = unravel(flat + correct(correction, self._features(draws)))
+        cheap, corrected = self.log_likelihood(means, draws), self.log_likelihood(moved, draws)
+        prior = -self._info.potential_fn(self.data)(self._unravel(z))
+        return Evaluated(
+            *(
+                jnp.where(fine & jnp.isfinite(value), value, -jnp.inf)
+                for fine, value in ((True, prior), (valid, cheap), (valid, corrected))
+            )  # type: ignore[arg-type]
+        )
+
+    @cached_property
+    def _constrain_block(self) -> Any:
+        return jax.jit(jax.vmap(self._constrain))
+
+    @cached_property
+    def _evaluate_block(self) -> Any:
+        def block(z: jax.Array, correction: Correction) -> Evaluated:
+            return jax.lax.map(lambda x: self._evaluate(x, correction), z, batch_size=_BATCH)
+
+        return jax.jit(block)
+
+    @cached_property
+    def _means_block(self) -> Any:
+        def one(z: jax.Array) -> tuple[jax.Array, jax.Array]:
+            means, valid = self._means(self._constrain(z))
+            return ravel_pytree(means)[0], valid
+
+        return jax.jit(lambda z: jax.lax.map(one, z, batch_size=_BATCH))
+
+    @cached_property
+    def _unconstrain(self) -> Any:
+        def one(draw: Mapping[str, jax.Array]) -> jax.Array:
+            z = unconstrain_fn(self._prior_program, (self.data,), {}, dict(draw))
+            return ravel_pytree(z)[0]
+
+        return jax.jit(jax.vmap(one))
+
+    @cached_property
+    def _prior_draws(self) -> Any:
+        def one(rng_key: jax.Array) -> dict[str, jax.Array]:
+            program = handlers.seed(self._prior_program, rng_key)
+            trace = handlers.trace(program).get_trace(self.data)
+            return {name: trace[name]["value"] for name in self.model.names}
+
+        return jax.jit(jax.vmap(one))
+
+    def _in_blocks(self, program: Any, z: np.ndarray) -> Any:
+        """``program`` of points (s, p), in blocks of one shape; the last one is filled up."""
+        padded = np.concatenate([z, np.repeat(z[-1:], -len(z) % _BLOCK, axis=0)])
+        parts = [
+            jax.tree.map(np.asarray, program(jnp.asarray(padded[k : k + _BLOCK])))
+            for k in range(0, len(padded), _BLOCK)
+        ]
+        return jax.tree.map(lambda *arrays: np.concatenate(arrays)[: len(z)], *parts)

@@ -1,0 +1,97 @@
+r"""Where a certificate looks: Student-t kernels on draws, straightened, and the prior.
+
+A posterior may be a thin, bent sheet. Its draws are straightened by a transport map of unit
+Jacobian (:mod:`calibrate.samplers.transport`), so that one covariance :math:`\Sigma` describes
+them, and a proposal is a mixture of kernels around some of them,
+
+.. math:: q(\zeta) = \frac1K \sum_k t_\nu(\zeta; \zeta_k, h^2 \Sigma)
+
+whose density is known at every point. Small :math:`h` follows the draws, large :math:`h` looks
+beyond them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit, gammaln, logsumexp
+
+from calibrate.samplers import transport
+
+CENTRES = 256  # kernels of a proposal
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Student-t kernels around draws, in straightened coordinates.
+
+    centres : (k, p), straightened; root : lower triangle of the covariance's square root, (p, p).
+    width : h; freedom : degrees of freedom.
+    """
+
+    map_: transport.TransportMap
+    centres: np.ndarray
+    root: np.ndarray
+    width: float
+    freedom: float
+
+    def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Points (count, p) in z."""
+        chosen = self.centres[rng.integers(len(self.centres), size=count)]
+        normal = rng.normal(size=chosen.shape)
+        scale = np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(count, 1)))
+        return bend(self.map_, chosen + self.width * scale * (normal @ self.root.T))
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Log densities (s,) in z; the map has unit Jacobian."""
+        p, nu = z.shape[1], self.freedom
+        points, centres = (
+            np.linalg.solve(self.root, x.T).T / self.width
+            for x in (straighten(self.map_, z), self.centres)
+        )
+        square = (points**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1)
+        square = np.maximum(square - 2.0 * points @ centres.T, 0.0)
+        norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * np.pi)
+        norm -= np.log(np.diag(self.root)).sum() + p * np.log(self.width)
+        tail = -0.5 * (nu + p) * np.log1p(square / nu)
+        return norm + logsumexp(tail, axis=1) - np.log(len(centres))
+
+
+def around(
+    draws: np.ndarray, widths: tuple[float, ...], freedom: float, rng: np.random.Generator
+) -> list[Kernels]:
+    """Kernels on some of the draws (s, p) of z, one proposal for each width."""
+    map_ = transport.fit(draws)
+    straight = straighten(map_, draws)
+    covariance = np.atleast_2d(np.cov(straight, rowvar=False))
+    # A coordinate that does not vary still gets a width, so that the density exists.
+    root = np.linalg.cholesky(covariance + np.diag(1e-9 * np.diag(covariance) + 1e-12))
+    rows = rng.choice(len(draws), size=min(CENTRES, len(draws)), replace=False)
+    return [Kernels(map_, straight[rows], root, width, freedom) for width in widths]
+
+
+def straighten(map_: transport.TransportMap, z: np.ndarray) -> np.ndarray:
+    """``zeta`` (s, p) from ``z`` (s, p): the inverse of :func:`calibrate.samplers.transport.apply`.
+
+    The map is triangular: each coordinate's shift depends on coordinates of ``z`` alone.
+    """
+    order, coefficients = np.asarray(map_.order), np.asarray(map_.coefficients)
+    squashed = expit(z[:, order])
+    zeta = np.array(z)
+    for k in range(1, z.shape[1]):
+        terms = np.asarray(transport.monomials(squashed, k))
+        zeta[:, order[k]] -= terms @ coefficients[k, : terms.shape[1]]
+    return zeta
+
+
+def bend(map_: transport.TransportMap, zeta: np.ndarray) -> np.ndarray:
+    """``z`` (s, p) from ``zeta`` (s, p)."""
+    order, coefficients = np.asarray(map_.order), np.asarray(map_.coefficients)
+    z = np.array(zeta)
+    squashed = expit(z[:, order])
+    for k in range(1, z.shape[1]):
+        terms = np.asarray(transport.monomials(squashed, k))
+        z[:, order[k]] += terms @ coefficients[k, : terms.shape[1]]
+        squashed[:, k] = expit(z[:, order[k]])
+    return z

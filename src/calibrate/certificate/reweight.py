@@ -1,0 +1,80 @@
+"""FEM's posterior as draws, from the points of a check."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import arviz_base
+import numpy as np
+
+from calibrate.certificate.check import Check, examine, resampled
+from calibrate.certificate.pool import effective
+from calibrate.certificate.verdict import Certificate
+from calibrate.posterior import Posterior
+from emulator.errors import InputError
+from emulator.fem import Simulator
+
+_CHAINS = 4
+
+
+def reweight(
+    posterior: Posterior,
+    simulator: Simulator,
+    *,
+    draws: int | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Posterior:
+    """FEM's posterior in place of ``posterior``, checked with ``draws`` FEM runs.
+
+    Raises
+    ------
+    InputError
+        As :func:`calibrate.certify`; or the verdict is neither ``accepted`` nor ``reweight``, so
+        that nothing says the reweighted posterior is FEM's.
+    """
+    check = examine(posterior, simulator, draws=draws, seed=seed, progress=progress)
+    return reweighted(check, seed=seed)
+
+
+def keeps(certificate: Certificate) -> bool:
+    """Whether the reweighted posterior is FEM's, as far as the check can tell."""
+    return certificate.verdict in ("accepted", "reweight")
+
+
+def reweighted(check: Check, *, seed: int = 0) -> Posterior:
+    """The corrected map's posterior as 4 chains of independent draws.
+
+    Resampled from the pool, 1000 draws or as many as the pool has effective points, whichever is
+    less; equal ones occur. Their number and the verdict are in the attributes ``reweighted``.
+
+    Raises
+    ------
+    InputError
+        The verdict is neither ``accepted`` nor ``reweight``.
+    """
+    verdict = check.certificate.verdict
+    if not keeps(check.certificate):
+        raise InputError(
+            f"reweight: the verdict is '{verdict}' ({check.certificate.reason}); a reweighted "
+            "posterior needs 'reweight' or 'accepted'"
+        )
+    points = effective(check.pool.corrected)
+    length = int(min(points, 1000.0) // _CHAINS)
+    rows = resampled(check.pool, _CHAINS * length, np.random.default_rng([seed, 1]))
+    drawn = check.predictive.constrain(check.pool.z[rows])
+    posterior = check.posterior
+    tree = posterior.tree.copy()
+    shape = (_CHAINS, length)
+    at = check.pool.at
+    groups: dict[str, Any] = {
+        "posterior": {name: drawn[name].reshape(shape) for name in posterior.model.names},
+        "sample_stats": {
+            "lp": (at.prior + at.corrected)[rows].reshape(shape),
+            "diverging": np.zeros(shape, dtype=bool),
+        },
+    }
+    tree.update(arviz_base.from_dict(groups).children)
+    tree.attrs["reweighted"] = json.dumps({"verdict": verdict, "effective_points": points})
+    return Posterior(tree, posterior.model, posterior.data)

@@ -1,0 +1,84 @@
+"""FEM at points of unconstrained coordinates, remembered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from tqdm import tqdm
+
+from calibrate.certificate.correction import Correction, fit, nothing
+from calibrate.certificate.predictive import Predictive
+from calibrate.fem_likelihood import FEMLikelihood, Likelihoods
+
+
+class Runs(NamedTuple):
+    """FEM at points z (s, p).
+
+    fem : log likelihoods (s,), ``-inf`` where FEM did not converge.
+    means : FEM's data without noise, flat (s, m); NaN where it did not converge.
+    smallest_J : (s,). stable : minimum of the energy, saddle, or ``None`` for not asked, (s,).
+    """
+
+    z: np.ndarray
+    fem: np.ndarray
+    means: np.ndarray
+    smallest_J: np.ndarray
+    stable: tuple[bool | None, ...]
+
+    @property
+    def converged(self) -> np.ndarray:
+        """Where FEM converged, (s,)."""
+        return np.isfinite(self.means).all(axis=1)
+
+
+def joined(parts: list[Runs]) -> Runs:
+    """Runs one after the other."""
+    arrays = [np.concatenate([np.asarray(p[k]) for p in parts]) for k in range(4)]
+    return Runs(*arrays, tuple(s for p in parts for s in p.stable))
+
+
+@dataclass
+class Solver:
+    """Solves FEM at points, each once; ``bar`` counts."""
+
+    predictive: Predictive
+    likelihood: FEMLikelihood
+    bar: tqdm
+
+    def __post_init__(self) -> None:
+        self._known: dict[bytes, Likelihoods] = {}
+
+    def __call__(self, z: np.ndarray, *, stability: int = 0) -> Runs:
+        """FEM at points (s, p); at the first ``stability`` of them, also whether it is stable."""
+        draws = self.predictive.constrain(z)
+        found = []
+        for s in range(len(z)):
+            draw = {name: values[s] for name, values in draws.items()}
+            found.append(self._solve(z[s].tobytes(), draw, stability=s < stability))
+        missing = np.full(len(self.predictive.scales), np.nan)
+        return Runs(
+            z,
+            np.array([f.fem if np.isfinite(f.fem) else -np.inf for f in found]),
+            np.array([ravel_pytree(f.means)[0] if f.converged else missing for f in found]),
+            np.array([f.smallest_J for f in found]),
+            tuple(f.stable for f in found),
+        )
+
+    def _solve(self, key: bytes, draw: dict[str, np.ndarray], *, stability: bool) -> Likelihoods:
+        if key not in self._known:
+            self._known[key] = self.likelihood(draw, self.predictive.data, stability=stability)
+        self.bar.update()
+        return self._known[key]
+
+
+def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction:
+    """The correction that FEM's ``runs`` say, with room for ``rows``."""
+    means, valid = predictive.means(runs.z)
+    x = predictive.features(runs.z)
+    fine = valid & runs.converged
+    if fine.sum() < x.shape[1] + 2:
+        return nothing(rows, x.shape[1], means.shape[1])
+    return fit(x[fine], (runs.means - means)[fine], predictive.scales, rows)

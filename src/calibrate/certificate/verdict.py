@@ -1,0 +1,180 @@
+"""The certificate and its verdict: every figure with its error, every finding with what to do.
+
+A figure counts as within its limit where its distance from it exceeds twice its Monte Carlo error,
+as beyond it likewise, and as undecided in between; so more FEM runs may decide what few leave open,
+but do not turn one verdict into the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from calibrate.certificate.evidence import Evidence, Figure, Physics, Sampling
+from calibrate.certificate.misfit import Misfit
+
+Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
+
+# Largest R-hat at which the chains count as draws of one posterior; samplers aim at 1.008.
+LARGEST_R_HAT = 1.05
+SMALLEST_ESS = 100.0
+LARGEST_DIVERGENT = 0.002
+LARGEST_FAILED = 0.02
+SMALLEST_P, SMALLEST_P_WORST = 0.005, 0.001
+# Spread of the log ratio of FEM's likelihood over the corrected map's, above which the two are too
+# different whatever the tail; at 1.5 a tenth of the FEM runs would count.
+LARGEST_SPREAD = 1.5
+SMALLEST_POOL = 200.0  # effective points under the corrected map
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Outcome of a check against FEM.
+
+    verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use the reweighted one),
+        ``undecided`` (give more FEM runs), or ``not certified``.
+    reason : the finding that decides, in words. findings : all of them, each with what to do.
+    evidence : the figures.
+    """
+
+    verdict: Verdict
+    reason: str
+    findings: tuple[str, ...]
+    evidence: Evidence
+
+    @property
+    def k_hat(self) -> float:
+        """Pareto shape of the weights of the FEM runs."""
+        return self.evidence.tail.k_hat
+
+    @property
+    def shift(self) -> dict[str, float]:
+        """Per parameter, mean under FEM less mean of the draws, in posterior sd."""
+        return {name: figure.value for name, figure in self.evidence.draws.shift.items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON: figures by name, each error beside its figure."""
+        e = self.evidence
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "findings": list(self.findings),
+            "k_hat": e.tail.k_hat,
+            "k_threshold": e.tail.k_threshold,
+            "ess": e.tail.ess,
+            "draws": e.physics.runs,
+            "failed": e.physics.failed,
+            **_columns("shift", e.draws.shift),
+            **_columns("log_sd_change", e.draws.log_sd),
+            **_columns("correlation_change", e.draws.correlation),
+            **_columns("mean_fem", e.mean),
+            **_columns("sd_fem", e.sd),
+            "misfit": {name: asdict(m) for name, m in e.misfit.items()},
+            "sampling": asdict(e.sampling),
+            "physics": asdict(e.physics),
+            "tail": asdict(e.tail),
+        }
+
+
+def judge(evidence: Evidence) -> Certificate:
+    """The verdict: the first of not certified, undecided, reweight and accepted with a reason.
+
+    Every comparison is written so that NaN fails it.
+    """
+    wrong = [*_sampling(evidence.sampling), *_physics(evidence.physics), *_misfit(evidence.misfit)]
+    verdict, words = _agreement(evidence)
+    if wrong:
+        verdict = "not certified"
+    findings = (*wrong, *words)
+    return Certificate(verdict, findings[0].split(":")[0], findings, evidence)
+
+
+def _agreement(evidence: Evidence) -> tuple[Verdict, list[str]]:
+    """Verdict and words on draws against FEM."""
+    tail, draws, corrected = evidence.tail, evidence.draws, evidence.corrected
+    if tail.ess == 0.0:
+        return "not certified", ["no FEM run supports the posterior: check map and FEM options"]
+    if tail.spread > LARGEST_SPREAD:
+        return "not certified", [
+            f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}: "
+            "train a better map, or put FEM into the likelihood"
+        ]
+    if tail.heavy or not tail.pool >= SMALLEST_POOL:
+        return "undecided", ["the weights' tail is too heavy to trust their errors: more FEM runs"]
+    agree = draws.within()
+    beyond = [words for words, f, limit in draws.judged() if f.within(limit) is False]
+    if agree:
+        worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
+        return "accepted", [f"no mean moves by more than {worst:.2f} posterior sd"]
+    if agree is None:
+        near = [words for words, f, limit in draws.judged() if f.within(limit) is None]
+        return "undecided", [f"{near[0]}, too close to the limit for its error: more FEM runs"]
+    repaired = corrected.within()
+    if repaired:
+        return "reweight", [f"{words}: use the reweighted posterior" for words in beyond]
+    verdict: Verdict = "undecided" if repaired is None else "not certified"
+    what = "more FEM runs" if repaired is None else "train a better map"
+    return verdict, [f"{words}, and reweighting does not repair it: {what}" for words in beyond]
+
+
+def _sampling(s: Sampling) -> list[str]:
+    found = []
+    if not s.vary:
+        found.append("the draws of a parameter do not vary: the sampler is stuck")
+    elif not np.isfinite(s.r_hat):
+        found.append("R-hat is not a number: draw more")
+    elif not s.r_hat <= LARGEST_R_HAT:
+        found.append(f"the chains disagree, R-hat {s.r_hat:.3f}: draw more, or find their modes")
+    if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
+        found.append(
+            f"{s.divergences} of {s.transitions} transitions diverged: the sampler cannot follow "
+            "the posterior everywhere; raise target_accept, or narrow a prior the data leaves open"
+        )
+    if s.vary and not min(s.ess_bulk, s.ess_tail) >= SMALLEST_ESS:
+        found.append(
+            f"too few effective draws, {s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the "
+            f"tails: draw until both reach {SMALLEST_ESS:.0f}"
+        )
+    return found
+
+
+def _physics(p: Physics) -> list[str]:
+    found = []
+    if not p.failed_mass <= LARGEST_FAILED:
+        found.append(
+            f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior: raise "
+            "NewtonOptions.load_steps, or narrow the prior to states that exist"
+        )
+    if p.unstable:
+        found.append(
+            f"FEM is at a saddle at {p.unstable} of {p.asked} draws: the body would leave that "
+            "state; follow the loading path with NewtonOptions.load_steps"
+        )
+    return found
+
+
+def _misfit(observations: dict[str, Misfit]) -> list[str]:
+    found = []
+    for name, m in observations.items():
+        if not (m.p >= SMALLEST_P and m.p_worst >= SMALLEST_P_WORST):
+            named = ", ".join(f"{k} by {d:.1f} sd" for k, d in list(m.outlying.items())[:4])
+            found.append(
+                f"{name} does not fit, posterior predictive p {min(m.p, m.p_worst):.3f}: check "
+                + (f"outlying data ({named}), " if named else "")
+                + "registration, units, law and noise sd"
+            )
+        elif not m.p <= 1.0 - SMALLEST_P:
+            found.append(
+                f"{name} fits closer than its noise allows, posterior predictive p {m.p:.3f}: "
+                "its noise sd is too large"
+            )
+    return found
+
+
+def _columns(name: str, figures: dict[str, Figure]) -> dict[str, dict[str, float]]:
+    return {
+        name: {k: f.value for k, f in figures.items()},
+        f"{name}_error": {k: f.error for k, f in figures.items()},
+    }
