@@ -8,6 +8,7 @@ import numpy as np
 import numpyro.distributions as dist
 
 import calibrate as cal
+from emulator.fem.solution import Solution, Status
 from emulator.surrogates.protocol import Prediction, all_nodes, fingerprint_of
 
 
@@ -81,3 +82,17 @@ def linear_problem(scene, forward=None):
     noise = 0.1 * np.random.default_rng(0).normal(size=(3, 3))
     exact = linear_forward(scene).at(observe.nodes)(jnp.array([72.0, 68.0]))
     return model, np.asarray(exact) + noise
+class LinearSimulator:
+    """Stands for FEM: a map that converges wherever it is valid."""
+
+    class system:
+        forces = ("no energy: nothing to ask about stability",)
+
+    def __init__(self, forward):
+        self.forward, self.scene, self.solves = forward, forward.scene, 0
+
+    def solve(self, theta, start=None):
+        self.solves += 1
+        u, valid = self.forward.evaluate(theta)
+        status = Status.CONVERGED if bool(valid) else Status.ITERATION_LIMIT
+        return Solution(u, jnp.array(status), *[jnp.array(0.0)] * 4)

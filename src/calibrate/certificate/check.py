@@ -1,12 +1,13 @@
 r"""A check against FEM with a fixed number of solves.
 
 1. **Train.** FEM at draws of the posterior, evenly spaced, and at draws of the prior. What the map
-   misses there is learned (:mod:`calibrate.certificate.correction`); a pool of cheap points follows
-   the corrected map's posterior wherever it leads (:mod:`calibrate.certificate.pool`), and a few
-   more runs go there.
-2. **Test.** The other half of the runs are fresh points :math:`z_j` of the pool, drawn with
-   probabilities :math:`a_j` that mix the corrected posterior, the map's and the whole pool
-   (defensive mixture; Hesterberg 1995). A moment under FEM is the corrected map's over the pool,
+   misses there is learned (:mod:`calibrate.certificate.correction`), and a pool of cheap points
+   follows the corrected map's posterior wherever it leads (:mod:`calibrate.certificate.pool`).
+   Further runs, in rounds, go where the correction is so uncertain that FEM may find the data
+   likely after all.
+2. **Test.** The other runs are fresh points :math:`z_j` of the pool, drawn with probabilities
+   :math:`a_j` that mix the corrected posterior, the map's, where FEM may find the data likely, and
+   the whole pool (defensive mixture; Hesterberg 1995). A moment under FEM is the corrected map's over the pool,
    plus what FEM changes of it at these points (a control variate; Owen and Zhou 2000):
 
    .. math:: \hat\theta_\text{FEM} = \hat\theta_\text{pool} +
@@ -22,6 +23,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from calibrate.certificate.correction import Correction
@@ -34,7 +36,17 @@ from calibrate.certificate.estimates import (
 )
 from calibrate.certificate.evidence import Evidence
 from calibrate.certificate.misfit import DRAWS, misfits
-from calibrate.certificate.pool import Pool, corrected_again, polish, search, tempered
+from calibrate.certificate.pool import (
+    MOST_TEMPERED,
+    Pool,
+    corrected_again,
+    effective,
+    normalised,
+    polish,
+    search,
+    step,
+    tempered,
+)
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, Solver, correction_from, joined
 from calibrate.certificate.verdict import Certificate, judge
@@ -46,9 +58,11 @@ from emulator.fem import Simulator
 _FEM_RUNS = 200
 _FEWEST = 25
 # Shares of the runs that train the correction; the others test it.
-_AT_DRAWS, _AT_PRIOR, _ADAPTIVE = 0.25, 0.15, 0.1
-# Shares of the test points: from the corrected posterior, the map's, and the whole pool.
-_CORRECTED, _MAP, _POOL = 0.6, 0.2, 0.2
+_AT_DRAWS, _AT_PRIOR, _ADAPTIVE = 0.2, 0.15, 0.2
+_ROUNDS = 5  # in which the adaptive ones are chosen
+# Shares of the test points: from the corrected posterior, the map's, where FEM may find the data
+# likely, and from the whole pool.
+_CORRECTED, _MAP, _EXPLORED, _POOL = 0.6, 0.15, 0.1, 0.15
 _STABILITY = 20  # draws at which the tangent's sign is asked for
 
 
@@ -89,7 +103,8 @@ def examine(
     likelihood = FEMLikelihood(posterior.model, simulator)
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
-    with tqdm(total=count, desc="FEM check", disable=not progress, unit="run") as bar:
+    # More threads than one for small matrices oversubscribe the cores: twice the time.
+    with threadpool_limits(1, user_api="blas"), tqdm(total=count, desc="FEM check", disable=not progress, unit="run") as bar:
         solver = Solver(predictive, likelihood, bar)
         at_draws, training, correction, pool = _train(solver, z, count, rng)
         tests = _test(solver, pool, count - len(training.z), rng)
@@ -130,21 +145,26 @@ def _train(
     at_draws = solver(z[rows], stability=_STABILITY)
     prior = predictive.prior_draws(_key(rng), max(round(_AT_PRIOR * count), 4))
     runs = joined([at_draws, solver(prior)])
-    pool = search(predictive, correction_from(runs, predictive, count), z, rng)
-    extra = max(round(_ADAPTIVE * count), 2)
-    chances = tempered(pool.log_corrected, min(20.0 * extra, 0.5 * len(pool.z)))
-    if chances.any():
-        chosen = pool.z[rng.choice(len(pool.z), size=extra, p=chances)]
-        runs = joined([runs, solver(chosen)])
     correction = correction_from(runs, predictive, count)
-    pool = polish(corrected_again(pool, predictive, correction), predictive, correction, rng)
-    return at_draws, runs, correction, pool
+    pool = search(predictive, correction, z, rng)
+    for _ in range(_ROUNDS):
+        chances = tempered(pool.log_explored, MOST_TEMPERED)
+        if chances.any():
+            size = max(round(_ADAPTIVE * count / _ROUNDS), 1)
+            chosen = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
+            runs = joined([runs, solver(chosen)])
+        correction = correction_from(runs, predictive, count)
+        pool = corrected_again(pool, predictive, correction)
+        if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
+            pool = step(pool, predictive, correction, pool.log_explored, rng)
+    return at_draws, runs, correction, polish(pool, predictive, correction, rng)
 
 
 def _test(solver: Solver, pool: Pool, count: int, rng: np.random.Generator) -> Tests:
     """FEM at fresh points of the pool, with the log density they were drawn from."""
     even = np.full(len(pool.z), 1.0 / len(pool.z))
     chances = _CORRECTED * pool.corrected + _MAP * pool.cheap + _POOL * even
+    chances += _EXPLORED * normalised(pool.log_explored)
     chances = chances / chances.sum()
     rows = rng.choice(len(chances), size=count, p=chances)
     return Tests(solver(pool.z[rows]), rows, pool.log_mixture[rows] + np.log(chances[rows]))

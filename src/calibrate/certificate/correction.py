@@ -7,9 +7,13 @@ FEM was solved at some theta; there the map misses the data's means by :math:`D`
 
 for all data at once, with theta standardised by its prior, :math:`x`, and a linear trend of wide
 prior :math:`v`. :math:`\ell` and :math:`\tau` are chosen by leave-one-out errors, which for a
-Gaussian process have a closed form (Rasmussen and Williams 2006, Eq. 5.12). Being wrong costs
-precision, not honesty: FEM at fresh points weighs what the correction says
-(:mod:`calibrate.certificate.check`).
+Gaussian process have a closed form (Rasmussen and Williams 2006, Eq. 5.10-5.12). Their size also
+sets the scale :math:`a^2` of the process's variance, in squared noise sd,
+
+.. math:: v(x) = a^2 (k(x, x) + \tau^2 - k(x, X) (k(X, X) + \tau^2 I)^{-1} k(X, x))
+
+Being wrong costs precision, not honesty: :math:`v` only says where to look, and FEM at fresh points
+weighs what the correction says (:mod:`calibrate.certificate.check`).
 """
 
 from __future__ import annotations
@@ -33,28 +37,32 @@ class Correction(NamedTuple):
     """A fitted process; zeros correct nothing.
 
     at : theta's features (n, q) where FEM was solved; rows may be padding.
-    weights : of the kernel, (n, m); trend : offset and slopes, (q + 1, m); length : of the kernel.
+    weights : of the kernel, (n, m), zero in rows of padding. inverse : of the kernel matrix, (n, n).
+    length, nugget, scale : of the kernel, :math:`\\ell`, :math:`\\tau^2` and :math:`a^2`.
     """
 
     at: np.ndarray
     weights: np.ndarray
-    trend: np.ndarray
+    inverse: np.ndarray
     length: float
+    nugget: float
+    scale: float
 
 
 def nothing(rows: int, features: int, data: int) -> Correction:
     """The correction that is zero, with room for ``rows`` points."""
-    return Correction(
-        np.zeros((rows, features)), np.zeros((rows, data)), np.zeros((features + 1, data)), 1.0
-    )
+    zeros = (np.zeros((rows, width)) for width in (features, data, rows))
+    return Correction(*zeros, length=1.0, nugget=0.0, scale=0.0)
 
 
-def correct(correction: Correction, x: jax.Array) -> jax.Array:
-    """The correction (m,) at features ``x`` (q,)."""
-    distance = jnp.sum((correction.at - x) ** 2, axis=-1)
-    kernel = jnp.exp(-0.5 * distance / correction.length**2)
-    trend = correction.trend[0] + x @ correction.trend[1:]
-    return trend + kernel @ correction.weights
+def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The correction (m,) at features ``x`` (q,), and its variance () in squared noise sd."""
+    c = correction
+    distance = jnp.sum((c.at - x) ** 2, axis=-1)
+    kernel = _TREND * (1.0 + c.at @ x) + jnp.exp(-0.5 * distance / c.length**2)
+    here = _TREND * (1.0 + x @ x) + 1.0 + c.nugget
+    variance = c.scale * jnp.maximum(here - kernel @ c.inverse @ kernel, c.nugget)
+    return kernel @ c.weights, variance
 
 
 def fit(x: np.ndarray, errors: np.ndarray, scales: np.ndarray, rows: int) -> Correction:
@@ -65,19 +73,23 @@ def fit(x: np.ndarray, errors: np.ndarray, scales: np.ndarray, rows: int) -> Cor
     scales : noise level of each datum, (m,); leave-one-out errors are judged in it.
     rows : of the result, padded with zeros, so that programs are compiled once.
     """
-    best, solution, length = np.inf, np.zeros_like(errors), 1.0
+    best, result = np.inf, nothing(rows, x.shape[1], errors.shape[1])
+    result.at[: len(x)] = x
     linear = _TREND * (1.0 + x @ x.T)
     distances = ((x[:, None] - x) ** 2).sum(axis=-1)
     for trial, nugget in product(_LENGTHS, _NUGGETS):
         kernel = linear + np.exp(-0.5 * distances / trial**2) + nugget * np.eye(len(x))
         inverse = cho_solve(cho_factor(kernel), np.eye(len(x)))
         weights = inverse @ errors
-        left_out = weights / np.diag(inverse)[:, None] / scales
+        # Leave-one-out errors in noise sd, and their variances up to a^2.
+        square = np.mean((weights / np.diag(inverse)[:, None] / scales) ** 2, axis=1)
+        variance = 1.0 / np.diag(inverse)
         # Geometric mean over the points: the prior's corners must not outvote the posterior.
-        loss = np.log(np.mean(left_out**2, axis=1) + _NEGLIGIBLE**2).mean()
+        loss = np.log(square + _NEGLIGIBLE**2).mean()
         if loss < best:
-            best, solution, length = loss, weights, trial
-    result = nothing(rows, x.shape[1], errors.shape[1])
-    result.at[: len(x)], result.weights[: len(x)] = x, solution
-    trend = _TREND * np.vstack([solution.sum(axis=0), x.T @ solution])
-    return result._replace(trend=trend, length=length)
+            best = loss
+            result.weights[: len(x)], result.inverse[: len(x), : len(x)] = weights, inverse
+            result = result._replace(
+                length=trial, nugget=nugget, scale=float(np.mean(square / variance))
+            )
+    return result

@@ -17,6 +17,7 @@ from calibrate.posterior import Posterior
 
 # Log weights closer together than this are equal to 0.1 %: their tail has no shape to fit.
 _EQUAL_WEIGHTS = 1e-3
+_FEWEST = 25  # weights that have a tail of five
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +84,8 @@ def _named(names: tuple[str, ...], values: np.ndarray, errors: np.ndarray) -> di
 
 def sampling_of(posterior: Posterior) -> Sampling:
     """The draws as draws; NumPy's maximum is NaN if any value is, unlike Python's."""
-    rows = posterior.summary().values()
+    with np.errstate(divide="ignore", invalid="ignore"):  # of draws that do not vary
+        rows = posterior.summary().values()
     sizes = posterior.tree["posterior"].sizes
     return Sampling(
         float(np.max([row["r_hat"] for row in rows])),
@@ -134,7 +136,9 @@ def tail_of(pool: Pool, tests: Tests) -> Tail:
 
 
 def _k_hat(log_weights: np.ndarray) -> float:
-    """Pareto shape of the weights' tail."""
+    """Pareto shape of the weights' tail; NaN of too few to have one."""
+    if len(log_weights) < _FEWEST:
+        return float("nan")
     if np.ptp(log_weights) < _EQUAL_WEIGHTS:
         return 0.0
     # ArviZ takes log likelihoods and negates them (docs/experiments.md, "A sign").

@@ -27,12 +27,12 @@ from calibrate.certificate.correction import Correction
 from calibrate.certificate.predictive import Evaluated, Predictive
 from calibrate.certificate.proposals import Kernels, around
 
-NEAR, NEAR_WIDTHS, NEAR_FREEDOM = 1024, (0.15, 0.5), 5.0
+NEAR, NEAR_WIDTHS, NEAR_FREEDOM = 2048, (0.15, 0.5), 5.0
 WIDE, WIDE_WIDTHS, WIDE_FREEDOM = 512, (2.0,), 3.0
-PRIOR = 1024
-STEP, STEP_WIDTHS, SEARCH_ROUNDS, POLISH_ROUNDS = 512, (0.15, 0.5), 8, 4
-_TEMPERED_ESS = 0.15  # of the points, for the next round's kernels
-ENOUGH = 1000.0  # effective points at which the pool is good
+PRIOR = 512
+STEP, SEARCH_ROUNDS, POLISH_ROUNDS = 512, 8, 4
+_TEMPERED_ESS, MOST_TEMPERED = 0.15, 300.0  # of the points, for the next round's kernels
+ENOUGH = 800.0  # effective points at which the pool is good
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +63,17 @@ class Pool:
     def log_corrected(self) -> np.ndarray:
         """Log weights (s,) of the posterior with the corrected map, up to a constant."""
         return self.at.prior + self.at.corrected - self.log_mixture
+
+    @property
+    def log_explored(self) -> np.ndarray:
+        """Log weights (s,) of where FEM may yet find the data likely, up to a constant.
+
+        A corrected log likelihood below the best one counts :math:`1 / (1 + v)` of its gap, with
+        the correction's variance :math:`v`: for Gaussian noise, that of a noise with the
+        correction's error added.
+        """
+        gap = self.at.corrected - np.max(self.at.corrected, initial=-1e300)
+        return self.at.prior + gap / (1.0 + self.at.variance) - self.log_mixture
 
     @property
     def log_cheap(self) -> np.ndarray:
@@ -122,11 +133,11 @@ def search(
     z = predictive.prior_draws(key, PRIOR)
     pool = Pool(z, predictive.evaluate(z, correction), PRIOR, (), (), np.zeros((0, PRIOR)))
     for _ in range(SEARCH_ROUNDS):
-        if effective(pool.corrected) >= _TEMPERED_ESS * len(pool.z):
+        if _effective(pool.log_explored) >= _TEMPERED_ESS * len(pool.z):
             break
-        pool = _step(pool, predictive, correction, pool.log_corrected, rng)
+        pool = step(pool, predictive, correction, pool.log_explored, rng)
     near = around(draws, NEAR_WIDTHS, NEAR_FREEDOM, rng)
-    pool = extend(pool, predictive, correction, near, NEAR // len(near), rng)
+    pool = extend(pool, predictive, correction, near, NEAR, rng)
     wide = around(draws, WIDE_WIDTHS, WIDE_FREEDOM, rng)
     pool = extend(pool, predictive, correction, wide, WIDE, rng)
     return polish(pool, predictive, correction, rng)
@@ -140,48 +151,45 @@ def polish(
         poorest = min((pool.log_corrected, pool.log_cheap), key=_effective)
         if _effective(poorest) >= ENOUGH:
             break
-        pool = _step(pool, predictive, correction, poorest, rng)
+        pool = step(pool, predictive, correction, poorest, rng)
     return pool
 
 
-def _step(
+def step(
     pool: Pool,
     predictive: Predictive,
     correction: Correction,
     log_weights: np.ndarray,
     rng: np.random.Generator,
 ) -> Pool:
-    """``pool`` with kernels around points resampled with tempered weights."""
-    chances = tempered(log_weights, _TEMPERED_ESS * len(pool.z))
+    """``pool`` with :data:`STEP` more points from kernels around points resampled with tempered weights."""
+    chances = tempered(log_weights, min(_TEMPERED_ESS * len(pool.z), MOST_TEMPERED))
     if not chances.any():
         return pool
     chosen = pool.z[rng.choice(len(pool.z), size=1024, p=chances)]
-    kernels = around(chosen, STEP_WIDTHS, NEAR_FREEDOM, rng)
-    return extend(pool, predictive, correction, kernels, STEP // len(kernels), rng)
+    kernels = around(chosen, NEAR_WIDTHS, NEAR_FREEDOM, rng)
+    return extend(pool, predictive, correction, kernels, STEP, rng)
 
 
 def extend(
     pool: Pool,
     predictive: Predictive,
     correction: Correction,
-    proposals: list[Kernels],
+    proposal: Kernels,
     count: int,
     rng: np.random.Generator,
 ) -> Pool:
-    """``pool`` with ``count`` points from each of ``proposals``."""
-    z = np.concatenate([q.sample(rng, count) for q in proposals])
+    """``pool`` with ``count`` points from ``proposal``."""
+    z = proposal.sample(rng, count)
     new = predictive.evaluate(z, correction)
     everything = np.concatenate([pool.z, z])
-    before = np.array([q.log_density(z) for q in pool.proposals]).reshape(-1, len(z))
+    before = np.array([q.log_density(z) for q in pool.proposals]).reshape(-1, count)
     log_kernels = np.vstack(
-        [
-            np.hstack([pool.log_kernels, before]),
-            *(q.log_density(everything)[None] for q in proposals),
-        ]
+        [np.hstack([pool.log_kernels, before]), proposal.log_density(everything)[None]]
     )
     at = Evaluated(*(np.concatenate(both) for both in zip(pool.at, new, strict=True)))
-    counts = (*pool.counts, *[count] * len(proposals))
-    return Pool(everything, at, pool.priors, (*pool.proposals, *proposals), counts, log_kernels)
+    counts, proposals = (*pool.counts, count), (*pool.proposals, proposal)
+    return Pool(everything, at, pool.priors, proposals, counts, log_kernels)
 
 
 def corrected_again(pool: Pool, predictive: Predictive, correction: Correction) -> Pool:

@@ -39,11 +39,13 @@ class Evaluated(NamedTuple):
 
     prior : of z, its Jacobian included.
     cheap, corrected : likelihoods of the map, and of the map with its correction.
+    variance : of the correction, in squared noise sd.
     """
 
     prior: np.ndarray
     cheap: np.ndarray
     corrected: np.ndarray
+    variance: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +105,7 @@ class Predictive:
     def corrected_means(self, z: np.ndarray, correction: Correction) -> np.ndarray:
         """The corrected map's data without noise, flat (s, m)."""
         features, means = self.features(z), self.means(z)[0]
-        return means + np.asarray(jax.vmap(lambda x: correct(correction, x))(features))
+        return means + np.asarray(jax.vmap(lambda x: correct(correction, x)[0])(features))
 
     def features(self, z: np.ndarray) -> np.ndarray:
         """Unknowns of theta (s, q) on their parameters' scales, standardised by the prior."""
@@ -122,8 +124,9 @@ class Predictive:
     # ---- programs -----------------------------------------------------------------------------
     @cached_property
     def _scale_of_features(self) -> tuple[np.ndarray, np.ndarray]:
-        draws = self.model.prior_draws(jax.random.key(0), _WIDTH_DRAWS)
-        x = np.asarray(self._on_scales(draws))
+        with jax.ensure_compile_time_eval():
+            draws = self.model.prior_draws(jax.random.key(0), _WIDTH_DRAWS)
+            x = np.asarray(self._on_scales(draws))
         return x.mean(axis=0), x.std(axis=0)
 
     def _on_scales(self, draws: Mapping[str, jax.Array]) -> jax.Array:
@@ -167,15 +170,15 @@ class Predictive:
         draws = self._constrain(z)
         means, valid = self._means(draws)
         flat, unravel = ravel_pytree(means)
-        moved = unravel(flat + correct(correction, self._features(draws)))
+        step, variance = correct(correction, self._features(draws))
+        moved = unravel(flat + step)
         cheap, corrected = self.log_likelihood(means, draws), self.log_likelihood(moved, draws)
         prior = -self._info.potential_fn(self.data)(self._unravel(z))
-        return Evaluated(
-            *(
-                jnp.where(fine & jnp.isfinite(value), value, -jnp.inf)
-                for fine, value in ((True, prior), (valid, cheap), (valid, corrected))
-            )  # type: ignore[arg-type]
+        prior, cheap, corrected = (
+            jnp.where(fine & jnp.isfinite(value), value, -jnp.inf)
+            for fine, value in ((True, prior), (valid, cheap), (valid, corrected))
         )
+        return Evaluated(prior, cheap, corrected, variance)
 
     @cached_property
     def _constrain_block(self) -> Any:

@@ -15,60 +15,62 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, gammaln, logsumexp
+from scipy.special import expit, gammaln
 
 from calibrate.samplers import transport
 
-CENTRES = 256  # kernels of a proposal
+CENTRES = 192  # kernels of a proposal
+FITTED = 1024  # draws that the straightening is fitted to
 
 
 @dataclass(frozen=True)
 class Kernels:
-    """Student-t kernels around draws, in straightened coordinates.
+    """Student-t kernels around draws, in straightened coordinates, each in several widths.
 
     centres : (k, p), straightened; root : lower triangle of the covariance's square root, (p, p).
-    width : h; freedom : degrees of freedom.
+    widths : h, all equally often; freedom : degrees of freedom.
     """
 
     map_: transport.TransportMap
     centres: np.ndarray
     root: np.ndarray
-    width: float
+    widths: tuple[float, ...]
     freedom: float
 
     def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Points (count, p) in z."""
         chosen = self.centres[rng.integers(len(self.centres), size=count)]
-        normal = rng.normal(size=chosen.shape)
-        scale = np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(count, 1)))
-        return bend(self.map_, chosen + self.width * scale * (normal @ self.root.T))
+        width = rng.choice(self.widths, size=(count, 1))
+        scale = width * np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(count, 1)))
+        return bend(self.map_, chosen + scale * (rng.normal(size=chosen.shape) @ self.root.T))
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log densities (s,) in z; the map has unit Jacobian."""
         p, nu = z.shape[1], self.freedom
-        points, centres = (
-            np.linalg.solve(self.root, x.T).T / self.width
-            for x in (straighten(self.map_, z), self.centres)
-        )
+        whiten = np.linalg.inv(self.root).T
+        points, centres = straighten(self.map_, z) @ whiten, self.centres @ whiten
         square = (points**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1)
         square = np.maximum(square - 2.0 * points @ centres.T, 0.0)
         norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * np.pi)
-        norm -= np.log(np.diag(self.root)).sum() + p * np.log(self.width)
-        tail = -0.5 * (nu + p) * np.log1p(square / nu)
-        return norm + logsumexp(tail, axis=1) - np.log(len(centres))
+        norm -= np.log(np.diag(self.root)).sum() + np.log(len(centres) * len(self.widths))
+        # Sums of powers, not of exponentials of logarithms: Student's tails do not underflow.
+        tails = [
+            (1.0 + square / (nu * h**2)) ** (-0.5 * (nu + p)) / h**p for h in self.widths
+        ]  # fmt: skip
+        return norm + np.log(sum(t.sum(axis=1) for t in tails))
 
 
 def around(
     draws: np.ndarray, widths: tuple[float, ...], freedom: float, rng: np.random.Generator
-) -> list[Kernels]:
-    """Kernels on some of the draws (s, p) of z, one proposal for each width."""
-    map_ = transport.fit(draws)
+) -> Kernels:
+    """Kernels on some of the draws (s, p) of z."""
+    rows = rng.permutation(len(draws))
+    map_ = transport.fit(draws[rows[:FITTED]])
     straight = straighten(map_, draws)
     covariance = np.atleast_2d(np.cov(straight, rowvar=False))
     # A coordinate that does not vary still gets a width, so that the density exists.
     root = np.linalg.cholesky(covariance + np.diag(1e-9 * np.diag(covariance) + 1e-12))
-    rows = rng.choice(len(draws), size=min(CENTRES, len(draws)), replace=False)
-    return [Kernels(map_, straight[rows], root, width, freedom) for width in widths]
+    return Kernels(map_, straight[rows[:CENTRES]], root, widths, freedom)
 
 
 def straighten(map_: transport.TransportMap, z: np.ndarray) -> np.ndarray:

@@ -132,7 +132,7 @@ def _sampling(s: Sampling) -> list[str]:
             f"{s.divergences} of {s.transitions} transitions diverged: the sampler cannot follow "
             "the posterior everywhere; raise target_accept, or narrow a prior the data leaves open"
         )
-    if s.vary and not min(s.ess_bulk, s.ess_tail) >= SMALLEST_ESS:
+    if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= SMALLEST_ESS:
         found.append(
             f"too few effective draws, {s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the "
             f"tails: draw until both reach {SMALLEST_ESS:.0f}"

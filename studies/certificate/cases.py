@@ -1,0 +1,211 @@
+"""Wrong maps and wrong draws of every kind, each with the posterior it leads to."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from problems import Map, Problem, by_quadrature, moments_of, posterior_of, sample_grid
+
+import calibrate as cal
+
+DRAWS = 4000
+
+
+@dataclass(frozen=True)
+class Case:
+    """A posterior made wrong on purpose.
+
+    kind, size : of the error; ``good`` where the map is good to 0.02 noise sd and nothing else is
+    wrong. make : problem -> posterior, FEM's mean and sd.
+    """
+
+    problem: str
+    kind: str
+    size: float
+    seed: int
+    make: Callable[..., Any]
+    good: bool = False
+
+    @property
+    def name(self):
+        return f"{self.problem}, {self.kind} {self.size:g}, seed {self.seed}"
+
+
+def with_map(problem, error, seed, *, noise=1.0, draws=None):
+    """Independent draws of the posterior of FEM's map plus ``error``, and FEM's mean and sd.
+
+    ``error`` : theta -> displacements (n, 3) of all nodes; ``noise`` factor on its sd.
+    """
+    rng = np.random.default_rng([3, seed])
+    data = problem.data(seed)
+    exact = problem.forward
+
+    def function(theta, nodes):
+        return exact.function(theta, nodes) + error(theta)[nodes]
+
+    wrong = Map(problem.scene, function, exact.nodes)
+    used = noise * problem.noise
+    observe = cal.nodal_displacements(problem.scene, problem.nodes)
+    model = cal.model(wrong, observe, cal.GaussianNoise(sd=used))
+    if problem.steps:
+        points, predictions = problem.grid()
+        truth = moments_of(by_quadrature(problem, predictions, data, problem.noise), points)
+        weights = by_quadrature(problem, problem.on_grid(wrong, points), data, used)
+        if draws is not None:
+            weights = draws(points, weights)
+        chosen = sample_grid(problem, weights, DRAWS, rng)
+    else:
+        mean, covariance = gaussian(problem, exact, data, problem.noise)
+        truth = mean, np.sqrt(np.diag(covariance))
+        chosen = rng.multivariate_normal(*gaussian(problem, wrong, data, used), size=DRAWS)
+    return posterior_of(model, data, chosen), truth
+
+
+def gaussian(problem, forward, data, sd):
+    """Mean and covariance of a linear map's posterior under a flat prior, from its values."""
+    at, p = forward.at(problem.nodes), len(problem.truth)
+    base = np.asarray(at(jnp.zeros(p))).ravel()
+    columns = [np.asarray(at(jnp.eye(p)[k])).ravel() - base for k in range(p)]
+    A = np.stack(columns, axis=1)
+    covariance = sd**2 * np.linalg.inv(A.T @ A)
+    return covariance @ A.T @ (data.ravel() - base) / sd**2, covariance
+
+
+def pattern(problem: Problem, seed: int) -> np.ndarray:
+    """An error of size 1 at every node and component (n, 3): where mu or a drives it, or random."""
+    rng = np.random.default_rng([4, seed])
+    if seed % 2:
+        return rng.choice([-1.0, 1.0], size=(len(problem.scene.mesh.nodes), 3))
+    step = np.zeros(len(problem.truth))
+    step[seed // 2 % len(step)] = 1e-3
+    moved = problem.forward(jnp.asarray(problem.truth + step)) - problem.forward(
+        jnp.asarray(problem.truth)
+    )
+    return np.sign(np.asarray(moved))
+
+
+def principal(problem: Problem, seed: int):
+    """FEM's posterior mean, and the direction along which it is widest, in sd: theta -> ()."""
+    data = problem.data(seed)
+    if problem.steps:
+        points, predictions = problem.grid()
+        weights = by_quadrature(problem, predictions, data, problem.noise)
+        mean = weights @ points
+        covariance = ((points - mean) * weights[:, None]).T @ (points - mean)
+    else:
+        mean, covariance = gaussian(problem, problem.forward, data, problem.noise)
+    sd = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sd, sd))
+    along = vectors[:, -1] / sd / np.sqrt(values[-1])
+    return lambda theta: along @ (theta - mean)
+
+
+def constant(problem, size, seed):
+    error = size * problem.noise * pattern(problem, seed)
+    return with_map(problem, lambda theta: jnp.asarray(error), seed)
+
+
+def growing(problem, size, seed):
+    error, along = size * problem.noise * pattern(problem, seed), principal(problem, seed)
+    return with_map(problem, lambda theta: error * along(theta), seed)
+
+
+def rough(problem, size, seed):
+    """Waves in theta much shorter than the posterior is wide, of random phase at every node."""
+    rng = np.random.default_rng([5, seed])
+    shape = (len(problem.scene.mesh.nodes), 3)
+    phase = rng.uniform(0.0, 2.0 * np.pi, shape)
+    waves = 2.0 * np.pi / np.array([1.1, 0.9])
+    error = size * problem.noise * np.sqrt(2.0)
+    return with_map(problem, lambda theta: error * jnp.sin(waves @ theta + phase), seed)
+
+
+def hides(problem, size, seed):
+    """``size`` mm wrong above the posterior's mean of the first parameter."""
+    data = problem.data(seed)
+    points, predictions = problem.grid()
+    middle = by_quadrature(problem, predictions, data, problem.noise) @ points[:, 0]
+    step = size * pattern(problem, seed)
+    return with_map(problem, lambda theta: jnp.where(theta[0] > middle, step, 0.0), seed)
+
+
+def spoiled(problem, size, seed):
+    """Every sensitivity wrong by a random ``size`` of itself, as from spoiled weights."""
+    rng = np.random.default_rng([7, seed])
+    factor = jnp.asarray(size * rng.normal(size=(len(problem.scene.mesh.nodes), 3)))
+    nodes, truth = problem.forward.nodes, jnp.asarray(problem.scene.centre)
+
+    def error(theta):
+        return factor * (problem.forward.function(theta, nodes)
+                         - problem.forward.function(truth, nodes))  # fmt: skip
+
+    return with_map(problem, error, seed)
+
+
+def wrong_noise(problem, size, seed):
+    return with_map(problem, _nothing(problem), seed, noise=size)
+
+
+def stuck(problem, size, seed):
+    """All chains in one of two modes (``size`` 1), or one of four in the other (2)."""
+    posterior, truth = with_map(
+        problem, _nothing(problem), seed, draws=lambda x, w: _half(w, x[:, 0] > 75.0)
+    )
+    if size == 2:
+        draws = np.stack(list(posterior.draws().values()), axis=1)
+        draws[: DRAWS // 4, 0] = 150.0 - draws[: DRAWS // 4, 0]
+        posterior = posterior_of(posterior.model, posterior.data["displacement"], draws)
+    return posterior, truth
+
+
+def _half(weights, kept):
+    return np.where(kept, weights, 0.0) / weights[kept].sum()
+
+
+def few(problem, size, seed):
+    """``size`` draws in four chains; above 100 they are correlated by 0.98 from one to the next."""
+    posterior, truth = with_map(problem, _nothing(problem), seed)
+    draws = np.stack(list(posterior.draws().values()), axis=1)[: int(size)]
+    if size > 100:
+        draws = draws[np.minimum(np.arange(len(draws)) // 50 * 50, len(draws) - 1)]
+        rng = np.random.default_rng(seed)
+        draws = draws * (1.0 + 1e-6 * rng.normal(size=draws.shape))
+    return posterior_of(posterior.model, posterior.data["displacement"], draws), truth
+
+
+def _nothing(problem):
+    zero = jnp.zeros((len(problem.scene.mesh.nodes), 3))
+    return lambda theta: zero
+
+
+def cases(quick: bool = False) -> list[Case]:
+    """Every kind on every problem it makes sense on."""
+    found = []
+
+    def add(problems, make, sizes, seeds, *, good_below=-1.0, name=None):
+        for problem in problems:
+            for size in sizes:
+                for seed in seeds[:1] if quick else seeds:
+                    found.append(
+                        Case(problem, name or make.__name__, size, seed, make, size <= good_below)
+                    )
+
+    two = ("beam", "five")
+    good = 0.02
+    if quick:
+        add(("five",), constant, (0.0, 1.0), (0,), good_below=good)
+        add(("modes",), stuck, (1,), (0,))
+        return found
+    add(two, constant, (0.0,), tuple(range(8)), good_below=good)
+    add(two, constant, (0.02, 0.1, 0.3, 1.0), (0, 1, 2), good_below=good)
+    add(two, growing, (0.02, 0.05, 0.1, 0.3), (0, 1, 2), good_below=good)
+    add(("beam",), rough, (0.02, 0.1, 0.3, 1.0), (0, 1, 2), good_below=good)
+    add(two, spoiled, (1e-4, 1e-2, 1e-1), (0, 1), good_below=1e-4)
+    add(two, wrong_noise, (0.4, 0.6, 0.8, 1.25, 1.7, 2.5), (0, 1))
+    add(two, few, (40, 2000), (0, 1))
+    add(("beam", "modes"), hides, (1.0, 5.0), (0, 1, 2))
+    add(("modes",), stuck, (1, 2), (0, 1, 2))
+    add(("modes",), constant, (0.0, 0.02), (0, 1, 2), good_below=good)
+    return found

@@ -1,0 +1,143 @@
+"""Does a certificate say the truth? Posteriors made wrong in known ways, verdict against truth.
+
+    python studies/certificate/run.py
+    python studies/certificate/run.py --quick --out DIR    # three posteriors
+
+Writes results.json and certificate.png, and asserts what the README of the study says.
+"""
+
+import argparse
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import problems
+from cases import cases
+from problems import ExactSimulator
+
+from calibrate.certificate import certify
+from calibrate.figures.drawing import pyplot
+from calibrate.provenance import study_header
+from emulator.store import replacing, write_json
+
+HERE = Path(__file__).parent
+SEED = 0
+LARGEST_SHIFT, LARGEST_SD = 0.5, 0.25  # what no accepted posterior may exceed
+COLOURS = {
+    "accepted": "tab:green",
+    "reweight": "tab:blue",
+    "undecided": "tab:orange",
+    "not certified": "tab:red",
+}
+
+
+def row(case, problem, budget) -> dict[str, Any]:
+    """Verdict and truth of one case."""
+    begin = time.perf_counter()
+    posterior, (mean, sd) = case.make(problem, case.size, case.seed)
+    certificate = certify(posterior, ExactSimulator(problem.forward), draws=budget)
+    draws = np.stack(list(posterior.draws().values()), axis=1)
+    e = certificate.evidence
+    return {
+        "name": case.name,
+        "status": certificate.verdict,
+        "problem": case.problem,
+        "kind": case.kind,
+        "size": case.size,
+        "good": case.good,
+        "reason": certificate.reason,
+        "true_shift": float(np.max(np.abs(draws.mean(0) - mean) / sd)),
+        "true_sd": float(np.max(np.abs(draws.std(0, ddof=1) / sd - 1.0))),
+        # How far FEM's mean and sd by the certificate are from the truth, and by its own errors.
+        "found_mean": _largest((f.value - m) / s for f, m, s in zip(e.mean.values(), mean, sd)),
+        "found_sd": _largest(f.value / s - 1.0 for f, s in zip(e.sd.values(), sd)),
+        "z": [float((f.value - m) / f.error) for f, m in zip(e.mean.values(), mean)],
+        "spread": e.tail.spread,
+        "p": min(m.p for m in e.misfit.values()),
+        "k_hat": e.tail.k_hat,
+        "pool": e.tail.pool,
+        "seconds": time.perf_counter() - begin,
+    }
+
+
+def _largest(values) -> float:
+    return float(np.max(np.abs(list(values))))
+
+
+def is_wrong(case) -> bool:
+    return case["true_shift"] > LARGEST_SHIFT or case["true_sd"] > LARGEST_SD
+
+
+def conclude(rows) -> dict[str, Any]:
+    good = [r for r in rows if r["good"]]
+    repaired = [r for r in rows if r["status"] == "reweight"]
+    return {
+        "posteriors": len(rows),
+        "verdicts": dict(Counter(r["status"] for r in rows)),
+        "wrong": sum(map(is_wrong, rows)),
+        "wrong_and_accepted": [r["name"] for r in rows if is_wrong(r) and r["status"] == "accepted"],
+        "good": len(good),
+        "good_verdicts": dict(Counter(r["status"] for r in good)),
+        "reweighted_largest_error_of_a_mean": max((r["found_mean"] for r in repaired), default=0.0),
+        "reweighted_largest_error_of_an_sd": max((r["found_sd"] for r in repaired), default=0.0),
+    }
+
+
+def draw(rows, path: Path) -> None:
+    """True shift and true change of sd of every posterior, coloured by verdict."""
+    plt = pyplot()
+    figure, axes = plt.subplots(figsize=(7.5, 5.5), layout="constrained")
+    axes.axvspan(0, LARGEST_SHIFT, 0, 1, color="0.95")
+    for verdict, colour in COLOURS.items():
+        chosen = [r for r in rows if r["status"] == verdict]
+        x = [max(r["true_shift"], 3e-3) for r in chosen]
+        y = [max(r["true_sd"], 3e-3) for r in chosen]
+        axes.plot(x, y, "o", color=colour, label=f"{verdict} ({len(chosen)})", alpha=0.7)
+    axes.axvline(LARGEST_SHIFT, color="k", lw=0.8)
+    axes.axhline(LARGEST_SD, color="k", lw=0.8)
+    axes.set(xscale="log", yscale="log", xlabel="largest true shift of a mean / sd")
+    axes.set(ylabel="largest true change of an sd")
+    axes.legend()
+    axes.set_title("Verdicts: no green beyond the lines")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=130)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--only", help="kinds to run, comma-separated")
+    parser.add_argument("--draws", type=int, default=200, help="FEM runs a certificate")
+    parser.add_argument("--out", type=Path, default=HERE)
+    arguments = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    built: dict[str, Any] = {}
+    for case in cases(arguments.quick):
+        if arguments.only and case.kind not in arguments.only.split(","):
+            continue
+        if case.problem not in built:
+            built[case.problem] = getattr(problems, case.problem)()
+        rows.append(row(case, built[case.problem], arguments.draws))
+        r = rows[-1]
+        print(
+            f"{r['name']:38s} {r['status']:13s} true {r['true_shift']:6.2f} {r['true_sd']:6.2f} "
+            f"found {r['found_mean']:6.3f} {r['found_sd']:6.3f} spread {r['spread']:8.3f} "
+            f"pool {r['pool']:5.0f} p {r['p']:.3f} k {r['k_hat']:5.2f} {r['seconds']:4.1f} s "
+            f"{r['reason']}",
+            flush=True,
+        )
+    summary = conclude(rows)
+    print(summary)
+    header = study_header(HERE, SEED)
+    write_json(arguments.out / "results.json", {**header, "summary": summary, "cases": rows})
+    draw(rows, arguments.out / "certificate.png")
+    assert not summary["wrong_and_accepted"]
+    refused = summary["good_verdicts"].get("not certified", 0)
+    assert refused <= 0.05 * summary["good"]
+
+
+if __name__ == "__main__":
+    main()

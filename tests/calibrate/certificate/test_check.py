@@ -1,0 +1,214 @@
+"""Certificates of posteriors whose FEM posterior is known."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import calibrate as cal
+import emulator as em
+from calibrate.certificate import examine
+from calibrate.posterior import Posterior, read_tree
+from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
+from emulator.errors import InputError
+from linear_support import LinearSimulator, linear_forward
+
+
+@pytest.fixture(scope="module")
+def fem(beam):
+    """The map that stands for FEM."""
+    return linear_forward(beam, size=0.02)
+
+
+@pytest.fixture(scope="module")
+def data(beam, fem):
+    return exact_data(linear_model(beam, forward=fem))
+
+
+def certified(beam, fem, data, wrong, draws=200, **options):
+    posterior = exact_posterior(linear_model(beam, forward=wrong), data, **options)
+    return posterior, cal.certify(posterior, LinearSimulator(fem), draws=draws)
+
+
+def exact_moments(fem, data):
+    points, weights = grid_of(), quadrature(fem, data)
+    mean = weights @ points
+    return mean, np.sqrt(weights @ (points - mean) ** 2)
+
+
+def test_the_right_map_is_accepted_with_figures_of_the_quadrature(beam, fem, data):
+    _, certificate = certified(beam, fem, data, fem)
+    assert certificate.verdict == "accepted"
+    e = certificate.evidence
+    for k, (mean, sd) in enumerate(zip(*exact_moments(fem, data), strict=True)):
+        found, spread = list(e.mean.values())[k], list(e.sd.values())[k]
+        assert abs(found.value - mean) < 4 * found.error < 0.3 * sd
+        assert abs(spread.value - sd) < 4 * spread.error < 0.3 * sd
+    assert e.physics.failed == 0
+
+
+@pytest.mark.parametrize("bias", [0.1, 0.3])
+def test_a_biased_map_is_to_be_reweighted_to_the_quadrature(beam, fem, data, bias):
+    """By one and three noise sd at every node."""
+    wrong = replace(fem, shift=fem.shift + bias)
+    posterior, certificate = certified(beam, fem, data, wrong)
+    assert certificate.verdict == "reweight"
+    for k, (mean, sd) in enumerate(zip(*exact_moments(fem, data), strict=True)):
+        assert abs(list(certificate.evidence.mean.values())[k].value - mean) < 0.2 * sd
+    assert max(map(abs, certificate.shift.values())) > 0.5
+
+
+@pytest.mark.parametrize("draws", [50, 800])
+def test_few_runs_and_many_do_not_contradict_each_other(beam, fem, data, draws):
+    for bias, verdict in ((0.0, "accepted"), (0.1, "reweight")):
+        wrong = replace(fem, shift=fem.shift + bias)
+        assert certified(beam, fem, data, wrong, draws)[1].verdict in (verdict, "undecided")
+
+
+def test_draws_of_half_a_posterior_are_not_accepted(beam, fem, data):
+    """Chains that never left one half: no likelihood ratio at the draws could tell."""
+    mean, _ = exact_moments(fem, data)
+    posterior, certificate = certified(beam, fem, data, fem, keep=lambda x: x[:, 0] < mean[0])
+    assert certificate.verdict == "reweight"
+    assert certificate.evidence.draws.log_sd["mu"].value > 0.2
+
+
+class Step:
+    """``fem`` above ``edge`` in mu is 1 mm off."""
+
+    def __init__(self, fem, edge):
+        self.fem, self.edge, self.nodes = fem, edge, fem.nodes
+        self.scene, self.kind, self.label = fem.scene, "step", "step"
+        self.fingerprint = "step"
+
+    def at(self, nodes):
+        return Step(self.fem.at(nodes), self.edge)
+
+    def __call__(self, theta):
+        return self.fem(theta) + jnp.where(theta[0] > self.edge, 1.0, 0.0)
+
+    def evaluate(self, theta):
+        u, valid = self.fem.evaluate(theta)
+        return type(self.fem.evaluate(theta))(self(theta) if u is not None else u, valid)
+
+
+def test_a_map_that_hides_half_of_the_posterior_is_not_accepted(beam, fem, data):
+    """1 mm, ten noise sd, wrong above the posterior's mean: the other half looks perfect."""
+    mean, _ = exact_moments(fem, data)
+    half = exact_posterior(
+        linear_model(beam, forward=fem), data, keep=lambda x: x[:, 0] < mean[0]
+    )
+    posterior = replace(half, model=linear_model(beam, forward=Step(fem, mean[0])))
+    assert cal.certify(posterior, LinearSimulator(fem)).verdict != "accepted"
+
+
+def test_an_error_that_grows_along_the_ridge_is_not_accepted(beam, fem, data):
+    wrong = replace(fem, matrix=fem.matrix * 1.02)
+    posterior, certificate = certified(beam, fem, data, wrong)
+    mean, sd = exact_moments(fem, data)
+    drawn = np.stack(list(posterior.draws().values()), axis=1)
+    assert np.max(np.abs(drawn.mean(0) - mean) / sd) > 0.5
+    assert certificate.verdict == "reweight"
+
+
+def test_misfit_is_not_certified(beam, fem, data):
+    spoiled = data.copy()
+    spoiled[2, 0] += 1.5
+    _, certificate = certified(beam, fem, spoiled, fem)
+    assert certificate.verdict == "not certified"
+    assert "displacement[2, 0]" in certificate.findings[0]
+
+
+def test_bad_chains_are_not_certified(beam, fem, data):
+    posterior = exact_posterior(linear_model(beam, forward=fem), data)
+    apart = posterior.tree.copy()
+    mu = apart["posterior"]["mu"]
+    apart["posterior"]["mu"] = mu + 20.0 * (mu.chain == 0)
+    certificate = cal.certify(replace(posterior, tree=apart), LinearSimulator(fem))
+    assert certificate.verdict == "not certified"
+    assert "the chains disagree" in certificate.reason
+    stuck = posterior.tree.copy()
+    stuck["posterior"]["mu"] = 0.0 * mu + 72.0
+    certificate = cal.certify(replace(posterior, tree=stuck), LinearSimulator(fem))
+    assert (certificate.verdict, certificate.reason) == (
+        "not certified",
+        "the draws of a parameter do not vary",
+    )
+    short = replace(posterior, tree=posterior.tree.isel(draw=slice(12)))
+    assert cal.certify(short, LinearSimulator(fem)).verdict == "not certified"
+
+
+@pytest.mark.parametrize("name", ["mu", "lam"])
+def test_one_r_hat_that_is_not_a_number_is_enough(beam, fem, data, name, monkeypatch):
+    """Python's max would drop a NaN that does not come first."""
+    posterior = exact_posterior(linear_model(beam, forward=fem), data)
+    table = posterior.summary()
+    table[name]["r_hat"] = float("nan")
+    monkeypatch.setattr(Posterior, "summary", lambda _: table)
+    certificate = cal.certify(posterior, LinearSimulator(fem), draws=25)
+    assert certificate.verdict == "not certified"
+
+
+def test_failed_fem_runs_count(beam, fem, data):
+    """Nowhere, or where half of the posterior is."""
+    posterior = exact_posterior(linear_model(beam, forward=fem), data)
+    nowhere = cal.certify(posterior, LinearSimulator(replace(fem, limit=0.0)))
+    assert (nowhere.verdict, nowhere.evidence.physics.failed) == ("not certified", 200)
+    half = replace(fem, limit=exact_moments(fem, data)[0][0])
+    partly = cal.certify(posterior, LinearSimulator(half))
+    assert partly.verdict == "not certified"
+    assert 0.2 < partly.evidence.physics.failed_mass < 0.8
+    assert partly.to_json()["failed"] == partly.evidence.physics.failed
+
+
+def test_certify_solves_as_often_as_asked_and_repeats_itself(beam, fem, data):
+    posterior = exact_posterior(linear_model(beam, forward=fem), data)
+    simulator = LinearSimulator(fem)
+    first = examine(posterior, simulator, draws=60)
+    assert 50 <= simulator.solves <= 60  # a point drawn twice is solved once
+    assert first.certificate.to_json()["draws"] == 60
+    again = examine(posterior, LinearSimulator(fem), draws=60)
+    assert again.certificate == first.certificate
+
+
+def test_certify_with_an_inferred_noise(beam):
+    forward = linear_forward(beam)
+    model = cal.model(
+        forward, cal.nodal_displacements(beam, "all"), cal.GaussianNoise(sd_scale=1.0)
+    )
+    noise = 0.3 * np.random.default_rng(1).normal(size=(45, 3))
+    data = np.asarray(forward(jnp.array([72.0, 68.0]))) + noise
+    posterior = cal.sample(model, data, options=cal.NUTSOptions(200, 300))
+    certificate = cal.certify(posterior, LinearSimulator(forward))
+    assert certificate.verdict == "accepted"
+    assert set(certificate.shift) == {"mu", "lam", "noise_sd"}
+
+
+def test_certify_refuses_what_makes_no_sense(beam, cube, fem, data):
+    posterior = exact_posterior(linear_model(beam, forward=fem), data)
+    with pytest.raises(InputError, match="the simulator's scene is not the posterior's"):
+        cal.certify(posterior, em.Simulator(cube))
+    with pytest.raises(InputError, match="10 FEM runs asked for; give 25 or more"):
+        cal.certify(posterior, LinearSimulator(fem), draws=10)
+
+
+def test_a_posterior_survives_the_disk(beam, tmp_path):
+    forward = linear_forward(beam)
+    model = cal.model(
+        forward, cal.nodal_displacements(beam, [3, 11, 20]), cal.GaussianNoise(sd=0.1)
+    )
+    truth = np.asarray(forward.at(model.observe.nodes)(jnp.array([72.0, 68.0])))
+    posterior = cal.sample(model, truth, options=cal.NUTSOptions(50, 50, rounds=1))
+    posterior.save(tmp_path / "p.nc")
+    tree = read_tree(tmp_path / "p.nc")
+    assert set(tree.children) == {"posterior", "sample_stats", "observed_data", "constant_data"}
+    back = Posterior(tree, posterior.model, posterior.data)
+    for name, values in posterior.draws().items():
+        np.testing.assert_array_equal(back.draws()[name], values)
+    assert tree.attrs["scene_fingerprint"] == posterior.model.forward.scene.fingerprint
+    assert "numpyro" in tree.attrs["versions"]
+    assert tree.attrs["seed"] == 0
+    (tmp_path / "p.nc").write_bytes((tmp_path / "p.nc").read_bytes()[:5000])
+    with pytest.raises(InputError, match="truncated or not netCDF"):
+        read_tree(tmp_path / "p.nc")

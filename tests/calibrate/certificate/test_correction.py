@@ -1,0 +1,59 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.certificate.correction import correct, fit, nothing
+
+
+def points(count, seed=0):
+    return np.random.default_rng(seed).normal(size=(count, 2))
+
+
+def linear(x):
+    return np.stack([1.0 + x[:, 0] - 2.0 * x[:, 1], 3.0 * x[:, 0]], axis=1)
+
+
+def at(correction, x):
+    return np.asarray(jax.vmap(lambda one: correct(correction, one)[0])(jnp.asarray(x)))
+
+
+def test_nothing_corrects_nothing():
+    np.testing.assert_array_equal(at(nothing(5, 2, 3), points(4)), np.zeros((4, 3)))
+
+
+def test_a_linear_error_is_learned_everywhere():
+    x = points(20)
+    correction = fit(x, linear(x), np.ones(2), 30)
+    far = 3.0 * points(50, 1)
+    np.testing.assert_allclose(at(correction, far), linear(far), rtol=1e-3, atol=1e-3)
+    assert correction.at.shape == (30, 2)  # padded
+
+
+def test_a_smooth_error_is_learned_between_its_points():
+    x, new = points(60), 0.7 * points(50, 1)
+    bend = lambda x: np.sin(x[:, :1]) * np.array([[1.0, -2.0]])
+    found = at(fit(x, bend(x), np.ones(2), 60), new)
+    assert np.sqrt(np.mean((found - bend(new)) ** 2)) < 0.02
+
+
+def test_white_noise_is_not_learned():
+    """Leave-one-out errors choose a large nugget, so that the correction stays small."""
+    x, rng = points(60), np.random.default_rng(3)
+    found = at(fit(x, rng.normal(size=(60, 40)), np.ones(40), 60), points(50, 1))
+    assert np.sqrt(np.mean(found**2)) < 0.5
+
+
+def test_it_matches_a_gaussian_process_solved_otherwise():
+    """Prediction k K^-1 D with all of the kernel in one matrix, linear trend included."""
+    x, new = points(12), points(3, 1)
+    errors = np.sin(x @ np.ones((2, 1)))
+    correction = fit(x, errors, np.ones(1), 12)
+    kernel = lambda a, b: 1e2 * (1 + a @ b.T) + np.exp(
+        -0.5 * ((a[:, None] - b) ** 2).sum(-1) / correction.length**2
+    )
+    gaps = [
+        kernel(new, x) @ np.linalg.solve(kernel(x, x) + nugget * np.eye(12), errors)
+        - at(correction, new)
+        for nugget in (1e-6, 1e-4, 1e-2, 1.0, 1e2)
+    ]
+    assert min(np.abs(gap).max() for gap in gaps) < 1e-6

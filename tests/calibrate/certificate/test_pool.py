@@ -1,0 +1,80 @@
+import jax
+import numpy as np
+import pytest
+
+from calibrate.certificate.correction import nothing
+from calibrate.certificate.pool import effective, normalised, search, tempered
+from calibrate.certificate.predictive import Predictive
+from calibrate.samplers import density_of
+from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
+
+
+@pytest.fixture(scope="module")
+def case(beam):
+    model = linear_model(beam)
+    data = exact_data(model)
+    return exact_posterior(model, data), data
+
+
+@pytest.fixture(scope="module")
+def predictive(case):
+    return Predictive(case[0].model, case[0].data)
+
+
+def test_densities_are_the_samplers(case, predictive):
+    """Prior and likelihood, each by itself, add up to the density that NUTS sees."""
+    z = predictive.prior_draws(jax.random.key(0), 7)
+    at = predictive.evaluate(z, nothing(1, 2, 9))
+    density = density_of(case[0].model)
+    seen = [float(density.log_density(x, case[0].data)) for x in z]
+    np.testing.assert_allclose(at.prior + at.cheap, seen, rtol=1e-12)
+    np.testing.assert_array_equal(at.cheap, at.corrected)
+
+
+def test_coordinates_go_there_and_back(case, predictive):
+    draws = {name: values[:300] for name, values in case[0].draws().items()}
+    back = predictive.constrain(predictive.unconstrain(draws))
+    for name, values in draws.items():
+        np.testing.assert_allclose(back[name], values, rtol=1e-12)
+    bound = predictive.unconstrain({"mu": np.array([100.0]), "lam": np.array([50.0])})
+    assert np.isfinite(bound).all()
+
+
+def test_the_priors_draws_are_log_uniform(predictive):
+    mu = predictive.constrain(predictive.prior_draws(jax.random.key(1), 2000))["mu"]
+    below = np.log(70.0 / 50.0) / np.log(2.0)
+    assert abs(np.mean(mu < 70.0) - below) < 4 * np.sqrt(below * (1 - below) / 2000)
+
+
+def mean_and_sd(weights, values):
+    mean = weights @ values
+    return mean, np.sqrt(weights @ (values - mean) ** 2)
+
+
+def test_the_pool_is_the_posterior_wherever_the_draws_are(case, predictive):
+    """Even from draws of one end of it."""
+    posterior, data = case
+    exact = mean_and_sd(quadrature(posterior.model.full, data), grid_of()[:, 0])
+    for values in (posterior.draws(), {"mu": 52.0 + np.arange(50.0) / 50, "lam": 90 + np.zeros(50)}):
+        z = predictive.unconstrain(values)
+        pool = search(predictive, nothing(1, 2, 9), z, np.random.default_rng(0))
+        assert effective(pool.corrected) > 500.0
+        mean, sd = mean_and_sd(pool.corrected, predictive.constrain(pool.z)["mu"])
+        assert abs(mean - exact[0]) < 0.15 * exact[1]
+        assert sd == pytest.approx(exact[1], rel=0.1)
+
+
+def test_tempering_leaves_as_many_as_asked():
+    log = np.append(-np.arange(100.0) ** 2, -np.inf)
+    assert effective(normalised(log)) < 3.0
+    flat = tempered(log, 40.0)
+    assert effective(flat) == pytest.approx(40.0, rel=1e-3)
+    assert flat[-1] == 0.0
+    even = np.zeros(50)
+    np.testing.assert_allclose(tempered(even, 40.0), 0.02)
+
+
+def test_no_density_has_no_weights():
+    weights = normalised(np.full(4, -np.inf))
+    np.testing.assert_array_equal(weights, 0.0)
+    assert effective(weights) == 0.0

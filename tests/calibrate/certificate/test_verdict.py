@@ -1,0 +1,128 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrate.certificate.evidence import Changes, Evidence, Figure, Physics, Sampling, Tail
+from calibrate.certificate.misfit import Misfit
+from calibrate.certificate.verdict import judge
+
+
+def changes(shift=0.0, error=0.01, log_sd=0.0, correlation=0.0):
+    return Changes(
+        {"x": Figure(shift, error)},
+        {"x": Figure(log_sd, error)},
+        {"x and y": Figure(correlation, error)},
+    )
+
+
+RIGHT = Evidence(
+    draws=changes(),
+    corrected=changes(),
+    mean={"x": Figure(1.0, 0.01)},
+    sd={"x": Figure(1.0, 0.01)},
+    sampling=Sampling(1.001, 900.0, 800.0, 0, 4000),
+    physics=Physics(200, 0, 0.0, 0.9, 0, 20),
+    tail=Tail(0.1, 0.5, 90.0, 1.5, 0.1, 1000.0),
+    misfit={"displacement": Misfit(0.4, 0.5, {})},
+)
+
+
+def verdict(**entries):
+    certificate = judge(replace(RIGHT, **entries))
+    return certificate.verdict, " ".join(certificate.findings)
+
+
+def sampling(**entries):
+    return verdict(sampling=replace(RIGHT.sampling, **entries))
+
+
+def test_what_is_right_is_accepted():
+    assert judge(RIGHT).verdict == "accepted"
+    assert judge(RIGHT).reason == "no mean moves by more than 0.00 posterior sd"
+
+
+@pytest.mark.parametrize("name", ["shift", "log_sd", "correlation"])
+def test_each_figure_is_compared_with_its_limit(name):
+    assert verdict(draws=changes(**{name: 0.1}))[0] == "accepted"
+    assert verdict(draws=changes(**{name: -0.6}))[0] == "reweight"
+    beyond = {"draws": changes(**{name: 0.6}), "corrected": changes(**{name: 0.6})}
+    assert verdict(**beyond)[0] == "not certified"
+    assert verdict(draws=changes(**{name: float("nan")}))[0] == "undecided"
+
+
+@pytest.mark.parametrize("shift", [0.2, 0.3])
+def test_a_figure_close_to_its_limit_is_undecided(shift):
+    """A better estimate decides, one way or the other."""
+    assert verdict(draws=changes(shift, error=0.04))[0] == "undecided"
+    decided = "accepted" if shift < 0.25 else "reweight"
+    assert verdict(draws=changes(shift, error=0.01))[0] == decided
+    words = verdict(draws=changes(shift, error=0.04))[1]
+    assert "too close to the limit for its error: more FEM runs" in words
+
+
+def test_reweighting_must_be_known_to_repair():
+    beyond = changes(0.6)
+    assert verdict(draws=beyond, corrected=changes(0.2, error=0.04))[0] == "undecided"
+
+
+def test_a_heavy_tail_is_undecided_and_an_irregular_map_is_not_certified():
+    heavy = replace(RIGHT.tail, k_hat=0.8, largest=20.0)
+    assert verdict(tail=heavy)[0] == "undecided"
+    assert verdict(tail=replace(heavy, largest=2.0))[0] == "accepted"  # k-hat cries wolf
+    assert verdict(tail=replace(heavy, k_hat=np.nan))[0] == "undecided"
+    assert verdict(tail=replace(RIGHT.tail, pool=50.0))[0] == "undecided"
+    assert verdict(tail=replace(RIGHT.tail, spread=3.0))[0] == "not certified"
+    assert verdict(tail=replace(RIGHT.tail, spread=np.inf, ess=0.0))[0] == "not certified"
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        ({"r_hat": 1.2}, "the chains disagree, R-hat 1.200"),
+        ({"r_hat": np.nan}, "R-hat is not a number"),
+        ({"vary": False, "r_hat": np.nan}, "the draws of a parameter do not vary"),
+        ({"divergences": 40}, "40 of 4000 transitions diverged"),
+        ({"ess_bulk": 40.0}, "too few effective draws, 40 in the bulk"),
+        ({"ess_tail": np.nan}, "too few effective draws"),
+    ],
+)
+def test_bad_draws_are_not_certified(entries, words):
+    found, said = sampling(**entries)
+    assert found == "not certified"
+    assert words in said
+
+
+def test_a_few_divergences_are_forgiven():
+    assert sampling(divergences=8)[0] == "accepted"
+
+
+def test_misfit_is_not_certified_and_names_what_lies_out():
+    bad = Misfit(0.0, 0.0, {"displacement[3, 1]": 7.2})
+    found, said = verdict(misfit={"displacement": bad})
+    assert found == "not certified"
+    assert "displacement does not fit, posterior predictive p 0.000" in said
+    assert "displacement[3, 1] by 7.2 sd" in said
+    worst = Misfit(0.2, 0.0, {})
+    assert verdict(misfit={"displacement": worst})[0] == "not certified"
+    close = verdict(misfit={"volume": Misfit(1.0, 0.5, {})})
+    assert close[0] == "not certified"
+    assert "its noise sd is too large" in close[1]
+    assert verdict(misfit={"volume": Misfit(np.nan, 0.5, {})})[0] == "not certified"
+
+
+def test_unphysical_draws_are_not_certified():
+    failing = replace(RIGHT.physics, failed=20, failed_mass=0.1)
+    assert "FEM fails on 10 % of the posterior" in verdict(physics=failing)[1]
+    saddle = replace(RIGHT.physics, unstable=2)
+    found, said = verdict(physics=saddle)
+    assert found == "not certified"
+    assert "a saddle at 2 of 20 draws" in said
+
+
+def test_json_has_every_figure_with_its_error():
+    written = judge(RIGHT).to_json()
+    assert written["shift"] == {"x": 0.0}
+    assert written["shift_error"] == {"x": 0.01}
+    assert written["mean_fem"] == {"x": 1.0}
+    assert written["misfit"]["displacement"]["p"] == 0.4
