@@ -12,9 +12,9 @@ NODES = [3, 11, 20]
 TRUTH = np.array([72.0, 68.0])
 
 
-def linear_model(beam, sd=0.1, forward=None):
+def linear_model(beam, sd=0.1, forward=None, nodes=NODES):
     forward = linear_forward(beam, size=0.02) if forward is None else forward
-    return cal.model(forward, cal.nodal_displacements(beam, NODES), cal.GaussianNoise(sd=sd))
+    return cal.model(forward, cal.nodal_displacements(beam, nodes), cal.GaussianNoise(sd=sd))
 
 
 def exact_data(model, seed=0, sd=0.1):
@@ -29,10 +29,10 @@ def grid_of(steps=400):
     return np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
 
 
-def quadrature(forward, data, sd=0.1, points=None):
+def quadrature(forward, data, sd=0.1, points=None, nodes=NODES):
     """Weights (g,) of :func:`grid_of`'s points under a log-uniform prior."""
     points = grid_of() if points is None else points
-    at = forward.at(np.array(NODES))
+    at = forward.at(np.array(nodes))
     A, b = np.asarray(at.matrix).reshape(-1, 2), np.asarray(at.shift).ravel()
     log = -0.5 * ((points @ A.T + b - data.ravel()) ** 2).sum(1) / sd**2 - np.log(points).sum(1)
     weights = np.exp(log - log.max())

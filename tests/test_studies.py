@@ -17,6 +17,7 @@ STUDIES = Path(__file__).parents[1] / "studies"
 QUICK = {
     "accuracy_vs_time": "--cases 4",
     "beam_coverage": "PUBLISHED --cases 2",
+    "certificate": "--quick",
     "decoder_speed": "--quick",
     "error_bar": "--scenes once_clamped_beam --cases 3 --outside 1",
     # No dolfin here: compiling its forms alone takes longer than all the rest.
@@ -57,6 +58,13 @@ def test_every_study_is_complete(folder):
 
 def accuracy_vs_time(results):
     assert len(results["cases"]) >= 8
+
+
+def certificate(results):
+    verdicts = {case["name"]: case["status"] for case in results["cases"]}
+    assert verdicts["five, constant 0, seed 0"] == "accepted"
+    assert verdicts["five, constant 1, seed 0"] == "reweight"
+    assert verdicts["modes, stuck 1, seed 0"] != "accepted"
 
 
 def decoder_speed(results):  # the study asserts equal gradients
@@ -130,6 +138,7 @@ CHECKS = {
     check.__name__: check
     for check in (
         accuracy_vs_time,
+        certificate,
         decoder_speed,
         error_bar,
         fem_speed,

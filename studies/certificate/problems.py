@@ -1,6 +1,6 @@
 """Calibration problems whose FEM posterior is known, and wrong maps for them.
 
-A cheap exact map stands for FEM, so that the true posterior comes from quadrature or in closed form:
+A cheap exact map stands for FEM, so that the true posterior comes from quadrature or a closed form:
 
 beam   : the shipped emulator of the once-clamped beam (1e-9 mm from FEM); (mu, lam) lie on a thin,
          bent ridge; quadrature.
@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import calibrate as cal
 import emulator as em
 from calibrate.observations import spread_nodes
 from emulator.fem.solution import Solution, Status
@@ -57,7 +56,7 @@ class ExactSimulator:
     def __init__(self, forward):
         self.scene, self._solve = forward.scene, jax.jit(forward)
 
-    def solve(self, theta, start=None):
+    def solve(self, theta, start=None):  # noqa: ARG002 - as FEM takes it
         u = self._solve(theta)
         return Solution(u, jnp.array(Status.CONVERGED), *[jnp.array(0.0)] * 4)
 
@@ -193,9 +192,7 @@ def modes():
     scene = em.scenes.once_clamped_beam(cells=(4, 2, 2))
     rng = np.random.default_rng(6)
     matrix = rng.normal(size=(len(scene.mesh.nodes), 3, 2)) * np.array([0.004, 0.03])
-    forward = linear(
-        scene, matrix, np.zeros((len(scene.mesh.nodes), 3)), lambda t: fold(t)
-    )
+    forward = linear(scene, matrix, np.zeros((len(scene.mesh.nodes), 3)), lambda t: fold(t))
     nodes = spread_nodes(scene, 10, 2)
     truth = np.array([87.0, 70.0])
     return Problem("modes", forward, nodes, 0.2, truth, (50.0, 50.0), (100.0, 100.0), (700, 300))

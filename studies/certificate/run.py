@@ -51,9 +51,11 @@ def row(case, problem, budget) -> dict[str, Any]:
         "true_shift": float(np.max(np.abs(draws.mean(0) - mean) / sd)),
         "true_sd": float(np.max(np.abs(draws.std(0, ddof=1) / sd - 1.0))),
         # How far FEM's mean and sd by the certificate are from the truth, and by its own errors.
-        "found_mean": _largest((f.value - m) / s for f, m, s in zip(e.mean.values(), mean, sd)),
-        "found_sd": _largest(f.value / s - 1.0 for f, s in zip(e.sd.values(), sd)),
-        "z": [float((f.value - m) / f.error) for f, m in zip(e.mean.values(), mean)],
+        "found_mean": _largest(
+            (f.value - m) / s for f, m, s in zip(e.mean.values(), mean, sd, strict=False)
+        ),
+        "found_sd": _largest(f.value / s - 1.0 for f, s in zip(e.sd.values(), sd, strict=False)),
+        "z": [float((f.value - m) / f.error) for f, m in zip(e.mean.values(), mean, strict=False)],
         "spread": e.tail.spread,
         "p": min(m.p for m in e.misfit.values()),
         "k_hat": e.tail.k_hat,
@@ -77,7 +79,9 @@ def conclude(rows) -> dict[str, Any]:
         "posteriors": len(rows),
         "verdicts": dict(Counter(r["status"] for r in rows)),
         "wrong": sum(map(is_wrong, rows)),
-        "wrong_and_accepted": [r["name"] for r in rows if is_wrong(r) and r["status"] == "accepted"],
+        "wrong_and_accepted": [
+            r["name"] for r in rows if is_wrong(r) and r["status"] == "accepted"
+        ],
         "good": len(good),
         "good_verdicts": dict(Counter(r["status"] for r in good)),
         "reweighted_largest_error_of_a_mean": max((r["found_mean"] for r in repaired), default=0.0),

@@ -7,8 +7,9 @@ r"""A check against FEM with a fixed number of solves.
    likely after all.
 2. **Test.** The other runs are fresh points :math:`z_j` of the pool, drawn with probabilities
    :math:`a_j` that mix the corrected posterior, the map's, where FEM may find the data likely, and
-   the whole pool (defensive mixture; Hesterberg 1995). A moment under FEM is the corrected map's over the pool,
-   plus what FEM changes of it at these points (a control variate; Owen and Zhou 2000):
+   the whole pool (defensive mixture; Hesterberg 1995). A moment under FEM is the corrected map's
+   over the pool, plus what FEM changes of it at these points (a control variate; Owen and Zhou
+   2000):
 
    .. math:: \hat\theta_\text{FEM} = \hat\theta_\text{pool} +
        \hat\theta\{\pi_\text{FEM} / (q a)\} - \hat\theta\{\pi_\text{corrected} / (q a)\}
@@ -104,7 +105,10 @@ def examine(
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
     # More threads than one for small matrices oversubscribe the cores: twice the time.
-    with threadpool_limits(1, user_api="blas"), tqdm(total=count, desc="FEM check", disable=not progress, unit="run") as bar:
+    with (
+        threadpool_limits(1, user_api="blas"),
+        tqdm(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
+    ):
         solver = Solver(predictive, likelihood, bar)
         at_draws, training, correction, pool = _train(solver, z, count, rng)
         tests = _test(solver, pool, count - len(training.z), rng)

@@ -34,10 +34,11 @@ _NEGLIGIBLE = 1e-3
 
 
 class Correction(NamedTuple):
-    """A fitted process; zeros correct nothing.
+    r"""A fitted process; zeros correct nothing.
 
     at : theta's features (n, q) where FEM was solved; rows may be padding.
-    weights : of the kernel, (n, m), zero in rows of padding. inverse : of the kernel matrix, (n, n).
+    weights : of the kernel, (n, m), zero in rows of padding.
+    inverse : of the kernel matrix, (n, n).
     length, nugget, scale : of the kernel, :math:`\\ell`, :math:`\\tau^2` and :math:`a^2`.
     """
 
@@ -51,8 +52,8 @@ class Correction(NamedTuple):
 
 def nothing(rows: int, features: int, data: int) -> Correction:
     """The correction that is zero, with room for ``rows`` points."""
-    zeros = (np.zeros((rows, width)) for width in (features, data, rows))
-    return Correction(*zeros, length=1.0, nugget=0.0, scale=0.0)
+    at, weights, inverse = (np.zeros((rows, width)) for width in (features, data, rows))
+    return Correction(at, weights, inverse, length=1.0, nugget=0.0, scale=0.0)
 
 
 def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -162,7 +162,10 @@ def step(
     log_weights: np.ndarray,
     rng: np.random.Generator,
 ) -> Pool:
-    """``pool`` with :data:`STEP` more points from kernels around points resampled with tempered weights."""
+    """``pool`` with :data:`STEP` more points, from kernels around points of large weight.
+
+    Those are resampled with tempered weights.
+    """
     chances = tempered(log_weights, min(_TEMPERED_ESS * len(pool.z), MOST_TEMPERED))
     if not chances.any():
         return pool

@@ -42,10 +42,10 @@ class Evaluated(NamedTuple):
     variance : of the correction, in squared noise sd.
     """
 
-    prior: np.ndarray
-    cheap: np.ndarray
-    corrected: np.ndarray
-    variance: np.ndarray
+    prior: Any
+    cheap: Any
+    corrected: Any
+    variance: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +83,10 @@ class Predictive:
 
     def constrain(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """Draws by name, each (s,)."""
-        return {name: values for name, values in self._in_blocks(self._constrain_block, z).items()}
+        return self._in_blocks(self._constrain_block, z)
 
     def unconstrain(self, draws: Mapping[str, np.ndarray]) -> np.ndarray:
-        """z (s, p) of draws by name; a draw on a bound of its parameter is moved inside."""
+        """Z (s, p) of draws by name; a draw on a bound of its parameter is moved inside."""
         z = self._unconstrain({name: jnp.asarray(draws[name]) for name in self.model.names})
         return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)
 

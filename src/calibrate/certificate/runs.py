@@ -36,8 +36,13 @@ class Runs(NamedTuple):
 
 def joined(parts: list[Runs]) -> Runs:
     """Runs one after the other."""
-    arrays = [np.concatenate([np.asarray(p[k]) for p in parts]) for k in range(4)]
-    return Runs(*arrays, tuple(s for p in parts for s in p.stable))
+    return Runs(
+        np.concatenate([p.z for p in parts]),
+        np.concatenate([p.fem for p in parts]),
+        np.concatenate([p.means for p in parts]),
+        np.concatenate([p.smallest_J for p in parts]),
+        tuple(s for p in parts for s in p.stable),
+    )
 
 
 @dataclass

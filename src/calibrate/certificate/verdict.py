@@ -44,6 +44,10 @@ class Certificate:
     findings: tuple[str, ...]
     evidence: Evidence
 
+    def __str__(self) -> str:
+        """Verdict, every finding, and what they cost."""
+        return f"{self.verdict}: {'; '.join(self.findings)} ({self.evidence.physics.runs} FEM runs)"
+
     @property
     def k_hat(self) -> float:
         """Pareto shape of the weights of the FEM runs."""

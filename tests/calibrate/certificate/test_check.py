@@ -10,7 +10,14 @@ import calibrate as cal
 import emulator as em
 from calibrate.certificate import examine
 from calibrate.posterior import Posterior, read_tree
-from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
+from certificate_support import (
+    exact_data,
+    exact_posterior,
+    grid_of,
+    linear_model,
+    posterior_of,
+    quadrature,
+)
 from emulator.errors import InputError
 from linear_support import LinearSimulator, linear_forward
 
@@ -51,25 +58,25 @@ def test_the_right_map_is_accepted_with_figures_of_the_quadrature(beam, fem, dat
 @pytest.mark.parametrize("bias", [0.1, 0.3])
 def test_a_biased_map_is_to_be_reweighted_to_the_quadrature(beam, fem, data, bias):
     """By one and three noise sd at every node."""
-    wrong = replace(fem, shift=fem.shift + bias)
-    posterior, certificate = certified(beam, fem, data, wrong)
+    wrong = replace(fem, shift=fem.shift + bias * np.sign(fem.matrix[..., 0]))
+    _posterior, certificate = certified(beam, fem, data, wrong)
     assert certificate.verdict == "reweight"
     for k, (mean, sd) in enumerate(zip(*exact_moments(fem, data), strict=True)):
         assert abs(list(certificate.evidence.mean.values())[k].value - mean) < 0.2 * sd
     assert max(map(abs, certificate.shift.values())) > 0.5
 
 
-@pytest.mark.parametrize("draws", [50, 800])
+@pytest.mark.parametrize("draws", [50, 400])
 def test_few_runs_and_many_do_not_contradict_each_other(beam, fem, data, draws):
     for bias, verdict in ((0.0, "accepted"), (0.1, "reweight")):
-        wrong = replace(fem, shift=fem.shift + bias)
+        wrong = replace(fem, shift=fem.shift + bias * np.sign(fem.matrix[..., 0]))
         assert certified(beam, fem, data, wrong, draws)[1].verdict in (verdict, "undecided")
 
 
 def test_draws_of_half_a_posterior_are_not_accepted(beam, fem, data):
     """Chains that never left one half: no likelihood ratio at the draws could tell."""
     mean, _ = exact_moments(fem, data)
-    posterior, certificate = certified(beam, fem, data, fem, keep=lambda x: x[:, 0] < mean[0])
+    _posterior, certificate = certified(beam, fem, data, fem, keep=lambda x: x[:, 0] < mean[0])
     assert certificate.verdict == "reweight"
     assert certificate.evidence.draws.log_sd["mu"].value > 0.2
 
@@ -96,15 +103,13 @@ class Step:
 def test_a_map_that_hides_half_of_the_posterior_is_not_accepted(beam, fem, data):
     """1 mm, ten noise sd, wrong above the posterior's mean: the other half looks perfect."""
     mean, _ = exact_moments(fem, data)
-    half = exact_posterior(
-        linear_model(beam, forward=fem), data, keep=lambda x: x[:, 0] < mean[0]
-    )
+    half = exact_posterior(linear_model(beam, forward=fem), data, keep=lambda x: x[:, 0] < mean[0])
     posterior = replace(half, model=linear_model(beam, forward=Step(fem, mean[0])))
     assert cal.certify(posterior, LinearSimulator(fem)).verdict != "accepted"
 
 
 def test_an_error_that_grows_along_the_ridge_is_not_accepted(beam, fem, data):
-    wrong = replace(fem, matrix=fem.matrix * 1.02)
+    wrong = replace(fem, matrix=fem.matrix * 1.04)
     posterior, certificate = certified(beam, fem, data, wrong)
     mean, sd = exact_moments(fem, data)
     drawn = np.stack(list(posterior.draws().values()), axis=1)
@@ -122,21 +127,23 @@ def test_misfit_is_not_certified(beam, fem, data):
 
 def test_bad_chains_are_not_certified(beam, fem, data):
     posterior = exact_posterior(linear_model(beam, forward=fem), data)
-    apart = posterior.tree.copy()
-    mu = apart["posterior"]["mu"]
-    apart["posterior"]["mu"] = mu + 20.0 * (mu.chain == 0)
-    certificate = cal.certify(replace(posterior, tree=apart), LinearSimulator(fem))
+    theta = np.asarray(posterior.thetas())
+    apart = theta + np.outer(np.arange(len(theta)) < 1000, [20.0, 0.0])
+    certificate = cal.certify(
+        posterior_of(posterior.model, data, apart), LinearSimulator(fem), draws=40
+    )
     assert certificate.verdict == "not certified"
     assert "the chains disagree" in certificate.reason
-    stuck = posterior.tree.copy()
-    stuck["posterior"]["mu"] = 0.0 * mu + 72.0
-    certificate = cal.certify(replace(posterior, tree=stuck), LinearSimulator(fem))
+    stuck = theta * [0.0, 1.0] + [72.0, 0.0]
+    certificate = cal.certify(
+        posterior_of(posterior.model, data, stuck), LinearSimulator(fem), draws=40
+    )
     assert (certificate.verdict, certificate.reason) == (
         "not certified",
         "the draws of a parameter do not vary",
     )
     short = replace(posterior, tree=posterior.tree.isel(draw=slice(12)))
-    assert cal.certify(short, LinearSimulator(fem)).verdict == "not certified"
+    assert cal.certify(short, LinearSimulator(fem), draws=40).verdict == "not certified"
 
 
 @pytest.mark.parametrize("name", ["mu", "lam"])
@@ -169,7 +176,7 @@ def test_certify_solves_as_often_as_asked_and_repeats_itself(beam, fem, data):
     assert 50 <= simulator.solves <= 60  # a point drawn twice is solved once
     assert first.certificate.to_json()["draws"] == 60
     again = examine(posterior, LinearSimulator(fem), draws=60)
-    assert again.certificate == first.certificate
+    assert repr(again.certificate) == repr(first.certificate)  # NaN included
 
 
 def test_certify_with_an_inferred_noise(beam):

@@ -48,8 +48,8 @@ def test_it_matches_a_gaussian_process_solved_otherwise():
     x, new = points(12), points(3, 1)
     errors = np.sin(x @ np.ones((2, 1)))
     correction = fit(x, errors, np.ones(1), 12)
-    kernel = lambda a, b: 1e2 * (1 + a @ b.T) + np.exp(
-        -0.5 * ((a[:, None] - b) ** 2).sum(-1) / correction.length**2
+    kernel = lambda a, b: (
+        1e2 * (1 + a @ b.T) + np.exp(-0.5 * ((a[:, None] - b) ** 2).sum(-1) / correction.length**2)
     )
     gaps = [
         kernel(new, x) @ np.linalg.solve(kernel(x, x) + nugget * np.eye(12), errors)

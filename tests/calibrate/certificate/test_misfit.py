@@ -6,27 +6,28 @@ import calibrate as cal
 from calibrate.certificate.correction import nothing
 from calibrate.certificate.misfit import misfits
 from calibrate.certificate.predictive import Predictive
-from certificate_support import exact_data, linear_model, quadrature, grid_of
+from certificate_support import exact_data, grid_of, linear_model, quadrature
 from linear_support import linear_forward
+
+MANY = list(range(5, 45))
 
 
 def found(beam, change=None, sd=0.1, seed=0):
     """Misfit of data with noise of 0.1 mm, ``change`` made to it, under a model of ``sd``."""
-    model = linear_model(beam, sd)
+    model = linear_model(beam, sd, nodes=MANY)
     data = exact_data(model, seed)
     if change is not None:
         change(data)
     points, rng = grid_of(), np.random.default_rng(seed)
-    rows = rng.choice(len(points), size=400, p=quadrature(model.full, data, sd, points))
+    rows = rng.choice(len(points), size=400, p=quadrature(model.full, data, sd, points, MANY))
     predictive = Predictive(model, {"displacement": data})
     z = predictive.unconstrain({"mu": points[rows, 0], "lam": points[rows, 1]})
-    return misfits(predictive, nothing(1, 2, 9), z, jax.random.key(seed))["displacement"]
+    return misfits(predictive, nothing(1, 2, 120), z, jax.random.key(seed))["displacement"]
 
 
 def test_data_of_the_model_fits(beam):
-    values = [found(beam, seed=seed).p for seed in range(6)]
-    assert min(values) > 0.05
-    assert max(values) < 0.98
+    values = [found(beam, seed=seed).p for seed in (0, 3)]
+    assert 0.05 < min(values) < max(values) < 0.98
 
 
 def test_the_p_value_is_that_of_chi_squared(beam):
@@ -36,7 +37,9 @@ def test_the_p_value_is_that_of_chi_squared(beam):
     model = linear_model(beam)
     data = exact_data(model, 3)
     predictive = Predictive(model, {"displacement": data})
-    z = np.repeat(predictive.unconstrain({"mu": np.array([72.0]), "lam": np.array([68.0])}), 4000, 0)
+    z = np.repeat(
+        predictive.unconstrain({"mu": np.array([72.0]), "lam": np.array([68.0])}), 4000, 0
+    )
     p = misfits(predictive, nothing(1, 2, 9), z, jax.random.key(0))["displacement"].p
     residual = data - np.asarray(model.forward(np.array([72.0, 68.0])))
     exact = chi2.sf((residual**2).sum() / 0.1**2, 9)
@@ -53,8 +56,8 @@ def test_an_outlier_is_found_and_named(beam):
 
 
 def test_a_wrong_noise_sd_is_found_on_either_side(beam):
-    assert found(beam, sd=0.03).p < 0.005
-    assert found(beam, sd=0.4).p > 0.995
+    assert found(beam, sd=0.07).p < 0.005
+    assert found(beam, sd=0.15).p > 0.995
 
 
 def test_an_inferred_noise_and_a_single_number(beam):

@@ -55,7 +55,10 @@ def test_the_pool_is_the_posterior_wherever_the_draws_are(case, predictive):
     """Even from draws of one end of it."""
     posterior, data = case
     exact = mean_and_sd(quadrature(posterior.model.full, data), grid_of()[:, 0])
-    for values in (posterior.draws(), {"mu": 52.0 + np.arange(50.0) / 50, "lam": 90 + np.zeros(50)}):
+    for values in (
+        posterior.draws(),
+        {"mu": 52.0 + np.arange(50.0) / 50, "lam": 90 + np.zeros(50)},
+    ):
         z = predictive.unconstrain(values)
         pool = search(predictive, nothing(1, 2, 9), z, np.random.default_rng(0))
         assert effective(pool.corrected) > 500.0
@@ -65,7 +68,7 @@ def test_the_pool_is_the_posterior_wherever_the_draws_are(case, predictive):
 
 
 def test_tempering_leaves_as_many_as_asked():
-    log = np.append(-np.arange(100.0) ** 2, -np.inf)
+    log = np.append(-(np.arange(100.0) ** 2), -np.inf)
     assert effective(normalised(log)) < 3.0
     flat = tempered(log, 40.0)
     assert effective(flat) == pytest.approx(40.0, rel=1e-3)

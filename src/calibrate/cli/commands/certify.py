@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress
 from calibrate.cli.posterior_table import summary
+from emulator.errors import InputError
 
 
 def register(commands: Any) -> None:
@@ -24,7 +26,12 @@ def register(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Check a kept posterior against FEM; a kept reweighted posterior is a success too."""
     from calibrate.workflow import certify_and_keep, read_posterior, report
+    from emulator.store import check_folder
 
+    if arguments.reweight is not None:
+        target = check_folder(arguments.reweight)
+        if target.resolve() == Path(arguments.folder).resolve():
+            raise InputError(f"--reweight {target}: that is DIR itself; name another folder")
     progress = show_progress(arguments)
     plan, posterior = read_posterior(arguments.folder)
     certificate = certify_and_keep(
