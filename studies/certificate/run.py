@@ -20,6 +20,7 @@ from problems import ExactSimulator
 from calibrate.certificate import certify
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
+from emulator import Simulator
 from emulator.store import replacing, write_json
 
 HERE = Path(__file__).parent
@@ -33,11 +34,11 @@ COLOURS = {
 }
 
 
-def row(case, problem, budget) -> dict[str, Any]:
+def row(case, problem, simulator, budget) -> dict[str, Any]:
     """Verdict and truth of one case."""
     begin = time.perf_counter()
     posterior, (mean, sd) = case.make(problem, case.size, case.seed)
-    certificate = certify(posterior, ExactSimulator(problem.forward), draws=budget)
+    certificate = certify(posterior, simulator, draws=budget)
     draws = np.stack(list(posterior.draws().values()), axis=1)
     e = certificate.evidence
     return {
@@ -114,6 +115,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", help="kinds to run, comma-separated")
+    parser.add_argument("--fem", action="store_true", help="the beam's, judged by FEM itself")
     parser.add_argument("--draws", type=int, default=200, help="FEM runs a certificate")
     parser.add_argument("--out", type=Path, default=HERE)
     arguments = parser.parse_args()
@@ -122,9 +124,13 @@ def main() -> None:
     for case in cases(arguments.quick):
         if arguments.only and case.kind not in arguments.only.split(","):
             continue
+        if arguments.fem and case.problem != "beam":
+            continue
         if case.problem not in built:
-            built[case.problem] = getattr(problems, case.problem)()
-        rows.append(row(case, built[case.problem], arguments.draws))
+            problem = getattr(problems, case.problem)()
+            exact = ExactSimulator(problem.forward)
+            built[case.problem] = problem, Simulator(problem.scene) if arguments.fem else exact
+        rows.append(row(case, *built[case.problem], arguments.draws))
         r = rows[-1]
         print(
             f"{r['name']:38s} {r['status']:13s} true {r['true_shift']:6.2f} {r['true_sd']:6.2f} "
