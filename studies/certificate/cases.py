@@ -6,6 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 from problems import Map, Problem, by_quadrature, moments_of, posterior_of, sample_grid
 
 import calibrate as cal
@@ -48,7 +49,10 @@ def with_map(problem, error, seed, *, noise=1.0, draws=None):
     wrong = Map(problem.scene, function, exact.nodes)
     used = noise * problem.noise
     observe = cal.nodal_displacements(problem.scene, problem.nodes)
-    model = cal.model(wrong, observe, cal.GaussianNoise(sd=used))
+    # The closed form has a flat prior.
+    flat = {p.name: dist.Uniform(p.low, p.high) for p in problem.scene.parameters}
+    prior = None if problem.steps else flat
+    model = cal.model(wrong, observe, cal.GaussianNoise(sd=used), prior)
     if problem.steps:
         points, predictions = problem.grid()
         truth = moments_of(by_quadrature(problem, predictions, data, problem.noise), points)

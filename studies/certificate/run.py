@@ -38,7 +38,7 @@ def row(case, problem, simulator, budget) -> dict[str, Any]:
     """Verdict and truth of one case."""
     begin = time.perf_counter()
     posterior, (mean, sd) = case.make(problem, case.size, case.seed)
-    certificate = certify(posterior, simulator, draws=budget)
+    certificate = certify(posterior, simulator, draws=budget, seed=case.seed)
     draws = np.stack(list(posterior.draws().values()), axis=1)
     e = certificate.evidence
     return {
