@@ -82,6 +82,8 @@ def linear_problem(scene, forward=None):
     noise = 0.1 * np.random.default_rng(0).normal(size=(3, 3))
     exact = linear_forward(scene).at(observe.nodes)(jnp.array([72.0, 68.0]))
     return model, np.asarray(exact) + noise
+
+
 class LinearSimulator:
     """Stands for FEM: a map that converges wherever it is valid."""
 

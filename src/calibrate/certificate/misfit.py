@@ -60,8 +60,9 @@ def misfits(
     def one(flat: jax.Array, draw: dict[str, jax.Array], key: jax.Array) -> Any:
         parts = predictive.distributions(unravel(flat), draw)
         keys = jax.random.split(key, len(parts))
+        means = unravel(flat)
         return {
-            name: _compared(d, predictive.data[name], k)
+            name: _compared(d, means[name], predictive.data[name], k)
             for (name, d), k in zip(parts.items(), keys, strict=True)
         }
 
@@ -69,21 +70,24 @@ def misfits(
     return {name: _misfit(name, *map(np.asarray, parts)) for name, parts in found.items()}
 
 
-def _compared(d: Any, y: jax.Array, rng_key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """At one draw: whether simulated data is as far off, wholly and at worst; distances of y."""
+def _compared(
+    d: Any, mean: jax.Array, y: jax.Array, rng_key: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """At one draw: whether simulated data is as unlikely as y, and both their distances."""
     simulated = d.sample(rng_key)
-    sd = jnp.sqrt(d.variance)
-    distance, replicated = jnp.abs(y - d.mean) / sd, jnp.abs(simulated - d.mean) / sd
-    whole = d.log_prob(simulated) <= d.log_prob(y)
-    return whole, jnp.max(replicated) >= jnp.max(distance), distance
+    return d.log_prob(simulated) <= d.log_prob(y), jnp.abs(simulated - mean), jnp.abs(y - mean)
 
 
-def _misfit(name: str, whole: np.ndarray, worst: np.ndarray, distance: np.ndarray) -> Misfit:
+def _misfit(name: str, whole: np.ndarray, simulated: np.ndarray, distance: np.ndarray) -> Misfit:
+    # The sd is the simulated data's: not every distribution knows its own.
+    sd = np.sqrt(np.mean(simulated**2, axis=0))
+    simulated, distance = (x.reshape(len(x), -1) / sd.ravel() for x in (simulated, distance))
     mean = distance.mean(axis=0)
-    outlying = {
-        f"{name}[{', '.join(map(str, index))}]" if index else name: float(mean[index])
-        for index in sorted(zip(*np.nonzero(mean > OUTLYING), strict=True), key=lambda i: -mean[i])
-    }
-    if mean.ndim == 0:
-        outlying = {name: float(mean)} if mean > OUTLYING else {}
-    return Misfit(float(whole.mean()), float(worst.mean()), outlying)
+    order = [k for k in np.argsort(-mean) if mean[k] > OUTLYING]
+    places = [np.unravel_index(k, sd.shape) for k in order]
+    names = [f"{name}[{', '.join(map(str, place))}]" if place else name for place in places]
+    return Misfit(
+        float(whole.mean()),
+        float(np.mean(simulated.max(axis=1) >= distance.max(axis=1))),
+        {label: float(mean[k]) for label, k in zip(names, order, strict=True)},
+    )

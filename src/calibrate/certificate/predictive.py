@@ -38,7 +38,8 @@ class Evaluated(NamedTuple):
     """Log densities at points (s, p): each (s,), ``-inf`` where there is none.
 
     prior : of z, its Jacobian included.
-    cheap, corrected : likelihoods of the map, and of the map with its correction.
+    cheap : likelihood that the draws are from: the map's, with what is allowed for its error.
+    corrected : likelihood of the map with its correction, and nothing allowed.
     variance : of the correction, in squared noise sd.
     """
 
@@ -172,7 +173,8 @@ class Predictive:
         flat, unravel = ravel_pytree(means)
         step, variance = correct(correction, self._features(draws))
         moved = unravel(flat + step)
-        cheap, corrected = self.log_likelihood(means, draws), self.log_likelihood(moved, draws)
+        cheap = self.model.map_log_likelihood(draws, self.data)
+        corrected = self.log_likelihood(moved, draws)
         prior = -self._info.potential_fn(self.data)(self._unravel(z))
         prior, cheap, corrected = (
             jnp.where(fine & jnp.isfinite(value), value, -jnp.inf)

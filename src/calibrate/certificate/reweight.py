@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
-import arviz_base
+import jax
 import numpy as np
 
 from calibrate.certificate.check import Check, examine, resampled
 from calibrate.certificate.pool import effective
 from calibrate.certificate.verdict import Certificate
 from calibrate.posterior import Posterior
+from calibrate.tree import make_tree
 from emulator.errors import InputError
 from emulator.fem import Simulator
 
@@ -64,17 +64,11 @@ def reweighted(check: Check, *, seed: int = 0) -> Posterior:
     length = int(min(points, 1000.0) // _CHAINS)
     rows = resampled(check.pool, _CHAINS * length, np.random.default_rng([seed, 1]))
     drawn = check.predictive.constrain(check.pool.z[rows])
-    posterior = check.posterior
-    tree = posterior.tree.copy()
+    posterior, at = check.posterior, check.pool.at
     shape = (_CHAINS, length)
-    at = check.pool.at
-    groups: dict[str, Any] = {
-        "posterior": {name: drawn[name].reshape(shape) for name in posterior.model.names},
-        "sample_stats": {
-            "lp": (at.prior + at.corrected)[rows].reshape(shape),
-            "diverging": np.zeros(shape, dtype=bool),
-        },
-    }
-    tree.update(arviz_base.from_dict(groups).children)
+    draws = {name: drawn[name].reshape(shape) for name in posterior.model.names}
+    statistics = {"lp": (at.prior + at.corrected)[rows].reshape(shape)}
+    tree = make_tree(posterior.model, posterior.data, draws, statistics, jax.random.key(seed))
+    tree.attrs.update(posterior.tree.attrs)
     tree.attrs["reweighted"] = json.dumps({"verdict": verdict, "effective_points": points})
     return Posterior(tree, posterior.model, posterior.data)

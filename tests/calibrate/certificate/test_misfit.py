@@ -71,3 +71,14 @@ def test_an_inferred_noise_and_a_single_number(beam):
     result = misfits(predictive, nothing(1, 2, 3), predictive.unconstrain(draws), jax.random.key(0))
     assert result["displacement"].p == pytest.approx(1.0)
     assert not result["displacement"].outlying
+
+
+def test_a_single_number_is_compared_too():
+    from calibrate.certificate.misfit import _misfit
+
+    rng = np.random.default_rng(0)
+    simulated = np.abs(rng.normal(size=500))
+    assert _misfit("volume", np.ones(500), simulated, np.full(500, 0.5)).p_worst > 0.5
+    far = _misfit("volume", np.zeros(500), simulated, np.full(500, 6.0))
+    assert list(far.outlying) == ["volume"]
+    assert far.p_worst == 0.0
