@@ -40,11 +40,11 @@ def quadrature(forward, data, sd=0.1, points=None, nodes=NODES):
 
 
 def posterior_of(model, data, theta, chains=4, diverging=0):
-    """A Posterior whose draws are ``theta`` (s, 2)."""
+    """A Posterior whose draws are ``theta`` (s, p)."""
     shape = (chains, len(theta) // chains)
     flags = np.zeros(shape, dtype=bool)
     flags.flat[:diverging] = True
-    draws = {n: theta[:, k].reshape(shape) for k, n in enumerate(("mu", "lam"))}
+    draws = {n: theta[:, k].reshape(shape) for k, n in enumerate(model.names)}
     tree = arviz_base.from_dict({"posterior": draws, "sample_stats": {"diverging": flags}})
     tree.attrs["run"] = "{}"
     return Posterior(tree, model, model.check_data(data))

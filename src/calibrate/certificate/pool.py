@@ -27,7 +27,7 @@ from calibrate.certificate.correction import Correction
 from calibrate.certificate.predictive import Evaluated, Predictive
 from calibrate.certificate.proposals import Kernels, around
 
-NEAR, NEAR_WIDTHS, NEAR_FREEDOM = 2048, (0.15, 0.5), 5.0
+NEAR, NEAR_FREEDOM = 2048, 5.0
 WIDE, WIDE_WIDTHS, WIDE_FREEDOM = 512, (2.0,), 3.0
 PRIOR = 512
 STEP, SEARCH_ROUNDS, POLISH_ROUNDS = 512, 8, 4
@@ -91,6 +91,11 @@ class Pool:
         return normalised(self.log_cheap)
 
 
+def widths(dimension: int) -> tuple[float, ...]:
+    """Widths of kernels on draws, in their sd; narrow ones are needles in many dimensions."""
+    return (0.15, 0.5) if dimension <= 2 else (0.35, 0.7)
+
+
 def normalised(log_weights: np.ndarray) -> np.ndarray:
     """Weights of sum 1; zeros where no log weight is finite."""
     largest = np.max(log_weights)
@@ -136,7 +141,7 @@ def search(
         if _effective(pool.log_explored) >= _TEMPERED_ESS * len(pool.z):
             break
         pool = step(pool, predictive, correction, pool.log_explored, rng)
-    near = around(draws, NEAR_WIDTHS, NEAR_FREEDOM, rng)
+    near = around(draws, widths(draws.shape[1]), NEAR_FREEDOM, rng)
     pool = extend(pool, predictive, correction, near, NEAR, rng)
     wide = around(draws, WIDE_WIDTHS, WIDE_FREEDOM, rng)
     pool = extend(pool, predictive, correction, wide, WIDE, rng)
@@ -169,8 +174,11 @@ def step(
     chances = tempered(log_weights, min(_TEMPERED_ESS * len(pool.z), MOST_TEMPERED))
     if not chances.any():
         return pool
+    h = widths(pool.z.shape[1])
     chosen = pool.z[rng.choice(len(pool.z), size=1024, p=chances)]
-    kernels = around(chosen, NEAR_WIDTHS, NEAR_FREEDOM, rng)
+    # Moved off the pool's points: a kernel on a point of the pool would take its weight away.
+    chosen = around(chosen, h, NEAR_FREEDOM, rng).sample(rng, len(chosen))
+    kernels = around(chosen, h, NEAR_FREEDOM, rng)
     return extend(pool, predictive, correction, kernels, STEP, rng)
 
 

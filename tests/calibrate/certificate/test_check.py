@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 
 import calibrate as cal
@@ -53,6 +54,29 @@ def test_the_right_map_is_accepted_with_figures_of_the_quadrature(beam, fem, dat
         assert abs(found.value - mean) < 4 * found.error < 0.3 * sd
         assert abs(spread.value - sd) < 4 * spread.error < 0.3 * sd
     assert e.physics.failed == 0
+
+
+@pytest.mark.slow
+def test_errors_are_honest_in_five_dimensions(ventricle):
+    """Over seeds, means scatter by the errors they claim; kernels on points of the pool broke it."""
+    rng = np.random.default_rng(5)
+    forward = linear_forward(ventricle, 1)
+    low, high = (np.array([getattr(p, e) for p in ventricle.parameters]) for e in ("low", "high"))
+    forward = replace(forward, matrix=forward.matrix * 100.0 / (high - low))
+    flat = {p.name: dist.Uniform(p.low, p.high) for p in ventricle.parameters}
+    observe = cal.nodal_displacements(ventricle, list(range(20)))
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.2), flat)
+    A = np.asarray(model.forward.matrix).reshape(-1, 5)
+    centre = 0.5 * (low + high)
+    data = (A @ centre + 0.2 * rng.normal(size=60)).reshape(20, 3)
+    covariance = 0.04 * np.linalg.inv(A.T @ A)
+    mean = covariance @ A.T @ data.ravel() / 0.04
+    posterior = posterior_of(model, data, rng.multivariate_normal(mean, covariance, size=4000))
+    z = []
+    for seed in range(8):
+        found = cal.certify(posterior, LinearSimulator(forward), draws=25, seed=seed).evidence.mean
+        z += [(f.value - m) / f.error for f, m in zip(found.values(), mean, strict=True)]
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
 @pytest.mark.parametrize("bias", [0.1, 0.3])
@@ -209,7 +233,7 @@ def test_a_posterior_survives_the_disk(beam, tmp_path):
     posterior = cal.sample(model, truth, options=cal.NUTSOptions(50, 50, rounds=1))
     posterior.save(tmp_path / "p.nc")
     tree = read_tree(tmp_path / "p.nc")
-    assert set(tree.children) == {"posterior", "sample_stats", "observed_data", "constant_data"}
+    assert {"posterior", "sample_stats", "observed_data", "constant_data"} <= set(tree.children)
     back = Posterior(tree, posterior.model, posterior.data)
     for name, values in posterior.draws().items():
         np.testing.assert_array_equal(back.draws()[name], values)
