@@ -44,6 +44,7 @@ from calibrate.certificate.pool import (
     effective,
     normalised,
     polish,
+    redrawn,
     search,
     step,
     tempered,
@@ -161,7 +162,8 @@ def _train(
         pool = corrected_again(pool, predictive, correction)
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = step(pool, predictive, correction, pool.log_explored, rng)
-    return at_draws, runs, correction, polish(pool, predictive, correction, rng)
+    pool = polish(pool, predictive, correction, rng)
+    return at_draws, runs, correction, redrawn(pool, predictive, correction, rng)
 
 
 def _test(solver: Solver, pool: Pool, count: int, rng: np.random.Generator) -> Tests:

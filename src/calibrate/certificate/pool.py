@@ -203,6 +203,21 @@ def extend(
     return Pool(everything, at, pool.priors, proposals, counts, log_kernels)
 
 
+def redrawn(
+    pool: Pool, predictive: Predictive, correction: Correction, rng: np.random.Generator
+) -> Pool:
+    """Fresh points from the proposals of ``pool``, as many of each.
+
+    Proposals were chosen by looking at points; only points drawn after the choice are independent
+    draws of the mixture (Marin, Pudlo and Sedki 2019).
+    """
+    prior = predictive.prior_draws(jax.random.key(int(rng.integers(2**31))), pool.priors)
+    drawn = [q.sample(rng, n) for q, n in zip(pool.proposals, pool.counts, strict=True)]
+    z = np.concatenate([prior, *drawn])
+    log_kernels = np.array([q.log_density(z) for q in pool.proposals]).reshape(-1, len(z))
+    return replace(pool, z=z, at=predictive.evaluate(z, correction), log_kernels=log_kernels)
+
+
 def corrected_again(pool: Pool, predictive: Predictive, correction: Correction) -> Pool:
     """``pool`` under another correction."""
     return replace(pool, at=predictive.evaluate(pool.z, correction))
