@@ -76,9 +76,9 @@ def test_the_covariance_is_that_of_the_errors():
     """Errors of one size everywhere: their second moment."""
     rng = np.random.default_rng(0)
     root = rng.normal(size=(4, 4))
-    errors = rng.normal(size=(4000, 2)) @ root[:2]
+    errors = rng.normal(size=(600, 2)) @ root[:2]
     noise = np.diag([0.1, 0.2, 0.3, 0.4]) ** 2
-    found = fit(rng.random((4000, 2)), errors, np.linalg.inv(noise))
+    found = fit(rng.random((600, 2)), errors, np.linalg.inv(noise))
     assert found.modes.shape == (2, 4)
     size = np.array([float(found.size(jnp.array(x))) for x in rng.random((20, 2))])
     middle = np.median(size) ** 2 * found.modes.T @ found.modes

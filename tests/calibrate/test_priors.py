@@ -68,6 +68,7 @@ def test_a_negligible_mass_is_cut_off_and_recorded(bounded, beam):
     assert model_with(bounded, beam, dist.Uniform(60.0, 90.0)).prior_cut == {}
 
 
+@pytest.mark.slow
 def test_a_prior_cut_by_request_is_sampled(bounded, beam):
     """Half of the normal's mass lies above the box."""
     prior = cal.truncated({**cal.box_prior(beam), "mu": dist.Normal(100.0, 5.0)}, beam)

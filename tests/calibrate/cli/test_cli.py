@@ -309,6 +309,7 @@ def test_a_scene_without_a_shipped_emulator_says_so(capsys, block, tmp_path):
     assert "is neither shipped nor a folder with emulator.json" in line
 
 
+@pytest.mark.slow
 def test_a_posterior_of_another_emulator_is_not_certified(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     from emulator.surrogates import load, save_emulator
@@ -351,8 +352,8 @@ def test_training_starts_from_another_emulator(capsys, block, tmp_path):
     assert record["command"].endswith("--seed 0 --start EMULATOR --out DIR")
 
 
-def test_train_evaluate_infer_certify(capsys, block, tmp_path):
-    """The whole path on a scene of the user's own."""
+def test_train_and_evaluate(capsys, block, tmp_path):
+    """The emulator of a scene of the user's own."""
     out = tmp_path / "e"
     code, record = answer(
         capsys, "train", block, "--steps", 100, "--simulations", 16, "--batch", 8, "--out", out
@@ -367,7 +368,10 @@ def test_train_evaluate_infer_certify(capsys, block, tmp_path):
     assert code == 0
     assert errors["cases"] == 5
     assert errors["err_u"]["median"] < 0.1 * errors["max_u"]["median"]
-    # A forward map made of FEM runs needs no training at all.
+
+
+def test_infer_and_certify(capsys, block, tmp_path):
+    """A scene of the user's own, and a forward map made of FEM runs, which needs no training."""
     words = ["--truth", "mu=9", "--observe", "landmarks:6", "--noise", "0.02"]
     run = [*words, "--forward", "reduced", "--fem-runs", 8, "--warmup", 200, "--draws", 200]
     code, result = answer(capsys, "infer", block, *run, "--no-certify", "--out", tmp_path / "r")
@@ -380,7 +384,16 @@ def test_train_evaluate_infer_certify(capsys, block, tmp_path):
     code, result = answer(capsys, "certify", tmp_path / "r", "--draws", 50)
     assert (code, result["verdict"]) == (0, "accepted")
     assert json.loads((tmp_path / "r" / "certificate.json").read_text())["verdict"] == "accepted"
-    # The kept data is data like any other, and infer certifies unless told not to.
+
+
+@pytest.mark.slow
+def test_kept_data_is_data_like_any_other(capsys, block, tmp_path):
+    """And infer certifies unless told not to."""
+    words = ["--truth", "mu=9", "--observe", "landmarks:6", "--noise", "0.02"]
+    run = [*words, "--forward", "reduced", "--fem-runs", 8, "--warmup", 200, "--draws", 200]
+    code, result = answer(capsys, "infer", block, *run, "--no-certify", "--out", tmp_path / "r")
+    assert code == 0
+    row = result["parameters"]["mu"]
     code, again = answer(
         capsys, "infer", block, "--data", tmp_path / "r" / "data.csv", "--noise", "0.02",
         *run[6:], "--out", tmp_path / "s",
