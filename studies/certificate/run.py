@@ -130,7 +130,8 @@ def main() -> None:
             problem = getattr(problems, case.problem)()
             exact = ExactSimulator(problem.forward)
             built[case.problem] = problem, Simulator(problem.scene) if arguments.fem else exact
-        rows.append(row(case, *built[case.problem], arguments.draws))
+        problem, simulator = built[case.problem]
+        rows.append(row(case, problem, simulator, arguments.draws))
         r = rows[-1]
         print(
             f"{r['name']:38s} {r['status']:13s} true {r['true_shift']:6.2f} {r['true_sd']:6.2f} "

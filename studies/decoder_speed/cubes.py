@@ -69,7 +69,7 @@ def cube(cells: int, order: int, points: np.ndarray | None, seed: int) -> Cube:
 def gradient(cube: Cube) -> Function:
     """Value and gradient of the landmarks' squared displacements."""
     at = cube.cached.at(cube.seen.nodes)
-    return jax.jit(jax.value_and_grad(lambda theta: jnp.sum(cube.seen(at(theta)) ** 2)))
+    return jax.jit(jax.value_and_grad(lambda theta: jnp.sum(cube.seen(at(theta), theta) ** 2)))
 
 
 def in_turns(cubes: list[Cube], functions: list[Function], count: int) -> list[float]:

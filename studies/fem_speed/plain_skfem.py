@@ -200,7 +200,8 @@ class Body:
 
     def solve(self, theta: np.ndarray, steps: int = 3) -> Result:
         """Newton from rest in equal load steps; twice as many when one of them fails."""
-        material = Material(*map(float, theta), self.kappa, self.fibres.T[:, :, None])
+        a, b, a_f, b_f = map(float, theta)
+        material = Material(a, b, a_f, b_f, self.kappa, self.fibres.T[:, :, None])
         spent = 0
         while steps <= 48:
             u, iterations, converged = self._walk(material, steps)

@@ -21,8 +21,8 @@ import emulator as em
 from emulator.catalogue import scene_from_origin
 from emulator.error.comparison import quantiles
 from emulator.fem import Runs, sobol
-from emulator.geometry.cavity import Cavity
 from emulator.scenes import Scene
+from emulator.scenes.cavities import find_cavity
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.taylor import Expansion
 
@@ -69,7 +69,7 @@ class Court:
         ]
         self.run_s = (clock() - first) / count  # a mean, late compilation included
         self.reference = jnp.stack(fields)
-        self._cavity = Cavity(scene)
+        self._cavity = find_cavity(scene)
         self._volume = jax.jit(lambda u: self._cavity(u[:, self._cavity.nodes]))
         self.volumes = self._volume(self.reference)
 

@@ -53,7 +53,7 @@ def beam(quick: bool) -> Scene:
 def plan_of(objective: str, steps: int, simulations: int, quick: bool) -> Plan:
     """The recipe ``network`` with ``objective``; initial weights, theta and rates do not differ."""
     plan = replace(recipe("network"), steps=steps, simulations=simulations)
-    plan = replace(plan, objective=objective)  # type: ignore[arg-type] - a name of OBJECTIVES
+    plan = replace(plan, objective=objective)  # a name of OBJECTIVES
     return replace(plan, batch=8, learning_rate=3e-3) if quick else plan
 
 

@@ -232,7 +232,7 @@ def ventricle(*, thin: bool = False, order: int = 1, dilatation: str = "pointwis
             "kappa": 25.0 if dilatation == "pointwise" else 1e4,
         },
         fibres=rule_based_fibres(mesh),
-        dilatation=dilatation,  # type: ignore[arg-type]
+        dilatation=dilatation,
     )
 
 

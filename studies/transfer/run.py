@@ -23,8 +23,9 @@ from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from emulator.error.comparison import evaluate, field_errors, quantiles
 from emulator.fem import Runs, run_campaign, sobol
-from emulator.geometry.cavity import Cavity, cavity_sets
+from emulator.geometry.cavity import Cavity
 from emulator.scenes import Scene
+from emulator.scenes.cavities import cavity_sets
 from emulator.store import replacing, write_json
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import Plan, pretrain, recipe, train
@@ -59,7 +60,7 @@ def family(count: int, mesh: tuple[int, int, int]) -> list[Scene]:
 def judge(problem: Problem, known: Runs) -> Callable[[Any], dict[str, Any]]:
     """Function of weights: err_u in mm and err_V in percent at the ``known`` FEM solutions."""
     scene = problem.emulator.scene
-    cavities = [Cavity(scene, name) for name in cavity_sets(scene)]
+    cavities = [Cavity(scene.mesh, name) for name in cavity_sets(scene)]
     predict = predictor(problem.emulator)
 
     @jax.jit

@@ -114,9 +114,11 @@ def test_sensitivities_where_cholesky_is_refused(ventricle):
     system, _ = ventricle.linearised(blown, soft)
     assert system.factorisation == "umfpack"
     columns = ventricle.sensitivities(blown, soft)
-    forces = jax.jacfwd(lambda t: system.residual(blown, t))(soft)
+    forces = jax.jit(jax.jacfwd(lambda t: system.residual(blown, t)))(soft)
+    # Compiled whole: one by one, the operations of a residual take minutes to compile.
+    along = jax.jit(lambda v: jax.jvp(lambda u: system.residual(u, soft), (blown,), (v,))[1])
     for k in range(len(theta)):
-        balanced = jax.jvp(lambda v: system.residual(v, soft), (blown,), (columns[k],))[1]
+        balanced = along(columns[k])
         np.testing.assert_allclose(balanced, -forces[:, k], atol=1e-8 * jnp.abs(forces).max())
 
 
