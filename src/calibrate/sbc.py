@@ -170,10 +170,13 @@ def calibration_of(replicates: Iterator[Replicate], seed: int = 0) -> Calibratio
             found.setdefault(name, []).append(
                 (below + rng.random() * (1 + ties)) / (len(values) + 1)
             )
-    count = min(map(len, found.values()), default=0)
-    if count < _FEWEST:
-        raise InputError(f"calibration: {count} replicates; give {_FEWEST} or more")
+    _check_count(min(map(len, found.values()), default=0))
     return Calibration({name: np.array(u) for name, u in found.items()})
+
+
+def _check_count(replicates: int) -> None:
+    if replicates < _FEWEST:
+        raise InputError(f"calibration: {replicates} replicates; give {_FEWEST} or more")
 
 
 Sample = Callable[[dict[str, np.ndarray], int], Mapping[str, np.ndarray]]
@@ -207,6 +210,7 @@ def sbc(
     InputError
         ``truth`` does not have the unknowns and observations of ``model``.
     """
+    _check_count(replicates)
     truth = model if truth is None else truth
     if (truth.names, truth.observe.shapes) != (model.names, model.observe.shapes):
         raise InputError(

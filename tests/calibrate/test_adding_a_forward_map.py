@@ -92,6 +92,7 @@ def test_it_is_evaluated(setting, tmp_path, capsys):
     assert report["err_u"]["median"] < 0.2 * report["mean_u"]["median"]
 
 
+@pytest.mark.slow
 def test_it_is_inferred_with_and_certified(tmp_path, capsys):
     words = ["infer", SCENE, "--truth", "mu=75", "lam=60", "--observe", "nodes:3", "--noise", "9"]
     words += ["--forward", "polynomial", "--order", 1, "--warmup", 40, "--draws", 40]

@@ -36,6 +36,7 @@ def test_the_demo_ends_accepted(folder, capsys):
     assert len(picture) > 30_000
 
 
+@pytest.mark.slow
 def test_a_kept_run_can_be_certified_again(folder, capsys):
     before = json.loads((folder / "certificate.json").read_text())
     assert main(["certify", str(folder), "--draws", "100", "--json"]) == 0

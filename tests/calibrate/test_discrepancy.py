@@ -55,6 +55,7 @@ def test_it_widens_the_posterior_until_it_covers_the_truth(beam, bent):
     np.testing.assert_allclose(covariance, np.linalg.inv(A.T @ np.linalg.solve(C, A)), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_its_size_is_inferred_and_vanishes_where_the_model_is_right(beam, bent):
     """The profile likelihood of its sd at the estimate of theta: about 0 for data of the model."""
     forward, data = bent

@@ -49,6 +49,7 @@ def test_newton_steps_square_the_error(folder, reference, monkeypatch):
     assert base["forward_options"] == {}
 
 
+@pytest.mark.slow
 def test_outside_comes_separately_with_files_and_figures(folder, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["--forward", "reduced", "--fem-runs", "10", "--cases", "4", "--outside", "0.5"]

@@ -141,6 +141,7 @@ def test_a_new_result_takes_the_old_map_with_it(infer_once, folder, monkeypatch)
     assert {path.name for path in folder.iterdir()} == {"run.json", "data.csv"}
 
 
+@pytest.mark.slow
 def test_a_reweighted_posterior_is_kept_and_certified_like_any_other(infer_once, tmp_path, capsys):
     source, target = tmp_path / "s", tmp_path / "t"
     infer(replace(RUN, draws=250), source)

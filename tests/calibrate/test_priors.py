@@ -83,6 +83,7 @@ def test_a_prior_cut_by_request_is_sampled(bounded, beam):
     assert draws.mean() == pytest.approx(100.0 - 5.0 * np.sqrt(2 / np.pi), abs=4 * 3.0 / ess**0.5)
 
 
+@pytest.mark.slow
 def test_a_map_without_a_box_takes_any_prior_and_chains_start(beam):
     """Before, NumPyro looked for starting points near 0 and gave up."""
 

@@ -137,6 +137,7 @@ def test_dependent_data_have_one_log_likelihood_a_draw():
     assert predictions._pointwise(site).shape == (3,)
 
 
+@pytest.mark.slow
 def test_correlated_noise_and_missing_values_have_their_groups(beam):
     forward = linear_forward(beam)
     observe = cal.nodal_displacements(beam, [3, 11, 20])
@@ -154,6 +155,7 @@ def test_correlated_noise_and_missing_values_have_their_groups(beam):
                 assert np.isfinite(values.values).all(), (group, name)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_single_number_is_plotted_too(ventricle):
     mpl.use("Agg")

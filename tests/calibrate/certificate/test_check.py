@@ -92,7 +92,7 @@ def test_a_biased_map_is_to_be_reweighted_to_the_quadrature(beam, fem, data, bia
     assert max(map(abs, certificate.shift.values())) > 0.5
 
 
-@pytest.mark.parametrize("draws", [50, 400])
+@pytest.mark.parametrize("draws", [50, pytest.param(400, marks=pytest.mark.slow)])
 def test_few_runs_and_many_do_not_contradict_each_other(beam, fem, data, draws):
     for bias, verdict in ((0.0, "accepted"), (0.1, "reweight")):
         wrong = replace(fem, shift=fem.shift + bias * np.sign(fem.matrix[..., 0]))
@@ -205,6 +205,7 @@ def test_certify_solves_as_often_as_asked_and_repeats_itself(beam, fem, data):
     assert repr(again.certificate) == repr(first.certificate)  # NaN included
 
 
+@pytest.mark.slow
 def test_certify_with_an_inferred_noise(beam):
     forward = linear_forward(beam)
     model = cal.model(

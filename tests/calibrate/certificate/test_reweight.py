@@ -19,6 +19,7 @@ def biased(beam):
     return exact_posterior(wrong, data), fem, data
 
 
+@pytest.mark.slow
 def test_the_reweighted_posterior_is_fems_and_is_accepted(biased):
     posterior, fem, data = biased
     reweighted = cal.reweight(posterior, LinearSimulator(fem))

@@ -352,6 +352,7 @@ def test_training_starts_from_another_emulator(capsys, block, tmp_path):
     assert record["command"].endswith("--seed 0 --start EMULATOR --out DIR")
 
 
+@pytest.mark.slow
 def test_train_and_evaluate(capsys, block, tmp_path):
     """The emulator of a scene of the user's own."""
     out = tmp_path / "e"

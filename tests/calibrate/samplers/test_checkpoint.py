@@ -46,7 +46,10 @@ def run(problem, name, **more):
     return cal.sample(model, data, sampler=name, options=options, seed=5, predictions=False, **more)
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize(
+    "name",
+    [n if n in ("nuts", "smc") else pytest.param(n, marks=pytest.mark.slow) for n in SAMPLERS],
+)
 def test_a_killed_run_goes_on_to_the_same_draws(name, problem, monkeypatch, tmp_path):
     """Killed early, in the pilot run or the first population, in the middle and at the end."""
     path = tmp_path / "sampling.safetensors"

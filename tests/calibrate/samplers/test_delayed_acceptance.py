@@ -60,6 +60,7 @@ def test_a_biased_cheap_map_leaves_fem_s_posterior_exact(beam, biased):
     assert abs(sds_off(cheap, exact, data)[0]).max() > 2 * (4 / np.sqrt(ess)).max()
 
 
+@pytest.mark.slow
 def test_statistics_count_fem_solves_and_acceptance(beam, biased):
     exact, model, data = biased
     solved = []

@@ -53,6 +53,7 @@ def test_unknown_noise_is_inferred(beam):
     assert row["sd"] == pytest.approx(0.3 / np.sqrt(2 * 135), rel=0.3)
 
 
+@pytest.mark.slow
 def test_no_draw_lies_where_the_forward_map_is_invalid(beam):
     from dataclasses import replace
 
@@ -119,6 +120,7 @@ def test_a_fitted_shear_straightens_a_bent_ridge():
     assert residual.std() == pytest.approx(1e-3, rel=0.2)
 
 
+@pytest.mark.slow
 def test_a_bent_posterior_is_sampled_well(beam):
     """mu known to a thousandth along a curve across the whole box of lam."""
 

@@ -29,6 +29,7 @@ def test_starts_of_a_sharp_gaussian_are_its_draws():
     np.testing.assert_allclose(z.std(axis=0), 1.0, atol=4 / np.sqrt(2 * len(z)))
 
 
+@pytest.mark.slow
 def test_both_modes_are_found():
     def log_density(x):
         return jax.nn.logsumexp(
@@ -39,6 +40,7 @@ def test_both_modes_are_found():
     assert 0.2 < right < 0.8
 
 
+@pytest.mark.slow
 def test_points_of_density_zero_are_no_starts():
     def log_density(x):
         return jnp.where(x[0] > 1.0, -0.5 * jnp.sum((x - 1.5) ** 2) / 0.04, -jnp.inf)
@@ -49,6 +51,7 @@ def test_points_of_density_zero_are_no_starts():
     assert np.isfinite(starts(lambda x: -jnp.inf + 0.0 * x[0], count=4)).all()
 
 
+@pytest.mark.slow
 def test_chains_may_start_by_pathfinder(beam):
     model, data = linear_problem(beam)
     options = cal.NUTSOptions(100, 200, chains=2, rounds=1, start="pathfinder")

@@ -45,6 +45,7 @@ def by_quadrature():
     return density[mu > 75].sum() * (mu[1] - mu[0]) / total, np.log(total)
 
 
+@pytest.mark.slow
 def test_two_modes_that_nuts_gets_wrong_have_their_shares(two_modes):
     model, data = two_modes
     share, log_evidence = by_quadrature()

@@ -86,6 +86,7 @@ def test_from_rest_up_a_ramp_then_newton(ventricle_simulator, inside_jit):
     np.testing.assert_allclose(inside.displacement, state.newton.u, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_jit_takes_the_iterations_that_python_takes(ventricle_simulator, inside_jit):
     theta = ventricle_simulator.scene.centre
     python, inside = ventricle_simulator.solve(theta), inside_jit(theta)
@@ -133,6 +134,7 @@ def test_a_ventricle_without_pressure_rests(ventricle_simulator, inside_jit, pre
             np.testing.assert_allclose(solution.displacement, 0.0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_sensitivities_without_pressure_are_finite(ventricle_simulator):
     """The moduli change nothing. In the pressure the switch of the fibres has a kink at rest."""
     theta = ventricle_simulator.scene.centre.at[-1].set(0.0)
@@ -143,7 +145,7 @@ def test_sensitivities_without_pressure_are_finite(ventricle_simulator):
     np.testing.assert_allclose(together[..., -1], columns[-1], atol=1e-9)
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.3])
+@pytest.mark.parametrize("shift", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_a_block_without_weight(shift):
     """It rests, or goes where its supports take it; from any start."""
     scene = replace(

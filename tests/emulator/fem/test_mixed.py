@@ -57,6 +57,7 @@ def test_a_step_makes_the_constraint_hold_to_first_order(scene, state):
     assert left[0] / left[1] == pytest.approx(4.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_as_many_iterations_however_incompressible(scene):
     # On the displacements alone nu = 0.49999 takes hundreds.
     simulator = em.Simulator(scene)

@@ -36,6 +36,7 @@ def beam_scene():
     return guccione(mesh, FollowerPressure("bottom", 0.004), "left", (8.0, 2.0, 4.0, 1e4))
 
 
+@pytest.mark.slow
 def test_a_carried_force_is_the_force_where_it_was_linearised(beam_scene):
     rng = np.random.default_rng(0)
     u = jnp.asarray(0.01 * rng.normal(size=beam_scene.held.shape))

@@ -87,6 +87,7 @@ def test_taylor_remainder_in_theta(beam, simulator):
     assert slope(steps, np.array(value)) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_vmap_equals_one_at_a_time(beam, simulator):
     thetas = beam.from_unit(jnp.asarray(np.random.default_rng(0).uniform(size=(4, 2))))
     together = jax.vmap(simulator.solve)(thetas)

@@ -26,6 +26,7 @@ COARSE = {
 
 SHARED = (
     "biventricle",
+    "left_ventricle_neo_hookean",
     "liver",
     "left_ventricle_segments",
     "traction_beam_guccione",

@@ -53,6 +53,7 @@ def test_a_body_on_springs_alone_sinks_by_its_load_over_their_stiffness():
     np.testing.assert_allclose(u[:, 0], 2.0, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_stiff_springs_clamp():
     load = (Traction("right", (0.2, 0.0, 0.1)),)
     clamped = em.Simulator(block(loads=load))(block().centre)

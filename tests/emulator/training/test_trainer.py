@@ -34,7 +34,7 @@ def tests(beam, simulator):
         ("energy", 0.8),
         pytest.param("simulations", 0.5, marks=pytest.mark.slow),
         pytest.param("gradients", 0.5, marks=pytest.mark.slow),
-        ("both", 0.5),
+        pytest.param("both", 0.5, marks=pytest.mark.slow),
     ],
 )
 def test_training_lowers_the_error(beam, tests, objective, factor, tmp_path):
@@ -71,6 +71,7 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
     assert resumed.record["plan"] == whole.record["plan"]
 
 
+@pytest.mark.slow
 def test_resuming_needs_a_checkpoint_of_this_scene(beam, cube, tmp_path):
     with pytest.raises(InputError, match="nothing to resume"):
         train(beam, Plan(), tmp_path, resume=True)
@@ -105,6 +106,7 @@ def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
     assert emulator.record["seconds"] < 50.0  # whatever else the machine is doing
 
 
+@pytest.mark.slow
 def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
     with pytest.raises(InputError, match=r"the budget leaves \d+ training steps .* give at least"):
         train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=1.0)
@@ -296,6 +298,7 @@ def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatc
     assert resumed.record["plan"] == hybrid.record["plan"]
 
 
+@pytest.mark.slow
 def test_frozen_modes_do_not_move(beam):
     problem = prepare(beam, HYBRID, SMALL)
     weights, state = problem.initial()

@@ -75,9 +75,8 @@ def test_the_energy_is_minus_p_times_the_change_in_volume():
     assert term.total(u, {}) == pytest.approx(-0.7 * float(change), rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "kind", [CavityPressure, pytest.param(PublishedPressure, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [CavityPressure, PublishedPressure])
 def test_a_pressed_face_gives_way_and_the_tangent_is_right(kind):
     scene = membrane(kind("right", 0.5))
     simulator = em.Simulator(scene)

@@ -90,6 +90,7 @@ def test_an_expansion_of_order_zero_leaves_the_position_alone(simulator, runs):
     np.testing.assert_allclose(plain(x), runs.displacement[3], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_one_parameter_two_runs():
     scene = block(loads=(Gravity(density=150.0),), cells=(1, 1, 1))
     scene = replace(scene, parameters=scene.parameters[:1], constants={"lam": 4.0})
@@ -100,6 +101,7 @@ def test_one_parameter_two_runs():
         np.testing.assert_allclose(fitted(scene.to_unit(theta)), u, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_equal_runs_count_once(simulator, runs, series):
     twice = runs.take(np.array([0, 1, 2, 0]))
     fitted = fit_discrepancy(simulator.scene, twice, series)
