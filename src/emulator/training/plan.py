@@ -63,6 +63,8 @@ class Plan:
                 raise InputError(
                     f"training: {name} is {getattr(self, name)}; it must be {value} or more"
                 )
+        if self.seed < 0:
+            raise InputError(f"training: seed {self.seed} is below 0")
         if self.objective != "energy" and self.simulations < self.batch:
             raise InputError(
                 f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"
