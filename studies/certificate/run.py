@@ -26,11 +26,12 @@ from emulator.store import replacing, write_json
 HERE = Path(__file__).parent
 SEED = 0
 LARGEST_SHIFT, LARGEST_SD = 0.5, 0.25  # what no accepted posterior may exceed
-COLOURS = {
-    "accepted": "tab:green",
-    "reweight": "tab:blue",
-    "undecided": "tab:orange",
-    "not certified": "tab:red",
+# Colours and shapes that differ for every reader (Okabe and Ito 2008).
+MARKS = {
+    "accepted": ("#009E73", "o"),
+    "reweight": ("#0072B2", "s"),
+    "undecided": ("#E69F00", "^"),
+    "not certified": ("#D55E00", "X"),
 }
 
 
@@ -94,18 +95,19 @@ def draw(rows, path: Path) -> None:
     """True shift and true change of sd of every posterior, coloured by verdict."""
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(7.5, 5.5), layout="constrained")
-    axes.axvspan(0, LARGEST_SHIFT, 0, 1, color="0.95")
-    for verdict, colour in COLOURS.items():
+    axes.fill_between([1e-9, LARGEST_SHIFT], 1e-9, LARGEST_SD, color="0.93", lw=0)
+    for verdict, (colour, mark) in MARKS.items():
         chosen = [r for r in rows if r["status"] == verdict]
         x = [max(r["true_shift"], 3e-3) for r in chosen]
         y = [max(r["true_sd"], 3e-3) for r in chosen]
-        axes.plot(x, y, "o", color=colour, label=f"{verdict} ({len(chosen)})", alpha=0.7)
+        axes.plot(x, y, mark, color=colour, ls="", label=f"{verdict} ({len(chosen)})", alpha=0.7)
     axes.axvline(LARGEST_SHIFT, color="k", lw=0.8)
     axes.axhline(LARGEST_SD, color="k", lw=0.8)
     axes.set(xscale="log", yscale="log", xlabel="largest true shift of a mean / sd")
+    axes.set(xlim=(2e-3, 9.0), ylim=(2.5e-3, 2.5))
     axes.set(ylabel="largest true change of an sd")
     axes.legend()
-    axes.set_title("Verdicts: no green beyond the lines")
+    axes.set_title("Verdicts: none accepted beyond the lines")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=130)
     plt.close(figure)
