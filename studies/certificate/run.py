@@ -106,7 +106,7 @@ def draw(rows, path: Path) -> None:
     axes.set(xscale="log", yscale="log", xlabel="largest true shift of a mean / sd")
     axes.set(xlim=(2e-3, 9.0), ylim=(2.5e-3, 2.5))
     axes.set(ylabel="largest true change of an sd")
-    axes.legend()
+    axes.legend(loc="lower right")
     axes.set_title("Verdicts: none accepted beyond the lines")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=130)
