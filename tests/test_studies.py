@@ -157,6 +157,10 @@ def test_every_study_has_a_line():
     assert set(CHECKS) <= set(QUICK)
 
 
+# Figures that need more than the few cases.
+FULL_ONLY = {"few_runs": {"meshes.png"}}
+
+
 @pytest.mark.parametrize(
     "name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in QUICK]
 )
@@ -167,8 +171,9 @@ def test_a_few_cases(name, tmp_path, request):
     words = [given.get(word, word) for word in QUICK[name].split()]
     results = run(name, *words, "--out", tmp_path)
     CHECKS.get(name, lambda _: None)(results)
-    for figure in (STUDIES / name).glob("*.png"):
-        assert (tmp_path / figure.name).stat().st_size > 10_000
+    drawn = {path.name for path in (STUDIES / name).glob("*.png")} - FULL_ONLY.get(name, set())
+    for figure in drawn:
+        assert (tmp_path / figure).stat().st_size > 10_000
 
 
 def test_a_hang_in_stability_is_recorded_and_loses_nothing(tmp_path):
