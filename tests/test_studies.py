@@ -24,6 +24,7 @@ QUICK = {
     "fem_speed": "--quick --fenics-python ABSENT",
     "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
     "many_solves": "--solves 3",
+    "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
     "new_ventricle": "--ventricles 1 --runs 8 --tests 3",
     "objectives": "--quick",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "

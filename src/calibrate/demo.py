@@ -15,7 +15,8 @@ from calibrate.figures.beam import beam_figure
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.ventricle import ventricle_figure
 from calibrate.identifiability import identify
-from calibrate.workflow import Run, certify_and_keep, infer, report, simulator_of
+from calibrate.run import Run
+from calibrate.workflow import certify_and_keep, infer, report, simulator_of
 from emulator.store import check_folder
 
 # Neither a theta of the training runs nor the centre of the Taylor series.

@@ -200,7 +200,7 @@ def sample(
     context = Context(progress, kept, fem)
     found = chosen.sample(density_of(model), checked, options, seed, context)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
-    draws = named_draws(model, checked, found.z)
+    draws = named_draws(model, found.z)
     tree = make_tree(model, checked, draws, found.statistics, rng_key)
     for name, value in {**made, **found.attributes}.items():
         tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)

@@ -240,7 +240,7 @@ def _replicates(
         true = {name: values[r] for name, values in made.draws.items()}
         found = draw(data, seed + r)
         yield Replicate(
-            {**true, LOG_LIKELIHOOD: _log_likelihoods(model, {n: true[n] for n in true}, data)},
+            {**true, LOG_LIKELIHOOD: _log_likelihoods(model, true, data)},
             {**found, LOG_LIKELIHOOD: _log_likelihoods(model, found, data)},
         )
 

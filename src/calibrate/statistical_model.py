@@ -100,19 +100,25 @@ class Model:
         """What is inferred: the unknowns of theta, then those of the noises."""
         return (*self.states.unknowns, *self.noise_priors)
 
+    @property
+    def on_log_scale(self) -> tuple[bool, ...]:
+        """Whether each unknown of theta has a logarithmic scale in its scene."""
+        scales = {parameter.name: parameter.scale for parameter in self.forward.scene.parameters}
+        return tuple(scales[split(name)[0]] == "log" for name in self.states.unknowns)
+
     @cached_property
-    def _sampled_prior(self) -> dict[str, dist.Distribution]:
-        return {name: standardised(self.prior[name]) for name in self.states.unknowns}
+    def sampled_priors(self) -> dict[str, dist.Distribution]:
+        """Prior of all that is inferred, as NumPyro samples it."""
+        theta = {name: standardised(self.prior[name]) for name in self.states.unknowns}
+        return {**theta, **self.noise_priors}
 
     def __call__(self, data: jax.Array | Data | None = None) -> None:
         """The NumPyro program; ``data`` by name, or as it is when one thing is observed."""
-        draw = {name: numpyro.sample(name, d) for name, d in self._sampled_prior.items()}
+        draw = {name: numpyro.sample(name, d) for name, d in self.sampled_priors.items()}
         thetas = self.states.thetas(draw)
         prediction = self.evaluate(thetas)
         # Where the forward map has no answer, the density is zero, not NaN.
         numpyro.factor("valid", jnp.where(prediction.valid, 0.0, -jnp.inf))
-        draw |= {name: numpyro.sample(name, d) for name, d in self.noise_priors.items()}
-        values = self.noise_values(draw)
         means = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0), thetas)
         observed = None if data is None else self.observe.name(data, "data")
         if self.error is not None:
@@ -120,12 +126,9 @@ class Model:
                 means = self.error.draw(numpyro.prng_key(), self._stacked(draw), means)
             else:
                 numpyro.factor("approximation_error", self._error_ratio(draw, means, observed))
-        for name, mean in means.items():
-            numpyro.sample(
-                f"observed_{name}",
-                self.noise[name].distribution(mean, values[name]),
-                obs=None if observed is None else observed[name],
-            )
+        for name, distribution in self.distributions(means, self.noise_values(draw)).items():
+            obs = None if observed is None else observed[name]
+            numpyro.sample(f"observed_{name}", distribution, obs=obs)
 
     def evaluate(self, thetas: jax.Array) -> Prediction:
         """Displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p), in one call.
@@ -151,6 +154,18 @@ class Model:
             for name, sites in self.noise_sites.items()
         }
 
+    def distributions(self, means: Data, values: NoiseValues) -> dict[str, dist.Distribution]:
+        """Distribution of each observation's data around its mean, by name.
+
+        ``values`` of the inferred numbers of the noises (:meth:`noise_values`).
+        """
+        return {n: self.noise[n].distribution(mean, values[n]) for n, mean in means.items()}
+
+    def log_density(self, means: Data, values: NoiseValues, data: Data) -> jax.Array:
+        """Log density of ``data`` around ``means``, shape ()."""
+        parts = self.distributions(means, values)
+        return sum((d.log_prob(data[name]) for name, d in parts.items()), jnp.zeros(()))
+
     def log_likelihood(
         self, displacement: jax.Array, thetas: jax.Array, values: NoiseValues, data: Data
     ) -> jax.Array:
@@ -162,12 +177,7 @@ class Model:
         thetas : (S, p).
         values : inferred numbers of the noises (:meth:`noise_values`).
         """
-        means = self.observe(displacement, thetas)
-        terms = [
-            self.noise[name].distribution(mean, values[name]).log_prob(data[name])
-            for name, mean in means.items()
-        ]
-        return sum(terms, jnp.zeros(()))
+        return self.log_density(self.observe(displacement, thetas), values, data)
 
     def map_log_likelihood(self, draw: Mapping[str, Any], data: Data) -> jax.Array:
         """Log density of ``data``, (), with the forward map and what is allowed for its error.
@@ -176,10 +186,10 @@ class Model:
         """
         thetas = self.states.thetas(draw)
         displacement, valid = self.evaluate(thetas)
-        displacement = jnp.where(valid, displacement, 0.0)
-        found = self.log_likelihood(displacement, thetas, self.noise_values(draw), data)
+        means = self.observe(jnp.where(valid, displacement, 0.0), thetas)
+        found = self.log_density(means, self.noise_values(draw), data)
         if self.error is not None:
-            found += self._error_ratio(draw, self.observe(displacement, thetas), data)
+            found += self._error_ratio(draw, means, data)
         return jnp.where(valid, found, -jnp.inf)
 
     def _error_ratio(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
@@ -305,10 +315,9 @@ def _noises(
 ) -> tuple[dict[str, str], dict[str, Noise]]:
     """The name each observation's noise was given under, and the noise."""
     if not isinstance(noise, Mapping):
-        bases = list(dict.fromkeys(split(name)[0] for name in observe.parts))
-        if len(bases) > 1:
-            raise InputError(f"noise: give one for each of {', '.join(bases)}, by name")
-        noise = {bases[0]: noise}
+        if len(observe.bases) > 1:
+            raise InputError(f"noise: give one for each of {', '.join(observe.bases)}, by name")
+        noise = {observe.bases[0]: noise}
     found = observe.expand(noise, "noise")
     for name in observe.parts:
         if name not in found:

@@ -15,23 +15,12 @@ from calibrate.approximation_error import ApproximationError, fit
 from calibrate.learned_error import with_error
 from calibrate.posterior import sample
 from emulator.errors import InputError
-from emulator.fem.solution import Solution, Status
-from linear_support import closed_form, linear_forward
+from linear_support import LinearSimulator, closed_form, linear_forward
 
 NODES = np.array([3, 11, 20, 30])
 NOISE = 0.02
 TRUTH = jnp.array([72.0, 68.0])
 MEAN, SD = np.array([75.0, 75.0]), np.array([8.0, 8.0])
-
-
-class Exact:
-    """Stands for FEM: a linear map that converges everywhere."""
-
-    def __init__(self, forward):
-        self.forward, self.scene = forward, forward.scene
-
-    def solve(self, theta, start=None):
-        return Solution(self.forward(theta), jnp.array(Status.CONVERGED), *[jnp.array(0.0)] * 4)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +43,7 @@ def model_of(forward, noise=NOISE):
 
 @pytest.fixture(scope="module")
 def aware(truth, poor):
-    return with_error(model_of(poor), Exact(truth), 40)
+    return with_error(model_of(poor), LinearSimulator(truth), 40)
 
 
 def test_the_density_is_that_of_the_sum_of_noise_and_error(aware, truth):
@@ -134,7 +123,7 @@ def test_nuts_and_replicated_data_know_of_it(truth, aware):
 
 
 def test_an_exact_map_changes_nothing(truth):
-    model = with_error(model_of(truth), Exact(truth), 10)
+    model = with_error(model_of(truth), LinearSimulator(truth), 10)
     data = model.check_data(np.asarray(truth.at(NODES)(TRUTH)))
     draw = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}
     plain = replace(model, error=None).map_log_likelihood(draw, data)
@@ -155,15 +144,15 @@ def test_it_is_kept_and_restored(aware):
 def test_what_is_refused(truth, poor, cube):
     model = model_of(poor)
     with pytest.raises(InputError, match="5 FEM runs; give 8 or more"):
-        with_error(model, Exact(truth), 5)
+        with_error(model, LinearSimulator(truth), 5)
     with pytest.raises(InputError, match="the simulator is for another scene"):
-        with_error(model, Exact(linear_forward(cube)), 10)
+        with_error(model, LinearSimulator(linear_forward(cube)), 10)
     observe = cal.nodal_displacements(poor.scene, NODES)
     unknown = cal.model(poor, observe, cal.GaussianNoise(sd_scale=0.1))
     with pytest.raises(InputError, match="the noise of displacement must be Gaussian and of known"):
-        with_error(unknown, Exact(truth), 10)
+        with_error(unknown, LinearSimulator(truth), 10)
     nowhere = cal.model(
         replace(poor, limit=10.0), observe, cal.GaussianNoise(sd=0.1), check_scale=False
     )
     with pytest.raises(InputError, match="answered at 0 of 10 draws of the prior; 8 are needed"):
-        with_error(nowhere, Exact(truth), 10)
+        with_error(nowhere, LinearSimulator(truth), 10)

@@ -10,7 +10,8 @@ import pytest
 import emulator as em
 from calibrate.cli import main
 from calibrate.posterior import read_tree
-from calibrate.workflow import Run, infer, read_posterior
+from calibrate.run import Run
+from calibrate.workflow import infer, read_posterior
 from emulator.errors import InputError
 from emulator.scenes import registry
 from emulator.store import read_arrays, save_arrays

@@ -10,7 +10,8 @@ import calibrate as cal
 from calibrate.data import read_data, write_data
 from calibrate.load_states import known_thetas, load_states
 from calibrate.observations import observations, parse_observation, spread_landmarks
-from calibrate.workflow import Run, make_data
+from calibrate.run import Run
+from calibrate.workflow import make_data
 from emulator.errors import InputError
 from linear_support import LinearForward, linear_forward
 

@@ -11,8 +11,9 @@ import pytest
 import calibrate as cal
 from calibrate.data import read_data, write_data
 from calibrate.observations import KINDS, Scalar, observations_from_json, parse_observation
+from calibrate.run import Run
 from calibrate.tree import labels_of
-from calibrate.workflow import Run, make_data
+from calibrate.workflow import make_data
 from emulator.errors import InputError
 from linear_support import linear_forward
 

@@ -13,7 +13,8 @@ from calibrate.cli.posterior_table import summary
 from calibrate.data import write_data
 from calibrate.noise import DiscrepancyNoise, StudentTNoise
 from calibrate.observations import parse_observation
-from calibrate.workflow import Run, infer, make_data, read_posterior, report
+from calibrate.run import Run
+from calibrate.workflow import infer, make_data, read_posterior, report
 from emulator import schema
 from emulator.errors import InputError
 from linear_support import linear_forward
@@ -113,3 +114,15 @@ def test_a_posterior_with_gaps_and_a_discrepancy_is_kept_and_read(tmp_path):
         for p in (posterior, back)
     ]
     assert densities[0] == pytest.approx(densities[1], rel=1e-12)
+
+
+def test_what_is_said_of_one_state_makes_its_noise_one_of_its_own(beam):
+    observe = parse_observation(beam, "nodes:4", 0, ("soft", "stiff"))
+    discrepancy = {"displacement": {"scale": 0.5, "length": 20.0}}
+    run = run_of(noise=0.3, noise_scale={"displacement@soft": 0.2}, discrepancy=discrepancy)
+    found = run.noises(observe)
+    assert {name: noise.sd for name, noise in found.items()} == {
+        "displacement@soft": None,
+        "displacement": 0.3,
+    }
+    assert all(isinstance(noise, DiscrepancyNoise) for noise in found.values())

@@ -14,7 +14,7 @@ from calibrate.observations import (
     observations_from_json,
     parse_observation,
 )
-from calibrate.workflow import Run
+from calibrate.run import Run
 from emulator.errors import InputError
 from linear_support import linear_forward
 

@@ -1,10 +1,10 @@
 r"""A check against FEM with a fixed number of solves.
 
-1. **Train.** FEM at draws of the posterior, evenly spaced, and at draws of the prior. What the map
-   misses there is learned (:mod:`calibrate.certificate.correction`), and a pool of cheap points
-   follows the corrected map's posterior wherever it leads (:mod:`calibrate.certificate.pool`).
-   Further runs, in rounds, go where the correction is so uncertain that FEM may find the data
-   likely after all.
+1. **Train.** FEM at draws of the posterior, evenly spaced, around them, and at draws of the prior.
+   What the map misses there is learned (:mod:`calibrate.certificate.correction`), and a pool of
+   cheap points follows the corrected map's posterior wherever it leads
+   (:mod:`calibrate.certificate.pool`). Further runs, in rounds, go where the correction is so
+   uncertain that FEM may find the data likely after all.
 2. **Test.** The other runs are fresh points :math:`z_j` of the pool, drawn with probabilities
    :math:`a_j` that mix the corrected posterior, the map's, where FEM may find the data likely, and
    the whole pool (defensive mixture; Hesterberg 1995). A moment under FEM is the corrected map's
@@ -40,6 +40,7 @@ from calibrate.certificate.misfit import DRAWS, misfits
 from calibrate.certificate.pool import (
     MOST_TEMPERED,
     Pool,
+    around_draws,
     corrected_again,
     effective,
     normalised,
@@ -54,17 +55,18 @@ from calibrate.certificate.runs import Runs, Solver, correction_from, joined
 from calibrate.certificate.verdict import Certificate, judge
 from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.posterior import Posterior
+from calibrate.samplers.registry import SAMPLERS
 from emulator.errors import InputError
 from emulator.fem import Simulator
 
 _FEM_RUNS = 200
 _FEWEST = 25
 # Shares of the runs that train the correction; the others test it.
-_AT_DRAWS, _AT_PRIOR, _ADAPTIVE = 0.2, 0.15, 0.2
+_AT_DRAWS, _AROUND, _AT_PRIOR, _ADAPTIVE = 0.15, 0.1, 0.1, 0.2
 _ROUNDS = 5  # in which the adaptive ones are chosen
 # Shares of the test points: from the corrected posterior, the map's, where FEM may find the data
-# likely, and from the whole pool.
-_CORRECTED, _MAP, _EXPLORED, _POOL = 0.6, 0.15, 0.1, 0.15
+# likely, around the draws, and from the whole pool.
+_CORRECTED, _MAP, _EXPLORED, _WIDE, _POOL = 0.55, 0.15, 0.1, 0.1, 0.1
 _STABILITY = 20  # draws at which the tangent's sign is asked for
 
 
@@ -96,8 +98,10 @@ def examine(
     Raises
     ------
     InputError
-        The simulator is for another scene, or too few runs are asked for.
+        The simulator is for another scene, too few runs are asked for, or FEM has decided on the
+        draws already.
     """
+    _refuse_fem_draws(posterior)
     count = _FEM_RUNS if draws is None else draws
     if count < _FEWEST:
         raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
@@ -141,6 +145,14 @@ def certify(
     return check.certificate
 
 
+def _refuse_fem_draws(posterior: Posterior) -> None:
+    sampler = posterior.tree.attrs.get("sampler")
+    if sampler in SAMPLERS and SAMPLERS[sampler].solves_fem:
+        raise InputError(
+            f"the posterior of sampler '{sampler}' is FEM's already; it needs no certificate"
+        )
+
+
 def _train(
     solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[Runs, Runs, Correction, Pool]:
@@ -148,8 +160,11 @@ def _train(
     predictive = solver.predictive
     rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
     at_draws = solver(z[rows], stability=_STABILITY)
+    # Next to the draws the map may hide a part of the posterior, by an error that draws of the
+    # prior are too far apart to show.
+    wide = around_draws(z, rng).sample(rng, max(round(_AROUND * count), 4))
     prior = predictive.prior_draws(_key(rng), max(round(_AT_PRIOR * count), 4))
-    runs = joined([at_draws, solver(prior)])
+    runs = joined([at_draws, solver(wide), solver(prior)])
     correction = correction_from(runs, predictive, count)
     pool = search(predictive, correction, z, rng)
     for _ in range(_ROUNDS):
@@ -170,6 +185,7 @@ def _test(solver: Solver, pool: Pool, count: int, rng: np.random.Generator) -> T
     """FEM at fresh points of the pool, with the log density they were drawn from."""
     even = np.full(len(pool.z), 1.0 / len(pool.z))
     chances = _CORRECTED * pool.corrected + _MAP * pool.cheap + _POOL * even
+    chances += _WIDE * pool.around
     chances += _EXPLORED * normalised(pool.log_explored)
     chances = chances / chances.sum()
     rows = rng.choice(len(chances), size=count, p=chances)

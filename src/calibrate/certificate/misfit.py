@@ -58,7 +58,8 @@ def misfits(
     unravel = ravel_pytree({name: jnp.zeros(shape) for name, shape in shapes.items()})[1]
 
     def one(flat: jax.Array, draw: dict[str, jax.Array], key: jax.Array) -> Any:
-        parts = predictive.distributions(unravel(flat), draw)
+        values = predictive.model.noise_values(draw)
+        parts = predictive.model.distributions(unravel(flat), values)
         keys = jax.random.split(key, len(parts))
         means = unravel(flat)
         return {

@@ -28,7 +28,7 @@ from calibrate.certificate.predictive import Evaluated, Predictive
 from calibrate.certificate.proposals import Kernels, around
 
 NEAR, NEAR_FREEDOM = 2048, 5.0
-WIDE, WIDE_WIDTHS, WIDE_FREEDOM = 512, (2.0,), 3.0
+WIDE, WIDE_WIDTHS, WIDE_FREEDOM = 512, (1.0, 2.0), 3.0
 PRIOR = 512
 STEP, SEARCH_ROUNDS, POLISH_ROUNDS = 512, 8, 4
 _TEMPERED_ESS, MOST_TEMPERED = 0.15, 300.0  # of the points, for the next round's kernels
@@ -41,6 +41,7 @@ class Pool:
 
     proposals, counts : kernels and how many points each gave; the first ``priors`` points are the
         prior's.
+    wide : which proposal surrounds the draws.
     log_kernels : of each proposal at each point, (c, s).
     at : log prior and likelihoods of the points, (s,) each.
     """
@@ -51,6 +52,7 @@ class Pool:
     proposals: tuple[Kernels, ...] = ()
     counts: tuple[int, ...] = ()
     log_kernels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    wide: int = 0
 
     @property
     def log_mixture(self) -> np.ndarray:
@@ -79,6 +81,11 @@ class Pool:
     def log_cheap(self) -> np.ndarray:
         """Log weights (s,) of the posterior with the map as it is, up to a constant."""
         return self.at.prior + self.at.cheap - self.log_mixture
+
+    @property
+    def around(self) -> np.ndarray:
+        """Weights (s,) of sum 1 of :func:`around_draws`, whatever a map says there."""
+        return normalised(self.log_kernels[self.wide] - self.log_mixture)
 
     @property
     def corrected(self) -> np.ndarray:
@@ -143,9 +150,14 @@ def search(
         pool = step(pool, predictive, correction, pool.log_explored, rng)
     near = around(draws, widths(draws.shape[1]), NEAR_FREEDOM, rng)
     pool = extend(pool, predictive, correction, near, NEAR, rng)
-    wide = around(draws, WIDE_WIDTHS, WIDE_FREEDOM, rng)
-    pool = extend(pool, predictive, correction, wide, WIDE, rng)
+    pool = replace(pool, wide=len(pool.proposals))
+    pool = extend(pool, predictive, correction, around_draws(draws, rng), WIDE, rng)
     return polish(pool, predictive, correction, rng)
+
+
+def around_draws(draws: np.ndarray, rng: np.random.Generator) -> Kernels:
+    """A proposal that surrounds the draws (s, p) of z, by one and two of their sd."""
+    return around(draws, WIDE_WIDTHS, WIDE_FREEDOM, rng)
 
 
 def polish(
@@ -200,7 +212,9 @@ def extend(
     )
     at = Evaluated(*(np.concatenate(both) for both in zip(pool.at, new, strict=True)))
     counts, proposals = (*pool.counts, count), (*pool.proposals, proposal)
-    return Pool(everything, at, pool.priors, proposals, counts, log_kernels)
+    return replace(
+        pool, z=everything, at=at, proposals=proposals, counts=counts, log_kernels=log_kernels
+    )
 
 
 def redrawn(

@@ -21,11 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from numpyro import handlers
-from numpyro.infer.util import initialize_model, unconstrain_fn
 
 from calibrate.certificate.correction import Correction, correct
-from calibrate.state_names import split
+from calibrate.samplers.density import Density, density_of
 from calibrate.statistical_model import Data, Model
 
 _BLOCK = 256  # points evaluated by one call of a program, so that it is compiled for one shape
@@ -57,43 +55,26 @@ class Predictive:
     data: Data
 
     @cached_property
-    def _prior_program(self) -> Any:
-        """The model without its data: only what is inferred is left.
-
-        Sites are hidden by name: the Jacobians that NumPyro adds count as observed, too.
-        """
-        seeded = handlers.seed(self.model, jax.random.key(0))
-        sites = handlers.trace(seeded).get_trace(self.data)
-        hidden = [n for n, s in sites.items() if s["type"] == "sample" and s["is_observed"]]
-        return handlers.block(self.model, hide=hidden)
-
-    @cached_property
-    def _info(self) -> Any:
-        return initialize_model(
-            jax.random.key(0), self._prior_program, model_args=(self.data,), dynamic_args=True
-        )
-
-    @cached_property
-    def _unravel(self) -> Any:
-        return ravel_pytree(self._info.param_info.z)[1]
+    def _density(self) -> Density:
+        return density_of(self.model)
 
     @property
     def dimension(self) -> int:
         """Number of unconstrained coordinates."""
-        return int(ravel_pytree(self._info.param_info.z)[0].size)
+        return self._density.dimension
 
     def constrain(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """Draws by name, each (s,)."""
-        return self._in_blocks(self._constrain_block, z)
+        return self._in_blocks(self._density.constrain, z)
 
     def unconstrain(self, draws: Mapping[str, np.ndarray]) -> np.ndarray:
         """Z (s, p) of draws by name; a draw on a bound of its parameter is moved inside."""
-        z = self._unconstrain({name: jnp.asarray(draws[name]) for name in self.model.names})
-        return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)
+        named = {name: jnp.asarray(draws[name]) for name in self.model.names}
+        return _inside(jax.jit(jax.vmap(self._density.unconstrain))(named))
 
     def prior_draws(self, rng_key: jax.Array, count: int) -> np.ndarray:
         """Points (count, p) from the prior."""
-        return self.unconstrain(self._prior_draws(jax.random.split(rng_key, count)))
+        return _inside(self._prior_draws(jax.random.split(rng_key, count)))
 
     def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
         """Log densities at points (s, p)."""
@@ -132,10 +113,9 @@ class Predictive:
 
     def _on_scales(self, draws: Mapping[str, jax.Array]) -> jax.Array:
         """Unknowns of theta (..., q), as logarithms where their parameter's scale is ``log``."""
-        scales = {p.name: p.scale for p in self.model.forward.scene.parameters}
         columns = [
-            jnp.log(draws[name]) if scales[split(name)[0]] == "log" else draws[name]
-            for name in self.model.states.unknowns
+            jnp.log(draws[name]) if log else draws[name]
+            for name, log in zip(self.model.states.unknowns, self.model.on_log_scale, strict=True)
         ]
         return jnp.stack(columns, axis=-1)
 
@@ -144,28 +124,11 @@ class Predictive:
         return (self._on_scales(draws) - centre) / width
 
     def _constrain(self, z: jax.Array) -> dict[str, jax.Array]:
-        return self._info.postprocess_fn(self.data)(self._unravel(z))
+        return jax.tree.map(lambda values: values[0], self._density.constrain(z[None]))
 
     def _means(self, draws: Mapping[str, jax.Array]) -> tuple[dict[str, jax.Array], jax.Array]:
         means, valid = self.model.predict(draws)
         return {name: jnp.where(valid, mean, 0.0) for name, mean in means.items()}, valid
-
-    def log_likelihood(
-        self, means: Mapping[str, jax.Array], draws: Mapping[str, jax.Array]
-    ) -> jax.Array:
-        """Log density of the data given its means by name, shape ()."""
-        terms = [d.log_prob(self.data[n]) for n, d in self.distributions(means, draws).items()]
-        return sum(terms, jnp.zeros(()))
-
-    def distributions(
-        self, means: Mapping[str, jax.Array], draws: Mapping[str, jax.Array]
-    ) -> dict[str, Any]:
-        """Distribution of each observation's data, by name, at one draw."""
-        values = self.model.noise_values(draws)
-        return {
-            name: self.model.noise[name].distribution(mean, values[name])
-            for name, mean in means.items()
-        }
 
     def _evaluate(self, z: jax.Array, correction: Correction) -> Evaluated:
         draws = self._constrain(z)
@@ -174,17 +137,13 @@ class Predictive:
         step, variance = correct(correction, self._features(draws))
         moved = unravel(flat + step)
         cheap = self.model.map_log_likelihood(draws, self.data)
-        corrected = self.log_likelihood(moved, draws)
-        prior = -self._info.potential_fn(self.data)(self._unravel(z))
+        corrected = self.model.log_density(moved, self.model.noise_values(draws), self.data)
+        prior = self._density.log_prior(z)
         prior, cheap, corrected = (
             jnp.where(fine & jnp.isfinite(value), value, -jnp.inf)
             for fine, value in ((True, prior), (valid, cheap), (valid, corrected))
         )
         return Evaluated(prior, cheap, corrected, variance)
-
-    @cached_property
-    def _constrain_block(self) -> Any:
-        return jax.jit(jax.vmap(self._constrain))
 
     @cached_property
     def _evaluate_block(self) -> Any:
@@ -202,21 +161,8 @@ class Predictive:
         return jax.jit(lambda z: jax.lax.map(one, z, batch_size=_BATCH))
 
     @cached_property
-    def _unconstrain(self) -> Any:
-        def one(draw: Mapping[str, jax.Array]) -> jax.Array:
-            z = unconstrain_fn(self._prior_program, (self.data,), {}, dict(draw))
-            return ravel_pytree(z)[0]
-
-        return jax.jit(jax.vmap(one))
-
-    @cached_property
     def _prior_draws(self) -> Any:
-        def one(rng_key: jax.Array) -> dict[str, jax.Array]:
-            program = handlers.seed(self._prior_program, rng_key)
-            trace = handlers.trace(program).get_trace(self.data)
-            return {name: trace[name]["value"] for name in self.model.names}
-
-        return jax.jit(jax.vmap(one))
+        return jax.jit(jax.vmap(self._density.prior_draw))
 
     def _in_blocks(self, program: Any, z: np.ndarray) -> Any:
         """``program`` of points (s, p), in blocks of one shape; the last one is filled up."""
@@ -226,3 +172,8 @@ class Predictive:
             for k in range(0, len(padded), _BLOCK)
         ]
         return jax.tree.map(lambda *arrays: np.concatenate(arrays)[: len(z)], *parts)
+
+
+def _inside(z: jax.Array) -> np.ndarray:
+    """Points whose coordinates are finite: a draw on a bound is at infinity."""
+    return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)

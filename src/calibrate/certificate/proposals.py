@@ -48,7 +48,7 @@ class Kernels:
         """Log densities (s,) in z; the map has unit Jacobian."""
         p, nu = z.shape[1], self.freedom
         whiten = np.linalg.inv(self.root).T
-        points, centres = straighten(self.map_, z) @ whiten, self.centres @ whiten
+        points, centres = transport.straighten(self.map_, z) @ whiten, self.centres @ whiten
         square = (points**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1)
         square = np.maximum(square - 2.0 * points @ centres.T, 0.0)
         norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * np.pi)
@@ -66,25 +66,11 @@ def around(
     """Kernels on some of the draws (s, p) of z."""
     rows = rng.permutation(len(draws))
     map_ = transport.fit(draws[rows[:FITTED]])
-    straight = straighten(map_, draws)
+    straight = transport.straighten(map_, draws)
     covariance = np.atleast_2d(np.cov(straight, rowvar=False))
     # A coordinate that does not vary still gets a width, so that the density exists.
     root = np.linalg.cholesky(covariance + np.diag(1e-9 * np.diag(covariance) + 1e-12))
     return Kernels(map_, straight[rows[:CENTRES]], root, widths, freedom)
-
-
-def straighten(map_: transport.TransportMap, z: np.ndarray) -> np.ndarray:
-    """``zeta`` (s, p) from ``z`` (s, p): the inverse of :func:`calibrate.samplers.transport.apply`.
-
-    The map is triangular: each coordinate's shift depends on coordinates of ``z`` alone.
-    """
-    order, coefficients = np.asarray(map_.order), np.asarray(map_.coefficients)
-    squashed = expit(z[:, order])
-    zeta = np.array(z)
-    for k in range(1, z.shape[1]):
-        terms = np.asarray(transport.monomials(squashed, k))
-        zeta[:, order[k]] -= terms @ coefficients[k, : terms.shape[1]]
-    return zeta
 
 
 def bend(map_: transport.TransportMap, zeta: np.ndarray) -> np.ndarray:

@@ -12,12 +12,19 @@ from collections.abc import Sequence
 
 from calibrate.cli import commands
 from calibrate.cli.common import BAD_INPUT, FAILED, Parser
+from calibrate.cli.compiled import VARIABLE, keep_programs
 from emulator.errors import InputError, SolverError
 
 
 def build_parser() -> Parser:
     """The parser with every command."""
     parser = Parser(prog="calibrate", description="Bayesian calibration of soft-tissue models.")
+    parser.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="neither use nor keep compiled programs; otherwise they are in the user's cache "
+        f"folder, or in {VARIABLE}",
+    )
     chosen = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND", parser_class=Parser
     )
@@ -30,6 +37,8 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
         arguments = build_parser().parse_args(words)
+        if not arguments.no_cache:
+            keep_programs()
         return arguments.run(arguments)
     except InputError as error:
         print(f"calibrate: {error}", file=sys.stderr)

@@ -55,7 +55,7 @@ def add_model(parser: argparse.ArgumentParser) -> None:
 
 
 def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What :func:`add_model` read, as fields of :class:`~calibrate.workflow.Run`."""
+    """What :func:`add_model` read, as fields of :class:`~calibrate.run.Run`."""
     return {
         "scene": _absolute(arguments.scene, is_path=arguments.scene.endswith(".toml")),
         "root": arguments.root and _absolute(arguments.root),

@@ -18,7 +18,6 @@ import numpy as np
 from scipy.linalg import eigh
 
 from calibrate.posterior import Posterior
-from calibrate.state_names import split
 from calibrate.statistical_model import Model
 
 _PRIOR_DRAWS = 4096
@@ -41,7 +40,7 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     names, draws = model.states.unknowns, posterior.draws()
     after = np.stack([draws[name] for name in names], axis=1)
     before = prior_table(model)
-    log = on_log_scale(model)
+    log = np.array(model.on_log_scale)
     x, prior = (_on_scale(thetas, log) for thetas in (after, before))
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
     correlation = np.atleast_2d(np.corrcoef(x, rowvar=False))
@@ -63,12 +62,6 @@ def prior_table(model: Model, count: int = _PRIOR_DRAWS) -> np.ndarray:
     """Draws (count, q) of the unknowns of theta from their prior."""
     draws = model.prior_draws(jax.random.key(0), count)
     return np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
-
-
-def on_log_scale(model: Model) -> np.ndarray:
-    """Whether each unknown of theta (q,) has a logarithmic scale in its scene."""
-    scales = {parameter.name: parameter.scale for parameter in model.forward.scene.parameters}
-    return np.array([scales[split(name)[0]] == "log" for name in model.states.unknowns])
 
 
 def _on_scale(thetas: np.ndarray, log: np.ndarray) -> np.ndarray:

@@ -17,11 +17,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpyro.distributions.transforms import biject_to
 from scipy.optimize import minimize
 
 from calibrate.posterior import Posterior
 from calibrate.priors import bounds
+from calibrate.samplers import density_of
 from emulator.errors import InputError
 
 DROP_95 = 1.92
@@ -57,22 +57,23 @@ def profile_likelihood(posterior: Posterior, name: str, points: int = 21) -> Pro
     model = posterior.model
     if name not in model.names:
         raise InputError(f"profile: '{name}' is not inferred; inferred: {', '.join(model.names)}")
+    density, data = density_of(model), posterior.data
+    named = {n: jnp.asarray(values) for n, values in posterior.draws().items()}
+    z = np.asarray(jax.jit(jax.vmap(density.unconstrain))(named))
+    k = density.names.index(name)
     priors = {**model.prior, **model.noise_priors}
-    transforms = {n: biject_to(d.support) for n, d in priors.items()}
-    limits = [_BOUND if np.isfinite(bounds(priors[n])).all() else np.inf for n in model.names]
-    draws = posterior.draws()
-    z = np.stack([np.asarray(transforms[n].inv(draws[n])) for n in model.names], axis=1)
-    k = model.names.index(name)
+    limits = [_BOUND if np.isfinite(bounds(priors[n])).all() else np.inf for n in density.names]
     grid = np.median(z[:, k]) + z[:, k].std() * np.linspace(-_WIDTH, _WIDTH, points)
     grid = np.clip(grid, -limits[k], limits[k])
+    along = np.median(z, axis=0) + np.zeros((points, 1))
+    along[:, k] = grid
+    values = np.asarray(density.constrain(jnp.asarray(along))[name])
 
     def log_likelihood(x: jax.Array) -> jax.Array:
-        draw = {n: transforms[n](value) for n, value in zip(model.names, x, strict=True)}
-        return model.map_log_likelihood(draw, posterior.data)
+        return density.log_likelihood(x, data)
 
     best = _profile(log_likelihood, z, k, grid, np.array(limits))
     drop = best.max() - best
-    values = np.asarray(transforms[name](jnp.asarray(grid)))
     return Profile(values, drop, *_interval(values, drop))
 
 

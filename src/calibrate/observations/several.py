@@ -40,6 +40,11 @@ class Observations:
         """The load states, (S,); one empty name where no observation names any."""
         return states_of(self.parts)
 
+    @property
+    def bases(self) -> tuple[str, ...]:
+        """Names without their load states, each once."""
+        return tuple(dict.fromkeys(split(name)[0] for name in self.parts))
+
     @cached_property
     def nodes(self) -> np.ndarray:
         """Nodes a forward map must return, (k,): the union of the parts', each once.
@@ -94,7 +99,7 @@ class Observations:
         InputError
             A value without a part; the message begins with ``what``.
         """
-        known = dict.fromkeys((*self.parts, *(split(name)[0] for name in self.parts)))
+        known = dict.fromkeys((*self.parts, *self.bases))
         for name in values:
             if name not in known:
                 raise InputError(f"{what}: '{name}' is not observed; observed: {', '.join(known)}")

@@ -13,6 +13,7 @@ element, so an observed strain is a gather of a few nodes; rotations leave no st
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Self
@@ -72,9 +73,9 @@ class Strains:
     default_noise: ClassVar[GaussianNoise] = GaussianNoise(sd=0.02)
 
     @property
+    @abstractmethod
     def shape(self) -> tuple[int, ...]:
         """(d, c)."""
-        raise NotImplementedError
 
     def check(self, name: str, values: np.ndarray) -> None:
         """Raise :class:`InputError` unless ``values`` is (d, c), each possible or missing."""

@@ -85,7 +85,7 @@ class _Place(NamedTuple):
 class _State(NamedTuple):
     """All that a run goes on from."""
 
-    map_: transport.TransportMap
+    map_: transport.StandardMap
     place: _Place
     count: Any  # draws made, the discarded ones included
     solves: Any  # FEM's, those of starts and discarded draws included
@@ -228,7 +228,7 @@ class _Run:
     def _log_w(self, z: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """FEM's less the tempered log likelihood (chains,), where wanted; ``-inf`` elsewhere."""
         assert self.fem is not None
-        named = jax.tree.map(np.asarray, self.density.constrain(self.data, jnp.asarray(z)))
+        named = jax.tree.map(np.asarray, self.density.constrain(jnp.asarray(z)))
         log_w = np.full(len(z), -np.inf)
         for k in np.flatnonzero(wanted):
             found = self.fem({name: values[k] for name, values in named.items()}, self.data)
@@ -254,7 +254,7 @@ class _Run:
         return _State(self.map_, self.place, self.count, self.solves, join(self.parts))
 
     def _template(self) -> _State:
-        map_ = transport.identity(self.density.dimension)
+        map_ = transport.standard_identity(self.density.dimension)
         keys = jax.random.split(jax.random.key(0), self.options.chains)
         states, _ = jax.eval_shape(self.programs.start, keys, self.data, map_)
         number = np.zeros(())

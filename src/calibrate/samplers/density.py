@@ -7,17 +7,16 @@ is an argument, so that programs compiled for one data set serve others of its s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 from numpyro.distributions.transforms import biject_to
-from numpyro.infer.util import initialize_model, potential_energy
+from numpyro.infer.util import potential_energy
 
 from calibrate.statistical_model import Data, Model
 
@@ -29,55 +28,65 @@ class Density(NamedTuple):
     log_prior : (z (p,),) -> (); the prior's density of ``z``, which integrates to 1.
     log_likelihood : (z (p,), data) -> (); ``-inf`` where the forward map has no answer.
     prior_draw : (rng_key,) -> z (p,) from the prior.
-    constrain : (data, z (s, p)) -> draws by name, each (s,).
-    dimension : p.
+    constrain : (z (s, p),) -> draws by name, each (s,).
+    unconstrain : (draw by name, each ()) -> z (p,).
+    names : of the coordinates, (p,), in their order.
     """
 
     log_density: Callable[[jax.Array, Data], jax.Array]
     log_prior: Callable[[jax.Array], jax.Array]
     log_likelihood: Callable[[jax.Array, Data], jax.Array]
     prior_draw: Callable[[jax.Array], jax.Array]
-    constrain: Callable[[Data, jax.Array], dict[str, jax.Array]]
-    dimension: int
+    constrain: Callable[[jax.Array], dict[str, jax.Array]]
+    unconstrain: Callable[[Mapping[str, jax.Array]], jax.Array]
+    names: tuple[str, ...]
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates, p."""
+        return len(self.names)
 
 
 @lru_cache(maxsize=4)
 def density_of(model: Model) -> Density:
     """The density of a model's posterior, up to a constant."""
+    names = tuple(sorted(model.sampled_priors))
+    transforms = {name: biject_to(model.sampled_priors[name].support) for name in names}
     example = {name: np.zeros(shape) for name, shape in model.observe.shapes.items()}
-    info = initialize_model(jax.random.key(0), model, model_args=(example,), dynamic_args=True)
-    flat, unravel = ravel_pytree(info.param_info.z)
-    sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(example)
     # By name: the Jacobian of a coordinate is a site too, and counts as observed.
-    hidden = [name for name, site in sites.items() if _observed(site)]
+    hidden = _observed_sites(model, example)
+
+    def coordinates(z: jax.Array) -> dict[str, jax.Array]:
+        return dict(zip(names, z, strict=True))
 
     def log_density(z: jax.Array, data: Data) -> jax.Array:
-        return -info.potential_fn(data)(unravel(z))
+        return -potential_energy(model, (data,), {}, coordinates(z))
 
     def log_prior(z: jax.Array) -> jax.Array:
         unobserved = handlers.block(model, hide=hidden)
-        return -potential_energy(unobserved, (example,), {}, unravel(z))
+        return -potential_energy(unobserved, (example,), {}, coordinates(z))
 
     def log_likelihood(z: jax.Array, data: Data) -> jax.Array:
-        draw = info.postprocess_fn(data)(unravel(z))
-        return sum_log_likelihood(trace_of(model, draw, data))
+        return sum_log_likelihood(trace_of(model, draw(z), data))
+
+    def draw(z: jax.Array) -> dict[str, jax.Array]:
+        return {name: transforms[name](value) for name, value in coordinates(z).items()}
 
     def prior_draw(rng_key: jax.Array) -> jax.Array:
         trace = handlers.trace(handlers.seed(model, rng_key)).get_trace()
-        sites = {name: trace[name] for name in info.param_info.z}
-        z = {n: biject_to(site["fn"].support).inv(site["value"]) for n, site in sites.items()}
-        return ravel_pytree(z)[0]
+        return unconstrain({name: trace[name]["value"] for name in names})
 
-    def constrain(data: Data, z: jax.Array) -> dict[str, jax.Array]:
-        return info.postprocess_fn(data)(unravel(z))
+    def unconstrain(draw: Mapping[str, jax.Array]) -> jax.Array:
+        return jnp.stack([transforms[name].inv(draw[name]) for name in names])
 
     return Density(
         log_density,
         log_prior,
         log_likelihood,
         prior_draw,
-        jax.jit(jax.vmap(constrain, (None, 0))),
-        flat.size,
+        jax.jit(jax.vmap(draw)),
+        unconstrain,
+        names,
     )
 
 
@@ -98,6 +107,18 @@ def trace_of(model: Model, draw: dict[str, jax.Array], data: Data) -> dict[str, 
     return handlers.trace(handlers.substitute(model, data=draw)).get_trace(data)
 
 
+def _observed_sites(model: Model, data: dict[str, np.ndarray]) -> list[str]:
+    """Names of what is observed, and of the factors; nothing is computed."""
+    found: list[str] = []
+
+    def trace() -> None:
+        sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(data)
+        found.extend(name for name, site in sites.items() if _observed(site))
+
+    jax.eval_shape(trace)
+    return found
+
+
 def _observed(site: dict[str, Any]) -> bool:
     return bool(site.get("is_observed", False))
 
@@ -110,7 +131,7 @@ def sum_log_likelihood(trace: dict[str, Any]) -> jax.Array:
     return sum(terms, jnp.zeros(()))
 
 
-def named_draws(model: Model, data: Data, z: np.ndarray) -> dict[str, np.ndarray]:
+def named_draws(model: Model, z: np.ndarray) -> dict[str, np.ndarray]:
     """Draws by parameter name, each (chains, draws), from ``z`` (chains, draws, p)."""
-    named = density_of(model).constrain(data, jnp.asarray(z.reshape(-1, z.shape[-1])))
+    named = density_of(model).constrain(jnp.asarray(z.reshape(-1, z.shape[-1])))
     return {name: np.asarray(named[name]).reshape(z.shape[:2]) for name in model.names}

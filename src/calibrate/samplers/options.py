@@ -15,7 +15,7 @@ class ChainOptions:
     """Length of a run.
 
     warmup : adapting iterations, not kept.
-    draws : kept iterations of a round; the pilot has one round.
+    draws : kept iterations of a round; the pilot is shorter.
     chains : independent chains.
     rounds : largest number of rounds; another one begins while R-hat or ESS miss their limits.
     r_hat, ess : largest R-hat and smallest bulk and tail ESS of any parameter to stop at.

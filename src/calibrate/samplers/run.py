@@ -33,6 +33,7 @@ from emulator.errors import SolverError
 _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
 _PILOT, _FINAL = 0, 1  # runs
+_PILOT_DRAWS = 1000  # of all chains, that a map is fitted to; more for maps of many coefficients
 
 
 @dataclass(frozen=True)
@@ -98,37 +99,37 @@ class Programs(NamedTuple):
 def compile_chains(sampler: ChainSampler, density: Density, options: ChainOptions) -> Programs:
     """The programs of one density in straightened coordinates; data and map are arguments."""
 
-    def log_density(zeta: jax.Array, data: Data, map_: transport.TransportMap) -> jax.Array:
-        return density.log_density(transport.apply(map_, zeta), data)
+    def log_density(w: jax.Array, data: Data, map_: transport.StandardMap) -> jax.Array:
+        return density.log_density(transport.apply_standard(map_, w), data)
 
     kernel = sampler.kernel(log_density, options)
 
-    def start(key: jax.Array, data: Data, map_: transport.TransportMap) -> Any:
+    def start(key: jax.Array, data: Data, map_: transport.StandardMap) -> Any:
         here, onwards = jax.random.split(key)
         shape = (_CANDIDATES, density.dimension)
         candidates = jax.random.uniform(here, shape, float, -2.0, 2.0)
 
-        def height(zeta: jax.Array) -> jax.Array:
-            return log_density(zeta, data, map_)
+        def height(w: jax.Array) -> jax.Array:
+            return log_density(w, data, map_)
 
         heights = jax.lax.map(height, candidates)
         if options.start == PATHFINDER:
-            zeta = pathfinder_start(jax.random.fold_in(here, 1), height, candidates, heights)
-            return kernel.init(onwards, zeta, data, map_), height(zeta)
+            w = pathfinder_start(jax.random.fold_in(here, 1), height, candidates, heights)
+            return kernel.init(onwards, w, data, map_), height(w)
         first = jnp.argmax(jnp.isfinite(heights))
         return kernel.init(onwards, candidates[first], data, map_), heights[first]
 
-    def advance(state: Any, data: Data, map_: transport.TransportMap, count: int) -> Any:
+    def advance(state: Any, data: Data, map_: transport.StandardMap, count: int) -> Any:
         def step(state: Any, _: None) -> Any:
-            state, zeta, statistics = kernel.step(state, data, map_)
-            return state, Draws(transport.apply(map_, zeta), statistics)
+            state, w, statistics = kernel.step(state, data, map_)
+            return state, Draws(transport.apply_standard(map_, w), statistics)
 
         return jax.lax.scan(step, state, length=count)
 
-    def start_all(keys: jax.Array, data: Data, map_: transport.TransportMap) -> Any:
+    def start_all(keys: jax.Array, data: Data, map_: transport.StandardMap) -> Any:
         return jax.lax.map(lambda key: start(key, data, map_), keys)
 
-    def advance_all(states: Any, data: Data, map_: transport.TransportMap, count: int) -> Any:
+    def advance_all(states: Any, data: Data, map_: transport.StandardMap, count: int) -> Any:
         return jax.lax.map(partial(advance, data=data, map_=map_, count=count), states)
 
     return Programs(jax.jit(start_all), jax.jit(advance_all, static_argnames="count"))
@@ -139,7 +140,7 @@ class _State(NamedTuple):
 
     run: Any  # _PILOT or _FINAL
     warmed: Any  # iterations of warm-up done
-    map_: transport.TransportMap
+    map_: transport.StandardMap
     states: Any
     draws: Draws
 
@@ -161,14 +162,16 @@ class Chains:
         self.programs = compile_chains(sampler, density, options)
         self._warmup = options.warmup if sampler.adapts_in_steps else 0
         self._parts: list[Draws] = []
-        self._plan = self._warmup + options.draws  # iterations of a run, in one round
+        wanted = max(_PILOT_DRAWS, 10 * transport.coefficient_count(density.dimension))
+        # In whole chunks: a part of one would be compiled on its own.
+        self._pilot = min(options.draws, -(-wanted // (options.chains * _CHUNK)) * _CHUNK)
 
     def start_straightened(self, pilot_key: jax.Array, key: jax.Array) -> None:
         """A pilot run, and the start of the final one.
 
         A single coordinate has no other one to depend on: no pilot.
         """
-        identity = transport.identity(self.density.dimension)
+        identity = transport.standard_identity(self.density.dimension)
         if self.density.dimension == 1:
             self._start(_FINAL, identity, key)
         else:
@@ -177,8 +180,8 @@ class Chains:
 
     def straighten(self, key: jax.Array) -> None:
         """The rest of the pilot run, and the start of the final one."""
-        z = self.draw(self.options.draws).z
-        self._start(_FINAL, transport.fit(z.reshape(-1, self.density.dimension)), key)
+        z = self.draw(self._pilot).z
+        self._start(_FINAL, transport.fit_standard(z.reshape(-1, self.density.dimension)), key)
 
     def draw(self, total: int) -> Draws:
         """The first ``total`` kept iterations of this run."""
@@ -200,11 +203,12 @@ class Chains:
         self.run, self.warmed = int(state.run), int(state.warmed)
         self.map_, self.states = state.map_, state.states
         self._parts, self._kept = [state.draws], state.draws.z.shape[1]
-        self._show((self.run == _FINAL and self.density.dimension > 1) * self._plan)
+        if self.run == _FINAL and self.density.dimension > 1:
+            self._show(self._warmup + self._pilot)
         self._show(self.warmed + self._kept)
         return True
 
-    def _start(self, run: int, map_: transport.TransportMap, key: jax.Array) -> None:
+    def _start(self, run: int, map_: transport.StandardMap, key: jax.Array) -> None:
         keys = jax.random.split(key, self.options.chains)
         self.states, heights = self.programs.start(keys, self.data, map_)
         if not np.isfinite(heights).all():
@@ -219,8 +223,9 @@ class Chains:
         return jax.tree.map(np.asarray, draws), count
 
     def _show(self, count: int) -> None:
-        runs = 1 if self.density.dimension == 1 else 2
-        self.bar.total = max(self.bar.total, runs * self._plan, self.bar.n + count)
+        pilot = 0 if self.density.dimension == 1 else self._warmup + self._pilot
+        planned = pilot + self._warmup + self.options.draws
+        self.bar.total = max(self.bar.total, planned, self.bar.n + count)
         self.bar.update(count)
 
     def _state(self) -> _State:
@@ -230,7 +235,7 @@ class Chains:
 
     def _template(self) -> _State:
         number = jax.ShapeDtypeStruct((), int)
-        map_ = transport.identity(self.density.dimension)
+        map_ = transport.standard_identity(self.density.dimension)
         keys = jax.random.split(jax.random.key(0), self.options.chains)
         states, _ = jax.eval_shape(self.programs.start, keys, self.data, map_)
         advance = partial(self.programs.advance, count=1)

@@ -10,16 +10,24 @@ with :math:`\varphi` all monomials up to a degree. The map is triangular with un
 Jacobian determinant is 1 and the density of :math:`\zeta` is that of :math:`z`: *any* coefficients
 leave the posterior exact, and good ones remove its curvature. They are fitted to the draws of a
 pilot run by least squares.
+
+Chains run in :math:`w` with :math:`\zeta = m + s \odot w`, mean and standard deviation of the
+straightened draws, so that the unit metric they begin with is about the right one. The constant
+Jacobian of that is left out.
 """
 
 from __future__ import annotations
 
 from itertools import combinations_with_replacement
+from math import comb
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import expit
+
+_LEAST_SD = 1e-9
 
 
 class TransportMap(NamedTuple):
@@ -27,6 +35,14 @@ class TransportMap(NamedTuple):
 
     order: jax.Array
     coefficients: jax.Array
+
+
+class StandardMap(NamedTuple):
+    """From w (p,), of about zero mean and unit sd, to z; ``centre`` and ``scale`` (p,) of zeta."""
+
+    bend: TransportMap
+    centre: jax.Array
+    scale: jax.Array
 
 
 def _degree(count: int) -> int:
@@ -46,13 +62,16 @@ def monomials(values: jax.Array, count: int) -> jax.Array:
     return jnp.stack(terms, axis=-1)
 
 
+def coefficient_count(dimension: int) -> int:
+    """The most coefficients that a coordinate has."""
+    counts = (comb(k + _degree(k), k) - 1 for k in range(1, dimension))
+    return max(counts, default=0)
+
+
 def identity(dimension: int) -> TransportMap:
     """The map that changes nothing."""
-    if dimension == 1:
-        width = 0
-    else:
-        width = max(monomials(jnp.zeros(dimension), k).size for k in range(1, dimension))
-    return TransportMap(jnp.arange(dimension), jnp.zeros((dimension, width)))
+    shape = (dimension, coefficient_count(dimension))
+    return TransportMap(jnp.arange(dimension), jnp.zeros(shape))
 
 
 def apply(map_: TransportMap, zeta: jax.Array) -> jax.Array:
@@ -68,10 +87,24 @@ def apply(map_: TransportMap, zeta: jax.Array) -> jax.Array:
     return jnp.stack(columns)[jnp.argsort(map_.order)]
 
 
+def straighten(map_: TransportMap, z: np.ndarray) -> np.ndarray:
+    """``zeta`` (s, p) from ``z`` (s, p): the inverse of :func:`apply`.
+
+    The map is triangular: each coordinate's shift depends on coordinates of ``z`` alone.
+    """
+    order, coefficients = np.asarray(map_.order), np.asarray(map_.coefficients)
+    squashed = expit(z[:, order])
+    zeta = np.array(z)
+    for k in range(1, z.shape[1]):
+        terms = np.asarray(monomials(squashed, k))
+        zeta[:, order[k]] -= terms @ coefficients[k, : terms.shape[1]]
+    return zeta
+
+
 def fit(draws: np.ndarray) -> TransportMap:
     """The map fitted to pilot draws (s, p) of ``z``."""
     dimension = draws.shape[1]
-    squashed = 1.0 / (1.0 + np.exp(-draws))
+    squashed = expit(draws)
     order = np.argsort(-squashed.std(axis=0), kind="stable")
     start = identity(dimension)
     coefficients = np.array(start.coefficients)
@@ -89,3 +122,23 @@ def fit(draws: np.ndarray) -> TransportMap:
         wanted = np.concatenate([target - target.mean(), np.zeros(terms.shape[1])])
         coefficients[k, : terms.shape[1]] = np.linalg.lstsq(design, wanted, rcond=None)[0] / sd
     return TransportMap(jnp.asarray(order), jnp.asarray(coefficients))
+
+
+def standard_identity(dimension: int) -> StandardMap:
+    """The map that changes nothing."""
+    return StandardMap(identity(dimension), jnp.zeros(dimension), jnp.ones(dimension))
+
+
+def apply_standard(map_: StandardMap, w: jax.Array) -> jax.Array:
+    """``z`` (p,) from ``w`` (p,)."""
+    return apply(map_.bend, map_.centre + map_.scale * w)
+
+
+def fit_standard(draws: np.ndarray) -> StandardMap:
+    """The map fitted to pilot draws (s, p) of ``z``."""
+    bend = fit(draws)
+    straight = straighten(bend, draws)
+    sd = straight.std(axis=0)
+    # A pilot that stood still has no scale.
+    scale = np.where(sd > _LEAST_SD, sd, 1.0)
+    return StandardMap(bend, jnp.asarray(straight.mean(axis=0)), jnp.asarray(scale))

@@ -27,13 +27,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
+from emulator.fem.definiteness import inverse_is_positive
 from emulator.fem.functional import displacement_gradient, strain_law, volume_ratio
 from emulator.fem.line_search import largest_sound
 from emulator.mechanics.measures import Measures, measures_read
@@ -115,7 +116,7 @@ class MipNewton:
             return jnp.array(True)  # CHOLMOD refuses any other
         if self.system.forces:  # not symmetric: at least the step goes down
             return jnp.vdot(residual, move) <= 0.0
-        return self.system.pattern.positive_definite(values)
+        return inverse_is_positive(partial(self.system.solve, values), self.system.pattern.size)
 
     def _error(self, u: jax.Array) -> jax.Array:
         return balance(self.system, u, self.theta, self.level)[1]

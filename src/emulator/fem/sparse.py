@@ -14,8 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import sparsax
-from scipy.sparse import coo_array
-from scipy.sparse.linalg import splu
 from threadpoolctl import ThreadpoolController
 
 # Relative increase of the diagonal, four units of round-off: an exactly zero pivot becomes tiny.
@@ -77,34 +75,6 @@ class Pattern:
         rows = jax.ops.segment_sum(jnp.abs(values), self.rows, num_segments=self.size)
         rows += jax.ops.segment_sum(jnp.abs(values), self.columns, num_segments=self.size)
         return jnp.all(jnp.isfinite(values)) & jnp.all(rows >= _LEAST_ROW)
-
-    def positive_definite(self, values: jax.Array) -> jax.Array:
-        """Whether the symmetric matrix of ``values`` (nnz,) is positive definite, shape ().
-
-        For use inside ``jit``, where CHOLMOD's refusal cannot be caught: SciPy factorises the
-        matrix by pivots on the diagonal, whose signs are those of the eigenvalues (Sylvester). It
-        costs a second factorisation (docs/experiments.md, "One equilibrium for every route").
-        """
-        return jax.pure_callback(
-            self._pivots_positive,
-            jax.ShapeDtypeStruct((), np.bool_),
-            values,
-            vmap_method="sequential",
-        )
-
-    def _pivots_positive(self, values: np.ndarray) -> np.ndarray:
-        matrix = coo_array((np.asarray(values), (self.rows, self.columns)), shape=(self.size,) * 2)
-        try:
-            factors = splu(
-                matrix.tocsc(),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
-        except RuntimeError:  # a pivot that is exactly zero
-            return np.array(False)
-        on_diagonal = np.array_equal(factors.perm_r, factors.perm_c)
-        return np.array(on_diagonal and bool((factors.U.diagonal() > 0.0).all()))
 
     def safe_values(self, values: jax.Array) -> jax.Array:
         """``values`` that UMFPACK does not raise on; the identity's where they are not solvable.

@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pytest
 
-from calibrate.certificate.proposals import around, bend, straighten
+from calibrate.certificate.proposals import around, bend
 from calibrate.samplers import transport
 
 
@@ -15,7 +15,7 @@ def bent():
 
 def test_straightening_inverts_the_samplers_map(bent):
     map_ = transport.fit(bent)
-    zeta = straighten(map_, bent)
+    zeta = transport.straighten(map_, bent)
     back = jax.vmap(lambda one: transport.apply(map_, one))(zeta)
     np.testing.assert_allclose(back, bent, atol=1e-12)
     np.testing.assert_allclose(bend(map_, zeta), bent, atol=1e-12)

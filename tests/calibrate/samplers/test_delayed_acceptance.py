@@ -55,6 +55,8 @@ def test_a_biased_cheap_map_leaves_fem_s_posterior_exact(beam, biased):
     assert ess.min() > 100
     assert (abs(shift) < 4 / np.sqrt(ess)).all()
     np.testing.assert_allclose(ratio, 1.0, atol=(4 / np.sqrt(2 * ess)).max())
+    with pytest.raises(InputError, match="is FEM's already; it needs no certificate"):
+        cal.certify(posterior, LinearFEM(beam, exact))
     # The cheap posterior is another one.
     cheap = cal.sample(model, data, options=cal.NUTSOptions(200, 400, rounds=1))
     assert abs(sds_off(cheap, exact, data)[0]).max() > 2 * (4 / np.sqrt(ess)).max()

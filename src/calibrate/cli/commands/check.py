@@ -47,9 +47,10 @@ def register(commands: Any) -> None:
 def run_sbc(arguments: argparse.Namespace) -> int:
     """Simulation-based calibration of the model."""
     from calibrate.figures.calibration import draw
+    from calibrate.run import Run
     from calibrate.samplers import NUTSOptions
     from calibrate.sbc import sbc
-    from calibrate.workflow import Run, by_fem, model_before_data
+    from calibrate.workflow import by_fem, model_before_data
     from emulator.store import check_folder, write_json
 
     folder, progress = check_folder(arguments.out), show_progress(arguments)
@@ -90,7 +91,8 @@ def run_prior(arguments: argparse.Namespace) -> int:
 
     from calibrate.figures.calibration import draw_prior_predictive
     from calibrate.predictions import prior_replicates
-    from calibrate.workflow import Run, model_before_data
+    from calibrate.run import Run
+    from calibrate.workflow import model_before_data
     from emulator.store import check_folder, save_arrays
 
     folder: Path = check_folder(arguments.out)

@@ -55,7 +55,8 @@ def sampler_options(words: list[str]) -> dict[str, Any]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Sample and keep a posterior."""
-    from calibrate.workflow import Run, certify_and_keep, report
+    from calibrate.run import Run
+    from calibrate.workflow import certify_and_keep, report
     from calibrate.workflow import infer as run_inference
     from emulator.store import check_folder
 

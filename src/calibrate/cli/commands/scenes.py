@@ -45,10 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
                 r["nodes"],
                 r["elements"],
                 r["law"],
-                ", ".join(
-                    f"{p['name']} {p['low']:g}-{p['high']:g} {p['unit']}".strip()
-                    for p in r["parameters"]
-                ),
+                _parameters(r["parameters"]),
                 "shipped" if r["emulator_shipped"] else "train it",
             )
             for r in rows
@@ -56,3 +53,17 @@ def run(arguments: argparse.Namespace) -> int:
     )
     emit(rows, as_json=arguments.json, text=text)
     return DONE
+
+
+def _parameters(parameters: list[dict[str, Any]]) -> str:
+    """Names with their ranges; numbered ones of one range are given by the first and the last."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for p in parameters:
+        about = f"{p['low']:g}-{p['high']:g} {p['unit']}".strip()
+        base = p["name"].rstrip("0123456789")
+        key = base if base.endswith("_") and base != p["name"] else p["name"]
+        groups.setdefault((key, about), []).append(p["name"])
+    return ", ".join(
+        f"{names[0]} to {names[-1]} {about}" if len(names) > 1 else f"{names[0]} {about}"
+        for (_, about), names in groups.items()
+    )

@@ -1,0 +1,73 @@
+"""Programs that commands compile are kept on disk for the next command.
+
+Half of what a short command takes is compilation. JAX can keep what it compiled; the command line
+asks it to, in the user's cache folder, with a bound on its size. As a library the package changes
+nothing. Who sets ``JAX_COMPILATION_CACHE_DIR`` has chosen already and is left alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+
+VARIABLE = "CALIBRATE_CACHE"
+LARGEST = 1 << 30  # bytes; the programs used longest ago go first
+_LEAST_SECONDS = 0.2  # of compilation that are worth a file
+
+
+def keep_programs(environment: Mapping[str, str] = os.environ) -> Path | None:
+    """Have JAX keep compiled programs; their folder, or ``None`` where none are kept.
+
+    ``CALIBRATE_CACHE`` names the folder; where it is empty, nothing is kept. A folder that cannot
+    be written costs a line, not the command.
+    """
+    if jax.config.jax_compilation_cache_dir is not None:
+        return None
+    folder = program_folder(environment)
+    if folder is None:
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f".writable-{os.getpid()}").touch()
+        (folder / f".writable-{os.getpid()}").unlink()
+    except OSError as error:
+        print(f"calibrate: compiled programs are not kept: {folder}: {error}", file=sys.stderr)
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", LARGEST)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_SECONDS)
+    return folder
+
+
+def program_folder(environment: Mapping[str, str]) -> Path | None:
+    """Where programs of this machine and this JAX are kept; ``None`` for nowhere.
+
+    Programs use the instructions of the processor they were compiled on, so that a home directory
+    on several machines holds a folder for each kind.
+    """
+    named = environment.get(VARIABLE)
+    if named == "":
+        return None
+    if named is not None:
+        base = Path(named).expanduser()
+    else:
+        home = environment.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        base = Path(home) / "calibrate"
+    return base / f"jax-{jax.__version__}-{_instructions()}"
+
+
+def _instructions() -> str:
+    """A short name of the processor's instruction set."""
+    flags = ""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        lines = cpuinfo.read_text(encoding="utf-8").splitlines()
+        flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    digest = hashlib.sha256(f"{platform.processor()} {flags}".encode()).hexdigest()[:8]
+    return f"{platform.machine()}-{digest}"

@@ -1,0 +1,121 @@
+"""Simulation-based calibration of the shipped emulators, their noise models and NUTS.
+
+``python studies/sbc/run.py [--replicates N] [--only NAME ...]``. FEM makes the data, the emulator's
+posterior is ranked. Writes results.json and a figure a case beside itself, or under --out, and
+asserts what the README says.
+"""
+
+import argparse
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpyro.distributions as dist
+
+import calibrate as cal
+from calibrate.figures.calibration import draw
+from calibrate.provenance import study_header
+from calibrate.run import Run
+from calibrate.samplers import NUTSOptions
+from calibrate.sbc import Calibration, sbc
+from calibrate.statistical_model import Model
+from calibrate.workflow import by_fem, model_before_data
+from emulator.store import write_json
+
+HERE = Path(__file__).parent
+SEED = 11
+BEAM = Run("once_clamped_beam", observe="landmarks:20", noise=0.2)
+VENTRICLE = Run(
+    "left_ventricle", observe="landmarks:24+volume", noise={"displacement": 0.3, "volume": 1.0}
+)
+
+
+def noisier(model: Model) -> Model:
+    """Data with 1.5 times the noise that the model takes it to have."""
+    return replace(model, noise=dict.fromkeys(model.noise, cal.GaussianNoise(sd=0.3)))
+
+
+def stiffer(model: Model) -> Model:
+    """Bodies from the upper half of the prior's range of mu."""
+    prior = {**model.prior, "mu": dist.Uniform(75.0, 100.0)}
+    return cal.model(model.full, model.observe, model.noise, prior, check_scale=False)
+
+
+def biased(model: Model) -> Model:
+    """Data of a body that moves 2 % more than the map says."""
+    return replace(model, forward=Biased(model.forward))
+
+
+@dataclass(frozen=True, eq=False)
+class Biased:
+    """A forward map whose displacements are 2 % too large."""
+
+    inner: Any
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+    def evaluate(self, theta: Any) -> Any:
+        """Displacement and validity."""
+        found = self.inner.evaluate(theta)
+        return found._replace(displacement=1.02 * found.displacement)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A run, who makes its data, and whether the check should pass."""
+
+    run: Run
+    truth: Callable[[Model], Model]
+    passes: bool
+
+
+CASES = {
+    "beam": Case(BEAM, by_fem, passes=True),
+    "left ventricle": Case(VENTRICLE, by_fem, passes=True),
+    "beam, noise 1.5 times the model's": Case(BEAM, noisier, passes=False),
+    "beam, mu from the upper half of its range": Case(BEAM, stiffer, passes=False),
+    "beam, 2 % more displacement": Case(BEAM, biased, passes=False),
+}
+
+
+def examine(name: str, replicates: int, out: Path) -> dict[str, Any]:
+    """Ranks of one case, with its figure."""
+    case, began = CASES[name], time.process_time()
+    model = model_before_data(case.run)
+    options = NUTSOptions(200, 250, 2, rounds=1)
+    found: Calibration = sbc(model, replicates, truth=case.truth(model), options=options, seed=SEED)
+    figure = f"{re.sub(r'[^a-z0-9]+', '_', name)}.png"
+    draw(found, name, out / figure)
+    result = found.to_json()
+    seconds = time.process_time() - began
+    verdict = "calibrated" if found.passed else "not calibrated"
+    print(f"{name:45s} {found.replicates} data sets, {seconds:4.0f} s: {verdict}", flush=True)
+    return {
+        "name": name,
+        "status": verdict,
+        "as_expected": found.passed == case.passes,
+        "processor_s": round(seconds, 1),
+        **{key: result[key] for key in ("replicates", "outside", "coverage", "ranks")},
+    }
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--replicates", type=int, default=200)
+    parser.add_argument("--only", nargs="+", choices=tuple(CASES), default=tuple(CASES))
+    parser.add_argument("--out", type=Path, default=HERE)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    cases = [examine(name, arguments.replicates, arguments.out) for name in arguments.only]
+    header = study_header(HERE, SEED)
+    write_json(arguments.out / "results.json", {**header, "cases": cases})
+    assert all(case["as_expected"] for case in cases)
+
+
+if __name__ == "__main__":
+    main()
