@@ -27,6 +27,7 @@ QUICK = {
     "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
     "new_ventricle": "--ventricles 1 --runs 8 --tests 3",
     "objectives": "--quick",
+    "sbc": "--replicates 20 --only map",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half",
     "transfer": "--quick --one --family 2 --pretrain 6 --steps 3 --longest 4 --runs 3 --tests 2",
@@ -116,6 +117,12 @@ def objectives(results):
     assert cases["gradients"]["err_F"]["median"] < start["err_F"]["median"]
 
 
+def sbc(results):
+    (case,) = results["cases"]
+    assert case["status"] == "not calibrated"
+    assert case["replicates"] == 20
+
+
 def stability(results):
     status = {case["name"]: case["status"] for case in results["cases"]}
     assert status == {
@@ -147,6 +154,7 @@ CHECKS = {
         many_solves,
         new_ventricle,
         objectives,
+        sbc,
         stability,
         transfer,
     )
@@ -159,7 +167,10 @@ def test_every_study_has_a_line():
 
 
 # Figures that need more than the few cases.
-FULL_ONLY = {"few_runs": {"meshes.png"}}
+FULL_ONLY = {
+    "few_runs": {"meshes.png"},
+    "sbc": {"beam.png", "ventricle.png", "noise.png", "prior.png"},
+}
 
 
 @pytest.mark.parametrize(

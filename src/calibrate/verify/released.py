@@ -66,7 +66,7 @@ def fenics_tolerance(scene: Scene, model: str) -> float:
     unit = units(model)
     force = unit.stress * unit.length**2
     system = Simulator(scene).system
-    free = system.restrict(jnp.asarray(system.dead_force)) / force
+    free = system.restrict(system.dead_force(scene.centre)) / force
     held = jnp.asarray(scene.held_displacement) / unit.length
     return 1e-8 * float(jnp.sqrt(jnp.sum(free**2) + jnp.sum(held**2))) * force
 

@@ -22,11 +22,12 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.fem.functional import (
+    DeadForce,
     at_points,
+    dead_force,
     displacement_gradient,
     local_forces,
     local_terms,
-    nodal_dead_force,
     point_energy,
     spring_terms,
     strain_energy,
@@ -78,10 +79,13 @@ class System:
         return block_pattern(dofs, free_index, symmetric=self.factorisation == "cholmod")
 
     @cached_property
-    def dead_force(self) -> np.ndarray:
-        """Nodal forces of the dead loads, (n, 3) in mN; zero when there are none."""
-        force = nodal_dead_force(self.scene)
-        return np.zeros(self.scene.held.shape) if force is None else force
+    def dead(self) -> DeadForce:
+        """The dead loads; zero when there are none."""
+        return dead_force(self.scene) or DeadForce(np.zeros(self.scene.held.shape), {})
+
+    def dead_force(self, theta: jax.Array) -> jax.Array:
+        """Nodal forces of the dead loads, (n, 3) in mN."""
+        return self.dead.total(self.scene.resolve(theta))
 
     def restrict(self, field: jax.Array) -> jax.Array:
         """Free entries (f,) of a nodal field (n, 3)."""
@@ -106,8 +110,8 @@ class System:
 
     def external_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Force of the loads at the full level, (n, 3) in mN."""
-        force = jnp.asarray(self.dead_force)
         values = self.scene.resolve(theta)
+        force = self.dead.total(values)
         if self.terms:
             force = force - jax.grad(lambda v: sum(t.total(v, values) for t in self.terms))(u)
         return force + self.follower_force(u, theta)
@@ -129,7 +133,7 @@ class System:
         A load without a potential counts as the dead force ``follower_force`` (n, 3).
         """
         stored = self.internal_energy(u, theta)
-        work = jnp.vdot(self.dead_force, u)
+        work = jnp.vdot(self.dead_force(theta), u)
         if self.forces:
             work = work + jnp.vdot(jnp.asarray(follower_force), u)
         if self.terms:

@@ -19,7 +19,8 @@ can meet without locking (Simo, Taylor & Pister 1985).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain, determinant
-from emulator.scenes.local_terms import LocalForce, LocalTerm
+from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
 from emulator.scenes.regions import Tissue, factors
 from emulator.scenes.scene import Scene
 
@@ -151,11 +152,36 @@ def local_forces(scene: Scene) -> list[LocalForce]:
     return [force for force in forces if force is not None]
 
 
-def nodal_dead_force(scene: Scene) -> np.ndarray | None:
-    """Nodal forces of the dead loads, (n, 3) in mN; ``None`` when there are none."""
+@dataclass(frozen=True, eq=False)
+class DeadForce:
+    """Nodal force of the loads that do not follow the deformation.
+
+    constant : (n, 3) in mN.
+    per_unit : (n, 3) in mN per unit of a parameter, by the parameter's name.
+    """
+
+    constant: np.ndarray
+    per_unit: Mapping[str, np.ndarray]
+
+    def total(self, values: Values) -> jax.Array:
+        """The force (n, 3) in mN."""
+        return sum(
+            (values[name] * force for name, force in self.per_unit.items()),
+            jnp.asarray(self.constant),
+        )
+
+
+def dead_force(scene: Scene) -> DeadForce | None:
+    """Force of the dead loads; ``None`` when there are none."""
     forces = [load.nodal_force(scene.discretisation) for load in scene.loads]
-    dead = [force for force in forces if force is not None]
-    return np.sum(dead, axis=0) if dead else None
+    constant = [force for force in forces if force is not None]
+    per_unit: dict[str, np.ndarray] = {}
+    for load in scene.loads:
+        for name, force in load.nodal_force_per_unit(scene.discretisation).items():
+            per_unit[name] = per_unit.get(name, 0.0) + force
+    if not constant and not per_unit:
+        return None
+    return DeadForce(np.sum(constant, axis=0) if constant else np.zeros(scene.held.shape), per_unit)
 
 
 def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
@@ -180,12 +206,12 @@ def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
                 "hold the rim and use CavityPressure, or work with FEM displacements"
             )
     internal, springs = strain_energy(scene, barriers), spring_terms(scene)
-    force, terms = nodal_dead_force(scene), local_terms(scene)
+    dead, terms = dead_force(scene), local_terms(scene)
 
     def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
         total = internal(u, theta)
-        if force is not None:
-            total = total - jnp.vdot(force, u)
+        if dead is not None:
+            total = total - jnp.vdot(dead.total(scene.resolve(theta)), u)
         if springs or terms:
             values = scene.resolve(theta)
             total = total + sum(term.total(u, values) for term in springs + terms)

@@ -1,6 +1,6 @@
 """Scenes: what can be simulated, emulated and calibrated."""
 
-from emulator.scenes.beams import once_clamped_beam, twice_clamped_beam
+from emulator.scenes.beams import once_clamped_beam, turned_beam, twice_clamped_beam
 from emulator.scenes.biventricle import biventricle
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.left_ventricle_neo_hookean import left_ventricle_neo_hookean
@@ -26,6 +26,7 @@ __all__ = [
     "once_clamped_beam",
     "traction_beam_guccione",
     "traction_beam_holzapfel_ogden",
+    "turned_beam",
     "twice_clamped_beam",
     "twisting_cube",
 ]

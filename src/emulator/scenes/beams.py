@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.scenes.loads import Gravity
+from emulator.scenes.loads import Gravity, GravityVector
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
+
+_G = 9.80  # m/s2, as published
 
 
 def _beam(name: str, cells: tuple[int, int, int], clamped: tuple[str, ...]) -> Scene:
@@ -19,7 +23,7 @@ def _beam(name: str, cells: tuple[int, int, int], clamped: tuple[str, ...]) -> S
             Parameter("mu", "kPa", 50.0, 100.0, "log"),
             Parameter("lam", "kPa", 50.0, 100.0, "log"),
         ),
-        loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80),),
+        loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=_G),),
         supports=tuple(Support(face) for face in clamped),
         origin={"scene": name, "cells": list(cells)},
     )
@@ -36,3 +40,19 @@ def once_clamped_beam(cells: tuple[int, int, int] = (12, 4, 5)) -> Scene:
 def twice_clamped_beam(cells: tuple[int, int, int] = (12, 4, 5)) -> Scene:
     """The beam of :func:`once_clamped_beam`, held at both ends."""
     return _beam("twice_clamped_beam", cells, ("left", "right"))
+
+
+def turned_beam(cells: tuple[int, int, int] = (12, 4, 5)) -> Scene:
+    """The beam of :func:`once_clamped_beam`, turned between measurements.
+
+    theta = (mu, lam, gravity_y, gravity_z): across the beam gravity may point anywhere. Along it
+    there is none.
+    """
+    beam = _beam("turned_beam", cells, ("left",))
+    across = tuple(Parameter(f"gravity_{axis}", "m/s2", -_G, _G) for axis in "yz")
+    return replace(
+        beam,
+        parameters=(*beam.parameters, *across),
+        loads=(GravityVector(density=1.0),),
+        constants={"gravity_x": 0.0},
+    )

@@ -17,7 +17,7 @@ A block that bends under its own weight:
     [[loads]]
     kind = "gravity"
     density = 1.0                            # g/cm3
-    direction = [0.0, 0.0, -1.0]
+    direction = [0.0, 0.0, -1.0]             # or, as parameters, kind "gravity_vector"
 
     [parameters.mu]                          # what varies
     unit = "kPa"

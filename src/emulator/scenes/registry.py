@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from emulator.scenes.beams import once_clamped_beam, twice_clamped_beam
+from emulator.scenes.beams import once_clamped_beam, turned_beam, twice_clamped_beam
 from emulator.scenes.biventricle import biventricle
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.left_ventricle_neo_hookean import left_ventricle_neo_hookean
@@ -19,6 +19,7 @@ BUILT_IN: dict[str, Callable[..., Scene]] = {
     for scene in (
         once_clamped_beam,
         twice_clamped_beam,
+        turned_beam,
         traction_beam_holzapfel_ogden,
         traction_beam_guccione,
         twisting_cube,

@@ -13,6 +13,7 @@ from emulator.scenes.registry import BUILT_IN
 COARSE = {
     "once_clamped_beam": "cells=(4, 2, 2)",
     "twice_clamped_beam": "cells=(4, 2, 2)",
+    "turned_beam": "cells=(4, 2, 2)",
     "traction_beam_holzapfel_ogden": "cells=(4, 2, 2)",
     "traction_beam_guccione": "cells=(4, 2, 2)",
     "twisting_cube": "cells=3",

@@ -105,7 +105,7 @@ def test_a_scene_from_a_file(folder):
         (
             'kind = "gravity"',
             'kind = "wind"',
-            r"\[\[loads\]\] number 1: kind = \"wind\"; expected \"gravity\" or \"traction\" or",
+            r"\[\[loads\]\] number 1: kind = \"wind\"; expected \"gravity\" or",
         ),
         ("density = 1.1", "density = -1.1", "density is -1.1"),
         (

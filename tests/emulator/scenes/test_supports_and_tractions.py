@@ -9,7 +9,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.fem.functional import nodal_dead_force, spring_terms, strain_energy
+from emulator.fem.functional import dead_force, spring_terms, strain_energy
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes.loads import Traction
 from emulator.scenes.supports import ElasticSupport
@@ -23,7 +23,7 @@ def quadratic(scene):
 @pytest.mark.parametrize("change", [lambda s: s, quadratic], ids=["P1", "P2"])
 def test_a_traction_pulls_with_its_value_times_the_area(change):
     scene = change(block(loads=(Traction("right", (1.0, 0.0, -2.0)),)))
-    force = nodal_dead_force(scene)  # the face is 3 x 4 mm
+    force = dead_force(scene).constant  # the face is 3 x 4 mm
     np.testing.assert_allclose(force.sum(axis=0), [12.0, 0.0, -24.0], atol=1e-12)
     # Its moment about the face's middle vanishes.
     arm = scene.mesh.nodes - [2.0, 1.5, 2.0]

@@ -4,7 +4,7 @@ A new kind is a frozen dataclass derived from :class:`Load` in a file of its own
 """
 
 from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.loads.gravity import Gravity
+from emulator.scenes.loads.gravity import Gravity, GravityVector
 from emulator.scenes.loads.load import Load
 from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure, SurfacePressure
 from emulator.scenes.loads.published_pressure import PublishedPressure
@@ -12,7 +12,14 @@ from emulator.scenes.loads.traction import Traction
 
 LOADS: dict[str, type[Load]] = {
     load.kind: load
-    for load in (Gravity, Traction, CavityPressure, FollowerPressure, PublishedPressure)
+    for load in (
+        Gravity,
+        GravityVector,
+        Traction,
+        CavityPressure,
+        FollowerPressure,
+        PublishedPressure,
+    )
 }
 
 __all__ = [
@@ -21,6 +28,7 @@ __all__ = [
     "CavityPressure",
     "FollowerPressure",
     "Gravity",
+    "GravityVector",
     "Load",
     "PublishedPressure",
     "SurfacePressure",

@@ -1,4 +1,8 @@
-"""Dead weight."""
+r"""Dead weight, in one direction or in any.
+
+Potential :math:`-\int_\Omega \rho\, g \cdot u\, dX` with the acceleration :math:`g`. It is linear
+in :math:`g`, so a body that is turned between measurements needs one force field a component.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
+from emulator.mechanics.quantity import Quantity
 from emulator.scenes.loads.load import Load, nodal_sums
 
 # (1 g/cm3)(1 m/s2) = 1e-6 kg/mm3 m/s2 = 1e-6 N/mm3 = 1e-3 mN/mm3, and 1 mN/mm2 = 1 kPa.
@@ -33,8 +38,7 @@ class Gravity(Load):
     acceleration: float = 9.81
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.density) or self.density < 0.0:
-            raise InputError(f"gravity: density is {self.density} g/cm3; it must be 0 or more")
+        _check_density(self.kind, self.density)
         if not np.isfinite(self.acceleration):
             raise InputError(f"gravity: acceleration is {self.acceleration} m/s2")
         if len(self.direction) != 3 or not 0.0 < np.linalg.norm(self.direction) < np.inf:
@@ -53,5 +57,50 @@ class Gravity(Load):
 
     def nodal_force(self, grid: Discretisation) -> np.ndarray:
         """Consistent nodal forces, (n, 3) in mN."""
-        volume = np.einsum("mq,qa->ma", grid.weights, grid.values)
-        return nodal_sums(grid.mesh, grid.connectivity, volume)[:, None] * self.body_force
+        return _nodal_volumes(grid)[:, None] * self.body_force
+
+
+@dataclass(frozen=True)
+class GravityVector(Load):
+    """Dead weight in any direction: the components of the acceleration are parameters, in m/s2.
+
+    Parameters
+    ----------
+    density : mass density in g/cm3.
+    parameter : the components are this name with _x, _y and _z.
+    """
+
+    kind: ClassVar[str] = "gravity_vector"
+
+    density: float = 1.0
+    parameter: str = "gravity"
+
+    def __post_init__(self) -> None:
+        _check_density(self.kind, self.density)
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Its three components."""
+        return tuple(Quantity(f"{self.parameter}_{axis}", "m/s2", -np.inf) for axis in "xyz")
+
+    def to_json(self) -> list[Any]:
+        """Kind, density and name."""
+        return [self.kind, float(self.density), self.parameter]
+
+    def nodal_force_per_unit(self, grid: Discretisation) -> dict[str, np.ndarray]:
+        """Consistent nodal forces (n, 3) in mN for 1 m/s2 along each axis."""
+        weight = self.density * _KPA_PER_MM * _nodal_volumes(grid)[:, None]
+        return {
+            quantity.name: weight * axis
+            for quantity, axis in zip(self.quantities, np.eye(3), strict=True)
+        }
+
+
+def _check_density(kind: str, density: float) -> None:
+    if not np.isfinite(density) or density < 0.0:
+        raise InputError(f"{kind}: density is {density} g/cm3; it must be 0 or more")
+
+
+def _nodal_volumes(grid: Discretisation) -> np.ndarray:
+    volume = np.einsum("mq,qa->ma", grid.weights, grid.values)
+    return nodal_sums(grid.mesh, grid.connectivity, volume)

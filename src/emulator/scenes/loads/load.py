@@ -16,8 +16,8 @@ from emulator.scenes.local_terms import LocalForce, LocalTerm
 class Load(ABC):
     """An external load; a concrete one is a frozen dataclass whose fields a scene file can give.
 
-    A load contributes in one of three ways, and overrides the method for it: a dead nodal force, a
-    potential, or a force that has no potential.
+    A load contributes in one of four ways, and overrides the method for it: a dead nodal force, one
+    in proportion to parameters, a potential, or a force that has no potential.
 
     kind : name in scene files and in :data:`~emulator.scenes.loads.LOADS`.
     """
@@ -55,6 +55,10 @@ class Load(ABC):
     def nodal_force(self, grid: Discretisation) -> np.ndarray | None:
         """Dead nodal force (n, 3) in mN, or None."""
         return None
+
+    def nodal_force_per_unit(self, grid: Discretisation) -> dict[str, np.ndarray]:
+        """Dead nodal force (n, 3) in mN per unit of each parameter that scales one."""
+        return {}
 
     def term(self, grid: Discretisation) -> LocalTerm | None:
         """Potential of a load that follows the deformation, or None."""
