@@ -2,8 +2,9 @@ r"""What a model predicts at draws: replicated data, and the log likelihood of e
 
 Replicates :math:`y^\text{rep} \sim p(y \mid \theta_s)` are drawn at draws of the posterior and of
 the prior. The log likelihood :math:`\log p(y_i \mid \theta_s)` of every datum at every draw is what
-leave-one-out cross-validation needs (Vehtari, Gelman and Gabry 2017). All are read off the
-NumPyro program, so they follow any observation and noise.
+leave-one-out cross-validation needs (Vehtari, Gelman and Gabry 2017); where noise correlates in
+space, :math:`\log p(y_i \mid y_{-i}, \theta_s)` takes its place. All are read off the NumPyro
+program, so they follow any observation and noise.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro import handlers
 
+from calibrate.noise.spatial import SpatialNormal
 from calibrate.samplers.density import sum_log_likelihood, trace_of
 from calibrate.statistical_model import Data, Model
 
@@ -41,8 +43,8 @@ class Prior(NamedTuple):
 def log_likelihood(model: Model, draws: Draws, data: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Log likelihood of each datum at each draw, (chains, draws, *shape), by observation.
 
-    An observation whose data depend on each other given theta has one number a draw instead,
-    (chains, draws).
+    Where noise correlates in space, given all other data of the observation. Data of a noise that
+    has no density of a single one have one number a draw instead, (chains, draws).
     """
     return _unflat(_programs(model).log_likelihood(_flat(draws), data), draws)
 
@@ -111,8 +113,10 @@ def _site(name: str) -> str:
 
 
 def _pointwise(site: dict[str, Any]) -> jax.Array:
-    """Log density of each datum, or of all where they are not independent."""
+    """Log density of each datum: given all the others, where they are not independent."""
     distribution, value = site["fn"], site["value"]
+    if isinstance(distribution, SpatialNormal):
+        return distribution.log_conditionals(value)
     while isinstance(distribution, dist.Independent):
         distribution = distribution.base_dist
     each = distribution.log_prob(value)

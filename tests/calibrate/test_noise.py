@@ -102,6 +102,23 @@ def test_correlated_noise_is_the_multivariate_normal(kernel, gaps, strict):
     assert abs(float(other.distribution(jnp.asarray(mean), {}).log_prob(data)) - expected) > 1e-2
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_each_datum_given_all_the_others(kernel, strict):
+    """Against the ratio of two densities of SciPy's: of all data, and of all but one."""
+    sites = Sites.of(POINTS, 3)
+    order = np.random.default_rng(3).permutation(18)[:15]  # raveled, out of order, with gaps
+    sites = Sites(sites.positions[order], sites.component[order])
+    mean, data = MEAN.ravel()[order], DATA.ravel()[order]
+    C = covariance(sites.positions, 12.0, kernel, 0.3, 0.8, sites.component)
+    noise = CorrelatedNoise(12.0, sd=0.3, spatial_sd=0.8, kernel=kernel).at(sites)
+    found = jax.jit(lambda y: noise.distribution(jnp.asarray(mean), {}).log_conditionals(y))
+    whole = stats.multivariate_normal.logpdf(data, mean, C)
+    for j, each in enumerate(np.asarray(found(jnp.asarray(data)))):
+        rest = np.delete(np.arange(15), j)
+        others = stats.multivariate_normal.logpdf(data[rest], mean[rest], C[rest][:, rest])
+        assert each == pytest.approx(whole - others, rel=1e-9)
+
+
 def test_draws_have_the_covariance():
     sites = Sites.of(POINTS, 3)
     noise = CorrelatedNoise(12.0, sd=0.3, spatial_sd=0.8).at(sites)
