@@ -3,8 +3,9 @@
     python studies/poor_emulators/run.py            # both meshes
     python studies/poor_emulators/run.py --quick --out DIR
 
-Emulators of a left ventricle from 1, 5 and 20 FEM runs infer data sets made by FEM, once as if they
-were exact (``error_runs`` 0) and once with their error learned from 24 FEM runs. Their posteriors
+Emulators of a left ventricle from 1, 5 and 20 FEM runs, and POD + GP from 20, infer data sets made
+by FEM, once as if they were exact (``error_runs`` 0) and once with their error learned from 24 FEM
+runs. Their posteriors
 are compared with FEM's: draws of a good emulator's posterior, weighted by FEM. Writes results.json
 and poor_emulators.png.
 """
@@ -31,6 +32,8 @@ from emulator.fem import Simulator, design, run_campaign, sobol
 from emulator.scenes.scene import Scene
 from emulator.store import replacing, write_json
 from emulator.surrogates.additive import Emulator
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import ForwardMap
 from emulator.surrogates.taylor import expand
 from emulator.training.discrepancy_stage import add_discrepancy
 
@@ -42,8 +45,16 @@ ERROR_RUNS = 24
 GOOD = 200  # FEM runs of the emulator that FEM's weights begin from
 LEVEL = 0.9
 MESHES = {"coarse": (4, 8, 1), "default": None}
-# Order of the Taylor series and FEM runs, the centre's included.
-POOR = {"1 run, 1st order": (1, 1), "1 run": (3, 1), "5 runs": (3, 5), "20 runs": (3, 20)}
+SETS = {"coarse": 6, "default": 3}
+WEIGHTS = {"coarse": 200, "default": 60}  # FEM runs a data set
+# Order of the Taylor series and FEM runs, the centre's included; order 0 is POD + GP.
+POOR = {
+    "POD + GP, 20 runs": (0, 20),
+    "1 run, 1st order": (1, 1),
+    "1 run": (3, 1),
+    "5 runs": (3, 5),
+    "20 runs": (3, 20),
+}
 OPTIONS = NUTSOptions(warmup=250, draws=300, chains=2, rounds=3, r_hat=1.02, ess=150.0)
 QUICK = NUTSOptions(warmup=100, draws=100, chains=2, rounds=1)
 
@@ -67,20 +78,26 @@ def scene_of(shape: tuple[int, int, int] | None) -> Scene:
     )
 
 
-def emulators(simulator: Simulator, wanted: list[tuple[int, int]]) -> dict[Any, Emulator]:
-    """Emulators by (order of the series, FEM runs); all from the first of the same runs."""
+def forward_maps(
+    simulator: Simulator, wanted: list[tuple[int, int]]
+) -> dict[tuple[int, int], ForwardMap]:
+    """Maps by (order of the series, FEM runs); all from the first of the same runs."""
     scene = simulator.scene
     series = expand(simulator, order=max(order for order, _ in wanted))
     more = design(scene, max(max(count for _, count in wanted) - 1, 1), SEED)
     thetas = jnp.concatenate([scene.centre[None], more])
     runs = run_campaign(simulator, thetas, sensitivities=True, predictor=series)
-    found: dict[Any, Emulator] = {}
+    found: dict[tuple[int, int], ForwardMap] = {}
     for order, count in wanted:
+        some = runs.take(slice(count))
+        if order == 0:
+            found[order, count] = fit_reduced(scene, some)
+            continue
         kept = np.sum(np.asarray(series.indices) >= 0, axis=1) <= order
         indices, derivatives = series.indices[kept], series.derivatives[kept]
         bare = Emulator(scene, taylor=replace(series, indices=indices, derivatives=derivatives))
-        some = runs.take(slice(count))
-        found[order, count] = bare if count == 1 else add_discrepancy(bare, some)[0]
+        made = bare if count == 1 else add_discrepancy(bare, some)[0]
+        found[order, count] = made.cache()
     return found
 
 
@@ -149,6 +166,7 @@ def compare(name: str, mesh: str, found: list[Moments], exact: list[Moments], tr
         "covered": int(np.sum(inside)),
         "of": int(truths.size),
         "shifts": shifts.tolist(),
+        "shifts_in_own_sd": own.tolist(),
     }
 
 
@@ -160,11 +178,11 @@ def study(mesh: str, quick: bool, sets: int) -> list[dict[str, Any]]:
     poor = {k: v for k, v in POOR.items() if not quick or k == "1 run, 1st order"}
     order = 2 if quick else max(v[0] for v in poor.values())
     good = (order, 20 if quick else GOOD)
-    made = emulators(simulator, [good, *poor.values()])
+    made = forward_maps(simulator, [good, *poor.values()])
     observe = parse_observation(scene, OBSERVE, SEED)
     noise = {name: cal.GaussianNoise(sd=sd) for name, sd in NOISE.items()}
     build = partial(cal.model, observe=observe, noise=noise)
-    reference = build(made[good].cache())
+    reference = build(made[good])
     sets_ = data_sets(simulator, reference, sets)
     truths = np.array([theta for theta, _, _ in sets_])
 
@@ -176,7 +194,9 @@ def study(mesh: str, quick: bool, sets: int) -> list[dict[str, Any]]:
 
     begin = time.process_time()
     fem, every = FEMLikelihood(reference, simulator), posteriors(reference)
-    exact, effective = zip(*(weighted(p, fem, 20 if quick else 200) for p in every), strict=True)
+    exact, effective = zip(
+        *(weighted(p, fem, 20 if quick else WEIGHTS[mesh]) for p in every), strict=True
+    )
     rows = [compare("FEM", mesh, list(exact), list(exact), truths)]
     plain = compare("FEM", mesh, [moments(p) for p in every], list(exact), truths)
     rows[0] |= {
@@ -188,7 +208,7 @@ def study(mesh: str, quick: bool, sets: int) -> list[dict[str, Any]]:
     }
     report(rows[0], begin)
     for name, key in poor.items():
-        model = build(made[key].cache())
+        model = build(made[key])
         sizes = [size(model, theta, means) for theta, means, _ in sets_]
         for runs in (0, ERROR_RUNS):
             begin = time.process_time()
@@ -216,6 +236,7 @@ def report(row: dict[str, Any], begin: float) -> None:
     row["processor_s"] = round(time.process_time() - begin, 1)
     print(
         f"{row['name']:42s} shift {row['shift_rms']:7.2f} sd (largest {row['shift_largest']:.1f}), "
+        f"{row['shift_in_own_sd_rms']:.2f} of its own, "
         f"width {row['width_median']:.2f}, covered {row['covered']}/{row['of']}, "
         f"{row['processor_s']:.0f} s",
         flush=True,
@@ -228,7 +249,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     poor = [row for row in rows if row["kind"] == "poor"]
     names = list(dict.fromkeys((row["mesh"], row["emulator"]) for row in poor))
     figure, (left, right) = plt.subplots(
-        1, 2, figsize=(11, 1.6 + 0.5 * len(names)), width_ratios=(3, 1), sharey=True,
+        1, 2, figsize=(11, 1.6 + 0.5 * len(names)), width_ratios=(2, 1), sharey=True,
         layout="constrained",
     )  # fmt: skip
     styles = {
@@ -238,23 +259,15 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     for row in poor:
         colour, marker, off, label = styles[row["error_runs"]]
         y = names.index((row["mesh"], row["emulator"])) + off
-        shifts = np.abs(np.ravel(row["shifts"]))
-        first = y == off
+        shifts, rms = np.abs(np.ravel(row["shifts_in_own_sd"])), row["shift_in_own_sd_rms"]
+        words = label if y == off else None
         left.plot(shifts, np.full(shifts.size, y), marker, color=colour, ms=4, alpha=0.4, mew=0)
-        left.plot(
-            row["shift_rms"],
-            y,
-            marker,
-            color=colour,
-            ms=9,
-            mec="black",
-            label=label if first else None,
-        )
+        left.plot(rms, y, marker, color=colour, ms=9, mec="black", label=words)
         right.barh(y, 100.0 * row["covered"] / row["of"], 0.28, color=colour)
     left.set(
         xscale="log",
-        xlabel="|shift| of a mean from FEM's, in FEM's posterior sd (large: rms)",
-        xlim=(1e-3, None),
+        xlabel="distance of a mean from FEM's, in the posterior's own sd (large: rms)",
+        xlim=(3e-3, None),
     )
     left.set_yticks(range(len(names)), [f"{mesh}, {name}" for mesh, name in names])
     left.axvline(1.0, color="0.5", lw=1, ls=":")
@@ -272,18 +285,17 @@ def check(rows: list[dict[str, Any]]) -> None:
     by = {(row["mesh"], row.get("emulator"), row.get("error_runs")): row for row in rows}
     for mesh in {row["mesh"] for row in rows}:
         for name in POOR:
-            if (mesh, name, 0) not in by:
-                continue
-            without, learned = by[mesh, name, 0], by[mesh, name, ERROR_RUNS]
-            assert learned["shift_rms"] < 1.0, learned["name"]
-            assert learned["covered"] >= 0.75 * learned["of"], learned["name"]
-            assert learned["shift_rms"] < max(without["shift_rms"], 0.5), learned["name"]
+            learned, taken = by[mesh, name, ERROR_RUNS], by[mesh, name, 0]
+            assert learned["shift_in_own_sd_rms"] < 1.0, learned["name"]
+            if taken["shift_in_own_sd_rms"] > 1.0:
+                assert learned["shift_in_own_sd_rms"] < 0.5 * taken["shift_in_own_sd_rms"]
+                assert learned["covered"] >= taken["covered"], learned["name"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--meshes", nargs="+", default=list(MESHES), choices=list(MESHES))
-    parser.add_argument("--sets", type=int, default=5, help="data sets")
+    parser.add_argument("--sets", type=int, help="data sets")
     parser.add_argument("--quick", action="store_true", help="one emulator, two data sets")
     parser.add_argument("--out", type=Path, default=HERE)
     arguments = parser.parse_args()
@@ -291,7 +303,7 @@ def main() -> None:
     meshes = ["coarse"] if arguments.quick else arguments.meshes
     rows: list[dict[str, Any]] = []
     for mesh in meshes:
-        rows += study(mesh, arguments.quick, 2 if arguments.quick else arguments.sets)
+        rows += study(mesh, arguments.quick, 2 if arguments.quick else arguments.sets or SETS[mesh])
         # Each mesh is kept before the next one begins.
         write_json(arguments.out / "results.json", {**study_header(HERE, SEED), "cases": rows})
     draw(rows, arguments.out / "poor_emulators.png")
