@@ -167,7 +167,7 @@ class Conditional(dist.Distribution):
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Draws, by inversion."""
-        q = self.centre + self.width * jax.random.normal(key, sample_shape)
+        q = jnp.asarray(self.centre) + self.width * jax.random.normal(key, sample_shape)
         return quantile(self.marginal, q)
 
 
