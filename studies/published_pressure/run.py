@@ -11,7 +11,7 @@ published_pressure.png.
 
 import argparse
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -130,7 +130,7 @@ def one(
         else cal.NUTSOptions(warmup=250, draws=300, chains=2, rounds=3, r_hat=1.02, ess=150.0)
     )
     posterior = cal.sample(model, data, options=options, seed=SEED, predictions=False)
-    certificate = cal.certify(posterior, simulator, draws=60 if quick else 100)
+    certificate = cal.certify(posterior, simulator, draws=60)
     misfit = {
         name: min(found.p, found.p_worst) for name, found in certificate.evidence.misfit.items()
     }
@@ -153,8 +153,10 @@ def one(
     }
 
 
-def study(quick: bool, sets: int, runs: int) -> list[dict[str, Any]]:
-    """A row for each load of the map, observation and data set."""
+def study(
+    quick: bool, sets: int, runs: int, keep: Callable[[list[dict[str, Any]]], object]
+) -> list[dict[str, Any]]:
+    """A row for each load of the map, observation and data set; ``keep`` gets all so far."""
     shape = QUICK_MESH if quick else MESH
     materials = truths(sets)
     exact = Simulator(scene_of(LOADS["exact"], shape))
@@ -184,6 +186,7 @@ def study(quick: bool, sets: int, runs: int) -> list[dict[str, Any]]:
                     "processor_s": round(time.process_time() - begin, 1),
                 }
                 rows.append(row)
+                keep(rows)
                 print(
                     f"{row['name']}: {row['status']}, p {min(row['misfit_p'].values()):.3f}, "
                     + "  ".join(
@@ -275,17 +278,17 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=4, help="data sets")
+    parser.add_argument("--sets", type=int, default=3, help="data sets")
     parser.add_argument("--runs", type=int, default=RUNS, help="FEM runs of each emulator")
     parser.add_argument("--quick", action="store_true", help="one data set, a coarse mesh")
     parser.add_argument("--out", type=Path, default=HERE)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    quick = arguments.quick
-    rows = study(quick, 1 if quick else arguments.sets, 30 if quick else arguments.runs)
+    quick, path = arguments.quick, arguments.out / "results.json"
     header = study_header(HERE, SEED)
-    found = {**header, "summary": conclude(rows), "cases": rows}
-    write_json(arguments.out / "results.json", found)
+    sets, runs = (1, 30) if quick else (arguments.sets, arguments.runs)
+    rows = study(quick, sets, runs, lambda some: write_json(path, {**header, "cases": some}))
+    write_json(path, {**header, "summary": conclude(rows), "cases": rows})
     draw(rows, arguments.out / "published_pressure.png")
 
 
