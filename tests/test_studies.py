@@ -27,6 +27,8 @@ QUICK = {
     "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
     "new_ventricle": "--ventricles 1 --runs 8 --tests 3",
     "objectives": "--quick",
+    "poor_emulators": "--quick",
+    "published_pressure": "--quick",
     "sbc": "--replicates 20 --only map",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half",
@@ -117,6 +119,25 @@ def objectives(results):
     assert cases["gradients"]["err_F"]["median"] < start["err_F"]["median"]
 
 
+def poor_emulators(results):
+    cases = {case["name"]: case for case in results["cases"]}
+    taken = cases["coarse, 1 run, 1st order, taken as exact"]
+    learned = cases["coarse, 1 run, 1st order, error learned"]
+    assert learned["error_runs"] == 24
+    assert learned["width_median"] > taken["width_median"]
+    assert learned["shift_in_own_sd_rms"] < taken["shift_in_own_sd_rms"]
+
+
+def published_pressure(results):
+    cases = {(case["load"], case["observed"]): case for case in results["cases"]}
+    assert len(cases) == 4
+    displaced = "24 landmarks and volume at 8 mmHg"
+    stiff = {
+        load: cases[load, displaced]["parameters"]["a_f"]["mean"] for load in ("exact", "published")
+    }
+    assert stiff["published"] > stiff["exact"]
+
+
 def sbc(results):
     (case,) = results["cases"]
     assert case["status"] == "not calibrated"
@@ -154,6 +175,8 @@ CHECKS = {
         many_solves,
         new_ventricle,
         objectives,
+        poor_emulators,
+        published_pressure,
         sbc,
         stability,
         transfer,

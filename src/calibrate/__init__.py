@@ -10,6 +10,7 @@ from numpyro import distributions as _distributions  # noqa: F401
 
 import emulator
 from calibrate.certificate import Certificate, certify, reweight
+from calibrate.joint_prior import Dependence, JointPrior
 from calibrate.noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from calibrate.observations import (
     CavityVolume,
@@ -21,6 +22,7 @@ from calibrate.observations import (
     strains,
     surface_points,
 )
+from calibrate.population import Population, population_of_fits
 from calibrate.posterior import Posterior, sample
 from calibrate.priors import box_prior, log_normal, truncated, truncated_normal
 from calibrate.samplers import NUTSOptions
@@ -32,11 +34,14 @@ __all__ = [
     "CavityVolume",
     "Certificate",
     "CorrelatedNoise",
+    "Dependence",
     "DiscrepancyNoise",
     "GaussianNoise",
+    "JointPrior",
     "MeasuredParameter",
     "Model",
     "NUTSOptions",
+    "Population",
     "Posterior",
     "StudentTNoise",
     "box_prior",
@@ -46,6 +51,7 @@ __all__ = [
     "log_normal",
     "model",
     "nodal_displacements",
+    "population_of_fits",
     "reweight",
     "sample",
     "segment_strains",

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 
+from calibrate.joint_prior import JointPrior
 from calibrate.priors import box_prior
 from calibrate.state_names import at, split
 from emulator.errors import InputError
@@ -74,7 +75,7 @@ def load_states(
     ----------
     prior, known : distributions and known values by ``parameter`` or ``parameter@state``; a
         parameter of the loads that is named without a state is meant in every state. What neither
-        names has the scene's box as its prior, unless a prior is given at all.
+        names has the scene's box as its prior, unless a prior is given that is not joint.
 
     Raises
     ------
@@ -83,7 +84,8 @@ def load_states(
     """
     given, known = dict(prior or {}), dict(known or {})
     by_state = _by_state(scene, states, (*given, *known))
-    default = box_prior(scene) if prior is None else {}
+    boxed = prior is None or isinstance(prior, JointPrior)
+    default = box_prior(scene) if boxed else {}
     entries: list[list[str | float]] = []
     priors: dict[str, dist.Distribution] = {}
     for state in states:

@@ -11,6 +11,7 @@ import numpyro.distributions as dist
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
+from calibrate.joint_prior import JointPrior
 from calibrate.state_names import split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -70,17 +71,18 @@ def log_normal(
     return _cut(whole, low, min(high, median * math.exp(9.0 * log_sd)))
 
 
-def truncated(prior: Prior, scene: Scene) -> dict[str, dist.Distribution]:
+def truncated(prior: Prior, scene: Scene) -> Prior:
     """``prior`` with each distribution cut to the parameter's range in ``scene``.
 
     A posterior under it speaks about the range only: a parameter that piles up at an end of it is
-    probably outside.
+    probably outside. A joint prior keeps its correlations.
     """
     ranges = {p.name: (p.low, p.high) for p in scene.parameters}
     for name in prior:
         if split(name)[0] not in ranges:
             raise InputError(f"prior names '{name}'; scene '{scene.name}' has {', '.join(ranges)}")
-    return {name: _cut(d, *ranges[split(name)[0]]) for name, d in prior.items()}
+    cut = {name: _cut(d, *ranges[split(name)[0]]) for name, d in prior.items()}
+    return JointPrior(cut, prior.dependence) if isinstance(prior, JointPrior) else cut
 
 
 class Truncated(dist.Distribution):

@@ -27,6 +27,8 @@ class Run:
     observe : observations of synthetic data, joined by ``+``, e.g. ``landmarks:24+volume``; each
         kind of :data:`calibrate.observations.KINDS` says which words ask for it. They are made in
         every load state that ``truth`` and ``known`` name; ``volume@diastole`` in one.
+    prior : ``box``, the name of a population of :data:`calibrate.population.POPULATIONS`, or the
+        fields of a :class:`calibrate.population.Population`.
     noise : standard deviation by the observation's name, in its unit, or a kind of
         :data:`calibrate.noise.KINDS` with its options, ``{"kind": "student_t", "dof": 4, "scale":
         0.2}``. A bare number belongs to a single observation, or to the displacements. What is not
@@ -50,6 +52,7 @@ class Run:
     truth: dict[str, float] = field(default_factory=dict)
     known: dict[str, float] = field(default_factory=dict)
     observe: str = "nodes:20"
+    prior: dict[str, Any] | str = "box"
     noise: Mapping[str, float | dict[str, Any]] | float = field(default_factory=dict)
     noise_scale: Mapping[str, float] | float = field(default_factory=dict)
     discrepancy: Mapping[str, dict[str, Any]] = field(default_factory=dict)

@@ -23,6 +23,7 @@ import numpyro
 import numpyro.distributions as dist
 
 from calibrate.approximation_error import ApproximationError
+from calibrate.joint_prior import Conditional, Dependence, JointPrior
 from calibrate.load_states import LoadStates, load_states
 from calibrate.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.noise import Noise
@@ -58,6 +59,7 @@ class Model:
     error : the forward map's own error, where the likelihood allows for it.
     prior_cut : unknown to the mass of its prior that was cut off (:mod:`calibrate.prior_range`).
     check_scale : whether :meth:`check_data` refuses data far from every prediction.
+    dependence : of the prior of some unknowns of theta, in theta's order.
     """
 
     forward: ForwardMap
@@ -70,6 +72,7 @@ class Model:
     error: ApproximationError | None = None
     prior_cut: Mapping[str, float] = field(default_factory=dict)
     check_scale: bool = True
+    dependence: Dependence | None = None
 
     @cached_property
     def noise_sites(self) -> dict[str, dict[str, str]]:
@@ -108,13 +111,15 @@ class Model:
 
     @cached_property
     def sampled_priors(self) -> dict[str, dist.Distribution]:
-        """Prior of all that is inferred, as NumPyro samples it."""
+        """Prior of all that is inferred, as NumPyro samples it, but for the dependence."""
         theta = {name: standardised(self.prior[name]) for name in self.states.unknowns}
         return {**theta, **self.noise_priors}
 
     def __call__(self, data: jax.Array | Data | None = None) -> None:
         """The NumPyro program; ``data`` by name, or as it is when one thing is observed."""
-        draw = {name: numpyro.sample(name, d) for name, d in self.sampled_priors.items()}
+        draw: dict[str, jax.Array] = {}
+        for name, prior in self.sampled_priors.items():
+            draw[name] = numpyro.sample(name, self._given_earlier(name, prior, draw))
         thetas = self.states.thetas(draw)
         prediction = self.evaluate(thetas)
         # Where the forward map has no answer, the density is zero, not NaN.
@@ -129,6 +134,15 @@ class Model:
         for name, distribution in self.distributions(means, self.noise_values(draw)).items():
             obs = None if observed is None else observed[name]
             numpyro.sample(f"observed_{name}", distribution, obs=obs)
+
+    def _given_earlier(
+        self, name: str, prior: dist.Distribution, draw: Mapping[str, jax.Array]
+    ) -> dist.Distribution:
+        """``prior`` of ``name``, given the unknowns before it that it depends on."""
+        if self.dependence is None or name not in self.dependence.names:
+            return prior
+        mean, sd = self.dependence.given_earlier(name, self.prior, draw)
+        return Conditional(self.prior[name], mean, sd, prior.support)
 
     def evaluate(self, thetas: jax.Array) -> Prediction:
         """Displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p), in one call.
@@ -203,10 +217,11 @@ class Model:
     def prior_draws(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
         """Draws (count,) from the prior of each unknown of theta."""
         keys = jax.random.split(key, len(self.states.unknowns))
-        return {
-            name: self.prior[name].sample(k, (count,))
-            for name, k in zip(self.states.unknowns, keys, strict=True)
-        }
+        found: dict[str, jax.Array] = {}
+        for name, k in zip(self.states.unknowns, keys, strict=True):
+            prior = self._given_earlier(name, self.prior[name], found)
+            found[name] = prior.sample(k, (count,))
+        return found
 
     def given(
         self, data: np.ndarray | Mapping[str, np.ndarray]
@@ -288,7 +303,8 @@ def model(
         noise and data are then given by the same names. ``volume@p8`` is the volume in the load
         state ``p8``; a noise under ``volume`` is that of every state.
     prior : of every parameter; the scene's box by default. In several load states, the loads'
-        parameters have one prior for each state, or separate ones under ``pressure@p8``.
+        parameters have one prior for each state, or separate ones under ``pressure@p8``. A
+        :class:`~calibrate.joint_prior.JointPrior` correlates some and leaves the box to others.
     known : parameters that are not inferred, by the same names.
     check_scale : ``False`` to take data however far from every prediction
         (:mod:`calibrate.magnitude`).
@@ -306,8 +322,11 @@ def model(
     restricted = forward.at(several.nodes)
     states, given = load_states(forward.scene, several.states, prior, known)
     check_known(restricted, states)
-    prior, cut = fit_to(restricted, given)
-    return Model(restricted, forward, several, noises, names, states, prior, None, cut, check_scale)
+    fitting, cut = fit_to(restricted, given)
+    joint = prior.dependence.ordered(states.unknowns) if isinstance(prior, JointPrior) else None
+    return Model(
+        restricted, forward, several, noises, names, states, fitting, None, cut, check_scale, joint
+    )
 
 
 def _noises(

@@ -25,6 +25,7 @@ from calibrate.learned_error import with_error
 from calibrate.load_states import known_thetas
 from calibrate.observations import Observations, observations_from_json, parse_observation
 from calibrate.observations.present import missing_values
+from calibrate.population import prior_of
 from calibrate.posterior import Posterior, read_tree, sample
 from calibrate.run import Run
 from calibrate.samplers import find_sampler, options_from
@@ -97,7 +98,8 @@ def build_model(run: Run, scene: Scene, observe: Observations, *, progress: bool
     """The statistical model of a run, before its data."""
     forward = build_forward(run, scene, progress=progress)
     noises = run.noises(observe)
-    return model(forward, observe, noises, known=run.known, check_scale=run.check_scale)
+    prior = prior_of(run.prior, scene)
+    return model(forward, observe, noises, prior, known=run.known, check_scale=run.check_scale)
 
 
 def model_before_data(run: Run, *, progress: bool = False) -> Model:
@@ -184,7 +186,8 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
     noises = run.noises(observe)
     # Its data was checked when it was sampled, or the check was overruled.
-    built: Model = model(forward, observe, noises, known=run.known, check_scale=False)
+    prior = prior_of(run.prior, scene)
+    built: Model = model(forward, observe, noises, prior, known=run.known, check_scale=False)
     if run.error_runs:
         error = restore_error(path, tree, folder / ERROR)
         built = replace(built, error=error)

@@ -141,5 +141,8 @@ def _k_hat(log_weights: np.ndarray) -> float:
         return float("nan")
     if np.ptp(log_weights) < _EQUAL_WEIGHTS:
         return 0.0
-    # ArviZ takes log likelihoods and negates them (docs/experiments.md, "A sign").
-    return float(array_stats.psislw(-(log_weights - log_weights.max()))[1])
+    try:
+        # ArviZ takes log likelihoods and negates them (docs/experiments.md, "A sign").
+        return float(array_stats.psislw(-(log_weights - log_weights.max()))[1])
+    except ValueError:  # the tail is one point of the pool, drawn again and again
+        return float("inf")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,14 @@ def add_model(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME=VALUE",
         help="parameters that are not inferred, e.g. pressure@p8=1.07",
+    )
+    parser.add_argument(
+        "--prior",
+        default="box",
+        metavar="NAME|FILE",
+        help="box (uniform over the scene's range), ventricles (correlated Holzapfel-Ogden "
+        "parameters of human ventricles), or a population's medians, log sds and correlations "
+        "in a .json file",
     )
     parser.add_argument(
         "--observe",
@@ -63,6 +72,7 @@ def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
         "truth": assignments(arguments.truth),
         "known": assignments(arguments.known),
         "observe": arguments.observe,
+        "prior": _prior(arguments.prior),
         "noise": noise_words(arguments.noise),
         "noise_scale": noise_scale_words(arguments.noise_scale),
         "discrepancy": discrepancy_words(arguments.discrepancy),
@@ -106,6 +116,13 @@ def _add_noise(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="take data however far from every prediction (m for mm, mm3 for mL, zero)",
     )
+
+
+def _prior(word: str) -> str | dict[str, Any]:
+    """A name as it is; a file's content, because a kept run must not change with the file."""
+    from calibrate.population import read_population
+
+    return asdict(read_population(word)) if word.endswith(".json") else word
 
 
 def _absolute(word: str, *, is_path: bool = True) -> str:
