@@ -70,9 +70,7 @@ def with_agreement(case: dict[str, Any]) -> dict[str, Any]:
         **case,
         "agreement": [of_runs(one, other, case["names"]) for one, other in pairs],
         "share_of_solves": {
-            run["method"]: late / run["solves_per_effective_draw"]
-            for run in runs
-            if run["adjoints"]
+            run["method"]: cost[LATE] / cost[run["method"]] for run in runs if run["adjoints"]
         },
     }
 
