@@ -34,6 +34,7 @@ from methods import (
 )
 from problems import PROBLEMS, Problem
 from shifts import certificates
+from tables import tables
 
 from calibrate.provenance import commit, study_header
 from emulator.store import write_json
@@ -41,6 +42,7 @@ from emulator.store import write_json
 HERE = Path(__file__).parent
 SEED = 0
 SIZES = {name: Sizes() for name in PROBLEMS}
+SIZES["cube"] = Sizes(warmup=100, draws=150, tuned=50)
 SIZES["ventricle"] = Sizes(weighed=400)
 # NUTS with FEM as its forward map; on 1564 nodes it would take hours.
 FEM_RUNS = dict.fromkeys(PROBLEMS, ("tuned", "plain")) | {"ventricle": ()}
@@ -134,8 +136,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.only:
-        found = part(arguments.only, quick=arguments.quick)
-        write_json(arguments.out / "part.json", found)
+        write_json(arguments.out / "part.json", part(arguments.only, quick=arguments.quick))
         return
     path = arguments.out / "results.json"
     kept = {c["key"]: c for c in json.loads(path.read_text())["cases"]} if path.exists() else {}
@@ -147,6 +148,7 @@ def main() -> None:
         cases = [kept[k] for k in PARTS if k in kept]
         write_json(path, {**study_header(HERE, SEED), "cases": cases})
         draw([case for case in cases if case["key"] in PROBLEMS], arguments.out / "costs.png")
+    print(tables(cases))
     if not arguments.quick:
         check(kept)
 
