@@ -61,17 +61,31 @@ def of_runs(one: dict[str, Any], other: dict[str, Any], names: list[str]) -> dic
 def with_agreement(case: dict[str, Any]) -> dict[str, Any]:
     """``case`` with every two of its runs compared, and delayed acceptance's share of the solves.
 
-    The share is of FEM solves an effective draw, against each run of NUTS with FEM.
+    The share is of FEM solves an effective draw, against each run of NUTS with FEM: as run, of the
+    kept draws alone, and of 1000 effective draws after the same warm-up.
     """
     runs = case["runs"]
     pairs = combinations(reversed(runs), 2)
-    cost = {run["method"]: run["solves_per_effective_draw"] for run in runs}
+    late = next(run for run in runs if run["method"] == LATE)
+    by_fem = [run for run in runs if run["adjoints"]]
     return {
         **case,
         "agreement": [of_runs(one, other, case["names"]) for one, other in pairs],
         "share_of_solves": {
-            run["method"]: cost[LATE] / cost[run["method"]] for run in runs if run["adjoints"]
+            run["method"]: {key: cost(late)[key] / value for key, value in cost(run).items()}
+            for run in by_fem
         },
+    }
+
+
+def cost(run: dict[str, Any]) -> dict[str, float]:
+    """FEM solves an effective draw: as run, of kept draws, of 1000 after the same warm-up."""
+    kept = run["kept_fem_solves"] / run["effective"]
+    warmup = run["fem_solves"] - run["kept_fem_solves"]
+    return {
+        "as run": run["fem_solves"] / run["effective"],
+        "kept": kept,
+        "of 1000": kept + warmup / 1000.0,
     }
 
 

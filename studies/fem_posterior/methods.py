@@ -29,17 +29,18 @@ PLAIN, TUNED, LATE, CHEAP = (
 
 @dataclass(frozen=True)
 class Sizes:
-    """Lengths of the runs. chains, warmup, draws, rounds : of FEM-NUTS.
+    """Lengths of the runs.
 
-    tuned : warm-up of the run that starts from the emulator's posterior. late : draws a chain of
-    delayed acceptance. weighed : emulator's draws at which FEM is solved. certificate : FEM runs.
-    cheap : warm-up and draws of the emulator's own run.
+    chains, warmup, draws : of FEM-NUTS. tuned : warm-up and draws of the run that starts from the
+    emulator's posterior. late, late_chains : draws and chains of delayed acceptance. weighed :
+    draws of the emulator at which FEM is solved. certificate : FEM runs. cheap : warm-up and draws
+    of the emulator's own run.
     """
 
     chains: int = 2
     warmup: int = 150
     draws: int = 200
-    tuned: int = 100
+    tuned: tuple[int, int] = (100, 200)
     late: int = 250
     late_chains: int = 4
     weighed: int = 1000
@@ -188,7 +189,8 @@ def by_tuned_fem(
 
     ``seconds`` that sampling it took are counted.
     """
-    options = NUTSOptions(sizes.tuned, sizes.draws, sizes.chains, rounds=1)
+    warmup, length = sizes.tuned
+    options = NUTSOptions(warmup, length, sizes.chains, rounds=1)
     before, begin = problem.solves.total(), time.process_time()
     density = density_of(problem.fem)
     data = problem.fem.check_data(problem.data)
@@ -198,13 +200,13 @@ def by_tuned_fem(
     keys = jax.random.split(jax.random.key(seed), sizes.chains)
     states, _ = programs.start(keys, data, map_)
     # One length of both, so that one program serves.
-    part = int(np.gcd(sizes.tuned, sizes.draws))
+    part = int(np.gcd(warmup, length))
     found = []
-    for _ in range((sizes.tuned + sizes.draws) // part):
+    for _ in range((warmup + length) // part):
         states, draws = programs.advance(states, data, map_, count=part)
         found.append(jax.tree.map(np.asarray, draws))
     solves = problem.solves.total() - before
-    kept = found[sizes.tuned // part :]
+    kept = found[warmup // part :]
     named = named_draws(problem.fem, np.concatenate([d.z for d in kept], axis=1))
     return Outcome(
         TUNED,

@@ -42,11 +42,12 @@ from emulator.store import write_json
 HERE = Path(__file__).parent
 SEED = 0
 SIZES = {name: Sizes() for name in PROBLEMS}
-SIZES["cube"] = Sizes(warmup=100, draws=150, tuned=50)
-SIZES["ventricle"] = Sizes(weighed=400)
+SIZES["cube"] = Sizes(warmup=100, draws=150, tuned=(50, 150))
+SIZES["coarse"] = Sizes(warmup=300, draws=500)
+SIZES["ventricle"] = Sizes(weighed=300)
 # NUTS with FEM as its forward map; on 1564 nodes it would take hours.
 FEM_RUNS = dict.fromkeys(PROBLEMS, ("tuned", "plain")) | {"ventricle": ()}
-QUICK = Sizes(2, 10, 10, 10, 20, 2, 30, 30, (100, 100))
+QUICK = Sizes(2, 10, 10, (10, 10), 20, 2, 30, 30, (100, 100))
 SHIFTS = "shifts"  # the part on certificates
 PARTS = (*PROBLEMS, SHIFTS)
 LARGEST_SHIFT, LARGEST_LOG_SD, SHARE = 0.1, float(np.log(1.1)), 0.1
@@ -124,7 +125,7 @@ def check(cases: dict[str, dict[str, Any]]) -> None:
             assert found["rms_z"] < 2.0, (case["name"], found["of"], found["against"])
             assert found["largest_z"] < 4.0, (case["name"], found["of"], found["against"])
         for share in [case["share_of_solves"][PLAIN]] if FEM_RUNS[key] else []:
-            assert share < SHARE, case["name"]
+            assert max(share["as run"], share["of 1000"]) < SHARE, case["name"]
 
 
 def main() -> None:

@@ -58,7 +58,7 @@ def parts_of(check: Check) -> dict[str, np.ndarray]:
 
 
 def certificates(
-    problem: Problem, count: int = 12, long: int = 8000, weighed: int = 800, posteriors: int = 4
+    problem: Problem, count: int = 8, long: int = 6000, weighed: int = 600, posteriors: int = 4
 ) -> dict[str, Any]:
     """``count`` certificates of ``posteriors`` posteriors, against a run of ``long`` draws."""
     names = problem.cheap.names
