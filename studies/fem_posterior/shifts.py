@@ -23,6 +23,12 @@ from calibrate.certificate.check import Check
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.samplers.nuts import NUTSOptions
 
+SHIFT = "shift, less FEM's change"
+SHIFT_AND_DRAWS = "the same, its error with the draws'"
+MEAN = "certificate's mean, less FEM's"
+DRAWS = "draws' mean, less the emulator's"
+PAIRED = "paired change, less FEM's"
+
 
 def parts_of(check: Check) -> dict[str, np.ndarray]:
     """Means (p,) by the pool, with and without correction, and what FEM changes of them.
@@ -103,7 +109,7 @@ def certificates(
             }
         )  # fmt: skip
         print(k, names[int(np.argmax(np.abs(rows[-1]["shift"])))], _round(rows[-1]), flush=True)
-    return {
+    case = {
         "name": f"certificates of the {problem.name}",
         "status": "measured",
         "names": list(names),
@@ -112,9 +118,9 @@ def certificates(
         ),
         "reference_error": truth_error.tolist(),
         "weights": by_weights,
-        "summary": summary(rows),
         "certificates": rows,
     }
+    return {**case, "summary": summary(case)}
 
 
 def errors_of_means(draws: np.ndarray) -> np.ndarray:
@@ -123,23 +129,38 @@ def errors_of_means(draws: np.ndarray) -> np.ndarray:
     return np.array([array_stats.mcse(x, method="mean", **AXES) for x in columns])
 
 
-def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Bias, scatter and claimed error of each term over the certificates, all in sd."""
-    found: dict[str, Any] = {}
-    for key in ("shift", "mean", "pool", "step", "paired", "uncorrected", "draws"):
-        values = np.array([row[key] for row in rows])
-        scatter = values.std(axis=0, ddof=1)
-        found[key] = {
+def summary(case: dict[str, Any]) -> dict[str, Any]:
+    """Each term less what it should be, in sd: average, scatter, and errors claimed for it."""
+    rows = case["certificates"]
+    change, change_error = (
+        np.array(list(case["weights"][key].values())) for key in ("shift", "shift_error")
+    )
+
+    def of(key: str) -> np.ndarray:
+        return np.array([row[key] for row in rows])
+
+    known = np.array(case["reference_error"])
+    terms = {
+        SHIFT: (of("shift") - change, of("shift_error")),
+        SHIFT_AND_DRAWS: (of("shift") - change, np.hypot(of("shift_error"), of("draws_error"))),
+        MEAN: (of("mean"), np.hypot(of("mean_error"), known)),
+        DRAWS: (of("draws") + change, np.hypot(of("draws_error"), known)),
+        PAIRED: (of("paired") - change, np.hypot(of("paired_error"), change_error)),
+    }
+    return {
+        name: {
             "average": values.mean(axis=0).tolist(),
-            "scatter": scatter.tolist(),
-            "rms": float(np.sqrt(np.mean(values**2))),
+            "rms": _rms(values),
             "largest": float(np.abs(values).max()),
+            "claimed": _rms(errors),
+            "rms_z": _rms(values / errors),
         }
-        if f"{key}_error" in rows[0]:
-            errors = np.array([row[f"{key}_error"] for row in rows])
-            found[key]["claimed"] = float(np.sqrt(np.mean(errors**2)))
-            found[key]["rms_z"] = float(np.sqrt(np.mean((values / errors) ** 2)))
-    return found
+        for name, (values, errors) in terms.items()
+    }
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _round(row: dict[str, Any]) -> dict[str, Any]:
