@@ -1,6 +1,6 @@
 """The emulator's posterior against FEM's, and what each way to FEM's posterior costs.
 
-    python studies/fem_posterior/run.py                       # an hour and a half
+    python studies/fem_posterior/run.py                       # some 45 minutes of processor time
     python studies/fem_posterior/run.py --quick --out DIR     # the beam, short runs
     python studies/fem_posterior/run.py --parts beam          # one part; the others' rows stay
 
