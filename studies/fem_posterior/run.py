@@ -106,7 +106,7 @@ def part(name: str, *, quick: bool) -> dict[str, Any]:
     if name == SHIFTS:
         return {**certificates(PROBLEMS["coarse"]()), "commit": commit(HERE)}
     if quick:
-        return examine(PROBLEMS[name](), QUICK, ("plain",))
+        return examine(PROBLEMS[name](), QUICK, ("tuned",))
     return examine(PROBLEMS[name](), SIZES[name], FEM_RUNS[name])
 
 
