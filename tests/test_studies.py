@@ -20,6 +20,7 @@ QUICK = {
     "certificate": "--quick",
     "decoder_speed": "--quick",
     "error_bar": "--scenes once_clamped_beam --cases 3 --outside 1",
+    "fem_posterior": "--quick",
     # No dolfin here: compiling its forms alone takes longer than all the rest.
     "fem_speed": "--quick --fenics-python ABSENT",
     "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
@@ -83,6 +84,18 @@ def error_bar(results):
     inside = cases["once_clamped_beam, shipped 'once_clamped_beam', inside"]
     assert inside["effectivity"]["error bar"]["within_factor_2"] == 1.0
     assert cases["once_clamped_beam, reduced, 5 FEM runs, 50 % outside"]["theta"] == 4
+
+
+def fem_posterior(results):
+    (case,) = results["cases"]
+    runs = {run["method"]: run for run in case["runs"]}
+    assert case["largest_shift"][0] < 1e-5
+    assert runs["emulator + certificate"]["fem_solves"] == 30
+    # Two chains: their starts, discarded draws, and at most four rounds.
+    assert runs["delayed acceptance"]["fem_solves"] <= 2 * (1 + 20 + 4 * 20)
+    # Gradients are counted in warm-up, too.
+    tuned = runs["FEM-NUTS, tuned by the emulator"]
+    assert tuned["fem_solves"] > tuned["kept_fem_solves"] > 20
 
 
 def fem_speed(results):
@@ -170,6 +183,7 @@ CHECKS = {
         certificate,
         decoder_speed,
         error_bar,
+        fem_posterior,
         fem_speed,
         few_runs,
         many_solves,
