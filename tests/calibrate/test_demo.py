@@ -1,3 +1,5 @@
+import contextlib
+import io
 import json
 
 import numpy as np
@@ -9,13 +11,16 @@ from calibrate.posterior import read_tree
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("demo")
+def demo(tmp_path_factory):
+    """Folder and report of the demo."""
+    folder, printed = tmp_path_factory.mktemp("demo"), io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main(["demo", "--out", str(folder), "--json"]) == 0
+    return folder, json.loads(printed.getvalue())
 
 
-def test_the_demo_ends_accepted(folder, capsys):
-    assert main(["demo", "--out", str(folder), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+def test_the_demo_ends_accepted(demo):
+    folder, report = demo
     assert report["verdict"] == "accepted"
     assert report["k_hat"] < report["certificate"]["k_threshold"]
     for name, truth in DEMO.truth.items():
@@ -37,7 +42,8 @@ def test_the_demo_ends_accepted(folder, capsys):
 
 
 @pytest.mark.slow
-def test_a_kept_run_can_be_certified_again(folder, capsys):
+def test_a_kept_run_can_be_certified_again(demo, capsys):
+    folder, _ = demo
     before = json.loads((folder / "certificate.json").read_text())
     assert main(["certify", str(folder), "--draws", "100", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
