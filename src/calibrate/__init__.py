@@ -11,6 +11,7 @@ from numpyro import distributions as _distributions  # noqa: F401
 import emulator
 from calibrate.certificate import Certificate, certify, reweight
 from calibrate.joint_prior import Dependence, JointPrior
+from calibrate.comparison import compare
 from calibrate.noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from calibrate.observations import (
     CavityVolume,
@@ -46,6 +47,7 @@ __all__ = [
     "StudentTNoise",
     "box_prior",
     "certify",
+    "compare",
     "landmarks",
     "length_between",
     "log_normal",

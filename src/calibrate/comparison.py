@@ -1,0 +1,164 @@
+r"""Which of several models predicts the same data better, and which makes it more likely.
+
+Leave-one-out cross-validation scores a model by what it says of each datum, having seen all others,
+
+.. math:: \text{elpd} = \sum_i \log p(y_i \mid y_{-i})
+
+estimated from the draws of one posterior by Pareto-smoothed importance sampling (Vehtari, Gelman
+and Gabry 2017). Differences are taken datum by datum, so that their standard error is smaller than
+the scores' own. It asks which model foretells another datum of this kind. The evidence
+
+.. math:: Z = \int p(y \mid \theta)\, p(\theta)\, d\theta
+
+asks which model, *prior included*, expected the data: halving the range of a parameter that the
+data fixes doubles it. Only tempered SMC estimates it. Neither says that the better model is good:
+that is what the misfit in a certificate is for.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import arviz_stats
+import numpy as np
+import xarray as xr
+
+from emulator.errors import InputError
+
+SURE = 2.0  # standard errors of a difference that is taken for one
+FEW = 4.0  # elpd: below, normal errors of a difference are not to be relied on (Sivula et al. 2020)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One of the models compared.
+
+    name : of the model.
+    elpd, se : expected log predictive density of left-out data, and its standard error.
+    difference, difference_se : elpd less the best model's, at most 0, and its standard error.
+    weight : in the mixture of the models that predicts best (stacking), in [0, 1].
+    parameters : effective number of parameters.
+    unreliable : number of data whose influence is too large for the estimate.
+    log_evidence, log_evidence_error : natural logarithm of Z where the sampler estimates it.
+    """
+
+    name: str
+    elpd: float
+    se: float
+    difference: float
+    difference_se: float
+    weight: float
+    parameters: float
+    unreliable: int
+    log_evidence: float | None
+    log_evidence_error: float | None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Models from best to worst elpd, and the number of data they were compared on."""
+
+    models: tuple[Compared, ...]
+    data: int
+
+    @property
+    def verdict(self) -> str:
+        """What can be said of the best model, in one sentence."""
+        best, second = self.models[:2]
+        gap, error = -second.difference, second.difference_se
+        bad = [model.name for model in self.models if model.unreliable]
+        if bad:
+            return (
+                f"not decided: single data decide too much in {', '.join(bad)}; "
+                "refit without them, or take noise with heavier tails"
+            )
+        if gap < FEW or gap < SURE * error:
+            return f"not decided: {best.name} is ahead by {gap:.1f} +- {error:.1f} only"
+        return f"{best.name} predicts better, by {gap:.1f} +- {error:.1f}"
+
+
+def compare(trees: Mapping[str, xr.DataTree]) -> Comparison:
+    """Compare posteriors of the same data, as :class:`~calibrate.posterior.Posterior` keeps them.
+
+    Raises
+    ------
+    InputError
+        Fewer than two, posteriors of different data, or without log likelihoods.
+    """
+    if len(trees) < 2:
+        raise InputError(f"compare: {len(trees)} posterior is given; give two or more")
+    first, *others = trees
+    for name in others:
+        _check_same_data((first, trees[first]), (name, trees[name]))
+    scores = {}
+    with warnings.catch_warnings():
+        # ArviZ's own warning of influential data; they are counted below.
+        warnings.simplefilter("ignore", UserWarning)
+        for name, tree in trees.items():
+            scores[name] = arviz_stats.loo(_all_data(name, tree), pointwise=True)
+        table = arviz_stats.compare(scores, round_to="none")
+    models = []
+    for name, row in table.iterrows():
+        score, attributes = scores[name], trees[name].attrs
+        models.append(
+            Compared(
+                name=str(name),
+                elpd=float(score.elpd),
+                se=float(score.se),
+                difference=float(row["elpd_diff"]),
+                difference_se=float(row["dse"]),
+                weight=float(row["weight"]),
+                parameters=float(score.p),
+                unreliable=int(np.sum(np.asarray(score.pareto_k) > score.good_k)),
+                log_evidence=_number(attributes.get("log_evidence")),
+                log_evidence_error=_number(attributes.get("log_evidence_error")),
+            )
+        )
+    return Comparison(tuple(models), int(scores[first].n_data_points))
+
+
+def _check_same_data(first: tuple[str, xr.DataTree], other: tuple[str, xr.DataTree]) -> None:
+    """Refuse posteriors that were not conditioned on the same numbers."""
+    (one, a), (two, b) = ((name, _observed(name, tree)) for name, tree in (first, other))
+    if set(a) != set(b):
+        raise InputError(
+            f"{one} observes {', '.join(sorted(a))}, {two} {', '.join(sorted(b))}; "
+            "only models of the same data can be compared"
+        )
+    for name, values in a.items():
+        if values.shape != b[name].shape or not np.array_equal(values, b[name]):
+            raise InputError(
+                f"{one} and {two} were given different data of '{name}'; only models of the same "
+                "data can be compared"
+            )
+
+
+def _observed(name: str, tree: xr.DataTree) -> dict[str, np.ndarray]:
+    if "observed_data" not in tree:
+        raise InputError(f"{name} has no observed data")
+    return {str(n): np.asarray(v) for n, v in tree["observed_data"].data_vars.items()}
+
+
+def _all_data(name: str, tree: xr.DataTree) -> xr.DataTree:
+    """Log likelihoods of all observations as one variable (chain, draw, datum)."""
+    if "log_likelihood" not in tree:
+        raise InputError(f"{name} has no log likelihoods; sample it with predictions")
+    if tree.attrs.get("forward_error") not in (None, "null"):
+        raise InputError(
+            f"{name} allows for its forward map's error, which log likelihoods of single data "
+            "leave out; sample it without --error-runs"
+        )
+    parts = [
+        np.asarray(values).reshape(*values.shape[:2], -1)
+        for _, values in sorted(tree["log_likelihood"].data_vars.items())
+    ]
+    joined = xr.Dataset({"data": (("chain", "draw", "datum"), np.concatenate(parts, axis=-1))})
+    return xr.DataTree.from_dict(
+        {"log_likelihood": joined, "posterior": tree["posterior"].to_dataset()}
+    )
+
+
+def _number(value: object) -> float | None:
+    return None if value is None else float(str(value))
