@@ -10,8 +10,8 @@ from numpyro import distributions as _distributions  # noqa: F401
 
 import emulator
 from calibrate.certificate import Certificate, certify, reweight
-from calibrate.joint_prior import Dependence, JointPrior
 from calibrate.comparison import compare
+from calibrate.joint_prior import Dependence, JointPrior
 from calibrate.noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from calibrate.observations import (
     CavityVolume,

@@ -1,8 +1,8 @@
 """Simulation-based calibration of the shipped emulators, their noise models and NUTS.
 
 ``python studies/sbc/run.py [--replicates N] [--only NAME ...]``. FEM makes the data, the emulator's
-posterior is ranked. Writes results.json and a figure a case beside itself, or under --out, and
-asserts what the README says.
+posterior is ranked. Writes results.json and a figure a case beside itself, or under --out, after
+each case; rows of other cases stay. Asserts what the README says.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from calibrate.samplers import NUTSOptions
 from calibrate.sbc import Calibration, sbc
 from calibrate.statistical_model import Model
 from calibrate.workflow import by_fem, model_before_data
-from emulator.store import write_json
+from emulator.store import read_json, write_json
 
 HERE = Path(__file__).parent
 SEED = 11
@@ -111,10 +111,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=HERE)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    cases = [examine(name, arguments.replicates, arguments.out) for name in arguments.only]
-    header = study_header(HERE, SEED)
-    write_json(arguments.out / "results.json", {**header, "cases": cases})
-    assert all(case["as_expected"] for case in cases)
+    path = arguments.out / "results.json"
+    rows = {row["name"]: row for row in read_json(path)["cases"]} if path.exists() else {}
+    for name in arguments.only:
+        rows[name] = examine(name, arguments.replicates, arguments.out)
+        ordered = [rows[case] for case in CASES if case in rows]
+        write_json(path, {**study_header(HERE, SEED), "cases": ordered})
+    assert all(rows[name]["as_expected"] for name in arguments.only)
 
 
 if __name__ == "__main__":

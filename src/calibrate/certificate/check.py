@@ -31,6 +31,7 @@ from calibrate.certificate.correction import Correction
 from calibrate.certificate.estimates import (
     Tests,
     figures_of,
+    missed_by,
     physics_of,
     sampling_of,
     tail_of,
@@ -126,7 +127,7 @@ def examine(
         sd,
         sampling_of(posterior),
         physics_of(at_draws, training, tests, pool),
-        tail_of(pool, tests),
+        tail_of(pool, tests, missed_by(predictive, correction, joined([training, tests.runs]))),
         misfits(predictive, correction, chosen, _key(rng)),
     )
     return Check(judge(evidence), posterior, predictive, pool, tests)

@@ -7,7 +7,9 @@ from itertools import combinations
 
 import numpy as np
 from arviz_stats.base import array_stats
+from scipy.stats import chi2
 
+from calibrate.certificate.correction import Correction
 from calibrate.certificate.evidence import Changes, Figure, Physics, Sampling, Tail
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.pool import Pool, effective, normalised
@@ -17,6 +19,8 @@ from calibrate.posterior import Posterior
 
 # Log weights closer together than this are equal to 0.1 %: their tail has no shape to fit.
 _EQUAL_WEIGHTS = 1e-3
+_LIKELY = 0.99  # mass of the region that FEM's runs are likely in
+_MISSED = 3.0  # in log likelihood: the corrected map finds a run 20 times less likely than FEM
 _FEWEST = 25  # weights that have a tail of five
 
 
@@ -114,14 +118,28 @@ def physics_of(at_draws: Runs, training: Runs, tests: Tests, pool: Pool) -> Phys
     )
 
 
-def tail_of(pool: Pool, tests: Tests) -> Tail:
+def missed_by(predictive: Predictive, correction: Correction, runs: Runs) -> int:
+    r"""Number of runs that FEM finds likely and the corrected map does not.
+
+    Likely: within the density that bounds 99 % of a Gaussian around the best run, so that
+    :math:`\log\pi > \max\log\pi - \tfrac12 \chi^2_p(0.99)`. There the correction should be right,
+    because these runs taught it; where it is not, the map errs by a jump that no smooth process
+    follows, and the pool may be empty where FEM's posterior is.
+    """
+    at = predictive.evaluate(runs.z, correction)
+    fem = np.where(runs.converged, at.prior + runs.fem, -np.inf)
+    likely = fem > fem.max() - 0.5 * chi2.ppf(_LIKELY, runs.z.shape[1])
+    return int(np.sum(likely & ~(at.prior + at.corrected > fem - _MISSED)))
+
+
+def tail_of(pool: Pool, tests: Tests, missed: int = 0) -> Tail:
     """Tail of FEM's weights, and how irregularly FEM and the corrected map differ."""
     log_fem, log_map = tests.log_fem(pool), tests.log_corrected(pool)
     threshold = float(min(1.0 - 1.0 / np.log10(len(log_fem)), 0.7))  # Vehtari et al. 2024, Eq. 13
     weights = normalised(log_fem)
     both = np.isfinite(log_fem) & np.isfinite(log_map)
     if not both.any():
-        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, effective(pool.corrected))
+        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, effective(pool.corrected), missed)
     share = normalised(np.where(both, log_map, -np.inf))[both]
     ratio = (log_fem - log_map)[both]
     spread = float(np.sqrt(share @ (ratio - share @ ratio) ** 2))
@@ -132,6 +150,7 @@ def tail_of(pool: Pool, tests: Tests) -> Tail:
         float(weights.max() * len(weights)),
         spread,
         effective(pool.corrected),
+        missed,
     )
 
 

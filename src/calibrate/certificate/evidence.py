@@ -99,6 +99,7 @@ class Tail:
     ess : their effective number. largest : largest weight over the mean one.
     spread : sd of the log ratio of FEM's likelihood over the corrected map's.
     pool : effective points under the corrected map.
+    missed : FEM runs of all kinds that FEM finds likely and the corrected map does not.
     """
 
     k_hat: float
@@ -107,6 +108,7 @@ class Tail:
     largest: float
     spread: float
     pool: float
+    missed: int = 0
 
     @property
     def heavy(self) -> bool:

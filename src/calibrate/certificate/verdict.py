@@ -107,6 +107,11 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[str]]:
         ]
     if tail.heavy or not tail.pool >= SMALLEST_POOL:
         return "undecided", ["the weights' tail is too heavy to trust their errors: more FEM runs"]
+    if tail.missed:
+        return "undecided", [
+            f"{tail.missed} FEM runs are likely where the corrected map says they are not, so the "
+            "map may hide a part of the posterior: train a better map, or more FEM runs"
+        ]
     agree = draws.within()
     beyond = [words for words, f, limit in draws.judged() if f.within(limit) is False]
     if agree:

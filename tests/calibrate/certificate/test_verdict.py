@@ -51,6 +51,12 @@ def test_each_figure_is_compared_with_its_limit(name):
     assert verdict(draws=changes(**{name: float("nan")}))[0] == "undecided"
 
 
+def test_runs_that_only_fem_finds_likely_leave_it_undecided():
+    found, words = verdict(tail=replace(RIGHT.tail, missed=2))
+    assert found == "undecided"
+    assert "2 FEM runs are likely where the corrected map says they are not" in words
+
+
 @pytest.mark.parametrize("shift", [0.2, 0.3])
 def test_a_figure_close_to_its_limit_is_undecided(shift):
     """A better estimate decides, one way or the other."""
