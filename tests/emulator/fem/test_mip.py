@@ -109,9 +109,8 @@ def test_a_law_that_blows_up_on_the_way_is_stopped_short():
     np.testing.assert_allclose(fraction, 0.25, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("traction_beam", marks=pytest.mark.slow), "ventricle"]
-)
+@pytest.mark.slow  # the ventricle's path is followed by Newton's method in test_loading_path, too
+@pytest.mark.parametrize("name", ["traction_beam", "ventricle"])
 def test_it_ends_where_newton_does(name, request):
     scene = request.getfixturevalue(name)
     theta, options = scene.centre, em.NewtonOptions(stress_iterates=False)

@@ -122,11 +122,11 @@ def test_second_derivatives_against_differences_of_sensitivities(ventricle, seco
             np.testing.assert_allclose(ours, central[b], atol=1e-4 * largest)
 
 
-def test_one_factor_serves_every_order(ventricle, second):
-    theta = ventricle.scene.from_unit(jnp.full(5, 0.45))
-    u = ventricle(theta)
+def test_one_factor_serves_every_order(simulator):
+    theta = simulator.scene.from_unit(jnp.full(2, 0.45))
+    u = simulator(theta)
     before = sparsax.factorization_count()
-    expand_at(ventricle, u, theta, 2)
+    expand_at(simulator, u, theta, 3)
     assert sparsax.factorization_count() <= before + 1
 
 
