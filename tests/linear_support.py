@@ -45,6 +45,25 @@ def linear_forward(scene, seed=0, size=0.01, bias=0.0) -> LinearForward:
     return LinearForward(scene, all_nodes(scene), matrix, np.full((count, 3), bias))
 
 
+class Step:
+    """``forward``, 1 mm off where mu is above ``edge``."""
+
+    kind = label = fingerprint = "step"
+
+    def __init__(self, forward, edge):
+        self.forward, self.edge = forward, edge
+        self.nodes, self.scene = forward.nodes, forward.scene
+
+    def at(self, nodes):
+        return Step(self.forward.at(nodes), self.edge)
+
+    def __call__(self, theta):
+        return self.forward(theta) + jnp.where(theta[0] > self.edge, 1.0, 0.0)
+
+    def evaluate(self, theta):
+        return self.forward.evaluate(theta)._replace(displacement=self(theta))
+
+
 @dataclass(frozen=True, eq=False)
 class LinearFEM:
     """Stands in for a simulator: its solutions are those of ``forward``; above ``limit`` it fails."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import arviz_stats
 import numpy as np
@@ -160,5 +161,5 @@ def _all_data(name: str, tree: xr.DataTree) -> xr.DataTree:
     )
 
 
-def _number(value: object) -> float | None:
-    return None if value is None else float(str(value))
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)

@@ -134,6 +134,11 @@ class JointPrior(Mapping[str, dist.Distribution]):
         return len(self.marginals)
 
 
+def dependence_of(prior: Mapping[str, dist.Distribution] | None) -> Dependence | None:
+    """How the parameters of ``prior`` depend on each other; ``None`` of independent ones."""
+    return prior.dependence if isinstance(prior, JointPrior) else None
+
+
 class Conditional(dist.Distribution):
     """One parameter given those before it: its marginal, its score normal(``centre``, ``width``).
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 
-from calibrate.joint_prior import JointPrior
+from calibrate.joint_prior import dependence_of
 from calibrate.priors import box_prior
 from calibrate.state_names import at, split
 from emulator.errors import InputError
@@ -84,7 +84,7 @@ def load_states(
     """
     given, known = dict(prior or {}), dict(known or {})
     by_state = _by_state(scene, states, (*given, *known))
-    boxed = prior is None or isinstance(prior, JointPrior)
+    boxed = prior is None or dependence_of(prior) is not None
     default = box_prior(scene) if boxed else {}
     entries: list[list[str | float]] = []
     priors: dict[str, dist.Distribution] = {}

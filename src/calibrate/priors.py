@@ -11,7 +11,7 @@ import numpyro.distributions as dist
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from calibrate.joint_prior import JointPrior
+from calibrate.joint_prior import JointPrior, dependence_of
 from calibrate.state_names import split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -82,7 +82,8 @@ def truncated(prior: Prior, scene: Scene) -> Prior:
         if split(name)[0] not in ranges:
             raise InputError(f"prior names '{name}'; scene '{scene.name}' has {', '.join(ranges)}")
     cut = {name: _cut(d, *ranges[split(name)[0]]) for name, d in prior.items()}
-    return JointPrior(cut, prior.dependence) if isinstance(prior, JointPrior) else cut
+    dependence = dependence_of(prior)
+    return cut if dependence is None else JointPrior(cut, dependence)
 
 
 class Truncated(dist.Distribution):

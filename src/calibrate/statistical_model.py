@@ -23,7 +23,7 @@ import numpyro
 import numpyro.distributions as dist
 
 from calibrate.approximation_error import ApproximationError
-from calibrate.joint_prior import Conditional, Dependence, JointPrior
+from calibrate.joint_prior import Conditional, Dependence, dependence_of
 from calibrate.load_states import LoadStates, load_states
 from calibrate.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.noise import Noise
@@ -323,7 +323,8 @@ def model(
     states, given = load_states(forward.scene, several.states, prior, known)
     check_known(restricted, states)
     fitting, cut = fit_to(restricted, given)
-    joint = prior.dependence.ordered(states.unknowns) if isinstance(prior, JointPrior) else None
+    dependence = dependence_of(prior)
+    joint = None if dependence is None else dependence.ordered(states.unknowns)
     return Model(
         restricted, forward, several, noises, names, states, fitting, None, cut, check_scale, joint
     )

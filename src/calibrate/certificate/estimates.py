@@ -132,7 +132,7 @@ def missed_by(predictive: Predictive, correction: Correction, runs: Runs) -> int
     return int(np.sum(likely & ~(at.prior + at.corrected > fem - _MISSED)))
 
 
-def tail_of(pool: Pool, tests: Tests, missed: int = 0) -> Tail:
+def tail_of(pool: Pool, tests: Tests, missed: int) -> Tail:
     """Tail of FEM's weights, and how irregularly FEM and the corrected map differ."""
     log_fem, log_map = tests.log_fem(pool), tests.log_corrected(pool)
     threshold = float(min(1.0 - 1.0 / np.log10(len(log_fem)), 0.7))  # Vehtari et al. 2024, Eq. 13

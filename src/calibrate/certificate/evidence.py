@@ -108,7 +108,7 @@ class Tail:
     largest: float
     spread: float
     pool: float
-    missed: int = 0
+    missed: int
 
     @property
     def heavy(self) -> bool:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, gammaln
+from scipy.special import gammaln
 
 from calibrate.samplers import transport
 
@@ -42,7 +42,8 @@ class Kernels:
         chosen = self.centres[rng.integers(len(self.centres), size=count)]
         width = rng.choice(self.widths, size=(count, 1))
         scale = width * np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(count, 1)))
-        return bend(self.map_, chosen + scale * (rng.normal(size=chosen.shape) @ self.root.T))
+        moved = chosen + scale * (rng.normal(size=chosen.shape) @ self.root.T)
+        return transport.bend(self.map_, moved)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log densities (s,) in z; the map has unit Jacobian."""
@@ -71,15 +72,3 @@ def around(
     # A coordinate that does not vary still gets a width, so that the density exists.
     root = np.linalg.cholesky(covariance + np.diag(1e-9 * np.diag(covariance) + 1e-12))
     return Kernels(map_, straight[rows[:CENTRES]], root, widths, freedom)
-
-
-def bend(map_: transport.TransportMap, zeta: np.ndarray) -> np.ndarray:
-    """``z`` (s, p) from ``zeta`` (s, p)."""
-    order, coefficients = np.asarray(map_.order), np.asarray(map_.coefficients)
-    z = np.array(zeta)
-    squashed = expit(z[:, order])
-    for k in range(1, z.shape[1]):
-        terms = np.asarray(transport.monomials(squashed, k))
-        z[:, order[k]] += terms @ coefficients[k, : terms.shape[1]]
-        squashed[:, k] = expit(z[:, order[k]])
-    return z

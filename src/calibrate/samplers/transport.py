@@ -101,6 +101,18 @@ def straighten(map_: TransportMap, z: np.ndarray) -> np.ndarray:
     return zeta
 
 
+def bend(map_: TransportMap, zeta: np.ndarray) -> np.ndarray:
+    """``z`` (s, p) from ``zeta`` (s, p): :func:`apply` to many points, uncompiled."""
+    order, coefficients = np.asarray(map_.order), np.asarray(map_.coefficients)
+    z = np.array(zeta)
+    squashed = expit(z[:, order])
+    for k in range(1, z.shape[1]):
+        terms = np.asarray(monomials(squashed, k))
+        z[:, order[k]] += terms @ coefficients[k, : terms.shape[1]]
+        squashed[:, k] = expit(z[:, order[k]])
+    return z
+
+
 def fit(draws: np.ndarray) -> TransportMap:
     """The map fitted to pilot draws (s, p) of ``z``."""
     dimension = draws.shape[1]

@@ -20,7 +20,7 @@ from certificate_support import (
     quadrature,
 )
 from emulator.errors import InputError
-from linear_support import LinearSimulator, linear_forward
+from linear_support import LinearSimulator, Step, linear_forward
 
 
 @pytest.fixture(scope="module")
@@ -105,25 +105,6 @@ def test_draws_of_half_a_posterior_are_not_accepted(beam, fem, data):
     _posterior, certificate = certified(beam, fem, data, fem, keep=lambda x: x[:, 0] < mean[0])
     assert certificate.verdict == "reweight"
     assert certificate.evidence.draws.log_sd["mu"].value > 0.2
-
-
-class Step:
-    """``fem`` above ``edge`` in mu is 1 mm off."""
-
-    def __init__(self, fem, edge):
-        self.fem, self.edge, self.nodes = fem, edge, fem.nodes
-        self.scene, self.kind, self.label = fem.scene, "step", "step"
-        self.fingerprint = "step"
-
-    def at(self, nodes):
-        return Step(self.fem.at(nodes), self.edge)
-
-    def __call__(self, theta):
-        return self.fem(theta) + jnp.where(theta[0] > self.edge, 1.0, 0.0)
-
-    def evaluate(self, theta):
-        u, valid = self.fem.evaluate(theta)
-        return type(self.fem.evaluate(theta))(self(theta) if u is not None else u, valid)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,19 @@
-"""The tail of the weights of FEM's runs."""
+"""The tail of the weights of FEM's runs, and runs that the corrected map does not foresee."""
 
 import numpy as np
+from scipy.stats import chi2, norm
 
-from calibrate.certificate.estimates import _k_hat
+from calibrate.certificate.correction import nothing
+from calibrate.certificate.estimates import _k_hat, missed_by
+from calibrate.certificate.predictive import Predictive
+from calibrate.certificate.runs import Runs
+from certificate_support import NODES, exact_data, linear_model
+from linear_support import Step, linear_forward
+
+
+def log_likelihoods(forward, data, points):
+    at = forward.at(np.array(NODES))
+    return np.array([norm.logpdf(data, np.asarray(at(x)), 0.1).sum() for x in points])
 
 
 def test_a_tail_that_is_one_point_drawn_again_has_no_shape_and_no_traceback():
@@ -17,3 +28,22 @@ def test_equal_weights_have_no_tail():
 def test_the_shape_of_pareto_weights_is_found():
     log_weights = -0.5 * np.log(np.random.default_rng(0).uniform(size=20_000))
     assert abs(_k_hat(log_weights) - 0.5) < 0.1
+
+
+def test_runs_that_fem_finds_likely_and_the_map_does_not_are_counted(beam):
+    """FEM is a linear map, and the cheap one is 1 mm off beyond mu = 72.5; counted by hand."""
+    fem = linear_forward(beam, size=0.02)
+    step = Step(fem, 72.5)
+    right, wrong = linear_model(beam, forward=fem), linear_model(beam, forward=step)
+    data = exact_data(right)
+    points = np.array([[mu, 68.0] for mu in (68.0, 70.0, 72.0, 73.0, 74.0, 95.0)])
+    exact = log_likelihoods(fem, data, points)
+    share = np.log(points / 50.0) / np.log(2.0)  # the prior is uniform in it, NumPyro's z its logit
+    density = exact + np.log(share * (1.0 - share)).sum(axis=1)
+    likely = density > density.max() - 0.5 * chi2.ppf(0.99, 2)
+    by_hand = np.sum(likely & (log_likelihoods(step, data, points) < exact - 3.0))
+    seen, missing = (Predictive(m, m.check_data(data)) for m in (right, wrong))
+    z = seen.unconstrain({"mu": points[:, 0], "lam": points[:, 1]})
+    runs = Runs(z, exact, np.zeros((6, 9)), np.ones(6), (None,) * 6)
+    assert missed_by(missing, nothing(1, 2, 9), runs) == by_hand > 0
+    assert missed_by(seen, nothing(1, 2, 9), runs) == 0

@@ -23,7 +23,7 @@ RIGHT = Evidence(
     sd={"x": Figure(1.0, 0.01)},
     sampling=Sampling(1.001, 900.0, 800.0, 0, 4000),
     physics=Physics(200, 0, 0.0, 0.9, 0, 20),
-    tail=Tail(0.1, 0.5, 90.0, 1.5, 0.1, 1000.0),
+    tail=Tail(0.1, 0.5, 90.0, 1.5, 0.1, 1000.0, missed=0),
     misfit={"displacement": Misfit(0.4, 0.5, {})},
 )
 
