@@ -13,8 +13,10 @@ forces, facet by facet. With mean dilatation the points of an element are couple
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,8 +33,10 @@ from emulator.fem.functional import (
     point_energy,
     spring_terms,
     strain_energy,
+    volume_ratio,
 )
 from emulator.fem.mixed import Condensed, consistent, linearise
+from emulator.fem.programs import compiled
 from emulator.fem.sparse import Factorisation, Pattern, block_pattern
 from emulator.scenes.local_terms import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
@@ -44,6 +48,11 @@ class System:
 
     scene: Scene
     factorisation: Factorisation = "umfpack"
+
+    @cached_property
+    def programs(self) -> dict[Callable, Callable]:
+        """Its compiled functions (:mod:`emulator.fem.programs`)."""
+        return {}
 
     @cached_property
     def free(self) -> np.ndarray:
@@ -116,11 +125,13 @@ class System:
             force = force - jax.grad(lambda v: sum(t.total(v, values) for t in self.terms))(u)
         return force + self.follower_force(u, theta)
 
+    @compiled
     def follower_force(self, u: jax.Array, theta: jax.Array) -> jax.Array | float:
         """Force (n, 3) in mN of the loads without a potential; 0 when there are none."""
         values = self.scene.resolve(theta)
         return sum((force.total(u, values) for force in self.forces), 0.0)
 
+    @compiled
     def potential(
         self,
         u: jax.Array,
@@ -206,6 +217,19 @@ class System:
         A = A * grid.weights[:, :, None, None, None, None]
         return jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
 
+    @compiled
+    def safe_tangent(
+        self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, jax.Array]:
+        """Nonzeros (nnz,) that a solver does not raise on, and whether they are the tangent's."""
+        tangent = self.tangent(u, theta, load)
+        return self.pattern.safe_values(tangent), self.pattern.solvable(tangent)
+
+    @compiled
+    def least_volume_ratio(self, u: jax.Array) -> jax.Array:
+        """The smallest ``J``, shape (): NaN if any is."""
+        return jnp.min(volume_ratio(self.scene, u))
+
     def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
         """Solve ``K x = rhs`` over the free degrees of freedom, shape (f,)."""
         return self.pattern.solve(tangent, rhs, self.factorisation)
@@ -215,7 +239,37 @@ def relative_residual(
     system: System, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
 ) -> jax.Array:
     """Norm of the residual relative to the internal and external forces, shape ()."""
-    return balance(system, u, theta, load)[1]
+    return balance(system, u, theta, load, 0.0)[1]
+
+
+class Forces(NamedTuple):
+    """Balance of a state.
+
+    residual : (f,) in mN. internal : norm () in mN of the internal forces, reactions included.
+    relative : norm of the residual relative to internal and external forces, ().
+    """
+
+    residual: jax.Array
+    internal: jax.Array
+    relative: jax.Array
+
+
+@compiled
+def forces_at(
+    system: System,
+    u: jax.Array,
+    theta: jax.Array,
+    load: jax.Array | float,
+    negligible: jax.Array | float,
+) -> Forces:
+    """Forces at ``u`` (n, 3) mm and ``load`` times the loads, see :func:`balance`."""
+    internal = system.internal_force(u, theta)
+    external = load * system.external_force(u, theta)
+    residual = system.restrict(internal - external)
+    size, norm = _norm(internal), _norm(residual)
+    scale = size + _norm(external)
+    relative = norm / jnp.where(scale > 0.0, scale, 1.0)
+    return Forces(residual, size, jnp.where(norm <= negligible, 0.0, relative))
 
 
 def balance(
@@ -230,10 +284,9 @@ def balance(
     The forces include reactions. A norm up to ``negligible`` (mN) counts as 0, and so does the
     relative residual of a body without any forces. NaN stays NaN.
     """
-    internal = system.internal_force(u, theta)
-    external = load * system.external_force(u, theta)
-    residual = system.restrict(internal - external)
-    norm = jnp.sqrt(jnp.sum(residual**2))
-    scale = jnp.sqrt(jnp.sum(internal**2)) + jnp.sqrt(jnp.sum(external**2))
-    relative = norm / jnp.where(scale > 0.0, scale, 1.0)
-    return residual, jnp.where(norm <= negligible, 0.0, relative)
+    forces = forces_at(system, u, theta, load, negligible)
+    return forces.residual, forces.relative
+
+
+def _norm(field: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(field**2))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 
 from emulator.fem.assembly import System
 from emulator.fem.mixed import Condensed, linearise
+from emulator.fem.programs import compiled, cond
 from emulator.fem.state import UNBALANCED, NewtonState
 
 _ENDLESS = 1e13  # a step this much longer than force over stiffness: a singular tangent
@@ -43,6 +44,8 @@ class Direction(NamedTuple):
     @property
     def descends(self) -> jax.Array:
         """Whether the tangent's own direction lowers the potential, as far as that is known."""
+        if self.condensed is not None:  # the point sought by mean dilatation is a saddle
+            return jnp.array(True)
         return ~self.settled | (self.slope <= 0.0)
 
 
@@ -55,68 +58,98 @@ def support_offset(system: System, u: jax.Array, level: jax.Array) -> jax.Array:
     return jnp.where(scene.held & (u != wanted), wanted - u, 0.0)
 
 
+@compiled
+def supports_met(system: System, u: jax.Array, level: jax.Array) -> jax.Array:
+    """Whether the held displacements of ``u`` (n, 3) are those of ``level``, shape ()."""
+    return jnp.all(support_offset(system, u, level) == 0.0)
+
+
 def newton_direction(system: System, theta: jax.Array, state: NewtonState) -> Direction:
     """Newton's step at ``state``, reversed where it would climb the potential."""
-    offset = support_offset(system, state.u, state.level)
-    settled = jnp.all(offset == 0.0)
+    settled = supports_met(system, state.u, state.level)
     linearised = _on_displacements if state.volumes is None else _on_volumes
-    tangent, solvable, residual, pull, condensed = linearised(system, theta, state, offset)
-    move = system.solve(tangent, -(residual + pull))
-    slope = jnp.vdot(residual, move)
-    endless = _endless(tangent, move, residual + pull)
-    if condensed is None:
-        move = jnp.where(settled & (slope > 0.0), -move, move)
-    move = system.extend(move) + offset
-    return Direction(
-        move=jnp.where(solvable, move, jnp.nan),
-        residual=residual,
-        pull=pull,
-        slope=slope,
-        settled=settled,
-        singular=~solvable | endless,
-        tangent=tangent,
-        condensed=condensed,
+    tangent, solvable, residual, pull, condensed = linearised(system, theta, state, settled)
+    move, slope, singular = _full_step(
+        system, state.u, state.level, tangent, solvable, residual, pull, settled
     )
+    return Direction(move, residual, pull, slope, settled, singular, tangent, condensed)
 
 
-def _checked(system: System, tangent: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return system.pattern.safe_values(tangent), system.pattern.solvable(tangent)
+@compiled
+def _full_step(
+    system: System,
+    u: jax.Array,
+    level: jax.Array,
+    tangent: jax.Array,
+    solvable: jax.Array,
+    residual: jax.Array,
+    pull: jax.Array,
+    settled: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Step (n, 3), residual . step before any reversal, and whether the tangent is singular."""
+    force = residual + pull
+    move = system.solve(tangent, -force)
+    slope = jnp.vdot(residual, move)
+    endless = _endless(tangent, move, force)
+    if not system.mixed:
+        move = jnp.where(settled & (slope > 0.0), -move, move)
+    move = system.extend(move) + support_offset(system, u, level)
+    return jnp.where(solvable, move, jnp.nan), slope, ~solvable | endless
 
 
 def _on_displacements(
-    system: System, theta: jax.Array, state: NewtonState, offset: jax.Array
+    system: System, theta: jax.Array, state: NewtonState, settled: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, None]:
-    """Tangent, whether it is solvable, residual, and its change along ``offset`` (n, 3)."""
+    """Tangent, whether it is solvable, residual, and its change as the supports are moved."""
     u = state.u
-    # Loads that nothing balances yet lend no stiffness: a pressure softens the tangent of a body
-    # that does not resist it and points the step nowhere useful.
-    stiffening = jnp.where(state.error > UNBALANCED, 0.0, state.level)
+    stiffening = _stiffening(state.error, state.level)
     # A kept tangent stays the same to the bit: the solver knows its factor by its values.
-    tangent, solvable = jax.lax.cond(
+    tangent, solvable = cond(
         state.refresh,
-        lambda: _checked(system, system.tangent(u, theta, stiffening)),
+        lambda: system.safe_tangent(u, theta, stiffening),
         lambda: (state.tangent, jnp.array(True)),
     )
-
-    def pulled() -> jax.Array:
-        """K times the offset, without assembling the held columns."""
-        return jax.jvp(lambda v: system.residual(v, theta, stiffening), (u,), (offset,))[1]
-
-    none = jnp.zeros_like(state.residual)
-    pull = jax.lax.cond(jnp.all(offset == 0.0), lambda: none, pulled)
+    pull = cond(
+        settled,
+        lambda: jnp.zeros_like(state.residual),
+        lambda: _pull(system, u, theta, stiffening, state.level),
+    )
     return tangent, solvable, state.residual, pull, None
 
 
+@jax.jit
+def _stiffening(error: jax.Array, level: jax.Array) -> jax.Array:
+    """Load level whose stiffness the tangent holds.
+
+    Loads that nothing balances yet lend none: a pressure softens the tangent of a body that does
+    not resist it and points the step nowhere useful.
+    """
+    return jnp.where(error > UNBALANCED, 0.0, level)
+
+
+@compiled
+def _pull(
+    system: System, u: jax.Array, theta: jax.Array, stiffening: jax.Array, level: jax.Array
+) -> jax.Array:
+    """K times the offset of the supports, (f,) mN, without assembling the held columns."""
+    offset = support_offset(system, u, level)
+    return jax.jvp(lambda v: system.residual(v, theta, stiffening), (u,), (offset,))[1]
+
+
+@compiled
 def _on_volumes(
-    system: System, theta: jax.Array, state: NewtonState, offset: jax.Array
+    system: System, theta: jax.Array, state: NewtonState, settled: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Condensed]:
     """The same with the volumes of mean dilatation eliminated, and their linearisation."""
+    del settled
     assert state.volumes is not None
     u, level = state.u, state.level
+    offset = support_offset(system, u, level)
     condensed = linearise(system.scene, u, state.volumes, theta)
     residual, pull = system.mixed_residual(u, theta, level, condensed, offset)
     assembled = system.assemble(condensed.tangent, u, theta, level)
-    return *_checked(system, assembled), residual, pull, condensed
+    safe, solvable = system.pattern.safe_values(assembled), system.pattern.solvable(assembled)
+    return safe, solvable, residual, pull, condensed
 
 
 def _endless(tangent: jax.Array, move: jax.Array, force: jax.Array) -> jax.Array:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 from emulator.fem.assembly import System
 from emulator.fem.loading_path import LoadingPath, PathState, Route
 from emulator.fem.options import NewtonOptions
+from emulator.fem.programs import compiled
 from emulator.fem.solution import Solution
 from emulator.fem.sparse import REFUSALS
 
@@ -27,7 +27,7 @@ _MOST_PATIENCE = 8  # iterations with UMFPACK before CHOLMOD is asked again
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """The steps of one scene, compiled one by one.
+    """The steps of one scene, put together from compiled programs.
 
     definite, general : the same equations with CHOLMOD and with UMFPACK.
     """
@@ -44,11 +44,11 @@ class Driver:
         jax.errors.JaxRuntimeError
             A tangent singular to the last bit.
         """
-        state = self._begin(theta, start)
+        state = self._path(theta).begin(start)
         while bool(state.running) and int(state.route) < Route.CLIMB:
-            step = self._ramp_step if bool(state.ramping) else self._definite_step
+            step = self.ramp_step if bool(state.ramping) else self.definite_step
             after = _unless_refused(step, theta, state)
-            state = self._give_up(theta, state) if after is None else after
+            state = self._path(theta).give_up(state) if after is None else after
         return self._climb(theta, state).newton.solution()
 
     def _climb(self, theta: jax.Array, state: PathState) -> PathState:
@@ -56,7 +56,7 @@ class Driver:
         definite, patience, wait = True, 1, 0
         while bool(state.running):
             if definite:
-                after = _unless_refused(self._definite_step, theta, state)
+                after = _unless_refused(self.definite_step, theta, state)
                 if after is not None:
                     state, patience = after, 1
                     continue
@@ -65,7 +65,7 @@ class Driver:
                 convex = jnp.array(False)
                 state = _forget_tangent(state, self.general)
                 state = state._replace(newton=state.newton._replace(convex=convex))
-            state = jax.block_until_ready(self._general_step(theta, state))
+            state = jax.block_until_ready(self.general_step(theta, state))
             wait -= 1
             definite = wait <= 0 or int(state.newton.at_level) == 0  # a new level: ask anew
             if definite:
@@ -79,48 +79,32 @@ class Driver:
 
     def linearise(self, u: jax.Array, theta: jax.Array) -> tuple[System, jax.Array]:
         """The system that can factorise the tangent at ``u`` (n, 3), and that tangent (nnz,)."""
-        tangent = self._definite_tangent(u, theta)
+        tangent, _ = self.definite.safe_tangent(u, theta, 1.0)
         # The solver keeps the factor of these values: the trial's work is used again.
-        if _unless_refused(self._definite_trial, tangent) is None:
-            return self.general, self._general_tangent(u, theta)
+        if _unless_refused(_trial, self.definite, tangent) is None:
+            return self.general, self.general.safe_tangent(u, theta, 1.0)[0]
         return self.definite, tangent
 
-    @cached_property
-    def _definite_tangent(self):  # noqa: ANN202
-        return jax.jit(partial(_safe_tangent, self.definite))
+    def ramp_step(self, theta: jax.Array, state: PathState) -> PathState:
+        """A step of the stress iterates."""
+        return self._path(theta).ramp_step(state)
 
-    @cached_property
-    def _general_tangent(self):  # noqa: ANN202
-        return jax.jit(partial(_safe_tangent, self.general))
+    def definite_step(self, theta: jax.Array, state: PathState) -> PathState:
+        """An iteration of Newton's method with CHOLMOD."""
+        return self._path(theta).newton_step(state)
 
-    @cached_property
-    def _definite_trial(self):  # noqa: ANN202
-        nothing = jnp.zeros(self.definite.pattern.size)
-        return jax.jit(lambda tangent: self.definite.solve(tangent, nothing))
-
-    @cached_property
-    def _begin(self):  # noqa: ANN202 - jitted closures, private
-        return jax.jit(lambda theta, start: self._path(theta).begin(start))
-
-    @cached_property
-    def _give_up(self):  # noqa: ANN202
-        return jax.jit(lambda theta, state: self._path(theta).give_up(state))
-
-    @cached_property
-    def _ramp_step(self):  # noqa: ANN202
-        return jax.jit(lambda theta, state: self._path(theta).ramp_step(state))
-
-    @cached_property
-    def _definite_step(self):  # noqa: ANN202
-        return jax.jit(lambda theta, state: self._path(theta).newton_step(state))
-
-    @cached_property
-    def _general_step(self):  # noqa: ANN202
-        path = partial(LoadingPath, self.general, self.options)
-        return jax.jit(lambda theta, state: path(theta).newton_step(state))
+    def general_step(self, theta: jax.Array, state: PathState) -> PathState:
+        """An iteration of Newton's method with UMFPACK."""
+        return LoadingPath(self.general, self.options, theta).newton_step(state)
 
     def _path(self, theta: jax.Array) -> LoadingPath:
         return LoadingPath(self.definite, self.options, theta)
+
+
+@compiled
+def _trial(system: System, tangent: jax.Array) -> jax.Array:
+    """The factorisation alone."""
+    return system.solve(tangent, jnp.zeros(system.pattern.size))
 
 
 def _unless_refused(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -135,7 +119,3 @@ def _unless_refused(function: Callable[..., Any], *arguments: Any) -> Any:
 
 def _forget_tangent(state: PathState, system: System) -> PathState:
     return state._replace(newton=state.newton.forget_tangent(system))
-
-
-def _safe_tangent(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
-    return system.pattern.safe_values(system.tangent(u, theta))

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System
+from emulator.fem.assembly import System, balance
 from emulator.fem.direction import Direction
-from emulator.fem.functional import volume_ratio
+from emulator.fem.programs import while_loop
 
 _LEAST_FRACTION = 2.0**-19
 # Natural monotonicity fails early: a lower load is cheaper than many short steps
@@ -77,15 +77,15 @@ def choose_fraction(
     -------
     The fraction, and whether it was crushed elements that forbade twice as much.
     """
-    floor = shrink * jnp.min(volume_ratio(system.scene, u))
+    floor = shrink * system.least_volume_ratio(u)
     follower = system.follower_force(u, theta)
 
     def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
         return system.potential(u + fraction * direction.move, theta, level, follower)
 
     def sound(fraction: jax.Array) -> jax.Array:
-        J = volume_ratio(system.scene, u + fraction * direction.move)
-        return jnp.min(J) > floor  # False for NaN
+        J = system.least_volume_ratio(u + fraction * direction.move)
+        return floor < J  # False for NaN
 
     least = _LEAST_FRACTION if nearer is None else _LEAST_NATURAL
     lowers = _progress(system, u, level, theta, direction, potential) if nearer is None else nearer
@@ -116,8 +116,8 @@ def _largest_good(
     def wanted(trial: _Trial) -> jax.Array:
         return ~trial.good & (trial.fraction >= 2.0 * least)
 
-    first = judge(jnp.array(1.0), jnp.array(False))
-    return jax.lax.while_loop(wanted, lambda t: judge(0.5 * t.fraction, ~t.sound), first)
+    first = judge(jnp.ones(()), jnp.array(False))
+    return while_loop(wanted, lambda t: judge(0.5 * t.fraction, ~t.sound), first)
 
 
 def _valley(
@@ -133,7 +133,7 @@ def _valley(
         return _Valley(half, at.of_half, potential(0.5 * half))
 
     first = _Valley(fraction, potential(fraction), potential(0.5 * fraction))
-    return jax.lax.while_loop(falls, halve, first).fraction
+    return while_loop(falls, halve, first).fraction
 
 
 def _progress(
@@ -145,14 +145,14 @@ def _progress(
     potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
 ) -> Callable[[jax.Array], jax.Array]:
     """Whether a fraction of the step makes progress, besides crushing no element."""
-    energy, size = potential(jnp.array(0.0))
+    energy, size = potential(jnp.zeros(()))
     ceiling = energy + _ROUND_OFF * size
     descent = jnp.where(direction.settled, -_ARMIJO * jnp.abs(direction.slope), jnp.inf)
 
     def lowers(fraction: jax.Array) -> jax.Array:
         lower = potential(fraction)[0] <= ceiling + fraction * descent
         if system.forces:
-            left = system.residual(u + fraction * direction.move, theta, level)
+            left = balance(system, u + fraction * direction.move, theta, level, 0.0)[0]
             before = jnp.sum(direction.residual**2)
             lower |= jnp.sum(left**2) < (1.0 - _ARMIJO * fraction) * before
         return lower

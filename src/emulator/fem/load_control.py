@@ -8,6 +8,7 @@ increment is not small.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -49,10 +50,15 @@ def judge_level(state: NewtonState, outcome: Outcome, options: NewtonOptions) ->
     return Verdict(solved, ~solved & (stuck | spent))
 
 
+@partial(jax.jit, static_argnames="options")
 def next_state(
-    state: NewtonState, outcome: Outcome, tangent: jax.Array, options: NewtonOptions
+    state: NewtonState, outcome: Outcome, descends: jax.Array, options: NewtonOptions
 ) -> NewtonState:
-    """Stay, move on to a higher load level, or fall back to a lower one."""
+    """Stay, move on to a higher load level, or fall back to a lower one.
+
+    descends : whether the tangent's own direction lowers the potential, as far as that is known.
+    """
+    state = state._replace(convex=state.convex & descends)
     solved, failed = judge_level(state, outcome, options)
     complete, moved = solved & (state.level >= 1.0), solved | failed
     iterations = state.iterations + 1
@@ -75,7 +81,6 @@ def next_state(
         factorisations=state.factorisations + state.refresh,
         residual=outcome.residual,
         error=outcome.error,
-        tangent=tangent,
         refresh=moved | ~_keeps_tangent(state, outcome, options),
         convex=(moved & ~complete) | _convex(state, outcome),
         crushed=crushed,

@@ -24,16 +24,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from emulator.fem.assembly import System
 from emulator.fem.mip import MipNewton, MipState, applies
 from emulator.fem.newton import Newton
 from emulator.fem.options import NewtonOptions
+from emulator.fem.programs import cond
 from emulator.fem.solution import Solution, Status
 from emulator.fem.state import NEAR, UNBALANCED, NewtonState
 
@@ -65,6 +67,7 @@ _CARRIED = 0.9
 # First level and largest increment of the climb where all ramps are lost (docs/experiments.md,
 # "Several equilibria in the soft corner").
 _TENTH = 0.1
+_FIRST_LEVELS = np.array([*(ramp.first for ramp in _RAMPS), _TENTH])  # by route
 # Load increment below which the climb takes steps that are not convex.
 _CAREFUL = 1.0 / 40.0
 _SHORT = 15  # iterations of Newton's method that a route may take, unless it is the last
@@ -115,110 +118,152 @@ class LoadingPath:
 
     def begin(self, start: jax.Array) -> PathState:
         """The state to search from, at ``start`` (n, 3) mm."""
-        rest = jnp.zeros_like(start)
         newton = self._newton.begin(start)
         # A load increment of the caller's choice is meant to be followed from rest.
-        warm = jnp.any(newton.u != 0.0) & (self.options.increment == 1.0)
-        if self.ramps:
-            warm &= newton.error <= UNBALANCED
-        first = Route.RAMP if self.ramps else Route.CLIMB
-        route = jnp.where(warm, Route.WARM, first)
-        state = PathState(
-            newton=newton,
-            mip=self._mip(jnp.array(1.0)).begin(newton.u) if self.ramps else None,
-            route=route,
-            ramping=(newton.error > NEAR) & self.ramps,
-            level=jnp.array(1.0),
-            on_ramp=jnp.array(0),
-        )
-        keep = warm | ~newton.running
-        return jax.lax.cond(
-            keep, lambda: state, lambda: self._enter(state, rest, route, jnp.array(True))
-        )
+        warm = _warm(newton, ramps=self.ramps) & (self.options.increment == 1.0)
+        route = jnp.where(warm, Route.WARM, Route.RAMP if self.ramps else Route.CLIMB)
+
+        def stay() -> PathState:
+            mip = self._mip(jnp.ones(())).begin(newton.u) if self.ramps else None
+            ramping = (newton.error > NEAR) & self.ramps
+            count = jnp.zeros((), dtype=int)
+            return PathState(newton, mip, route, ramping, jnp.ones(()), count)
+
+        rest = jnp.zeros_like(start)
+        return cond(warm | ~newton.running, stay, lambda: self._enter(newton, rest, route, True))
 
     def ramp_step(self, state: PathState) -> PathState:
         """One step of the stress iterates."""
         assert state.mip is not None
-        # Loads that nothing balances yet lend no stiffness, as in Newton's method.
-        unbalanced = (state.route != Route.WARM) & (state.on_ramp == 0)
-        stiffening = jnp.where(unbalanced, 0.0, state.level)
+        stiffening = _stiffening(state.level, state.route, state.on_ramp)
         mip = self._mip(state.level).step(state.mip, stiffening)
-        newton = state.newton._replace(
-            iterations=state.newton.iterations + 1, factorisations=state.newton.factorisations + 1
+        level, lost, leaves = _judged(
+            state.level, state.route, state.on_ramp, mip.error, mip.fraction, mip.definite
         )
-        _, increment, steps = jnp.array(_RAMPS)[state.route]
-        sound = (mip.fraction > 0.0) & jnp.isfinite(mip.error) & mip.definite
-        found = sound & (state.level == 1.0) & (mip.error <= NEAR)
-        lost = ~sound | (~found & (state.on_ramp + 1 >= steps))
-        higher = jnp.minimum(1.0, state.level + increment)
-        after = state._replace(
-            newton=newton,
-            mip=mip,
-            level=jnp.where(mip.error < _CARRIED, higher, state.level),
-            on_ramp=state.on_ramp + 1,
-        )
-        route = jnp.where(lost, self._next(state.route), state.route)
-        u = jnp.where(lost, 0.0, mip.u)
-        enter = lambda: self._enter(after, u, route, lost)  # noqa: E731
-        return self._limited(jax.lax.cond(lost | found, enter, lambda: after))
+        counts = _counted(state.newton.iterations, state.newton.factorisations, state.on_ramp)
+        iterations, factorisations, on_ramp = counts
+        newton = state.newton._replace(iterations=iterations, factorisations=factorisations)
+        newton = newton._replace(status=_limited(newton, self.options.max_iterations))
+        after = state._replace(newton=newton, mip=mip, level=level, on_ramp=on_ramp)
+
+        def enter() -> PathState:
+            u = jnp.where(lost, 0.0, mip.u)
+            return self._enter(newton, u, jnp.where(lost, state.route + 1, state.route), lost)
+
+        return cond(leaves & newton.running, enter, lambda: after)
 
     def newton_step(self, state: PathState) -> PathState:
         """One iteration of Newton's method."""
-        newton = self._newton.step(state.newton)
-        after = state._replace(newton=newton)
-        ended = (newton.status == Status.CONVERGED) | (newton.status == Status.ITERATION_LIMIT)
-        failed = ~newton.running & ~ended
-        # A level that failed is followed by a lower one.
-        astray = failed | ~newton.convex | (newton.level < 1.0)
-        astray |= newton.running & (newton.at_level >= _SHORT)
-        return jax.lax.cond(
-            astray & (state.route < Route.CLIMB), self.give_up, lambda state: state, after
-        )
-
-    def _limited(self, state: PathState) -> PathState:
-        """The state, ended where all iterations are spent."""
-        newton = state.newton
-        spent = newton.running & (newton.iterations >= self.options.max_iterations)
-        status = jnp.where(spent, Status.ITERATION_LIMIT, newton.status)
-        return state._replace(newton=newton._replace(status=status.astype(newton.status.dtype)))
+        after = state._replace(newton=self._newton.step(state.newton))
+        newton = after.newton
+        astray = _astray(newton.status, newton.convex, newton.level, newton.at_level, after.route)
+        return cond(astray, self.give_up, lambda state: state, after)
 
     def give_up(self, state: PathState) -> PathState:
         """The state at the beginning of the next route."""
         rest = jnp.zeros_like(state.newton.u)
-        return self._enter(state, rest, self._next(state.route), jnp.array(True))
+        return self._enter(state.newton, rest, self._next(state.route), True)
 
     def _next(self, route: jax.Array) -> jax.Array:
         return route + 1 if self.ramps else jnp.full_like(route, Route.CLIMB)
 
     def _enter(
-        self, state: PathState, u: jax.Array, route: jax.Array, ramping: jax.Array
+        self, before: NewtonState, u: jax.Array, route: jax.Array, ramping: jax.Array | bool
     ) -> PathState:
         """The state at ``u`` (n, 3) mm on ``route``, at the foot of its ramp if ``ramping``.
 
         Iterations are counted on.
         """
-        newton, level, mip = self._newton.begin(u), jnp.array(1.0), None
-        ramping &= newton.running & (route < Route.CLIMB) & self.ramps
+        newton, level, mip = self._newton.begin(u, before.negligible), jnp.ones(()), None
         if self.ramps:
-            level = jnp.array([ramp.first for ramp in _RAMPS] + [_TENTH])[route]
+            level = jnp.asarray(_FIRST_LEVELS)[route]
             mip = self._mip(level).begin(u)
-            climb = route == Route.CLIMB
-            level_of_newton = jnp.where(climb, _TENTH, 1.0)
-            newton = newton._replace(
-                level=level_of_newton,
-                increment=level_of_newton,
-                careful=jnp.where(climb, _CAREFUL, jnp.inf),
-            )
-        return PathState(
-            newton=newton._replace(
-                iterations=state.newton.iterations, factorisations=state.newton.factorisations
-            ),
-            mip=mip,
-            route=route,
-            ramping=ramping,
-            level=level,
-            on_ramp=jnp.array(0),
+        newton = newton._replace(iterations=before.iterations, factorisations=before.factorisations)
+        return _entered(newton, mip, route, ramping, level)
+
+
+@partial(jax.jit, static_argnames="ramps")
+def _warm(newton: NewtonState, *, ramps: bool) -> jax.Array:
+    """Whether Newton's method is worth trying from where it begins."""
+    moved = jnp.any(newton.u != 0.0)
+    return moved & (newton.error <= UNBALANCED) if ramps else moved
+
+
+@jax.jit
+def _stiffening(level: jax.Array, route: jax.Array, on_ramp: jax.Array) -> jax.Array:
+    """Load level whose stiffness a ramp's step reads.
+
+    Loads that nothing balances yet lend none, as in Newton's method.
+    """
+    return jnp.where((route != Route.WARM) & (on_ramp == 0), 0.0, level)
+
+
+@jax.jit
+def _judged(
+    level: jax.Array,
+    route: jax.Array,
+    on_ramp: jax.Array,
+    error: jax.Array,
+    fraction: jax.Array,
+    definite: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Next level of a ramp after a step; whether the ramp is lost, and whether it is left."""
+    _, increment, steps = jnp.array(_RAMPS)[route]
+    sound = (fraction > 0.0) & jnp.isfinite(error) & definite
+    found = sound & (level == 1.0) & (error <= NEAR)
+    lost = ~sound | (~found & (on_ramp + 1 >= steps))
+    higher = jnp.minimum(1.0, level + increment)
+    return jnp.where(error < _CARRIED, higher, level), lost, lost | found
+
+
+@jax.jit
+def _counted(*counts: jax.Array) -> list[jax.Array]:
+    return [count + 1 for count in counts]
+
+
+def _limited(newton: NewtonState, most: int) -> jax.Array:
+    """Status where ``most`` iterations are allowed."""
+    return jnp.where(newton.iterations >= most, np.int64(Status.ITERATION_LIMIT), newton.status)
+
+
+@jax.jit
+def _astray(
+    status: jax.Array, convex: jax.Array, level: jax.Array, at_level: jax.Array, route: jax.Array
+) -> jax.Array:
+    """Whether Newton's method shows that another route has to be tried."""
+    running = status == Status.RUNNING
+    ended = (status == Status.CONVERGED) | (status == Status.ITERATION_LIMIT)
+    # A level that failed is followed by a lower one.
+    astray = (~running & ~ended) | ~convex | (level < 1.0) | (running & (at_level >= _SHORT))
+    return astray & (route < Route.CLIMB)
+
+
+@jax.jit
+def _entered(
+    newton: NewtonState,
+    mip: MipState | None,
+    route: jax.Array,
+    ramping: jax.Array | bool,
+    level: jax.Array,
+) -> PathState:
+    """The state on ``route``, Newton's method and stress iterates begun."""
+    ramps = mip is not None
+    if ramps:
+        climb = route == Route.CLIMB
+        level_of_newton = jnp.where(climb, _TENTH, 1.0)
+        newton = newton._replace(
+            level=level_of_newton,
+            increment=level_of_newton,
+            careful=jnp.where(climb, _CAREFUL, jnp.inf),
         )
+    return PathState(
+        newton=newton,
+        mip=mip,
+        route=route,
+        ramping=ramping & newton.running & (route < Route.CLIMB) & ramps,
+        level=level,
+        on_ramp=jnp.zeros((), dtype=int),
+    )
 
 
 def find_equilibrium(

@@ -35,10 +35,12 @@ import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
 from emulator.fem.definiteness import inverse_is_positive
-from emulator.fem.functional import displacement_gradient, strain_law, volume_ratio
+from emulator.fem.functional import displacement_gradient, strain_law
 from emulator.fem.line_search import largest_sound
+from emulator.fem.programs import compiled
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
+from emulator.scenes.scene import Scene
 
 _SHORTEST = 2.0**-4  # fraction of a step; where less is left, the ramp of loads is lost
 _BISECTIONS = 7
@@ -49,7 +51,7 @@ class MipState(NamedTuple):
     """What the next iteration needs.
 
     u : (n, 3) mm. measures : (m, q, k), the strain measures that the stresses belong to.
-    error : residual of u relative to the forces at work, supports met.
+    error : residual of u relative to the forces at work, supports met; inf before the first step.
     fraction : of the last step that was taken; below 1 where elements would have been crushed, 0
     where there was no step.
     definite : whether the tangent of the last step was positive definite.
@@ -78,92 +80,137 @@ class MipNewton:
     theta: jax.Array
     level: jax.Array
 
-    @cached_property
-    def _measures(self) -> Measures:
-        names = measures_read(self.system.scene.law)
-        assert names is not None
-        return Measures(names)
-
     def begin(self, u: jax.Array) -> MipState:
         """The state at ``u`` (n, 3) mm that Newton's method would start from."""
-        H = displacement_gradient(self.system.scene, u)
-        measures = self._everywhere(lambda H, at: self._measures.of(H, at.directions), H)
-        return MipState(u, measures, self._error(u), jnp.array(1.0), jnp.array(True))
+        unknown = jnp.full((), jnp.inf)
+        return MipState(u, _measures_of(self.system, u), unknown, jnp.ones(()), jnp.array(True))
 
     def step(self, state: MipState, stiffening: jax.Array) -> MipState:
         """One iteration, with ``stiffening`` times the stiffness of the loads in its tangent."""
-        system, scene, u = self.system, self.system.scene, state.u
-        grid = scene.discretisation
-        H = displacement_gradient(scene, u)
-        stress, tangent = self._everywhere(self._linearise, H, state.measures)
-        force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
-        residual = system.restrict(system.scatter(force) + system.others(u, self.theta, self.level))
-        K = system.assemble(system.element_blocks(tangent), u, self.theta, stiffening)
-        values = system.pattern.safe_values(K)
-        move = system.solve(values, -residual)
-        definite = self._definite(values, residual, move)
-        move = system.extend(jnp.where(system.pattern.solvable(K), move, jnp.nan))
-        fraction = self._fraction(u, move)
-        ahead = jnp.where(fraction > 0.0, u + fraction * move, u)
-        change = displacement_gradient(scene, move)
-        measures = self._everywhere(self._at_stress, H, change, state.measures)
-        measures = jnp.where(fraction > 0.0, measures, state.measures)
-        return MipState(ahead, measures, self._error(ahead), fraction, definite)
+        move, definite = _promised_step(
+            self.system, state.u, state.measures, self.theta, self.level, stiffening
+        )
+        fraction = self._fraction(state.u, move)
+        ahead, measures = _taken(self.system, state.u, state.measures, self.theta, move, fraction)
+        _, error = balance(self.system, ahead, self.theta, self.level)
+        return MipState(ahead, measures, error, fraction, definite)
 
-    def _definite(self, values: jax.Array, residual: jax.Array, move: jax.Array) -> jax.Array:
-        """Whether the tangent ``values`` (nnz,) is positive definite, as far as can be told."""
-        if self.system.factorisation == "cholmod":
-            return jnp.array(True)  # CHOLMOD refuses any other
-        if self.system.forces:  # not symmetric: at least the step goes down
-            return jnp.vdot(residual, move) <= 0.0
-        return inverse_is_positive(partial(self.system.solve, values), self.system.pattern.size)
+    def _fraction(self, u: jax.Array, move: jax.Array) -> jax.Array:
+        """How much of a step crushes no element; 0 if almost none of it does."""
+        floor = self.shrink * self.system.least_volume_ratio(u)
+        return largest_sound(
+            lambda fraction: floor < self.system.least_volume_ratio(u + fraction * move), _SHORTEST
+        )
 
-    def _error(self, u: jax.Array) -> jax.Array:
-        return balance(self.system, u, self.theta, self.level)[1]
 
-    def _everywhere(self, function, *fields):  # noqa: ANN001, ANN002, ANN202
-        """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...)."""
-        axes = (0,) * len(fields)
-        each = jax.vmap(jax.vmap(function, (*axes, None)), (*axes, 0))
-        return each(*fields, self.system.scene.tissue)
+@compiled
+def _measures_of(system: System, u: jax.Array) -> jax.Array:
+    """Strain measures (m, q, k) of the displacement ``u`` (n, 3) mm."""
+    measures, H = _measures(system.scene), displacement_gradient(system.scene, u)
+    return _everywhere(system.scene, lambda H, at: measures.of(H, at.directions), H)
 
-    def _energy(self, at: Tissue):  # noqa: ANN202
-        law = strain_law(self.system.scene, self.theta)
-        return self._measures.energy(lambda strain: law(strain, at), at.directions)
 
-    def _linearise(self, H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
+@compiled
+def _promised_step(
+    system: System,
+    u: jax.Array,
+    measures: jax.Array,
+    theta: jax.Array,
+    level: jax.Array,
+    stiffening: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The full step (n, 3) mm, NaN where there is none, and whether its tangent is definite."""
+    point, grid = MaterialPoint(system.scene, theta), system.scene.discretisation
+    H = displacement_gradient(system.scene, u)
+    stress, tangent = _everywhere(system.scene, point.linearise, H, measures)
+    force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
+    residual = system.restrict(system.scatter(force) + system.others(u, theta, level))
+    K = system.assemble(system.element_blocks(tangent), u, theta, stiffening)
+    values = system.pattern.safe_values(K)
+    move = system.solve(values, -residual)
+    definite = _definite(system, values, residual, move)
+    return system.extend(jnp.where(system.pattern.solvable(K), move, jnp.nan)), definite
+
+
+@compiled
+def _taken(
+    system: System,
+    u: jax.Array,
+    measures: jax.Array,
+    theta: jax.Array,
+    move: jax.Array,
+    fraction: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Displacement (n, 3) mm and measures (m, q, k) after ``fraction`` of the step."""
+    point = MaterialPoint(system.scene, theta)
+    H, change = (displacement_gradient(system.scene, field) for field in (u, move))
+    after = _everywhere(system.scene, point.at_stress, H, change, measures)
+    taken = fraction > 0.0
+    return jnp.where(taken, u + fraction * move, u), jnp.where(taken, after, measures)
+
+
+def _definite(system: System, values: jax.Array, residual: jax.Array, move: jax.Array) -> jax.Array:
+    """Whether the tangent ``values`` (nnz,) is positive definite, as far as can be told."""
+    if system.factorisation == "cholmod":
+        return jnp.array(True)  # CHOLMOD refuses any other
+    if system.forces:  # not symmetric: at least the step goes down
+        return jnp.vdot(residual, move) <= 0.0
+    return inverse_is_positive(partial(system.solve, values), system.pattern.size)
+
+
+def _measures(scene: Scene) -> Measures:
+    names = measures_read(scene.law)
+    assert names is not None
+    return Measures(names)
+
+
+def _everywhere(scene: Scene, function, *fields):  # noqa: ANN001, ANN002, ANN202
+    """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...)."""
+    axes = (0,) * len(fields)
+    return jax.vmap(jax.vmap(function, (*axes, None)), (*axes, 0))(*fields, scene.tissue)
+
+
+@dataclass(frozen=True)
+class MaterialPoint:
+    """What happens at one integration point, at ``theta`` (p,)."""
+
+    scene: Scene
+    theta: jax.Array
+
+    @cached_property
+    def measures(self) -> Measures:
+        """The strain measures that the law reads."""
+        return _measures(self.scene)
+
+    def energy(self, at: Tissue) -> Callable[[jax.Array], jax.Array]:
+        """Strain energy density in kPa as a function of the measures (k,)."""
+        law = strain_law(self.scene, self.theta)
+        return self.measures.energy(lambda strain: law(strain, at), at.directions)
+
+    def linearise(self, H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
         """First Piola stress (3, 3) and tangent (3, 3, 3, 3) in kPa at a point."""
-        phi = self._energy(at)
+        phi = self.energy(at)
         s, C = jax.grad(phi)(own), jax.hessian(phi)(own)
 
         def measures(H: jax.Array) -> jax.Array:
-            return self._measures.of(H, at.directions)
+            return self.measures.of(H, at.directions)
 
         slope = jax.jacfwd(measures)(H)
         stress = jnp.tensordot(s + C @ (measures(H) - own), slope, 1)
         tangent = jnp.einsum("kij,kl,lab->ijab", slope, C, slope)
         return stress, tangent + jax.hessian(lambda H: jnp.vdot(s, measures(H)))(H)
 
-    def _at_stress(self, H: jax.Array, change: jax.Array, own: jax.Array, at: Tissue) -> jax.Array:
+    def at_stress(self, H: jax.Array, change: jax.Array, own: jax.Array, at: Tissue) -> jax.Array:
         """Measures (k,) of a point where the law has the stress that its step promises."""
-        phi = self._energy(at)
-        xi, along = jax.jvp(lambda H: self._measures.of(H, at.directions), (H,), (change,))
+        phi = self.energy(at)
+        xi, along = jax.jvp(lambda H: self.measures.of(H, at.directions), (H,), (change,))
         step = xi + along - own
 
         def one(block: jax.Array) -> jax.Array:
             return fraction_at_stress(lambda beta: phi(own + beta * block * step))
 
-        fractions = jax.vmap(one)(jnp.asarray(self._measures.blocks))
-        return own + (fractions @ self._measures.blocks) * step
-
-    def _fraction(self, u: jax.Array, move: jax.Array) -> jax.Array:
-        """How much of a step crushes no element; 0 if almost none of it does."""
-        floor = self.shrink * jnp.min(volume_ratio(self.system.scene, u))
-
-        def sound(fraction: jax.Array) -> jax.Array:
-            return jnp.min(volume_ratio(self.system.scene, u + fraction * move)) > floor
-
-        return largest_sound(sound, _SHORTEST)
+        fractions = jax.vmap(one)(jnp.asarray(self.measures.blocks))
+        return own + (fractions @ self.measures.blocks) * step
 
 
 def applies(system: System) -> bool:

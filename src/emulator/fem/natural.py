@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from emulator.fem.assembly import System
 from emulator.fem.direction import Direction
 from emulator.fem.mixed import Volumes, advance, carried
+from emulator.fem.programs import compiled
 
 
 def natural_monotonicity(
@@ -40,20 +41,29 @@ def natural_monotonicity(
     u, volumes, level, theta : where the step starts.
     direction : the step, with its tangent and condensed linearisation.
     """
+    return lambda fraction: _nearer(system, u, volumes, level, theta, direction, fraction)
+
+
+@compiled
+def _nearer(
+    system: System,
+    u: jax.Array,
+    volumes: Volumes,
+    level: jax.Array,
+    theta: jax.Array,
+    direction: Direction,
+    fraction: jax.Array,
+) -> jax.Array:
     move, at, tangent = direction.move, direction.condensed, direction.tangent
     assert at is not None
-
-    def nearer(fraction: jax.Array) -> jax.Array:
-        after = advance(system.scene, volumes, at, move, fraction)
-        there = u + fraction * move
-        force = system.scatter(carried(system.scene, there, after, theta, at))
-        force = system.restrict(force + system.others(there, theta, level))
-        left = system.extend(system.solve(tangent, -(force + (1.0 - fraction) * direction.pull)))
-        left = left + (1.0 - fraction) * jnp.where(system.scene.held, move, 0.0)
-        kept_open = jnp.min(after.change) > -1.0
-        return kept_open & (_size(left) <= (1.0 - 0.25 * fraction) * _size(move))
-
-    return nearer
+    after = advance(system.scene, volumes, at, move, fraction)
+    there = u + fraction * move
+    force = system.scatter(carried(system.scene, there, after, theta, at))
+    force = system.restrict(force + system.others(there, theta, level))
+    left = system.extend(system.solve(tangent, -(force + (1.0 - fraction) * direction.pull)))
+    left = left + (1.0 - fraction) * jnp.where(system.scene.held, move, 0.0)
+    kept_open = jnp.min(after.change) > -1.0
+    return kept_open & (_size(left) <= (1.0 - 0.25 * fraction) * _size(move))
 
 
 def _size(field: jax.Array) -> jax.Array:

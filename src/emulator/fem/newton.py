@@ -18,21 +18,23 @@ With mean dilatation the elements' volumes and pressures are iterates of their o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System
+from emulator.fem.assembly import System, forces_at
 from emulator.fem.direction import Direction, newton_direction
-from emulator.fem.functional import volume_ratio
 from emulator.fem.load_control import next_state
-from emulator.fem.mixed import Volumes, advance, consistent
+from emulator.fem.mixed import Condensed, Volumes, advance, consistent
 from emulator.fem.options import NewtonOptions
+from emulator.fem.programs import compiled, cond
 from emulator.fem.solution import Status
 from emulator.fem.state import NewtonState
 from emulator.fem.step_length import Outcome, level_balance, take_step
 
 _ROUND_OFF = 1e-15  # strain that floating point cannot tell from none
+_STRETCH = 1e-6  # small enough for the forces to be linear in it
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,54 +45,43 @@ class Newton:
     options: NewtonOptions
     theta: jax.Array
 
-    def begin(self, start: jax.Array) -> NewtonState:
-        """The state to iterate from: ``start``, or rest where that is no start."""
-        negligible = self.negligible()
-        residual, error = level_balance(self.system, start, self.theta, jnp.array(1.0), negligible)
-        fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(self.theta))
-        inverted = ~(jnp.min(volume_ratio(self.system.scene, start)) > 0.0)
-        solved = ~inverted & (error <= self.options.tolerance)
-        status = jnp.where(solved, Status.CONVERGED, Status.RUNNING)
-        u = jnp.where(fine & ~inverted, start, 0.0)
-        return NewtonState(
-            u=u,
-            volumes=consistent(self.system.scene, u, self.theta) if self.system.mixed else None,
-            level=jnp.array(self.options.increment),
-            u_reached=jnp.zeros_like(u),
-            reached=jnp.array(0.0),
-            increment=jnp.array(self.options.increment),
-            at_level=jnp.array(0),
-            iterations=jnp.array(0),
-            factorisations=jnp.array(0),
-            residual=residual,
-            error=jnp.where(fine, error, jnp.inf),
-            negligible=negligible,
-            tangent=jnp.zeros(len(self.system.pattern.rows)),
-            refresh=jnp.array(True),
-            convex=jnp.array(True),
-            careful=jnp.array(jnp.inf),
-            crushed=jnp.array(False),
-            singular=jnp.array(False),
-            squeezed=jnp.array(0),
-            status=jnp.asarray(jnp.where(fine, status, Status.INVALID_INPUT), dtype=jnp.int64),
+    def begin(self, start: jax.Array, negligible: jax.Array | None = None) -> NewtonState:
+        """The state to iterate from: ``start``, or rest where that is no start.
+
+        negligible : residual in mN that is round-off, if known.
+        """
+        system, theta = self.system, self.theta
+        negligible = self.negligible() if negligible is None else negligible
+        residual, error = level_balance(system, start, theta, jnp.ones(()), negligible)
+        least_J = system.least_volume_ratio(start)
+        state = _first(
+            theta,
+            start,
+            residual,
+            error,
+            negligible,
+            least_J,
+            entries=len(system.pattern.rows),
+            options=self.options,
         )
+        return state._replace(volumes=_consistent(system, state.u, theta) if system.mixed else None)
 
     def negligible(self) -> jax.Array:
         r"""Residual in mN that is round-off: :math:`10^{-15} |K_0 X|`, at least ``absolute``.
 
-        A uniform stretch by 1e-15 of the body at rest changes the internal forces by so much.
-        Without loads there is no other force to compare a residual with.
+        A uniform stretch by 1e-15 of the body at rest changes the internal forces by so much; it is
+        taken from a stretch by 1e-6. Without loads there is no other force to compare a residual
+        with.
         """
         X = jnp.asarray(self.system.scene.mesh.nodes)
-        rest = jnp.zeros_like(X)
-        _, force = jax.jvp(lambda u: self.system.internal_force(u, self.theta), (rest,), (X,))
-        size = _ROUND_OFF * jnp.sqrt(jnp.sum(force**2))
+        stretched = forces_at(self.system, _STRETCH * X, self.theta, 0.0, 0.0)
+        size = _ROUND_OFF / _STRETCH * stretched.internal
         return jnp.maximum(jnp.where(jnp.isfinite(size), size, 0.0), self.options.absolute)
 
     def step(self, state: NewtonState) -> NewtonState:
         """One iteration."""
         system, theta = self.system, self.theta
-        residual, error = jax.lax.cond(
+        residual, error = cond(
             state.at_level == 0,
             lambda: level_balance(system, state.u, theta, state.level, state.negligible),
             lambda: (state.residual, state.error),
@@ -98,11 +89,8 @@ class Newton:
         state = state._replace(residual=residual, error=error)
         direction = newton_direction(system, theta, state)
         outcome = take_step(system, theta, state, direction, self.options)
-        convex = state.convex
-        if direction.condensed is None:  # the point sought by mean dilatation is a saddle
-            convex &= direction.descends
-        state = state._replace(singular=direction.singular, convex=convex)
-        after = next_state(state, outcome, direction.tangent, self.options)
+        state = state._replace(tangent=direction.tangent, singular=direction.singular)
+        after = next_state(state, outcome, direction.descends, self.options)
         if state.volumes is None:
             return after
         return after._replace(volumes=self._volumes(state, outcome, direction, after))
@@ -111,12 +99,67 @@ class Newton:
         self, state: NewtonState, outcome: Outcome, direction: Direction, after: NewtonState
     ) -> Volumes:
         """Volumes after the step; of the last solution where the level has changed."""
-        volumes, condensed, scene = state.volumes, direction.condensed, self.system.scene
+        volumes, condensed = state.volumes, direction.condensed
         assert volumes is not None
         assert condensed is not None
         move = jnp.where(outcome.fraction > 0.0, direction.move, 0.0)
-        return jax.lax.cond(
+        return cond(
             after.level == state.level,
-            lambda: advance(scene, volumes, condensed, move, outcome.fraction),
-            lambda: consistent(scene, after.u, self.theta),
+            lambda: _advance(self.system, volumes, condensed, move, outcome.fraction),
+            lambda: _consistent(self.system, after.u, self.theta),
         )
+
+
+@partial(jax.jit, static_argnames=("entries", "options"))
+def _first(
+    theta: jax.Array,
+    start: jax.Array,
+    residual: jax.Array,
+    error: jax.Array,
+    negligible: jax.Array,
+    least_J: jax.Array,
+    *,
+    entries: int,
+    options: NewtonOptions,
+) -> NewtonState:
+    """The state at ``start`` or at rest, for tangents of ``entries``; volumes left out."""
+    fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(theta))
+    inverted = ~(least_J > 0.0)
+    solved = ~inverted & (error <= options.tolerance)
+    status = jnp.where(solved, Status.CONVERGED, Status.RUNNING)
+    u = jnp.where(fine & ~inverted, start, 0.0)
+    count, increment = jnp.zeros((), dtype=int), jnp.full((), options.increment)
+    return NewtonState(
+        u=u,
+        volumes=None,
+        level=increment,
+        u_reached=jnp.zeros_like(u),
+        reached=jnp.zeros(()),
+        increment=increment,
+        at_level=count,
+        iterations=count,
+        factorisations=count,
+        residual=residual,
+        error=jnp.where(fine, error, jnp.inf),
+        negligible=negligible,
+        tangent=jnp.zeros(entries),
+        refresh=jnp.array(True),
+        convex=jnp.array(True),
+        careful=jnp.full((), jnp.inf),
+        crushed=jnp.array(False),
+        singular=jnp.array(False),
+        squeezed=count,
+        status=jnp.asarray(jnp.where(fine, status, Status.INVALID_INPUT), dtype=jnp.int64),
+    )
+
+
+@compiled
+def _consistent(system: System, u: jax.Array, theta: jax.Array) -> Volumes:
+    return consistent(system.scene, u, theta)
+
+
+@compiled
+def _advance(
+    system: System, volumes: Volumes, at: Condensed, move: jax.Array, fraction: jax.Array
+) -> Volumes:
+    return advance(system.scene, volumes, at, move, fraction)

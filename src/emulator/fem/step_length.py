@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
 from emulator.fem.direction import Direction, support_offset
-from emulator.fem.functional import volume_ratio
 from emulator.fem.line_search import choose_fraction
 from emulator.fem.natural import natural_monotonicity
 from emulator.fem.options import NewtonOptions
+from emulator.fem.programs import compiled, cond
 from emulator.fem.state import NEAR, NewtonState
 
 
@@ -36,8 +36,13 @@ def level_balance(
 ) -> tuple[jax.Array, jax.Array]:
     """Residual (f,) and its relative size, infinite unless finite and the supports are met."""
     residual, error = balance(system, u, theta, level, negligible)
-    placed = jnp.all(support_offset(system, u, level) == 0.0)
-    return residual, jnp.where(placed & jnp.isfinite(error), error, jnp.inf)
+    return residual, _where_met(system, u, level, error)
+
+
+@compiled
+def _where_met(system: System, u: jax.Array, level: jax.Array, error: jax.Array) -> jax.Array:
+    met = jnp.all(support_offset(system, u, level) == 0.0)
+    return jnp.where(met & jnp.isfinite(error), error, jnp.inf)
 
 
 def take_step(
@@ -50,7 +55,7 @@ def take_step(
     """The full step where the residual alone shows that it is good, else a line search."""
     quick = _full_step(system, theta, state, direction, options)
     # A kept tangent is worth a full step or nothing: its direction is not searched along.
-    return jax.lax.cond(
+    return cond(
         (quick.fraction > 0.0) | ~state.refresh,
         lambda: quick,
         lambda: _searched_step(system, theta, state, direction, options),
@@ -64,19 +69,33 @@ def _full_step(
     direction: Direction,
     options: NewtonOptions,
 ) -> Outcome:
-    """The full step where it halves a residual that is small already."""
-    near = direction.settled & (state.error < NEAR) & (not system.mixed)
-    trial = state.u + direction.move
-    residual, error = level_balance(system, trial, theta, state.level, state.negligible)
-    J, now = (jnp.min(volume_ratio(system.scene, u)) for u in (trial, state.u))
-    good = near & (error <= 0.5 * state.error) & (options.shrink * now < J)
-    return Outcome(
-        u=jnp.where(good, trial, state.u),
-        residual=jnp.where(good, residual, state.residual),
-        error=jnp.where(good, error, state.error),
-        fraction=jnp.where(good, 1.0, 0.0),
-        crushed=jnp.array(False),
-    )
+    """The full step where it halves a residual that is small already; else none."""
+    none = Outcome(state.u, state.residual, state.error, jnp.zeros(()), jnp.array(False))
+    if system.mixed:
+        return none
+
+    def tried() -> Outcome:
+        trial = state.u + direction.move
+        residual, error = level_balance(system, trial, theta, state.level, state.negligible)
+        J, now = system.least_volume_ratio(trial), system.least_volume_ratio(state.u)
+        good = _good(error, state.error, J, options.shrink, now)
+        whole = Outcome(trial, residual, error, jnp.ones(()), jnp.array(False))
+        return cond(good, lambda: whole, lambda: none)
+
+    return cond(_near(direction.settled, state.error), tried, lambda: none)
+
+
+@jax.jit
+def _near(settled: jax.Array, error: jax.Array) -> jax.Array:
+    return settled & (error < NEAR)
+
+
+@jax.jit
+def _good(
+    error: jax.Array, before: jax.Array, J: jax.Array, shrink: float, now: jax.Array
+) -> jax.Array:
+    """Whether a step halves the residual and crushes no element."""
+    return (error <= 0.5 * before) & (shrink * now < J)
 
 
 def _searched_step(
@@ -98,9 +117,17 @@ def _searched_step(
     fraction, crushed = choose_fraction(
         system, state.u, state.level, theta, direction, options.shrink, nearer
     )
-    u = jnp.where(fraction > 0.0, state.u + fraction * direction.move, state.u)
-    # After a full step the supports are met; setting them avoids the last bit of round-off.
-    scene = system.scene
-    u = jnp.where(scene.held & (fraction == 1.0), state.level * scene.held_displacement, u)
+    u = _moved(system, state.u, direction.move, fraction, state.level)
     residual, error = level_balance(system, u, theta, state.level, state.negligible)
     return Outcome(u, residual, error, fraction, crushed)
+
+
+@compiled
+def _moved(
+    system: System, u: jax.Array, move: jax.Array, fraction: jax.Array, level: jax.Array
+) -> jax.Array:
+    """``u`` (n, 3) mm after a fraction of the step."""
+    scene = system.scene
+    u = jnp.where(fraction > 0.0, u + fraction * move, u)
+    # After a full step the supports are met; setting them avoids the last bit of round-off.
+    return jnp.where(scene.held & (fraction == 1.0), level * scene.held_displacement, u)

@@ -8,7 +8,7 @@ import pytest
 
 import emulator as em
 from emulator.fem.assembly import System, relative_residual
-from emulator.fem.mip import MipNewton, applies, fraction_at_stress
+from emulator.fem.mip import MaterialPoint, MipNewton, applies, fraction_at_stress
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import modulus
@@ -45,17 +45,17 @@ def test_stress_and_tangent_of_a_point_whose_measures_are_others(ventricle):
     The stress is that of the model about the point's own measures; the tangent weighs the second
     derivatives of the measures with its own stress, as does a model about where H is.
     """
-    own, at = mip(ventricle, ventricle.centre), Tissue(jnp.array([1.0, 2.0, 2.0]) / 3.0)
+    own, at = MaterialPoint(ventricle, ventricle.centre), Tissue(jnp.array([1.0, 2.0, 2.0]) / 3.0)
     H = 0.1 * jax.random.normal(jax.random.key(1), (3, 3))
-    xi = lambda G: own._measures.of(G, at.directions)
+    xi = lambda G: own.measures.of(G, at.directions)
     others = 0.5 * xi(H) + 0.01
-    phi = own._energy(at)
+    phi = own.energy(at)
     s, C = jax.grad(phi)(others), jax.hessian(phi)(others)
 
     def model(about):
         return lambda G: s @ xi(G) + 0.5 * (xi(G) - about) @ C @ (xi(G) - about)
 
-    stress, tangent = own._linearise(H, others, at)
+    stress, tangent = own.linearise(H, others, at)
     np.testing.assert_allclose(stress, jax.grad(model(others))(H), rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(tangent, jax.hessian(model(xi(H)))(H), rtol=1e-10, atol=1e-9)
 
@@ -129,7 +129,7 @@ def test_no_tangent_on_the_way_is_indefinite(ventricle, monkeypatch):
     def never(*arguments):
         raise AssertionError("UMFPACK was asked for")
 
-    monkeypatch.setitem(simulator._driver.__dict__, "_general_step", never)
+    monkeypatch.setitem(simulator._driver.__dict__, "general_step", never)
     assert simulator.solve(ventricle.centre).converged
 
 
@@ -155,8 +155,7 @@ def test_where_it_fails_newton_climbs_from_rest(ventricle, monkeypatch, how):
         return after._replace(error=jnp.array(jnp.nan if how == "nan" else 0.9))
 
     monkeypatch.setattr(MipNewton, "step", fail)
-    ramp_step = simulator._driver._ramp_step
-    vars(simulator._driver).pop("_ramp_step")
+    failing = simulator._driver.ramp_step
 
     def noting(theta, state):
         begun.append(float(state.level))
@@ -164,9 +163,7 @@ def test_where_it_fails_newton_climbs_from_rest(ventricle, monkeypatch, how):
             raise ValueError("INTERNAL: sparsax: matrix is not positive definite")
         return failing(theta, state)
 
-    failing = simulator._driver._ramp_step
-    assert failing is not ramp_step
-    monkeypatch.setitem(vars(simulator._driver), "_ramp_step", noting)
+    monkeypatch.setitem(vars(simulator._driver), "ramp_step", noting)
     solution = simulator.solve(theta)
     assert solution.converged
     assert {0.1, 0.25, 0.5} <= set(begun)  # every ramp
@@ -179,7 +176,7 @@ def test_other_errors_are_not_swallowed(ventricle, monkeypatch):
     def fail(*arguments):
         raise jax.errors.JaxRuntimeError("out of memory")
 
-    monkeypatch.setitem(simulator._driver.__dict__, "_ramp_step", fail)
+    monkeypatch.setitem(simulator._driver.__dict__, "ramp_step", fail)
     with pytest.raises(jax.errors.JaxRuntimeError, match="out of memory"):
         simulator.solve(ventricle.centre)
 
@@ -201,13 +198,13 @@ def test_whom_it_is_for(beam, traction_beam):
 def test_a_good_start_keeps_its_load_and_a_poor_one_is_left(ventricle, monkeypatch):
     simulator, theta = em.Simulator(ventricle), ventricle.centre
     u = simulator(theta)
-    step, levels = simulator._driver._ramp_step, []
+    step, levels = simulator._driver.ramp_step, []
 
     def noting(theta, state):
         levels.append(float(state.level))
         return step(theta, state)
 
-    monkeypatch.setitem(simulator._driver.__dict__, "_ramp_step", noting)
+    monkeypatch.setitem(simulator._driver.__dict__, "ramp_step", noting)
     errors = {k: float(relative_residual(simulator.system, k * u, theta)) for k in (0.8, 0.05)}
     assert 0.05 < errors[0.8] < 0.5 < errors[0.05]
     good, poor = (simulator.solve(theta, k * u) for k in (0.8, 0.05))

@@ -1,0 +1,72 @@
+"""Programs of a system of equations: compiled in parts, put together by Python or inside ``jit``.
+
+A solver compiled whole holds every evaluation of the forces as often as its branches mention it,
+and compiling it takes longer than a hundred solves. So what costs time to run is compiled by
+itself, once for each system (:func:`compiled`), and the decisions between are taken by
+:func:`cond` and :func:`while_loop`: in Python where the numbers are known, by ``jax.lax`` where
+they are traced. The same code serves both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, Concatenate, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class HasPrograms(Protocol):
+    """What keeps its programs: ``programs`` by the function they were compiled from."""
+
+    @property
+    def programs(self) -> dict[Callable, Callable]:
+        """Compiled functions."""
+
+
+def compiled[H: HasPrograms, **P, R](
+    function: Callable[Concatenate[H, P], R],
+) -> Callable[Concatenate[H, P], R]:
+    """``function(system, *arrays)``, compiled once for each system; also as a method of it.
+
+    Python's numbers are taken as arrays, so that 1.0 and an array are not two programs.
+    """
+
+    @wraps(function)
+    def run(system: H, /, *arguments: P.args, **named: P.kwargs) -> R:
+        program = system.programs.get(function)
+        if program is None:
+            program = system.programs[function] = jax.jit(partial(function, system))
+        by_name = {name: _strong(value) for name, value in named.items()}
+        return program(*[_strong(value) for value in arguments], **by_name)
+
+    return run
+
+
+def cond[S](decision: jax.Array, yes: Callable[..., S], no: Callable[..., S], *operands: Any) -> S:
+    """``jax.lax.cond``; where ``decision`` is a number, only the branch it takes."""
+    if isinstance(decision, jax.core.Tracer):
+        return jax.lax.cond(decision, yes, no, *operands)
+    return (yes if bool(decision) else no)(*operands)
+
+
+def while_loop[S](wanted: Callable[[S], jax.Array], body: Callable[[S], S], state: S) -> S:
+    """``jax.lax.while_loop``, or Python's where ``state`` and what ``wanted`` says are numbers."""
+    more = wanted(state)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((more, state))):
+        return jax.lax.while_loop(wanted, body, state)
+    while bool(more):
+        state = body(state)
+        more = wanted(state)
+    return state
+
+
+def _strong(value: Any) -> Any:
+    """``value`` as an array of a type of its own, which decides which program it is for."""
+    if isinstance(value, float | int):
+        return np.asarray(value)
+    if getattr(value, "weak_type", False):
+        return jnp.asarray(value, dtype=value.dtype)
+    return value
