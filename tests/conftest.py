@@ -10,12 +10,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 # Read by JAX when it is imported, here and in the processes that tests start.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 import jax
 import pytest
 
-import calibrate  # noqa: F401 - with all it imports, before pytest turns warnings into errors
+import calibrate.workflow  # noqa: F401 - with all it imports, before warnings are errors
 import emulator as em
 from emulator.scenes import Scene
 

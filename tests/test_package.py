@@ -27,6 +27,25 @@ def test_importing_turns_on_float64_and_nothing_else():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_importing_loads_nothing_but_jax():
+    """The libraries behind it take seconds, and are imported by what needs them."""
+    code = (
+        "import sys, calibrate;"
+        "slow = {'numpyro', 'blackjax', 'arviz_stats', 'flax', 'sklearn', 'skfem', 'xarray'};"
+        "assert not slow & set(sys.modules), slow & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_arviz_may_be_imported_first():
+    """It puts a lazy module in NumPyro's place (calibrate.arviz)."""
+    code = (
+        "import arviz_base, calibrate; from numpyro import distributions;"
+        "calibrate.sample; distributions.distribution"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_the_emulator_never_imports_calibrate():
     for path in (ROOT / "src" / "emulator").rglob("*.py"):
         assert not re.search(r"^\s*(from|import) calibrate", path.read_text(), re.M), path

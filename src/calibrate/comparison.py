@@ -22,10 +22,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import arviz_stats
 import numpy as np
 import xarray as xr
 
+from calibrate.arviz import stats
 from emulator.errors import InputError
 
 SURE = 2.0  # standard errors of a difference that is taken for one
@@ -98,8 +98,8 @@ def compare(trees: Mapping[str, xr.DataTree]) -> Comparison:
         # ArviZ's own warning of influential data; they are counted below.
         warnings.simplefilter("ignore", UserWarning)
         for name, tree in trees.items():
-            scores[name] = arviz_stats.loo(_all_data(name, tree), pointwise=True)
-        table = arviz_stats.compare(scores, round_to="none")
+            scores[name] = stats.loo(_all_data(name, tree), pointwise=True)
+        table = stats.compare(scores, round_to="none")
     models = []
     for name, row in table.iterrows():
         score, attributes = scores[name], trees[name].attrs

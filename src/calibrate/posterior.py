@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import arviz_stats
 import jax
 import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
+from calibrate.arviz import stats
 from calibrate.diagnosis import diagnose
 from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.observations.present import missing_values
@@ -66,7 +66,7 @@ class Posterior:
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
         """Per parameter: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
         draws = self.tree["posterior"].to_dataset()
-        bulk, tail = arviz_stats.ess(draws, method="bulk"), arviz_stats.ess(draws, method="tail")
+        bulk, tail = stats.ess(draws, method="bulk"), stats.ess(draws, method="tail")
         edge = 0.5 * (1.0 - probability)
         table = {}
         for name, values in self.draws().items():

@@ -25,15 +25,11 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from arviz_stats.ecdf_utils import (
-    compute_ecdf,
-    get_pointwise_confidence_band,
-    simulate_confidence_bands,
-)
 from scipy.stats import beta
 from tqdm import tqdm
 
 from calibrate import predictions
+from calibrate.arviz import ecdf_utils
 from calibrate.posterior import sample
 from calibrate.statistical_model import Model
 from emulator.errors import InputError
@@ -92,7 +88,11 @@ class Calibration:
         u = self.ranks[name]
         x = np.arange(1, len(u)) / len(u)
         pointwise = _pointwise(len(u), probability)
-        return Band(x, compute_ecdf(u, x), *get_pointwise_confidence_band(pointwise, len(u), x))
+        return Band(
+            x,
+            ecdf_utils.compute_ecdf(u, x),
+            *ecdf_utils.get_pointwise_confidence_band(pointwise, len(u), x),
+        )
 
     def outside(self, probability: float = 0.95) -> dict[str, float]:
         r"""Distance of each quantity's function from its band, 0 inside.
@@ -140,7 +140,9 @@ class Calibration:
 def _pointwise(count: int, probability: float) -> float:
     """Probability of the pointwise bands that hold together with ``probability``."""
     x, rng = np.arange(1, count) / count, np.random.default_rng(0)
-    return float(simulate_confidence_bands(count, 1, x, probability, _BAND_SIMULATIONS, rng))
+    return float(
+        ecdf_utils.simulate_confidence_bands(count, 1, x, probability, _BAND_SIMULATIONS, rng)
+    )
 
 
 def _fraction(hits: np.ndarray, probability: float) -> tuple[float, float, float]:

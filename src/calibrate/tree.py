@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import arviz_base
 import jax
 import numpy as np
 import xarray as xr
 
 from calibrate import predictions
+from calibrate.arviz import base
 from calibrate.observations import Observations
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
@@ -52,7 +52,7 @@ def make_tree(
             more[group] |= {name: more[group][name][..., None] for name in single}
         groups.update(more)
     likelihood = groups.pop("log_likelihood", None)
-    tree = arviz_base.from_dict(groups, dims=dims, coords=coords)
+    tree = base.from_dict(groups, dims=dims, coords=coords)
     if likelihood is not None:
         tree["log_likelihood"] = xr.DataTree(_likelihood(likelihood, data, dims, coords))
         replicated = tree["posterior_predictive"].to_dataset()
@@ -89,7 +89,7 @@ def _likelihood(
         name: dims[name] for name in values if name in dims and values[name].ndim == full[name]
     }
     used = {name for names in pointwise.values() for name in names}
-    return arviz_base.dict_to_dataset(
+    return base.dict_to_dataset(
         dict(values), dims=pointwise, coords={n: c for n, c in coords.items() if n in used}
     )
 

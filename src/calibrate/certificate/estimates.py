@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from arviz_stats.base import array_stats
 from scipy.stats import chi2
 
+from calibrate.arviz import array_stats
 from calibrate.certificate.correction import Correction
 from calibrate.certificate.evidence import Changes, Figure, Physics, Sampling, Tail
 from calibrate.certificate.moments import jackknife, moments

@@ -16,8 +16,8 @@ from calibrate.cli.compiled import VARIABLE, keep_programs
 from emulator.errors import InputError, SolverError
 
 
-def build_parser() -> Parser:
-    """The parser with every command."""
+def build_parser(only: str | None = None) -> Parser:
+    """The parser with every command, or with ``only`` one: the others' modules cost imports."""
     parser = Parser(prog="calibrate", description="Bayesian calibration of soft-tissue models.")
     parser.add_argument(
         "--no-cache",
@@ -28,15 +28,25 @@ def build_parser() -> Parser:
     chosen = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND", parser_class=Parser
     )
-    for module in pkgutil.iter_modules(commands.__path__):
-        importlib.import_module(f"{commands.__name__}.{module.name}").register(chosen)
+    for name in command_names() if only is None else [only]:
+        importlib.import_module(f"{commands.__name__}.{name}").register(chosen)
     return parser
+
+
+def command_names() -> list[str]:
+    """One command a module."""
+    return [module.name for module in pkgutil.iter_modules(commands.__path__)]
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
-        arguments = build_parser().parse_args(words)
+        words = sys.argv[1:] if words is None else words
+        first = next((word for word in words if not word.startswith("-")), None)
+        known = command_names()
+        if first is not None and first not in known:
+            raise InputError(f"'{first}' is no command; there are {', '.join(known)}")
+        arguments = build_parser(first).parse_args(words)
         if not arguments.no_cache:
             keep_programs()
         return arguments.run(arguments)

@@ -18,7 +18,7 @@ import jax
 
 VARIABLE = "CALIBRATE_CACHE"
 LARGEST = 1 << 30  # bytes; the programs used longest ago go first
-_LEAST_SECONDS = 0.2  # of compilation that are worth a file
+_LEAST_SECONDS = 0.0  # of compilation that are worth a file: a hundred small programs take 2 s
 
 
 def keep_programs(environment: Mapping[str, str] = os.environ) -> Path | None:

@@ -19,10 +19,10 @@ from typing import Any, ClassVar, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from arviz_stats.base import array_stats
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
+from calibrate.arviz import array_stats
 from calibrate.samplers.density import Density
 from calibrate.samplers.options import check_counts
 from calibrate.samplers.protocol import Context, Draws

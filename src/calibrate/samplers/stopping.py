@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from arviz_stats.base import array_stats
+
+from calibrate.arviz import array_stats
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
 _FEWEST = 8  # draws of a single chain: two in each quarter

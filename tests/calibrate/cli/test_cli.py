@@ -173,7 +173,7 @@ def test_bad_meshes_in_scene_files(capsys, block):
         ),
         (["simulate", "published:OnceClampedBeam"], "with --root DIR"),
         (["simulate"], "SCENE"),
-        (["dance"], "invalid choice: 'dance'"),
+        (["dance"], "'dance' is no command"),
         (["train", "liver", "--objective", "luck", "--out", "e"], "invalid choice: 'luck'"),
         (
             ["train", "once_clamped_beam", "--budget", "soon", "--out", "x"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments, check_vtu, emit
@@ -31,6 +32,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve at one theta and print status and key figures."""
+    import jax
     import numpy as np
 
     from emulator.catalogue import find_scene
@@ -46,10 +48,12 @@ def run(arguments: argparse.Namespace) -> int:
     simulator = Simulator(scene, NewtonOptions.load_steps(arguments.load_steps))
     solution = simulator.solve(theta)
     status = Status(int(solution.status))
-    J = np.asarray(volume_ratio(scene, solution.displacement))
+    J = np.asarray(jax.jit(partial(volume_ratio, scene))(solution.displacement))
     # A follower pressure on an open patch has no potential energy.
     open_patch = not all(load.has_potential for load in scene.loads)
-    energy = None if open_patch else float(potential_energy(scene)(solution.displacement, theta))
+    energy = None
+    if not open_patch:
+        energy = float(jax.jit(potential_energy(scene))(solution.displacement, theta))
     stable = None
     if status is Status.CONVERGED and not open_patch:
         stable = simulator.is_stable(solution.displacement, theta)

@@ -1,0 +1,53 @@
+from .certificate import Certificate, certify, reweight
+from .comparison import compare
+from .joint_prior import Dependence, JointPrior
+from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
+from .observations import (
+    CavityVolume,
+    MeasuredParameter,
+    landmarks,
+    length_between,
+    nodal_displacements,
+    segment_strains,
+    strains,
+    surface_points,
+)
+from .population import Population, population_of_fits
+from .posterior import Posterior, sample
+from .priors import box_prior, log_normal, truncated, truncated_normal
+from .samplers import NUTSOptions
+from .statistical_model import Model, model
+
+__version__: str
+
+__all__ = [
+    "CavityVolume",
+    "Certificate",
+    "CorrelatedNoise",
+    "Dependence",
+    "DiscrepancyNoise",
+    "GaussianNoise",
+    "JointPrior",
+    "MeasuredParameter",
+    "Model",
+    "NUTSOptions",
+    "Population",
+    "Posterior",
+    "StudentTNoise",
+    "box_prior",
+    "certify",
+    "compare",
+    "landmarks",
+    "length_between",
+    "log_normal",
+    "model",
+    "nodal_displacements",
+    "population_of_fits",
+    "reweight",
+    "sample",
+    "segment_strains",
+    "strains",
+    "surface_points",
+    "truncated",
+    "truncated_normal",
+]

@@ -1,0 +1,35 @@
+from . import fem, scenes
+from .catalogue import find_scene
+from .errors import InputError, SolverError
+from .fem import NewtonOptions, Simulator, Solution, Status
+from .fem.functional import potential_energy
+from .scenes import Parameter, Scene, Support
+from .surrogates import Emulator, load, save_emulator, shipped
+from .surrogates.fem import FEMForward, fem_forward
+from .surrogates.protocol import ForwardMap, Prediction
+
+__version__: str
+
+__all__ = [
+    "Emulator",
+    "FEMForward",
+    "ForwardMap",
+    "InputError",
+    "NewtonOptions",
+    "Parameter",
+    "Prediction",
+    "Scene",
+    "Simulator",
+    "Solution",
+    "SolverError",
+    "Status",
+    "Support",
+    "fem",
+    "fem_forward",
+    "find_scene",
+    "load",
+    "potential_energy",
+    "save_emulator",
+    "scenes",
+    "shipped",
+]
