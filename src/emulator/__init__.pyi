@@ -7,6 +7,7 @@ from .scenes import Parameter, Scene, Support
 from .surrogates import Emulator, load, save_emulator, shipped
 from .surrogates.fem import FEMForward, fem_forward
 from .surrogates.protocol import ForwardMap, Prediction
+from .surrogates.released_network import released_network
 
 __version__: str
 
@@ -29,6 +30,7 @@ __all__ = [
     "find_scene",
     "load",
     "potential_energy",
+    "released_network",
     "save_emulator",
     "scenes",
     "shipped",

@@ -72,9 +72,9 @@ class PublishedTests:
 Shape = tuple[int | None, ...]
 
 
-def _array(root: str | Path, model: str, part: str, shape: Shape | None = None) -> np.ndarray:
+def read_array(root: str | Path, model: str, part: str, shape: Shape | None = None) -> np.ndarray:
     """A finite array of the given shape, ``None`` standing for any length."""
-    path = _folder(root, model) / part
+    path = folder_of(root, model) / part
     if not path.is_file():
         raise InputError(f"published data: {path} is missing; {_remedy(root, model)}")
     try:
@@ -95,25 +95,27 @@ def _array(root: str | Path, model: str, part: str, shape: Shape | None = None) 
     return array
 
 
-def _array_if_there(root: str | Path, model: str, part: str, shape: Shape) -> np.ndarray | None:
-    return _array(root, model, part, shape) if (_folder(root, model) / part).is_file() else None
+def read_array_if_there(root: str | Path, model: str, part: str, shape: Shape) -> np.ndarray | None:
+    """The array, or ``None`` where the release has no such file."""
+    there = (folder_of(root, model) / part).is_file()
+    return read_array(root, model, part, shape) if there else None
 
 
-def _folder(root: str | Path, model: str) -> Path:
+def folder_of(root: str | Path, model: str) -> Path:
     """Folder of ``model`` in the release's folder ``data`` or in a clone of the whole release."""
     inside = Path(root) / "data" / model
     return inside if inside.is_dir() else Path(root) / model
 
 
 def _remedy(root: str | Path, model: str) -> str:
-    if _folder(root, model).is_dir():
+    if folder_of(root, model).is_dir():
         return "the clone lacks it, perhaps for its size: fetch that file"
     return f"give the folder that holds {model}/"
 
 
 def models_in(root: str | Path) -> tuple[str, ...]:
     """Released models whose folder is in ``root``."""
-    return tuple(model for model in UNITS if _folder(root, model).is_dir())
+    return tuple(model for model in UNITS if folder_of(root, model).is_dir())
 
 
 def units(model: str) -> PublishedUnits:
@@ -126,21 +128,21 @@ def units(model: str) -> PublishedUnits:
 def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
     """The mesh of ``model`` in mm, with node set ``held`` and, if released, the pressed facets."""
     scale, folder = units(model).length, "geometryData"
-    nodes = _array(root, model, f"{folder}/reference-coords.npy", (None, 3)) * scale
-    elements = _array(root, model, f"{folder}/elements.npy", (None, 4)).astype(np.int64)
+    nodes = read_array(root, model, f"{folder}/reference-coords.npy", (None, 3)) * scale
+    elements = read_array(root, model, f"{folder}/elements.npy", (None, 4)).astype(np.int64)
     if elements.min() < 0 or elements.max() >= len(nodes):
         raise InputError(f"published data: elements of {model} name nodes there are none of")
-    interior = _array(root, model, f"{folder}/interior-points.npy").reshape(-1)
+    interior = read_array(root, model, f"{folder}/interior-points.npy").reshape(-1)
     if len(interior) != len(nodes):
         raise InputError(
             f"published data: {model} marks {len(interior)} nodes but has {len(nodes)}"
         )
     held = np.flatnonzero(~interior.astype(bool))
-    moved = _array_if_there(root, model, f"{folder}/disp-add.npy", nodes.shape)
+    moved = read_array_if_there(root, model, f"{folder}/disp-add.npy", nodes.shape)
     displacement = np.zeros((len(held), 3)) if moved is None else moved[held] * scale
     # The release does not orient its elements and facets.
     elements = orient(nodes, elements)
-    pressed = _array_if_there(root, model, f"{folder}/pressure-surface-facets.npy", (None, 4))
+    pressed = read_array_if_there(root, model, f"{folder}/pressure-surface-facets.npy", (None, 4))
     facets = {}
     if pressed is not None:
         surface = boundary_facets(elements)
@@ -152,7 +154,7 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
                 f"of {model} are not on the surface of its elements"
             )
         facets[PRESSURE_SURFACE] = surface[inside]
-    fibres = _array_if_there(
+    fibres = read_array_if_there(
         root, model, f"{folder}/fibre-field-elementwise.npy", (len(elements), 3, 1)
     )
     if fibres is not None:
@@ -165,11 +167,11 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
 def read_tests(root: str | Path, model: str) -> PublishedTests:
     """The test solutions of ``model``."""
     unit, folder = units(model), "simulationData/test"
-    theta = _array(root, model, f"{folder}/theta.npy", (None, None))
+    theta = read_array(root, model, f"{folder}/theta.npy", (None, None))
     shape = (len(theta), None, 3)
-    displacement = _array_if_there(root, model, f"{folder}/displacement.npy", shape)
+    displacement = read_array_if_there(root, model, f"{folder}/displacement.npy", shape)
     return PublishedTests(
         theta=theta,
-        energy=_array(root, model, f"{folder}/pe-values.npy", (len(theta),)) * unit.energy,
+        energy=read_array(root, model, f"{folder}/pe-values.npy", (len(theta),)) * unit.energy,
         displacement=None if displacement is None else displacement * unit.length,
     )

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from emulator.errors import InputError
 from emulator.mechanics.laws import find_law
@@ -97,6 +98,10 @@ def published_tests(model: str, root: str | Path) -> tuple[jax.Array, PublishedT
     tests = read_tests(root, model)
     if tests.theta.shape[1] != len(parameters):
         raise InputError(f"published model '{model}': theta has shape {tests.theta.shape}")
+    return jnp.asarray(tests.theta) * theta_units(model), tests
+
+
+def theta_units(model: str) -> np.ndarray:
+    """Factors (p,) from the stored theta to the scene's."""
     stress = units(model).stress
-    scale = jnp.array([stress if parameter.unit == "kPa" else 1.0 for parameter in parameters])
-    return jnp.asarray(tests.theta) * scale, tests
+    return np.array([stress if p.unit == "kPa" else 1.0 for p in _find(model).parameters])

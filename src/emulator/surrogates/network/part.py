@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from emulator.scenes.parameter_space import ParameterSpace
 from emulator.scenes.scene import Scene
 from emulator.store import fill_tree, inside, named_leaves
 from emulator.surrogates.network.graph import AugmentedGraph
@@ -31,6 +32,22 @@ _TO_UNIT_SD = 12.0**0.5
 
 
 @dataclass(frozen=True, eq=False)
+class Standardisation:
+    """Theta as a network takes it that was trained on ``(theta - mean) / sd``.
+
+    space : the parameters, in whose units mean and sd (p,) are.
+    """
+
+    space: ParameterSpace
+    mean: np.ndarray
+    sd: np.ndarray
+
+    def __call__(self, position: jax.Array) -> jax.Array:
+        """Standardised theta (..., p) at positions (..., p) in the unit box."""
+        return (self.space.from_unit(position) - self.mean) / self.sd
+
+
+@dataclass(frozen=True, eq=False)
 class Network:
     """A graph network with its graph and weights.
 
@@ -42,6 +59,7 @@ class Network:
     weights : state of the network, an NNX ``State``.
     scale : (3,) mm, of the network's output.
     basis : (f, n, 3) in units of ``scale``, modes given to a separable decoder.
+    standardisation : of theta, for a network that takes theta in place of its position in the box.
     """
 
     architecture: Architecture
@@ -50,6 +68,7 @@ class Network:
     weights: nnx.State
     scale: np.ndarray
     basis: np.ndarray
+    standardisation: Standardisation | None = None
 
     @cached_property
     def definition(self) -> nnx.GraphDef:
@@ -59,6 +78,8 @@ class Network:
 
     def normalise(self, position: jax.Array) -> jax.Array:
         """Positions (..., p) in the unit box as the network takes them, float32."""
+        if self.standardisation is not None:
+            return self.standardisation(position).astype(jnp.float32)
         return ((position - 0.5) * _TO_UNIT_SD).astype(jnp.float32)
 
     def prepare(self, weights: nnx.State) -> tuple[Decoder, jax.Array]:
@@ -102,6 +123,8 @@ class Network:
             "scale": self.scale,
             "basis": self.basis,
         }
+        if self.standardisation is not None:
+            tree["theta"] = {"mean": self.standardisation.mean, "sd": self.standardisation.sd}
         return named_leaves(tree)
 
     def to_json(self) -> dict[str, Any]:
@@ -116,11 +139,25 @@ class Network:
         architecture = Architecture.from_json(description["architecture"])
         graph = AugmentedGraph(**inside(arrays, "graph"), real=len(scene.mesh.nodes))
         basis, parameters = arrays["basis"], len(scene.parameters)
-        state = nnx.state(_outline(architecture, graph, parameters, len(basis)))
-        weights = inside(arrays, "weights")
-        pure = fill_tree(nnx.to_pure_dict(state), weights, "the emulator's network")
-        nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))
-        return cls(architecture, parameters, graph, state, widened(arrays["scale"]), basis)
+        state = filled(architecture, graph, parameters, basis, inside(arrays, "weights"))
+        theta = {name: widened(values) for name, values in inside(arrays, "theta").items()}
+        standardisation = Standardisation(scene.space, **theta) if theta else None
+        scale = widened(arrays["scale"])
+        return cls(architecture, parameters, graph, state, scale, basis, standardisation)
+
+
+def filled(
+    architecture: Architecture,
+    graph: AugmentedGraph,
+    parameters: int,
+    basis: np.ndarray,
+    weights: Mapping[str, np.ndarray],
+) -> nnx.State:
+    """The network's state with ``weights`` by name; :class:`InputError` where one does not fit."""
+    state = nnx.state(_outline(architecture, graph, parameters, len(basis)))
+    pure = fill_tree(nnx.to_pure_dict(state), weights, "the emulator's network")
+    nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))
+    return state
 
 
 def fresh(

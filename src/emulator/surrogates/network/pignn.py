@@ -39,6 +39,8 @@ class Architecture:
     hidden : widths of each network's hidden layers.
     decoder : ``pointwise``, Algorithm 1's, or ``separable``.
     modes : learned modes of the separable decoder.
+    edge_sum : of a node's edges in its final state: ``antisymmetric``, Algorithm 1's, or over the
+        edges it ``receives``, as the released code has it.
     """
 
     steps: int = 5
@@ -46,10 +48,13 @@ class Architecture:
     hidden: tuple[int, ...] = (128, 128)
     decoder: Literal["pointwise", "separable"] = "pointwise"
     modes: int = 16
+    edge_sum: Literal["antisymmetric", "receives"] = "antisymmetric"
 
     def __post_init__(self) -> None:
         if self.decoder not in ("pointwise", "separable"):
             raise InputError(f"decoder '{self.decoder}': use pointwise or separable")
+        if self.edge_sum not in ("antisymmetric", "receives"):
+            raise InputError(f"edge sum '{self.edge_sum}': use antisymmetric or receives")
 
     @classmethod
     def from_json(cls, description: Mapping[str, Any]) -> Self:
@@ -85,6 +90,12 @@ def antisymmetric_sum(messages: jax.Array, graph: AugmentedGraph) -> jax.Array:
     return zero.at[graph.receivers].add(messages).at[graph.senders].add(-messages)
 
 
+def received_sum(messages: jax.Array, graph: AugmentedGraph) -> jax.Array:
+    """Sum at each node (N, M) of the messages (E, M) it receives."""
+    zero = jnp.zeros((len(graph.node_features), messages.shape[1]), messages.dtype)
+    return zero.at[graph.receivers].add(messages)
+
+
 class Processor(nnx.Module):
     """Geometry to the state of each mesh node, for all theta alike."""
 
@@ -98,6 +109,7 @@ class Processor(nnx.Module):
             [MessagePassing(architecture, rngs) for _ in range(architecture.steps)]
         )
         self.norm = nnx.LayerNorm(2 * M, param_dtype=jnp.float32, rngs=rngs)
+        self.edge_sum = architecture.edge_sum
 
     def __call__(self, graph: AugmentedGraph) -> jax.Array:
         """States (n, 2M) of the mesh nodes."""
@@ -105,7 +117,8 @@ class Processor(nnx.Module):
         edges = self.encode_edge(jnp.asarray(graph.edge_features))
         for one_round in self.rounds:
             nodes, edges = _recomputed(one_round, nodes, edges, graph)
-        state = jnp.concatenate([nodes, antisymmetric_sum(edges, graph)], axis=1)
+        summed = antisymmetric_sum if self.edge_sum == "antisymmetric" else received_sum
+        state = jnp.concatenate([nodes, summed(edges, graph)], axis=1)
         return self.norm(state[: graph.real])
 
 
