@@ -30,6 +30,7 @@ QUICK = {
     "objectives": "--quick",
     "poor_emulators": "--quick",
     "published_pressure": "--quick",
+    "released_networks": "--quick --published PUBLISHED",
     "sbc": "--replicates 20 --only map",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half",
@@ -149,6 +150,16 @@ def published_pressure(results):
     assert a["published"] > a["exact"]
 
 
+def released_networks(results):
+    models = {row["model"]: row for row in results["models"]}
+    assert len(models) == 3
+    assert max(row["off_the_released_code"] for row in models.values()) < 1e-6
+    assert models["TwistingBeam"]["err_u_stored_mm"] == pytest.approx(9.4e-5, abs=0.05e-5)
+    network, ours = results["cases"]
+    shifts = [max(abs(v) for v in row["shift_sd"].values()) for row in (network, ours)]
+    assert shifts[0] > shifts[1]
+
+
 def sbc(results):
     (case,) = results["cases"]
     assert case["status"] == "not calibrated"
@@ -189,6 +200,7 @@ CHECKS = {
         objectives,
         poor_emulators,
         published_pressure,
+        released_networks,
         sbc,
         stability,
         transfer,

@@ -77,7 +77,7 @@ def test_errors_of_the_ventricle_against_our_fem(published):
     assert solved.converged.all()
     found = jax.jit(jax.vmap(emulator.cache()))(thetas)
     err_u = np.median(np.linalg.norm(found - solved.displacement, axis=-1))
-    assert err_u == pytest.approx(2.96e-2, abs=0.005e-2)
+    assert err_u == pytest.approx(3.0e-2, abs=0.05e-2)
     energy = jax.jit(jax.vmap(em.potential_energy(emulator.scene)))(found, thetas)
     err_pi = 100.0 * np.median(np.abs((energy - tests.energy) / tests.energy))
     assert err_pi == pytest.approx(1.2e-2, abs=0.05e-2)
