@@ -112,7 +112,7 @@ def posteriors(root: Path, quick: bool, keep: Any) -> list[dict[str, Any]]:
                     "name": f"{name}, noise {noise:g} mm",
                     "map": name,
                     "noise_mm": noise,
-                    "verdict": certificate.verdict,
+                    "status": certificate.verdict,
                     "reason": certificate.reason,
                     "shift_sd": {n: f.value for n, f in certificate.evidence.draws.shift.items()},
                     "shift_error": {
@@ -149,7 +149,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             axes.errorbar(
                 x, list(row["shift_sd"].values()), yerr=list(row["shift_error"].values()),
                 color=colour, marker=marker, linestyle="none", capsize=3,
-                label=f"{row['map']}: {row['verdict']}",
+                label=f"{row['map']}: {row['status']}",
             )  # fmt: skip
         axes.axhline(0.0, color="black", lw=1)
         axes.set_xticks(range(len(row["shift_sd"])), list(row["shift_sd"]))

@@ -48,7 +48,7 @@ def run(problem, name, **more):
 
 @pytest.mark.parametrize(
     "name",
-    [n if n in ("nuts", "smc") else pytest.param(n, marks=pytest.mark.slow) for n in SAMPLERS],
+    [n if n == "nuts" else pytest.param(n, marks=pytest.mark.slow) for n in SAMPLERS],
 )
 def test_a_killed_run_goes_on_to_the_same_draws(name, problem, monkeypatch, tmp_path):
     """Killed early, in the pilot run or the first population, in the middle and at the end."""

@@ -41,6 +41,7 @@ def sds_off(posterior, exact, data):
     return (draws.mean(axis=1) - mean) / sd, draws.std(axis=1) / sd, ess
 
 
+@pytest.mark.slow  # test_samplers has the map that is not biased
 def test_a_biased_cheap_map_leaves_fem_s_posterior_exact(beam, biased):
     exact, model, data = biased
     posterior = cal.sample(

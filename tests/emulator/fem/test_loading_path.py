@@ -145,7 +145,8 @@ def test_sensitivities_without_pressure_are_finite(ventricle_simulator):
     np.testing.assert_allclose(together[..., -1], columns[-1], atol=1e-9)
 
 
-@pytest.mark.parametrize("shift", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shift", [0.0, 0.3])
 def test_a_block_without_weight(shift):
     """It rests, or goes where its supports take it; from any start."""
     scene = replace(

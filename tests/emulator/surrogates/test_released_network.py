@@ -49,7 +49,9 @@ def clone(published, tmp_path):
     return tmp_path, path, weights
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    "model", [m if m == "TwistingBeam" else pytest.param(m, marks=pytest.mark.slow) for m in MODELS]
+)
 def test_predictions_are_those_of_the_released_code(published, model):
     emulator = released_network(model, published)
     thetas, _ = published_tests(model, published)
