@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from calibrate.cli import build_parser
 from calibrate.noise.registry import KINDS as NOISES
 from calibrate.observations.registry import KINDS as OBSERVATIONS
 from calibrate.samplers.registry import SAMPLERS
@@ -117,6 +118,7 @@ def test_laws_and_commands_are_found_in_their_folders():
     text = (ROOT / "src/calibrate/cli/__init__.py").read_text(encoding="utf-8")
     names = {path.stem for path in commands.glob("*.py")} - {"__init__"}
     assert {"infer", "certify"} <= names
+    assert names == set(build_parser()._subparsers._group_actions[0].choices)
     assert not [name for name in names if re.search(rf"\b{name}\b", text)]
 
 

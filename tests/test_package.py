@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import calibrate
 import emulator
 
@@ -18,31 +20,27 @@ def test_what_the_readme_imports_is_there():
             assert getattr(module, name) is not None
 
 
-def test_importing_turns_on_float64_and_nothing_else():
-    code = (
-        "import os, jax; before = dict(os.environ); import emulator;"
-        "assert jax.config.jax_enable_x64; assert dict(os.environ) == before;"
-        "import sys; assert 'matplotlib' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_importing_loads_nothing_but_jax():
-    """The libraries behind it take seconds, and are imported by what needs them."""
-    code = (
-        "import sys, calibrate;"
-        "slow = {'numpyro', 'blackjax', 'arviz_stats', 'flax', 'sklearn', 'skfem', 'xarray'};"
-        "assert not slow & set(sys.modules), slow & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_arviz_may_be_imported_first():
-    """It puts a lazy module in NumPyro's place (calibrate.arviz)."""
-    code = (
-        "import arviz_base, calibrate; from numpyro import distributions;"
-        "calibrate.sample; distributions.distribution"
-    )
+@pytest.mark.parametrize(
+    "code",
+    [
+        pytest.param(
+            "import os, sys, jax; before = dict(os.environ); import emulator, calibrate;"
+            "assert jax.config.jax_enable_x64; assert dict(os.environ) == before;"
+            # The libraries behind it take seconds, and are imported by what needs them.
+            "slow = {'matplotlib', 'numpyro', 'blackjax', 'arviz_stats', 'flax', 'sklearn',"
+            "        'skfem', 'xarray'};"
+            "assert not slow & set(sys.modules), slow & set(sys.modules)",
+            id="importing turns on float64, loads JAX and does nothing else",
+        ),
+        pytest.param(
+            # ArviZ puts a lazy module in NumPyro's place (calibrate.arviz).
+            "import arviz_base, calibrate; from numpyro import distributions;"
+            "calibrate.sample; distributions.distribution",
+            id="ArviZ may be imported first",
+        ),
+    ],
+)
+def test_in_a_fresh_process(code):
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

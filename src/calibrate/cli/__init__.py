@@ -15,12 +15,14 @@ from calibrate.cli.common import BAD_INPUT, FAILED, Parser
 from calibrate.cli.compiled import VARIABLE, keep_programs
 from emulator.errors import InputError, SolverError
 
+_NO_CACHE = "--no-cache"
+
 
 def build_parser(only: str | None = None) -> Parser:
     """The parser with every command, or with ``only`` one: the others' modules cost imports."""
     parser = Parser(prog="calibrate", description="Bayesian calibration of soft-tissue models.")
     parser.add_argument(
-        "--no-cache",
+        _NO_CACHE,
         action="store_true",
         help="neither use nor keep compiled programs; otherwise they are in the user's cache "
         f"folder, or in {VARIABLE}",
@@ -42,11 +44,11 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
         words = sys.argv[1:] if words is None else words
-        first = next((word for word in words if not word.startswith("-")), None)
-        known = command_names()
-        if first is not None and first not in known:
+        first, known = next((word for word in words if word != _NO_CACHE), "-"), command_names()
+        option = first.startswith("-")
+        if not option and first not in known:
             raise InputError(f"'{first}' is no command; there are {', '.join(known)}")
-        arguments = build_parser(first).parse_args(words)
+        arguments = build_parser(None if option else first).parse_args(words)
         if not arguments.no_cache:
             keep_programs()
         return arguments.run(arguments)

@@ -67,8 +67,12 @@ def supports_met(system: System, u: jax.Array, level: jax.Array) -> jax.Array:
 def newton_direction(system: System, theta: jax.Array, state: NewtonState) -> Direction:
     """Newton's step at ``state``, reversed where it would climb the potential."""
     settled = supports_met(system, state.u, state.level)
-    linearised = _on_displacements if state.volumes is None else _on_volumes
-    tangent, solvable, residual, pull, condensed = linearised(system, theta, state, settled)
+    linearised = (
+        _on_displacements(system, theta, state, settled)
+        if state.volumes is None
+        else _on_volumes(system, theta, state)
+    )
+    tangent, solvable, residual, pull, condensed = linearised
     move, slope, singular = _full_step(
         system, state.u, state.level, tangent, solvable, residual, pull, settled
     )
@@ -138,10 +142,9 @@ def _pull(
 
 @compiled
 def _on_volumes(
-    system: System, theta: jax.Array, state: NewtonState, settled: jax.Array
+    system: System, theta: jax.Array, state: NewtonState
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Condensed]:
     """The same with the volumes of mean dilatation eliminated, and their linearisation."""
-    del settled
     assert state.volumes is not None
     u, level = state.u, state.level
     offset = support_offset(system, u, level)

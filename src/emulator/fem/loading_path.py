@@ -66,10 +66,10 @@ _RAMPS = (_Ramp(1.0, 0.0, 8), _Ramp(0.5, 0.25, 12), _Ramp(0.25, 0.125, 20), _Ram
 _CARRIED = 0.9
 # First level and largest increment of the climb where all ramps are lost (docs/experiments.md,
 # "Several equilibria in the soft corner").
-_TENTH = 0.1
+_TENTH = np.float64(0.1)
 _FIRST_LEVELS = np.array([*(ramp.first for ramp in _RAMPS), _TENTH])  # by route
 # Load increment below which the climb takes steps that are not convex.
-_CAREFUL = 1.0 / 40.0
+_CAREFUL = np.float64(1.0 / 40.0)
 _SHORT = 15  # iterations of Newton's method that a route may take, unless it is the last
 
 
@@ -121,7 +121,8 @@ class LoadingPath:
         newton = self._newton.begin(start)
         # A load increment of the caller's choice is meant to be followed from rest.
         warm = _warm(newton, ramps=self.ramps) & (self.options.increment == 1.0)
-        route = jnp.where(warm, Route.WARM, Route.RAMP if self.ramps else Route.CLIMB)
+        cold = np.int64(Route.RAMP if self.ramps else Route.CLIMB)
+        route = jnp.where(warm, Route.WARM, cold)
 
         def stay() -> PathState:
             mip = self._mip(jnp.ones(())).begin(newton.u) if self.ramps else None
@@ -140,11 +141,12 @@ class LoadingPath:
         level, lost, leaves = _judged(
             state.level, state.route, state.on_ramp, mip.error, mip.fraction, mip.definite
         )
-        counts = _counted(state.newton.iterations, state.newton.factorisations, state.on_ramp)
-        iterations, factorisations, on_ramp = counts
-        newton = state.newton._replace(iterations=iterations, factorisations=factorisations)
+        newton = state.newton
+        newton = newton._replace(
+            iterations=newton.iterations + 1, factorisations=newton.factorisations + 1
+        )
         newton = newton._replace(status=_limited(newton, self.options.max_iterations))
-        after = state._replace(newton=newton, mip=mip, level=level, on_ramp=on_ramp)
+        after = state._replace(newton=newton, mip=mip, level=level, on_ramp=state.on_ramp + 1)
 
         def enter() -> PathState:
             u = jnp.where(lost, 0.0, mip.u)
@@ -214,11 +216,6 @@ def _judged(
     lost = ~sound | (~found & (on_ramp + 1 >= steps))
     higher = jnp.minimum(1.0, level + increment)
     return jnp.where(error < _CARRIED, higher, level), lost, lost | found
-
-
-@jax.jit
-def _counted(*counts: jax.Array) -> list[jax.Array]:
-    return [count + 1 for count in counts]
 
 
 def _limited(newton: NewtonState, most: int) -> jax.Array:

@@ -82,7 +82,7 @@ class MipNewton:
 
     def begin(self, u: jax.Array) -> MipState:
         """The state at ``u`` (n, 3) mm that Newton's method would start from."""
-        unknown = jnp.full((), jnp.inf)
+        unknown = jnp.full((), jnp.inf, float)
         return MipState(u, _measures_of(self.system, u), unknown, jnp.ones(()), jnp.array(True))
 
     def step(self, state: MipState, stiffening: jax.Array) -> MipState:

@@ -15,8 +15,6 @@ is factorised already, so the test costs one evaluation of the forces and one ba
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 
@@ -26,26 +24,8 @@ from emulator.fem.mixed import Volumes, advance, carried
 from emulator.fem.programs import compiled
 
 
-def natural_monotonicity(
-    system: System,
-    u: jax.Array,
-    volumes: Volumes,
-    level: jax.Array,
-    theta: jax.Array,
-    direction: Direction,
-) -> Callable[[jax.Array], jax.Array]:
-    """``fraction -> bool``: whether that fraction of ``direction`` passes the test.
-
-    Parameters
-    ----------
-    u, volumes, level, theta : where the step starts.
-    direction : the step, with its tangent and condensed linearisation.
-    """
-    return lambda fraction: _nearer(system, u, volumes, level, theta, direction, fraction)
-
-
 @compiled
-def _nearer(
+def natural_monotonicity(
     system: System,
     u: jax.Array,
     volumes: Volumes,
@@ -54,6 +34,13 @@ def _nearer(
     direction: Direction,
     fraction: jax.Array,
 ) -> jax.Array:
+    """Whether ``fraction`` of ``direction`` passes the test, shape ().
+
+    Parameters
+    ----------
+    u, volumes, level, theta : where the step starts.
+    direction : the step, with its tangent and condensed linearisation.
+    """
     move, at, tangent = direction.move, direction.condensed, direction.tangent
     assert at is not None
     after = advance(system.scene, volumes, at, move, fraction)

@@ -128,7 +128,7 @@ def _first(
     solved = ~inverted & (error <= options.tolerance)
     status = jnp.where(solved, Status.CONVERGED, Status.RUNNING)
     u = jnp.where(fine & ~inverted, start, 0.0)
-    count, increment = jnp.zeros((), dtype=int), jnp.full((), options.increment)
+    count, increment = jnp.zeros((), dtype=int), jnp.full((), options.increment, float)
     return NewtonState(
         u=u,
         volumes=None,
@@ -145,7 +145,7 @@ def _first(
         tangent=jnp.zeros(entries),
         refresh=jnp.array(True),
         convex=jnp.array(True),
-        careful=jnp.full((), jnp.inf),
+        careful=jnp.full((), jnp.inf, float),
         crushed=jnp.array(False),
         singular=jnp.array(False),
         squeezed=count,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -108,8 +109,8 @@ def _searched_step(
     """The part of the step that makes most progress."""
     nearer = None
     if state.volumes is not None:
-        natural = natural_monotonicity(
-            system, state.u, state.volumes, state.level, theta, direction
+        natural = partial(
+            natural_monotonicity, system, state.u, state.volumes, state.level, theta, direction
         )
         # Where round-off is all that is left, it cannot be told from progress.
         drowned = state.error <= options.round_off

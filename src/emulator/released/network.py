@@ -20,6 +20,7 @@ from emulator.released.files import folder_of, read_array, units
 
 _PICKLE = "emulationResults/trainedParameters/{model}/trainedNetworkParams.pkl"
 _FIRST = "params/"
+_DEEPEST = 8  # dictionaries within each other; the released ones have four
 
 
 class ReleasedNetwork(NamedTuple):
@@ -108,13 +109,16 @@ def _from_pickle(path: Path) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: {error}") from error
 
 
-def _leaves(tree: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
+def _leaves(tree: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, np.ndarray]]:
     """Arrays of nested dictionaries, by their joined keys."""
+    name = "/".join(names)
+    if len(names) > _DEEPEST:
+        raise InputError(f"nests more than {_DEEPEST} dictionaries, at '{name}'; it is not read")
     if isinstance(tree, np.ndarray) and tree.dtype.kind == "f":
         yield name, tree
     elif isinstance(tree, dict) and all(isinstance(key, str) for key in tree):
         for key, part in tree.items():
-            yield from _leaves(part, f"{name}/{key}" if name else key)
+            yield from _leaves(part, (*names, key))
     else:
         what = type(tree).__name__
         raise InputError(f"holds a {what} at '{name}'; only arrays by name are read")

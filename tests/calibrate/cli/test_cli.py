@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate.cli import main
+from calibrate.cli import command_names, main
 from calibrate.cli.common import seconds
 from emulator.geometry.bodies.box import box
 from emulator.surrogates.files import SHIPPED, load
@@ -138,6 +138,14 @@ def test_bad_scene_files(capsys, block, old, new, message):
     said = complaint(capsys, "simulate", block)
     assert "scene.toml" in said
     assert message in said
+
+
+@pytest.mark.parametrize("words", [["-h"], ["-h", "simulate"], ["--no-cache", "--help"]])
+def test_help_names_every_command(capsys, words):
+    with pytest.raises(SystemExit):
+        main(words)
+    said = capsys.readouterr().out
+    assert all(f"    {name} " in said or f"    {name}\n" in said for name in command_names())
 
 
 def test_bad_meshes_in_scene_files(capsys, block):

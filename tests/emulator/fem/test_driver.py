@@ -55,6 +55,18 @@ def test_good_tangents_are_kept(beam):
     assert cold.factorisations < cold.iterations
 
 
+@pytest.mark.parametrize("scene", ["beam", "cube"])
+def test_the_residual_of_round_off_is_that_of_a_stretch_by_round_off(scene, request):
+    """A finite stretch stands for the derivative: 1e-15 |K0 X|."""
+    scene = request.getfixturevalue(scene)
+    system, X = em.Simulator(scene).system, jnp.asarray(scene.mesh.nodes)
+    internal = lambda u: system.internal_force(u, scene.centre)
+    _, force = jax.jvp(internal, (0.0 * X,), (X,))
+    newton = Newton(system, em.NewtonOptions(absolute=0.0), scene.centre)
+    expected = 1e-15 * float(jnp.linalg.norm(force))
+    assert float(newton.negligible()) == pytest.approx(expected, rel=1e-4)
+
+
 def test_one_iteration_is_a_function_of_its_state(beam):
     system = em.Simulator(beam).system
     newton = Newton(system, em.NewtonOptions(), beam.centre)

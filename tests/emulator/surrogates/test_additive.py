@@ -199,6 +199,8 @@ def test_an_untrained_network_adds_nothing_to_its_series(beam, simulator):
     np.testing.assert_allclose(emulator(beam.from_unit(x)), expected, atol=1e-12)
 
 
-def test_an_unknown_decoder():
+def test_an_unknown_decoder_or_edge_sum():
     with pytest.raises(em.InputError, match="decoder 'dense': use pointwise or separable"):
         Architecture(decoder="dense")
+    with pytest.raises(em.InputError, match="edge sum 'all': use antisymmetric or receives"):
+        Architecture(edge_sum="all")

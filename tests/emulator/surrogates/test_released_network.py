@@ -138,6 +138,13 @@ class Call:
         return self.function, self.arguments
 
 
+def within_itself():
+    """A dictionary that holds itself."""
+    around = {}
+    around["x"] = around
+    return around
+
+
 def test_a_pickle_that_calls_anything_is_refused(clone, tmp_path):
     folder, path, weights = clone
     mark = tmp_path / "called"
@@ -152,6 +159,7 @@ def test_a_pickle_that_calls_anything_is_refused(clone, tmp_path):
         (np.array([None]), "holds a ndarray at 'params/x'"),
         ([some], "holds a list at 'params/x'"),
         (1.5, "holds a float at 'params/x'"),
+        (within_itself(), "nests more than 8 dictionaries, at 'params/x/x/x"),
         (some.astype(np.int64), "holds a ndarray"),
         (some.astype(float), "is not of finite float32"),
         (np.full(3, np.nan, np.float32), "is not of finite float32"),

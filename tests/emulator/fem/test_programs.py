@@ -1,0 +1,106 @@
+"""Programs of a system: compiled once, and put together alike by Python and inside ``jit``."""
+
+import logging
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.fem.programs import compiled, cond, while_loop
+
+# Of a solve, where the time of compilation goes; the first row is of each system anew.
+OWN = {"forces_at", "safe_tangent", "least_volume_ratio"}
+PARTS = OWN | {"balance", "next_state", "_first", "_astray", "_entered"}
+
+
+class Spring:
+    """A system of equations, as far as programs are concerned."""
+
+    def __init__(self, stiffness):
+        self.stiffness, self.programs, self.traced = stiffness, {}, 0
+
+    @compiled
+    def force(self, u, load=0.0):
+        """stiffness u - load"""
+        self.traced += 1
+        return self.stiffness * u - load
+
+
+@pytest.fixture
+def counted(caplog):
+    """The names of what XLA compiles from now on."""
+    jax.config.update("jax_log_compiles", True)
+
+    def names():
+        found = [r.getMessage() for r in caplog.records if "XLA compilation" in r.getMessage()]
+        return [message.split("of ")[1].split(" in ")[0] for message in found]
+
+    with caplog.at_level(logging.WARNING, logger="jax._src.dispatch"):
+        yield names
+    jax.config.update("jax_log_compiles", False)
+
+
+def test_numbers_and_arrays_are_one_program():
+    spring = Spring(3.0)
+    weak = jax.jit(lambda: 2.0)()
+    assert weak.weak_type
+    for u in (2.0, np.float64(2.0), np.asarray(2.0), jnp.asarray(2.0, float), weak):
+        assert spring.force(u, 1.0) == 5.0
+        assert spring.force(u, load=jnp.ones(())) == 5.0
+    assert spring.traced == 2  # by position and by name
+
+
+def test_each_system_has_its_own():
+    assert [Spring(k).force(1.0) for k in (1.0, 2.0)] == [1.0, 2.0]
+
+
+def test_derivatives_and_jit_go_through():
+    spring = Spring(3.0)
+    assert jax.grad(spring.force)(2.0) == 3.0
+    assert jax.jit(jax.grad(spring.force, argnums=1))(2.0, 1.0) == -1.0
+    np.testing.assert_array_equal(jax.vmap(spring.force)(jnp.arange(3.0)), [0.0, 3.0, 6.0])
+
+
+@pytest.mark.parametrize("decision", [True, False])
+def test_a_decision_known_runs_its_branch_alone(decision):
+    run = []
+
+    def branch(name, sign):
+        return lambda x: run.append(name) or sign * x
+
+    def decided(decision, x):
+        return cond(decision, branch("yes", 1.0), branch("no", -1.0), x)
+
+    expected = 2.0 if decision else -2.0
+    assert decided(jnp.array(decision), 2.0) == expected
+    assert run == ["yes" if decision else "no"]
+    assert jax.jit(decided)(decision, 2.0) == expected
+    assert sorted(run[1:]) == ["no", "yes"]
+
+
+def test_a_loop_is_the_same_in_python_and_inside_jit():
+    def halvings(x, most):
+        return while_loop(
+            lambda state: (state[0] > 1.0) & (state[1] < most),
+            lambda state: (0.5 * state[0], state[1] + 1),
+            (x, 0),
+        )
+
+    x = jnp.asarray(37.0)
+    for most, expected in ((99, 6), (2, 2), (0, 0)):
+        assert halvings(x, most) == jax.jit(halvings)(x, most)
+        assert halvings(x, most)[1] == expected
+        # What is traced may be in the condition alone.
+        assert jax.jit(lambda most: halvings(37.0, most))(most)[1] == expected
+
+
+def test_solves_compile_each_part_once(beam, counted):
+    simulator = em.Simulator(beam)
+    cold = simulator.solve(beam.centre)
+    assert simulator.solve(1.01 * beam.centre).converged
+    assert simulator.solve(1.01 * beam.centre, cold.displacement).converged
+    parts = [name for name in counted() if name[4:-1] in PARTS]
+    assert sorted(parts) == sorted(set(parts))
+    assert {name[4:-1] for name in parts} >= OWN
