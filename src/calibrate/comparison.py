@@ -13,6 +13,16 @@ the scores' own. It asks which model foretells another datum of this kind. The e
 asks which model, *prior included*, expected the data: halving the range of a parameter that the
 data fixes doubles it. Only tempered SMC estimates it. Neither says that the better model is good:
 that is what the misfit in a certificate is for.
+
+Importance sampling fails where single data move the posterior far, as in a model that does not fit.
+Such a model can still lose: a datum is never less likely to the posterior that has seen it,
+
+.. math::
+    p(y_i \mid y_{-i}) = \Big( \mathrm{E}\, \frac{1}{p(y_i \mid \theta)} \Big)^{-1}
+    \le \mathrm{E}\, p(y_i \mid \theta) = p(y_i \mid y),
+
+both means over the posterior, so that the sum of the right side, estimated without weights, is a
+ceiling of elpd.
 """
 
 from __future__ import annotations
@@ -56,6 +66,11 @@ class Compared:
     log_evidence: float | None
     log_evidence_error: float | None
 
+    @property
+    def ceiling(self) -> float:
+        """What elpd is at most: how well the data are predicted by draws that have seen them."""
+        return self.elpd + self.parameters
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -67,17 +82,27 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """What can be said of the best model, in one sentence."""
-        best, second = self.models[:2]
-        gap, error = -second.difference, second.difference_se
-        bad = [model.name for model in self.models if model.unreliable]
+        best, *others = self.models
+        bad = [model.name for model in others if model.unreliable and not self._beaten(model)]
+        if best.unreliable:
+            bad.insert(0, best.name)
         if bad:
             return (
                 f"not decided: single data decide too much in {', '.join(bad)}; "
                 "refit without them, or take noise with heavier tails"
             )
+        second = others[0]
+        if second.unreliable:  # and beaten even so
+            return f"{best.name} predicts better, by at least {best.elpd - second.ceiling:.1f}"
+        gap, error = -second.difference, second.difference_se
         if gap < FEW or gap < SURE * error:
             return f"not decided: {best.name} is ahead by {gap:.1f} +- {error:.1f} only"
         return f"{best.name} predicts better, by {gap:.1f} +- {error:.1f}"
+
+    def _beaten(self, model: Compared) -> bool:
+        """Whether the best model's elpd is above all that ``model``'s can be, beyond its error."""
+        gap = self.models[0].elpd - model.ceiling
+        return gap >= max(FEW, SURE * model.difference_se)
 
 
 def compare(trees: Mapping[str, xr.DataTree]) -> Comparison:

@@ -114,6 +114,24 @@ def test_an_outlier_that_decides_alone_is_named(problems, trees):
     assert found.verdict.startswith("not decided: single data decide too much in spoiled")
 
 
+def test_a_model_that_no_datum_fits_loses_though_its_score_is_unreliable(problems, trees):
+    """Its ceiling, the data given the draws that have seen them, is a closed form here."""
+    models, data = problems
+    hopeless = trees["right"].copy(deep=True)
+    values = hopeless["log_likelihood"]["displacement"].values
+    values[..., 0, 0] -= np.random.default_rng(0).exponential(3.0, values.shape[:2])
+    values -= 60.0
+    found = compare({"right": trees["right"], "hopeless": hopeless})
+    assert found.models[1].unreliable == 1
+    assert found.verdict.startswith("right predicts better, by at least 5")
+    right = found.models[0]
+    assert right.ceiling == pytest.approx(exact_fit(models["right"], data), abs=0.3)
+    # The other way round: a best model whose own score is not to be relied on.
+    hopeless["log_likelihood"]["displacement"].values += 120.0
+    verdict = compare({"right": trees["right"], "hopeless": hopeless}).verdict
+    assert verdict.startswith("not decided: single data decide too much in hopeless")
+
+
 def test_only_models_of_the_same_data(problems, trees):
     right = trees["right"]
     other = right.copy(deep=True)
