@@ -81,11 +81,11 @@ def steps_within(seconds: float, problem: Problem) -> int:
     InputError
         Fewer than a warm-up.
     """
-    plan, network = problem.plan, problem.emulator.network
+    plan = problem.plan
     started = time.perf_counter()
     one = late = _seconds_a_step(problem)
-    if plan.decoder == "separable" and network is not None:
-        late = _seconds_a_step(problem, network.prepare(network.weights)[1])
+    if plan.decoder == "separable":
+        late = _seconds_a_step(problem, *problem.keep(problem.initial()[0]))
     left = 0.98 * seconds - (time.perf_counter() - started)
     early = min(left / one, plan.freeze) if late < one else left / one
     steps = int(early + max(left - early * one, 0.0) / late)

@@ -36,12 +36,13 @@ def optimise(state: State, total: int, advance: Advance, hooks: Sequence[Hook]) 
 class Steps:
     """One step after another of several problems in turn, their weights in common.
 
-    After ``freeze`` steps of a separable decoder, its modes are computed once and kept.
+    After ``freeze`` steps of a separable decoder, what these have learned is computed once and
+    kept.
     """
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self._problems = problems
-        self._kept: dict[int, jax.Array] = {}
+        self._kept: dict[int, tuple[jax.Array, ...]] = {}
 
     def __call__(self, state: State, total: int) -> State:
         """The next step."""
@@ -51,17 +52,15 @@ class Steps:
         plan = problem.plan
         kept: tuple[jax.Array, ...] = ()
         if plan.decoder == "separable" and state.done >= plan.freeze:
-            kept = (self._modes(turn, state),)
+            kept = self._keep(turn, state)
         done, of = jnp.asarray(state.done), jnp.asarray(total)
         weights, optimiser, loss = problem.step(state.weights, state.optimiser, done, of, *kept)
         return State(weights, optimiser, state.done + 1, loss)
 
-    def _modes(self, turn: int, state: State) -> jax.Array:
-        """The decoder's prepared part of problem ``turn``; no later step changes it."""
+    def _keep(self, turn: int, state: State) -> tuple[jax.Array, ...]:
+        """What problem ``turn`` keeps; no later step changes it."""
         if turn not in self._kept:
-            network = self._problems[turn].emulator.network
-            assert network is not None, "only a network has steps"
-            self._kept[turn] = jax.jit(lambda w: network.prepare(w)[1])(state.weights)
+            self._kept[turn] = self._problems[turn].keep(state.weights)
         return self._kept[turn]
 
 

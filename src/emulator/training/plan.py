@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from emulator.errors import InputError
 
-Objective = Literal["energy", "simulations", "gradients", "both"]
+Objective = Literal["energy", "simulations", "gradients", "both", "modes"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
 
@@ -17,8 +17,9 @@ class Plan:
 
     recipe : the name in :data:`RECIPES` it came from, for the record.
     objective : of the network: ``energy`` (no FEM run but the centre), ``simulations``,
-        ``gradients`` (simulations and their deformation gradients), or ``both`` (simulations and
-        energy).
+        ``gradients`` (simulations and their deformation gradients), ``both`` (simulations and
+        energy), or ``modes`` (simulations, their deformation gradients and slopes in theta, all at
+        every step: :mod:`~emulator.training.modal`).
     steps : optimiser steps; without any, which a discrepancy model allows, there is no network.
     simulations : FEM runs to train the network on (not used by ``energy``) and to fit the
         discrepancy model to.
@@ -31,6 +32,7 @@ class Plan:
     decoder : ``pointwise`` or ``separable``.
     modes : mechanical modes given to a separable decoder, at most.
     freeze : step after which a separable decoder keeps its modes and trains its branch alone.
+    polish : iterations of L-BFGS on the branch after the steps, for ``modes``.
     discrepancy : fit a discrepancy model to the FEM runs and their sensitivities.
     checkpoint_every : steps between checkpoints.
     seed : of the weights, the FEM runs' theta, and the batches.
@@ -49,6 +51,7 @@ class Plan:
     decoder: Literal["pointwise", "separable"] = "pointwise"
     modes: int = 40
     freeze: int = 200
+    polish: int = 0
     discrepancy: bool = False
     checkpoint_every: int = 500
     seed: int = 0
@@ -74,6 +77,18 @@ class Plan:
                 f"training: a series of order {self.order}"
                 f"{'' if self.centred else ' without a centre'}; give 0 to 4, 0 without a centre"
             )
+
+        alone = self.decoder == "separable" and self.centred and not self.order
+        if self.objective == "modes" and (not alone or self.discrepancy or self.modes):
+            raise InputError(
+                f"training: recipe '{self.recipe}' cannot have the objective 'modes', which is for "
+                "a separable network alone about the centre's solution; use recipe modal"
+            )
+
+    @property
+    def slopes(self) -> bool:
+        """Whether the FEM runs' derivatives in theta are wanted."""
+        return self.discrepancy or self.objective == "modes"
 
     @property
     def runs(self) -> int:
@@ -101,6 +116,17 @@ RECIPES: dict[str, Plan] = {
         steps=0,
     ),
     "network": Plan(),
+    "modal": Plan(
+        recipe="modal",
+        objective="modes",
+        decoder="separable",
+        modes=0,
+        simulations=400,
+        learning_rate=2e-3,
+        steps=20_000,
+        freeze=2000,
+        polish=4000,
+    ),
     "paper": Plan(
         recipe="paper",
         objective="energy",
@@ -113,9 +139,11 @@ RECIPES: dict[str, Plan] = {
 }
 """``hybrid``: a Taylor series, a network trained on the energy in mechanical modes, and a
 discrepancy model. ``mechanics``: the same without a network, from a mesh to an emulator in a
-minute. ``network``: Algorithm 1 about the FEM solution at the centre, trained on FEM runs and the
-energy. ``paper``: Algorithm 1 from zero, the energy at one theta a step, Adam at 1e-4 and then
-1e-5, as released by Dalton et al. (2023)."""
+minute. ``modal``: a network alone about the FEM solution at the centre, its modes by variable
+projection, their coefficients from values and slopes of FEM runs. ``network``: Algorithm 1 about
+the FEM solution at the centre, trained on FEM runs and the energy. ``paper``: Algorithm 1 from
+zero, the energy at one theta a step, Adam at 1e-4 and then 1e-5, as released by Dalton et al.
+(2023)."""
 
 
 def recipe(name: str) -> Plan:

@@ -21,10 +21,11 @@ from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.taylor import Expansion, constant, expand
 from emulator.training.basis import mechanical_modes
 from emulator.training.discrepancy_stage import FEWEST
+from emulator.training.modal import ARCHITECTURE, Modal
 from emulator.training.objectives import Scales, make_loss, mean_square_gradient
 from emulator.training.plan import Plan
 from emulator.training.start import architecture_from, with_network_of
-from emulator.training.step import Step, make_step
+from emulator.training.step import Step, batch_descent, make_step
 
 # Standard deviation of the displacements as a fraction of the centre's, where no FEM run tells it.
 _GUESSED_SD = 0.2
@@ -38,6 +39,7 @@ class Problem:
     emulator : untrained; without a network where the plan has no optimiser step.
     runs : FEM solutions, the centre's first.
     optimiser, step : of the network (:func:`~emulator.training.step.make_step`), or None.
+    modal : what teaches the network modes and then coefficients, for plans that do.
     """
 
     plan: Plan
@@ -45,12 +47,27 @@ class Problem:
     runs: Runs
     optimiser: optax.GradientTransformation | None
     step: Step | None
+    modal: Modal | None = None
 
     @property
     def architecture(self) -> Architecture | None:
         """Sizes of the network; None without one."""
         network = self.emulator.network
         return None if network is None else network.architecture
+
+    def keep(self, weights: Any) -> tuple[jax.Array, ...]:
+        """What steps after ``plan.freeze`` of a separable decoder take from ``weights``."""
+        network = self.emulator.network
+        assert network is not None, "only a network has steps"
+        if self.modal is not None:
+            return tuple(jax.jit(self.modal.keep)(weights))
+        return (jax.jit(lambda w: network.prepare(w)[1])(weights),)
+
+    def finish(self, weights: Any, *, progress: bool = False) -> Any:
+        """The trained weights, from those after the last step."""
+        if self.modal is None:
+            return weights
+        return self.modal.finish(weights, self.plan.polish, progress=progress)
 
     def initial(self) -> tuple[Any, Any]:
         """Copies of the untrained weights, and the optimiser's state; empty without a network."""
@@ -89,16 +106,24 @@ def prepare(
     if series is None and plan.centred:
         series = constant(np.asarray(scene.to_unit(scene.centre)), runs.displacement[0])
     emulator = Emulator(scene, taylor=series)
+    if plan.objective == "modes" and plan.freeze >= plan.steps:
+        plan = replace(plan, freeze=plan.steps // 2)
     if not plan.steps:
         return Problem(plan, emulator, runs, None, None)
     scale, scales = _scales(scene, plan, runs)
-    network = _network(simulator, plan, architecture or Architecture(), series, scale)
+    sizes = architecture or (ARCHITECTURE if plan.objective == "modes" else Architecture())
+    network = _network(simulator, plan, sizes, series, scale)
     emulator = replace(emulator, network=network)
     if start is not None:
         emulator = with_network_of(emulator, start)
-    loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
-    step = make_step(emulator, plan, runs, loss, optimiser)
+    if plan.objective == "modes":
+        assert emulator.network is not None, "it was given one"
+        modal = Modal(scene, emulator.network, runs, scales)
+        step = make_step(plan, modal.descend, optimiser)
+        return Problem(plan, emulator, runs, optimiser, step, modal)
+    loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
+    step = make_step(plan, batch_descent(emulator, plan, runs, loss), optimiser)
     return Problem(plan, emulator, runs, optimiser, step)
 
 
@@ -109,12 +134,12 @@ def _run(
     scene = simulator.scene
     thetas = scene.centre[None]
     if plan.runs:
-        draw = design if plan.discrepancy else sobol
+        draw = design if plan.slopes else sobol
         thetas = jnp.concatenate([thetas, draw(scene, plan.runs, plan.seed)])
     return run_campaign(
         simulator,
         thetas,
-        sensitivities=plan.discrepancy,
+        sensitivities=plan.slopes,
         predictor=series,
         deadline=deadline,
         at_least=FEWEST + 1,
@@ -153,6 +178,8 @@ def _scales(scene: Scene, plan: Plan, runs: Runs) -> tuple[np.ndarray, Scales]:
         gradient=float(jnp.sqrt(mean_square_gradient(scene, jnp.asarray(deviation)))),
         energy=float(jnp.abs(runs.energy[0])),
     )
+    if plan.objective == "modes":  # their products are the same in all directions
+        return np.full(3, scales.displacement), scales
     if not plan.centred:
         return np.full(3, np.sqrt(np.mean(centre**2))), scales
     return np.maximum(component, 1e-3 * max(component)), scales

@@ -21,6 +21,8 @@ WARMUP = 100  # steps
 Weights = nnx.State
 Step = Callable[..., tuple[Weights, Any, jax.Array]]
 Loss = Callable[[jax.Array, Batch], jax.Array]
+Descent = Callable[..., tuple[jax.Array, Weights, Weights]]
+"""``descend(weights, number, *kept)``: loss, its gradient, and the weights that both are of."""
 
 
 def predictor(emulator: Emulator) -> Callable[..., jax.Array]:
@@ -44,24 +46,32 @@ def predictor(emulator: Emulator) -> Callable[..., jax.Array]:
     return predict
 
 
-def make_step(
-    emulator: Emulator, plan: Plan, runs: Runs, loss: Loss, optimiser: optax.GradientTransformation
-) -> Step:
+def batch_descent(emulator: Emulator, plan: Plan, runs: Runs, loss: Loss) -> Descent:
+    """Descent of ``loss`` on batches, each of which follows from the step's number."""
+    draw, predict = _batches(emulator, plan, runs), predictor(emulator)
+
+    def descend(
+        weights: Weights, number: jax.Array, *kept: jax.Array
+    ) -> tuple[jax.Array, Weights, Weights]:
+        batch = draw(number)
+        misfit = lambda w: loss(predict(w, batch.theta, *kept), batch)  # noqa: E731
+        return *jax.value_and_grad(misfit)(weights), weights
+
+    return descend
+
+
+def make_step(plan: Plan, descend: Descent, optimiser: optax.GradientTransformation) -> Step:
     """``step(weights, state, number, total, *kept) -> (weights, state, loss)``, compiled.
 
     Batch and learning rate follow from ``number`` and ``total`` alone, so that a resumed run
-    repeats them. With ``kept``, the decoder's prepared part, only the branch is trained. The step
+    repeats them. With ``kept``, what no later step changes, only the branch is trained. The step
     consumes the weights and the state it is given.
     """
-    draw, predict = _batches(emulator, plan, runs), predictor(emulator)
 
     def step(
         weights: Weights, state: Any, number: jax.Array, total: jax.Array, *kept: jax.Array
     ) -> tuple[Weights, Any, jax.Array]:
-        batch = draw(number)
-        value, gradient = jax.value_and_grad(lambda w: loss(predict(w, batch.theta, *kept), batch))(
-            weights
-        )
+        value, gradient, weights = descend(weights, number, *kept)
         updates, moved = optimiser.update(gradient, state, weights)
         rate = learning_rate(plan, number, total)
         updates = jax.tree.map(lambda d: (-rate * d).astype(d.dtype), updates)
@@ -99,9 +109,14 @@ def _branch_only(path: Any, update: jax.Array) -> jax.Array:
 def learning_rate(plan: Plan, number: jax.Array, total: jax.Array) -> jax.Array:
     """Learning rate of step ``number`` of ``total``: see :class:`Plan`.
 
-    The cosine follows ``WARMUP`` steps in which the rate rises linearly.
+    The cosine follows ``WARMUP`` steps in which the rate rises linearly. Modes and coefficients
+    that are learned one after the other have a cosine each.
     """
     peak = plan.learning_rate
+    if plan.objective == "modes":
+        later = number >= plan.freeze
+        total = jnp.where(later, total - plan.freeze, plan.freeze)
+        number = jnp.where(later, number - plan.freeze, number)
     if plan.schedule == "halves":
         return jnp.where(number < total // 2, peak, 0.1 * peak)
     warm = jnp.minimum(1.0, (number + 1) / WARMUP)

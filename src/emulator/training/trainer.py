@@ -60,7 +60,7 @@ def train(
     spent = saved.seconds if saved is not None else 0.0
     clock = lambda: spent + time.perf_counter() - began  # noqa: E731
     state = _optimise(problem, saved, limit, Keep(writer, problem.plan, clock), progress)
-    emulator, record = _finish(problem, state)
+    emulator, record = _finish(problem, state, progress=progress)
     record |= {"start": source} if source else {}
     return replace(emulator, record={**record, "seconds": round(clock(), 1)})
 
@@ -83,12 +83,12 @@ def _optimise(
         return optimise(state, total, Steps([problem]), [*hooks, bar, keep])
 
 
-def _finish(problem: Problem, state: State) -> tuple[Emulator, dict[str, Any]]:
+def _finish(problem: Problem, state: State, *, progress: bool) -> tuple[Emulator, dict[str, Any]]:
     """The trained emulator with its discrepancy model, if the plan has one, and the record."""
     plan, emulator, loss = replace(problem.plan, steps=state.done), problem.emulator, None
     if emulator.network is not None:
         loss = require_finite(state)
-        emulator = with_weights(emulator, state.weights)
+        emulator = with_weights(emulator, problem.finish(state.weights, progress=progress))
     record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
     if plan.discrepancy:
         emulator, record["discrepancy"] = add_discrepancy(emulator, problem.runs)

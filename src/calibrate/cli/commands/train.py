@@ -27,7 +27,8 @@ def register(commands: Any) -> None:
         "--recipe",
         choices=tuple(RECIPES),
         help="default hybrid: Taylor series, network trained on the energy, discrepancy model of "
-        "FEM runs; mechanics: the same without the network, in a minute",
+        "FEM runs; mechanics: the same without the network, in a minute; modal: a network alone, "
+        "from values and slopes of FEM runs",
     )
     parser.add_argument(
         "--start",
@@ -39,7 +40,8 @@ def register(commands: Any) -> None:
         "--objective",
         choices=OBJECTIVES,
         help="what the network is trained on: the energy; FEM displacements; those and their "
-        "deformation gradients; FEM displacements and the energy",
+        "deformation gradients; FEM displacements and the energy; modes and coefficients, from "
+        "values and slopes of FEM runs",
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument(

@@ -58,12 +58,24 @@ class MLP(nnx.Module):
 
     def finish(self, first: jax.Array) -> jax.Array:
         """The output (..., out) from the sum of all projections."""
+        x = self._before(first, len(self.layers))
+        return x if self.norm is None else self.norm(x)
+
+    def hidden(self, *values: jax.Array) -> jax.Array:
+        """What the last layer takes (..., hidden[-1]), from all parts."""
+        return jax.nn.celu(self._before(self._first(values), len(self.layers) - 1))
+
+    def _first(self, values: tuple[jax.Array, ...]) -> jax.Array:
+        return reduce(jnp.add, (self.project(k, v) for k, v in enumerate(values)))
+
+    def _before(self, first: jax.Array, stop: int) -> jax.Array:
+        """Output of layer ``stop - 1`` from the sum of all projections."""
         bias = self.layers[0].bias
         x = first if bias is None else first + bias
-        for layer in self.layers[1:]:
+        for layer in self.layers[1:stop]:
             x = layer(jax.nn.celu(x))
-        return x if self.norm is None else self.norm(x)
+        return x
 
     def __call__(self, *values: jax.Array) -> jax.Array:
         """The output (..., out) from all parts."""
-        return self.finish(reduce(jnp.add, (self.project(k, v) for k, v in enumerate(values))))
+        return self.finish(self._first(values))

@@ -41,6 +41,7 @@ class Architecture:
     modes : learned modes of the separable decoder.
     edge_sum : of a node's edges in its final state: ``antisymmetric``, Algorithm 1's, or over the
         edges it ``receives``, as the released code has it.
+    trunk : widths of the hidden layers below the learned modes; empty for those of ``hidden``.
     """
 
     steps: int = 5
@@ -49,6 +50,7 @@ class Architecture:
     decoder: Literal["pointwise", "separable"] = "pointwise"
     modes: int = 16
     edge_sum: Literal["antisymmetric", "receives"] = "antisymmetric"
+    trunk: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.decoder not in ("pointwise", "separable"):
@@ -59,7 +61,8 @@ class Architecture:
     @classmethod
     def from_json(cls, description: Mapping[str, Any]) -> Self:
         """The architecture with these fields, JSON's lists turned into tuples."""
-        return cls(**{**description, "hidden": tuple(description["hidden"])})
+        widths = {name: tuple(description.get(name, ())) for name in ("hidden", "trunk")}
+        return cls(**{**description, **widths})
 
 
 class MessagePassing(nnx.Module):
@@ -183,12 +186,22 @@ class SeparableDecoder(nnx.Module):
             zero_last=True,
             rngs=rngs,
         )
-        self.trunk = MLP((2 * M,), hidden, 3 * architecture.modes, layer_norm=False, rngs=rngs)
+        self.trunk = MLP(
+            (2 * M,),
+            architecture.trunk or hidden,
+            3 * architecture.modes,
+            layer_norm=False,
+            rngs=rngs,
+        )
 
     def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
         """All modes (r, n, 3): ``basis`` (f, n, 3), then the learned ones."""
         learned = self.trunk(states).reshape(len(states), 3, -1)
         return jnp.concatenate([basis.astype(learned.dtype), jnp.moveaxis(learned, -1, 0)])
+
+    def features(self, states: jax.Array) -> jax.Array:
+        """What each learned mode is a linear combination of, (n, width of the last layer)."""
+        return self.trunk.hidden(states)
 
     def coefficients(self, theta: jax.Array) -> jax.Array:
         """Coefficients (..., r) of the modes for normalised ``theta`` (..., p)."""
