@@ -30,6 +30,11 @@ class Case:
     good: bool = False
 
     @property
+    def sampled(self):
+        """Whether the map or the noise is what is wrong, and not the draws."""
+        return self.kind not in ("few", "stuck")
+
+    @property
     def name(self):
         return f"{self.problem}, {self.kind} {self.size:g}, seed {self.seed}"
 

@@ -2,8 +2,10 @@
 
     python studies/certificate/run.py
     python studies/certificate/run.py --quick --out DIR    # three posteriors
+    python studies/certificate/run.py --fem --nuts         # the beam's: FEM judges what NUTS drew
 
-Writes results.json and certificate.png, and asserts what the README of the study says.
+Writes results.json and certificate.png (with --fem, --nuts or both: fem.json, nuts.json or
+fem_nuts.json), and asserts what the README of the study says.
 """
 
 import argparse
@@ -17,6 +19,7 @@ import problems
 from cases import cases
 from problems import ExactSimulator
 
+import calibrate as cal
 from calibrate.certificate import certify
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
@@ -24,6 +27,7 @@ from emulator import Simulator
 from emulator.store import replacing, write_json
 
 HERE = Path(__file__).parent
+NUTS = cal.NUTSOptions(500, 1000, chains=4)
 SEED = 0
 LARGEST_SHIFT, LARGEST_SD = 0.5, 0.25  # what no accepted posterior may exceed
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
@@ -35,10 +39,13 @@ MARKS = {
 }
 
 
-def row(case, problem, simulator, budget) -> dict[str, Any]:
-    """Verdict and truth of one case."""
+def row(case, problem, simulator, budget, *, nuts=False) -> dict[str, Any]:
+    """Verdict and truth of one case; with ``nuts``, of NUTS's draws from its wrong model."""
     begin = time.perf_counter()
     posterior, (mean, sd) = case.make(problem, case.size, case.seed)
+    if nuts and case.sampled:
+        data = posterior.data["displacement"]
+        posterior = cal.sample(posterior.model, data, options=NUTS, seed=case.seed)
     certificate = certify(posterior, simulator, draws=budget, seed=case.seed)
     draws = np.stack(list(posterior.draws().values()), axis=1)
     e = certificate.evidence
@@ -118,6 +125,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", help="kinds to run, comma-separated")
     parser.add_argument("--fem", action="store_true", help="the beam's, judged by FEM itself")
+    parser.add_argument("--nuts", action="store_true", help="draws by NUTS, not independent ones")
     parser.add_argument("--draws", type=int, default=200, help="FEM runs a certificate")
     parser.add_argument("--out", type=Path, default=HERE)
     arguments = parser.parse_args()
@@ -133,7 +141,7 @@ def main() -> None:
             exact = ExactSimulator(problem.forward)
             built[case.problem] = problem, Simulator(problem.scene) if arguments.fem else exact
         problem, simulator = built[case.problem]
-        rows.append(row(case, problem, simulator, arguments.draws))
+        rows.append(row(case, problem, simulator, arguments.draws, nuts=arguments.nuts))
         r = rows[-1]
         print(
             f"{r['name']:38s} {r['status']:13s} true {r['true_shift']:6.2f} {r['true_sd']:6.2f} "
@@ -145,8 +153,11 @@ def main() -> None:
     summary = conclude(rows)
     print(summary)
     header = study_header(HERE, SEED)
-    write_json(arguments.out / "results.json", {**header, "summary": summary, "cases": rows})
-    draw(rows, arguments.out / "certificate.png")
+    routes = [name for name in ("fem", "nuts") if getattr(arguments, name)]
+    name = "_".join(routes) or "results"
+    write_json(arguments.out / f"{name}.json", {**header, "summary": summary, "cases": rows})
+    if not routes:
+        draw(rows, arguments.out / "certificate.png")
     assert not summary["wrong_and_accepted"]
     refused = summary["good_verdicts"].get("not certified", 0)
     assert refused <= 0.05 * summary["good"]
