@@ -77,6 +77,11 @@ def _problems(
             f"pretraining: recipe '{plan.recipe}' fits a discrepancy model, which belongs to one "
             "scene; use recipe network or paper"
         )
+    if plan.objective == "modes":
+        raise InputError(
+            f"pretraining: recipe '{plan.recipe}' solves for the last layer of one scene; "
+            "use recipe network or paper"
+        )
     first = prepare(scenes[0], plan, architecture)
     others = tqdm(scenes[1:], "prepare", disable=not progress)
     # Starting from the first one's network also checks that each scene can have its weights.

@@ -190,7 +190,8 @@ class Modal:
         network = nnx.merge(self.network.definition, weights)
         last = network.decoder.trunk.layers[-1]
         flat = W.reshape(len(W), -1).astype(jnp.float32)
-        last.kernel.value, last.bias.value = flat[:-1], flat[-1]
+        last.kernel.set_value(flat[:-1])
+        last.bias.set_value(flat[-1])
         return nnx.state(network)
 
     def descend(

@@ -1,0 +1,175 @@
+"""Modes by variable projection, then their coefficients."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.errors import InputError
+from emulator.fem.campaign import Runs, run_campaign
+from emulator.fem.designs import design, sobol
+from emulator.surrogates.network.pignn import Architecture
+from emulator.training import Plan, pretrain, recipe, train
+from emulator.training.modal import Modal
+from emulator.training.objectives import mean_square_gradient
+from emulator.training.problem import prepare
+
+SMALL = Architecture(
+    steps=2, latent=8, hidden=(16, 16), decoder="separable", modes=6, trunk=(16, 40)
+)
+PLAN = replace(recipe("modal"), simulations=12, batch=4, steps=60, freeze=30, polish=100)
+
+
+@pytest.fixture(scope="module")
+def problem(beam):
+    return prepare(beam, PLAN, SMALL)
+
+
+@pytest.fixture(scope="module")
+def modal(problem) -> Modal:
+    return problem.modal
+
+
+def field(modal, seed):
+    """Displacements (n, 3) in units of the scale, zero where held."""
+    values = np.random.default_rng(seed).normal(size=modal.scene.held.shape)
+    return jnp.asarray(np.where(modal.scene.held, 0.0, values))
+
+
+def test_the_product_is_that_of_displacements_and_their_gradients(modal):
+    """Its square of a field is the objective ``gradients`` of that field."""
+    v, scales = field(modal, 0), modal.scales
+    mm = scales.displacement * v
+    expected = jnp.mean(jnp.sum(v**2, axis=-1))
+    expected += mean_square_gradient(modal.scene, mm[None]) / scales.gradient**2
+    assert jnp.vdot(v, modal.weighted(v)) == pytest.approx(float(expected), rel=1e-12)
+
+
+def test_targets_hold_what_the_snapshots_vary_by(modal, problem):
+    """A run's displacement, projected on the targets, is it again, up to the modes left out."""
+    modes = modal.targets
+    flat = modes.reshape(-1, modes.shape[-1])
+    weighted = modal.weighted(modes).reshape(flat.shape)
+    products = np.asarray(flat.T @ weighted)
+    sizes = np.diag(products)
+    np.testing.assert_allclose(products, np.diag(sizes), atol=1e-10 * sizes[0])
+    assert (np.diff(sizes) <= 0.0).all()
+    runs = problem.runs
+    deviation = np.asarray(runs.displacement - runs.displacement[0]) / modal.scales.displacement
+    for d in deviation.reshape(len(deviation), -1):
+        left = d - flat @ ((d @ weighted) / sizes)
+        assert np.linalg.norm(left) <= 1e-3 * np.linalg.norm(d) + 1e-12
+
+
+def test_the_last_layer_is_the_least_squares_solution(modal, problem):
+    """Against NumPy's, component by component, in the factor of the product."""
+    H = modal._hidden(problem.initial()[0])
+    W, misfit, _ = modal._project(H)
+    n, targets = len(H), np.asarray(modal.targets)
+    K = np.asarray(jax.vmap(modal.weighted, 1, 1)(jnp.eye(n)))
+    root = np.linalg.cholesky(K).T
+    left = size = 0.0
+    for k in range(3):
+        free = ~modal.scene.held[:, k : k + 1]
+        # The ridge of the solution, as rows of the least-squares problem.
+        A, b = root @ (free * np.asarray(H)), root @ targets[:, k]
+        ridge = np.sqrt(1e-9 * np.mean(np.sum(A**2, axis=0))) * np.eye(A.shape[1])
+        w = np.linalg.lstsq(
+            np.concatenate([A, ridge]), np.concatenate([b, 0.0 * ridge[:, : b.shape[1]]])
+        )[0]
+        left, size = left + np.sum((A @ w - b) ** 2), size + np.sum(b**2)
+        np.testing.assert_allclose(A @ np.asarray(W[:, k]), A @ w, atol=1e-6 * np.sqrt(size))
+    assert float(misfit) == pytest.approx(left / size, rel=1e-6)
+
+
+def test_the_derivative_in_the_hidden_layer_needs_none_of_the_solution(modal, problem):
+    """Of few features, so that the misfit is far above what the ridge costs."""
+    H = modal._hidden(problem.initial()[0])[:, :8]
+    _, _, pull = modal._project(H)
+    along = jnp.asarray(np.random.default_rng(1).normal(size=H.shape))
+    h = 1e-6
+    ends = [float(modal._project(H + sign * h * along)[1]) for sign in (1.0, -1.0)]
+    assert jnp.vdot(pull, along) == pytest.approx((ends[0] - ends[1]) / (2.0 * h), rel=2e-3)
+
+
+def test_coefficients_are_of_values_and_slopes(modal, problem):
+    """A branch that gives the coefficients gives displacements and their slopes in theta."""
+    scene, runs = modal.scene, problem.runs
+    weights = jax.jit(modal._settled)(problem.initial()[0])
+    taught = jax.jit(modal.keep)(weights)
+    s = modal.scales.displacement
+    found = s * np.tensordot(np.asarray(taught.values), np.asarray(taught.modes, float), axes=1)
+    expected = np.asarray(runs.displacement - runs.displacement[0])
+    free = ~scene.held
+    size = np.sqrt(np.mean(expected[:, free] ** 2))
+    assert np.sqrt(np.mean((found - expected)[:, free] ** 2)) < 0.05 * size
+    # Slopes along the unit box, against the difference of two runs a little apart.
+    theta, h = runs.theta[3], 1e-4
+    x = scene.to_unit(theta)
+    simulator = em.Simulator(scene)
+    for k in range(len(x)):
+        ends = [simulator(scene.from_unit(x.at[k].add(sign * h))) for sign in (1.0, -1.0)]
+        slope = np.asarray(ends[0] - ends[1]) / (2.0 * h)
+        found = s * np.tensordot(np.asarray(taught.slopes[3, k]), np.asarray(taught.modes), axes=1)
+        assert np.sqrt(np.mean((found - slope)[free] ** 2)) < 0.1 * np.sqrt(np.mean(slope**2))
+
+
+def test_a_network_alone_learns_a_beam(beam, tmp_path):
+    plan = replace(PLAN, simulations=30, steps=900, freeze=300, polish=300)
+    emulator = train(beam, plan, tmp_path, architecture=replace(SMALL, hidden=(32, 32)))
+    assert list(emulator.parts) == ["taylor", "network"]
+    assert emulator.taylor.indices.size == 0  # the centre's solution, no series
+    tests = run_campaign(em.Simulator(beam), sobol(beam, 10, 7))
+    found = jax.jit(jax.vmap(emulator.cache()))(tests.theta)
+    err_u = np.median(np.linalg.norm(found - tests.displacement, axis=-1))
+    centre = emulator.taylor.displacement
+    untrained = np.median(np.linalg.norm(tests.displacement - centre, axis=-1))
+    assert err_u < 5e-3 * untrained
+
+
+@pytest.mark.slow
+def test_a_killed_training_goes_on_to_the_same_weights(beam, tmp_path, monkeypatch):
+    whole = train(beam, PLAN, tmp_path / "whole", architecture=SMALL)
+    for stop in (10, 45):  # among the modes, among the coefficients
+        folder = tmp_path / str(stop)
+        _killed_after(beam, folder, stop, monkeypatch)
+        again = train(beam, PLAN, folder, resume=True)
+        for a, b in zip(*(jax.tree.leaves(e.network.weights) for e in (whole, again)), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def _killed_after(scene, folder, stop, monkeypatch):
+    from emulator.training import loop
+
+    advance = loop.Steps.__call__
+
+    def killed(self, state, total):
+        if state.done == stop:
+            raise KeyboardInterrupt
+        return advance(self, state, total)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop.Steps, "__call__", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train(scene, replace(PLAN, checkpoint_every=5), folder, architecture=SMALL)
+
+
+def test_more_modes_than_snapshots_leave_zeros(beam):
+    plan = replace(PLAN, simulations=4, batch=2)
+    runs = run_campaign(em.Simulator(beam), design(beam, 2, 0), sensitivities=True)
+    problem = prepare(beam, plan, replace(SMALL, modes=30))
+    few = Modal(beam, problem.emulator.network, Runs(*runs), problem.modal.scales)
+    assert (np.asarray(few.targets)[..., 20:] == 0.0).all()
+    assert np.isfinite(few.keep(problem.initial()[0]).values).all()
+
+
+def test_bad_plans_and_families(beam, tmp_path):
+    for other in ("network", "hybrid", "paper"):
+        with pytest.raises(InputError, match=f"recipe '{other}' cannot have the objective 'modes'"):
+            replace(recipe(other), objective="modes")
+    with pytest.raises(InputError, match="recipe 'modal' solves for the last layer of one scene"):
+        pretrain([beam, beam], PLAN, tmp_path, architecture=SMALL)
+    assert Plan().slopes is False
