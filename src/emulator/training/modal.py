@@ -83,12 +83,14 @@ class Modal:
     """Teaches ``network`` of ``scene`` the runs, whose sensitivities are needed.
 
     scales : s and s_F of the inner product; s is the network's scale, too.
+    slopes : gamma above.
     """
 
     scene: Scene
     network: Network
     runs: Runs
     scales: Scales
+    slopes: float = _SLOPES
 
     def __post_init__(self) -> None:
         # Now, because what is first wanted inside jit would be traced there.
@@ -138,7 +140,7 @@ class Modal:
         """The modes to learn, (n, 3, r); zero beyond the rank of the snapshots."""
         deviations, slopes = self._snapshots
         n, most = deviations.shape[1], self.network.architecture.modes
-        rows = np.concatenate([deviations, np.sqrt(_SLOPES) * slopes.reshape(-1, n, 3)])
+        rows = np.concatenate([deviations, np.sqrt(self.slopes) * slopes.reshape(-1, n, 3)])
         rows = np.moveaxis(rows / np.sqrt(len(deviations)), 0, -1)
         weighted = np.asarray(jax.jit(self.weighted)(jnp.asarray(rows)))
         flat = rows.reshape(3 * n, -1)
@@ -238,8 +240,8 @@ class Modal:
         value, slope = jax.vmap(lambda x: (branch(x), jax.jacfwd(branch)(x)))(x)
         squares = lambda e: jnp.sum((e @ taught.products) * e)  # noqa: E731
         left = squares(value - taught.values)
-        left += _SLOPES * squares(jnp.swapaxes(slope, 1, 2).astype(jnp.float32) - taught.slopes)
-        return left / (squares(taught.values) + _SLOPES * squares(taught.slopes))
+        left += self.slopes * squares(jnp.swapaxes(slope, 1, 2).astype(jnp.float32) - taught.slopes)
+        return left / (squares(taught.values) + self.slopes * squares(taught.slopes))
 
     def finish(self, weights: Weights, iterations: int, *, progress: bool = False) -> Weights:
         """``weights`` with the last layer solved for and the branch led on by L-BFGS."""
