@@ -228,7 +228,7 @@ def medians(cases: list[dict[str, Any]], idea: str, key: str) -> list[float]:
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--polish", type=int, default=1000, help="iterations of L-BFGS")
     parser.add_argument("--simulations", type=int, default=100)
     parser.add_argument("--tests", type=int, default=50)

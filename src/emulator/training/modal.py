@@ -53,9 +53,16 @@ from emulator.surrogates.network.pignn import Architecture
 from emulator.training.objectives import Scales
 
 ARCHITECTURE = Architecture(
-    steps=3, latent=24, hidden=(64, 64), decoder="separable", modes=40, trunk=(64, 512)
+    steps=3,
+    latent=24,
+    hidden=(64, 64),
+    decoder="separable",
+    modes=40,
+    trunk=(64, 512),
+    branch=(128, 128, 128),
 )
-"""Smaller messages than the paper's, and a wide last layer, which costs a least-squares solve."""
+"""Smaller messages than the paper's, a wide last layer of the trunk, which costs a least-squares
+solve, and a branch that can bend (docs/experiments.md, "A network alone")."""
 
 _SLOPES = 0.1  # gamma: positions have a variance of 1/12 in the unit box
 _RIDGE = 1e-9  # of the mean square of the hidden layer; weights beyond are noise in float32

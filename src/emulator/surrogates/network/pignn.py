@@ -41,7 +41,8 @@ class Architecture:
     modes : learned modes of the separable decoder.
     edge_sum : of a node's edges in its final state: ``antisymmetric``, Algorithm 1's, or over the
         edges it ``receives``, as the released code has it.
-    trunk : widths of the hidden layers below the learned modes; empty for those of ``hidden``.
+    trunk, branch : widths of the hidden layers below the learned modes and below the coefficients
+        of a separable decoder; empty for those of ``hidden``.
     """
 
     steps: int = 5
@@ -51,6 +52,7 @@ class Architecture:
     modes: int = 16
     edge_sum: Literal["antisymmetric", "receives"] = "antisymmetric"
     trunk: tuple[int, ...] = ()
+    branch: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.decoder not in ("pointwise", "separable"):
@@ -61,7 +63,7 @@ class Architecture:
     @classmethod
     def from_json(cls, description: Mapping[str, Any]) -> Self:
         """The architecture with these fields, JSON's lists turned into tuples."""
-        widths = {name: tuple(description.get(name, ())) for name in ("hidden", "trunk")}
+        widths = {name: tuple(description.get(name, ())) for name in ("hidden", "trunk", "branch")}
         return cls(**{**description, **widths})
 
 
@@ -180,7 +182,7 @@ class SeparableDecoder(nnx.Module):
         M, hidden = architecture.latent, architecture.hidden
         self.branch = MLP(
             (parameters,),
-            hidden,
+            architecture.branch or hidden,
             fixed + architecture.modes,
             layer_norm=False,
             zero_last=True,
