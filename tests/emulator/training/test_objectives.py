@@ -1,0 +1,114 @@
+"""What a training step minimises, by hand and by differences."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.fem import run_campaign, sobol
+from emulator.surrogates import Architecture
+from emulator.training import Plan
+from emulator.training.objectives import Batch, Scales, make_loss
+from emulator.training.plan import OBJECTIVES
+from emulator.training.problem import _scales, prepare
+
+SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
+SCALES = Scales(displacement=2.0, gradient=0.3, energy=7.0)
+
+
+@pytest.fixture(scope="module")
+def tests(beam, simulator):
+    return run_campaign(simulator, sobol(beam, 6, seed=5))
+
+
+def test_objectives_by_hand(beam, tests):
+    u = tests.displacement + 0.1
+    batch = Batch(*tests[:3])
+    Pi = em.potential_energy(beam)
+    values = np.array([Pi(v, t) for v, t in zip(u, tests.theta, strict=True)])
+    misfit = 3 * 0.1**2 / 4.0
+    gap = np.mean((values - tests.energy) / np.abs(tests.energy))
+    expected = {
+        "energy": values.mean() / 7.0,
+        "simulations": misfit,
+        "gradients": misfit,  # a shift has none
+        "both": misfit + 0.5 * gap,
+    }
+    assert set(expected) == set(OBJECTIVES) - {"modes"}  # test_modal.py
+    for objective, value in expected.items():
+        loss = make_loss(beam, objective, SCALES, weight=0.5)
+        assert float(loss(u, batch)) == pytest.approx(float(value), rel=1e-12)
+    # At the solutions nothing is left but round-off.
+    assert abs(make_loss(beam, "both", SCALES, 0.5)(tests.displacement, batch)) < 1e-12
+    assert float(make_loss(beam, "gradients", SCALES, 0.5)(tests.displacement, batch)) == 0.0
+
+
+def rough(tests):
+    """The solutions with noise that has gradients, (c, n, 3) mm."""
+    noise = np.random.default_rng(3).normal(0.0, 0.1, tests.displacement.shape)
+    return np.asarray(tests.displacement) + noise
+
+
+def deformation_gradients(mesh, u):
+    """F (m, 3, 3) of linear tetrahedra from their edges before and after, and volumes (m,) mm3."""
+    before, after = (
+        np.swapaxes(x[mesh.elements[:, 1:]] - x[mesh.elements[:, :1]], 1, 2)
+        for x in (mesh.nodes, mesh.nodes + u)
+    )
+    return after @ np.linalg.inv(before), np.abs(np.linalg.det(before)) / 6.0
+
+
+def test_gradients_by_an_independent_evaluation(tests):
+    """On elements of unequal volume."""
+    bent = em.scenes.once_clamped_beam(cells=(4, 2, 2))
+    nodes = bent.mesh.nodes.copy()
+    nodes[:, 0] = 100.0 * (nodes[:, 0] / 100.0) ** 2
+    graded = replace(bent, mesh=replace(bent.mesh, nodes=nodes), origin={})
+    u = rough(tests)
+    misfits = []
+    for found, exact in zip(u, np.asarray(tests.displacement), strict=True):
+        F, volume = deformation_gradients(graded.mesh, found)
+        error = F - deformation_gradients(graded.mesh, exact)[0]
+        F_part = np.average(np.sum(error**2, axis=(1, 2)), weights=volume) / SCALES.gradient**2
+        u_part = np.mean(np.sum((found - exact) ** 2, axis=1)) / SCALES.displacement**2
+        misfits.append(u_part + F_part)
+    assert np.ptp(volume) > volume.min()
+    loss = make_loss(graded, "gradients", SCALES, 0.5)(jnp.asarray(u), Batch(*tests[:3]))
+    assert float(loss) == pytest.approx(np.mean(misfits), rel=1e-12)
+
+
+def test_the_slope_of_gradients_by_differences(beam, tests):
+    loss = make_loss(beam, "gradients", SCALES, 0.5)
+    batch, u = Batch(*tests[:3]), rough(tests)
+    direction = np.random.default_rng(4).normal(size=u.shape)
+    step = 1e-3  # the loss is quadratic: differences are exact but for round-off
+    ahead, behind = (loss(jnp.asarray(u + sign * step * direction), batch) for sign in (1, -1))
+    slope = jax.grad(loss)(jnp.asarray(u), batch)
+    by_differences = float(ahead - behind) / (2.0 * step)
+    assert float(jnp.vdot(slope, direction)) == pytest.approx(by_differences, rel=1e-9)
+
+
+@pytest.mark.parametrize("objective", ["energy", "simulations", "both"])
+def test_other_objectives_do_not_know_the_scale_of_gradients(beam, tests, objective):
+    u, batch = jnp.asarray(rough(tests)), Batch(*tests[:3])
+    without = SCALES._replace(gradient=float("nan"))
+    one, other = (make_loss(beam, objective, scales, 0.5)(u, batch) for scales in (SCALES, without))
+    assert float(one) == float(other)
+
+
+def test_both_terms_of_gradients_are_one_at_the_centre(beam):
+    """Over the runs its scales were taken from."""
+    plan = Plan(objective="gradients", steps=1, simulations=8, batch=4)
+    runs = prepare(beam, plan, SMALL).runs
+    _, scales = _scales(beam, plan, runs)
+    batch = Batch(*runs.take(slice(1, None))[:3])
+    centre = jnp.broadcast_to(runs.displacement[0], batch.displacement.shape)
+    simulations, gradients = (
+        float(make_loss(beam, name, scales, 0.5)(centre, batch))
+        for name in ("simulations", "gradients")
+    )
+    assert simulations == pytest.approx(1.0, rel=1e-12)
+    assert gradients - simulations == pytest.approx(1.0, rel=1e-12)
