@@ -42,6 +42,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import scipy.linalg
 import scipy.sparse as sp
 from flax import nnx
 from tqdm import tqdm
@@ -66,6 +67,7 @@ solve, and a branch that can bend (docs/experiments.md, "A network alone")."""
 
 _SLOPES = 0.1  # gamma: positions have a variance of 1/12 in the unit box
 _RIDGE = 1e-9  # of the mean square of the hidden layer; weights beyond are noise in float32
+_ZERO = 1e-12  # of the sum of the modes' squares
 _MEMORY = 20  # steps that L-BFGS remembers
 _AT_ONCE = 50  # of its iterations, between two looks at the progress
 
@@ -154,7 +156,7 @@ class Modal:
         energies, vectors = np.linalg.eigh(flat.T @ weighted.reshape(3 * n, -1))
         order = np.argsort(energies)[::-1][:most]
         found = (flat @ vectors[:, order]).reshape(n, 3, -1)
-        found = np.where(energies[order] > 1e-12 * energies.max(), found, 0.0)
+        found = np.where(energies[order] > _ZERO * energies.max(), found, 0.0)
         return jnp.asarray(np.pad(found, ((0, 0), (0, 0), (0, most - len(order)))))
 
     @cached_property
@@ -219,22 +221,23 @@ class Modal:
 
     def keep(self, weights: Weights) -> Taught:
         """The modes of ``weights`` and the snapshots' coefficients in them."""
-        deviations, slopes = map(jnp.asarray, self._snapshots)
-        free = jnp.asarray(~self.scene.held, dtype=float)
-        kept = self.network.prepare(self._settled(weights))[1]
-        modes = jnp.moveaxis(kept.astype(jnp.float64) * free, 0, -1)  # (n, 3, r)
-        flat, weighted = (a.reshape(-1, modes.shape[-1]) for a in (modes, self.weighted(modes)))
+        deviations, slopes = self._snapshots
+        kept = jax.jit(lambda w: self.network.prepare(self._settled(w))[1])(weights)
+        free = ~self.scene.held
+        modes = np.moveaxis(np.asarray(kept, dtype=float) * free, 0, -1)  # (n, 3, r)
+        weighted = np.asarray(jax.jit(self.weighted)(jnp.asarray(modes)))
+        flat, weighted = (fields.reshape(-1, modes.shape[-1]) for fields in (modes, weighted))
         products = flat.T @ weighted
-        r, (c, p) = len(products), slopes.shape[:2]
-        ridge = 1e-12 * jnp.trace(products) * jnp.eye(r)
-        factor = jax.scipy.linalg.cho_factor(products + ridge)
+        # Modes beyond the rank of the snapshots are zero.
+        safe = products + _ZERO * np.trace(products) * np.eye(len(products))
 
-        def coefficients(fields: jax.Array) -> jax.Array:
+        def coefficients(fields: np.ndarray) -> jax.Array:
             pulled = fields.reshape(-1, len(flat)) @ weighted
-            return jax.scipy.linalg.cho_solve(factor, pulled.T).T
+            found = scipy.linalg.solve(safe, pulled.T, assume_a="pos").T
+            return jnp.asarray(found.reshape(*fields.shape[:-2], -1), dtype=jnp.float32)
 
-        a, b = coefficients(deviations), coefficients(slopes).reshape(c, p, r)
-        return Taught(kept, *(x.astype(jnp.float32) for x in (a, b, products)))
+        values, along = coefficients(deviations), coefficients(slopes)
+        return Taught(kept, values, along, jnp.asarray(products, dtype=jnp.float32))
 
     def _branch_misfit(self, weights: Weights, taught: Taught) -> jax.Array:
         """The misfit of the coefficients as a part of the snapshots', ()."""
@@ -253,7 +256,7 @@ class Modal:
     def finish(self, weights: Weights, iterations: int, *, progress: bool = False) -> Weights:
         """``weights`` with the last layer solved for and the branch led on by L-BFGS."""
         weights = jax.jit(self._settled)(weights)
-        taught = jax.jit(self.keep)(weights)
+        taught = self.keep(weights)
         branch, joined = _split(weights)
 
         def misfit(branch: Any) -> jax.Array:

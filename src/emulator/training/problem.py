@@ -60,7 +60,7 @@ class Problem:
         network = self.emulator.network
         assert network is not None, "only a network has steps"
         if self.modal is not None:
-            return tuple(jax.jit(self.modal.keep)(weights))
+            return tuple(self.modal.keep(weights))
         return (jax.jit(lambda w: network.prepare(w)[1])(weights),)
 
     def finish(self, weights: Any, *, progress: bool = False) -> Any:
