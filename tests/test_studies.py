@@ -26,6 +26,7 @@ QUICK = {
     "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
     "many_solves": "--solves 3",
     "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
+    "networks_alone": "--quick",
     "new_ventricle": "--ventricles 1 --runs 8 --tests 3",
     "objectives": "--quick",
     "poor_emulators": "--quick",
