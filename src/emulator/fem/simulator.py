@@ -17,12 +17,14 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
 from emulator.fem.functional import volume_ratio
 from emulator.fem.loading_path import find_equilibrium
+from emulator.fem.near import NearSolver
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
@@ -144,6 +146,20 @@ class Simulator:
             return self._driver.linearise(u, theta)
         return self.system, self.system.pattern.safe_values(self.system.tangent(u, theta))
 
+    def near(self, u: jax.Array, theta: jax.Array) -> NearSolver:
+        """For solves inside ``jit`` with tangents like that at ``u`` (n, 3) mm and ``theta`` (p,).
+
+        Both are numbers. Where that tangent is not positive definite, or no load has a potential,
+        the solver is UMFPACK.
+        """
+        theta, u = self._checked(theta, u, "displacement")
+        reference = None
+        if self._drives(u, theta):
+            system, tangent = self._driver.linearise(u, theta)
+            if system.factorisation == "cholmod":
+                reference = np.asarray(tangent)
+        return NearSolver(self.system, System(self.scene, "cholmod"), reference)
+
     def _checked(
         self, theta: jax.Array, start: jax.Array, what: str = "start"
     ) -> tuple[jax.Array, jax.Array]:
@@ -246,18 +262,10 @@ def _one_by_one(solve: Callable[..., Solution]) -> Callable[..., Solution]:
     return alone
 
 
-def displacement_derivative(
-    system: System, u: jax.Array, theta: jax.Array, direction: jax.Array
-) -> jax.Array:
-    """Derivative (n, 3) of the equilibrium ``u`` along ``direction`` (p,) in theta."""
-    tangent = system.pattern.safe_values(system.tangent(u, theta))
-    return _moved(system, tangent, u, theta, direction)
-
-
 def _moved(
     system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
 ) -> jax.Array:
-    """:func:`displacement_derivative` with the tangent (nnz,) at hand."""
+    """Derivative (n, 3) of the equilibrium ``u`` along ``direction`` (p,) in theta."""
     _, force = jax.jvp(lambda t: system.residual(u, t), (theta,), (direction,))
     return system.extend(-system.solve(tangent, force))
 
