@@ -16,6 +16,7 @@ from .population import Population, population_of_fits
 from .posterior import Posterior, sample
 from .priors import box_prior, log_normal, truncated, truncated_normal
 from .samplers import NUTSOptions
+from .sensitivity_analysis import sensitivity
 from .statistical_model import Model, model
 
 __version__: str
@@ -46,6 +47,7 @@ __all__ = [
     "reweight",
     "sample",
     "segment_strains",
+    "sensitivity",
     "strains",
     "surface_points",
     "truncated",

@@ -72,13 +72,13 @@ def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
         "truth": assignments(arguments.truth),
         "known": assignments(arguments.known),
         "observe": arguments.observe,
-        "prior": _prior(arguments.prior),
+        "prior": prior_word(arguments.prior),
         "noise": noise_words(arguments.noise),
         "noise_scale": noise_scale_words(arguments.noise_scale),
         "discrepancy": discrepancy_words(arguments.discrepancy),
         "check_scale": not arguments.no_unit_check,
         "forward": arguments.forward,
-        "emulator": _emulator(arguments.emulator),
+        "emulator": emulator_word(arguments.emulator),
         "forward_options": forward_options(arguments),
         "error_runs": arguments.error_runs,
     }
@@ -118,7 +118,7 @@ def _add_noise(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _prior(word: str) -> str | dict[str, Any]:
+def prior_word(word: str) -> str | dict[str, Any]:
     """A name as it is; a file's content, because a kept run must not change with the file."""
     from calibrate.population import read_population
 
@@ -130,7 +130,8 @@ def _absolute(word: str, *, is_path: bool = True) -> str:
     return str(Path(word).resolve()) if is_path else word
 
 
-def _emulator(word: str | None) -> str | None:
+def emulator_word(word: str | None) -> str | None:
+    """A shipped name as it is, a folder as an absolute path."""
     from emulator.surrogates import shipped
 
     return word if word is None or word in shipped() else _absolute(word)

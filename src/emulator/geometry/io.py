@@ -122,6 +122,14 @@ def write_mesh(
             meshio.write(temporary, content, file_format=suffix[1:], **options)
 
 
+def write_nodal(path: str | Path, mesh: Mesh, fields: Mapping[str, np.ndarray]) -> None:
+    """Write values at the nodes, (n,) by name, as VTU."""
+    cells = [(_KINDS[mesh.elements.shape[1]][0], mesh.elements)]
+    output = meshio.Mesh(mesh.nodes, cells, point_data=dict(fields))
+    with replacing(path) as temporary:
+        meshio.write(temporary, output, file_format="vtu")
+
+
 def write_solution(
     path: str | Path, mesh: Mesh, displacement: np.ndarray, fields: Mapping[str, np.ndarray] = {}
 ) -> None:

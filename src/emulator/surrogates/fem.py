@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem.simulator import Simulator
@@ -48,6 +49,11 @@ class FEMForward:
         start = None if self.start is None else self.start(theta)
         solution = self.simulator.solve(theta, start)
         return Prediction(solution.displacement[self.nodes], solution.converged)
+
+    def evaluate_all(self, thetas: jax.Array) -> Prediction:
+        """Predictions at many theta (c, p), one after the other."""
+        found = [self.evaluate(theta) for theta in thetas]
+        return Prediction(*(jnp.stack(values) for values in zip(*found, strict=True)))
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (k, 3) in mm."""

@@ -62,6 +62,15 @@ def shipped() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob("*/emulator.json"))
 
 
+def shipped_for(scene: str) -> list[str]:
+    """Names of the emulators that come with the package for the built-in ``scene``."""
+    return [
+        name
+        for name in shipped()
+        if read_json(SHIPPED / name / "emulator.json")["scene"].get("scene") == scene
+    ]
+
+
 def load(name: str | Path, scene: Scene | None = None) -> Emulator:
     """The emulator in folder ``name``, or the shipped one of that name.
 

@@ -62,6 +62,20 @@ class ForwardMap(Protocol):
         ...
 
 
+_AT_ONCE = 64  # theta evaluated side by side
+
+
+def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
+    """Predictions at many theta (c, p); fields gain a leading axis.
+
+    Compiled; FEM, which is faster driven from Python, has its own way.
+    """
+    own = getattr(forward, "evaluate_all", None)
+    if own is not None:
+        return own(thetas)
+    return jax.jit(lambda t: jax.lax.map(forward.evaluate, t, batch_size=_AT_ONCE))(thetas)
+
+
 def fingerprint_of(*parts: str | np.ndarray | jax.Array) -> str:
     """Short hash of words and arrays; shape and type of an array count as its values do."""
     digest = hashlib.sha256()

@@ -30,8 +30,11 @@ def test_scenes(capsys):
     assert code == 0
     beam = next(row for row in rows if row["name"] == "once_clamped_beam")
     assert (beam["nodes"], beam["elements"], beam["emulator_shipped"]) == (390, 1440, True)
+    assert beam["emulators"] == ["once_clamped_beam", "once_clamped_beam_pignn"]
     assert main(["scenes"]) == 0
-    assert "once_clamped_beam" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) < 80
+    assert "stiffness_1 ... stiffness_17 0.5 to 2" in "\n".join(lines)
 
 
 def test_simulate(capsys, block, tmp_path):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from typing import Any
 
 from calibrate.cli.common import DONE, add_json, emit, table
+
+_WIDTH = 79
 
 
 def register(commands: Any) -> None:
@@ -18,9 +21,8 @@ def register(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """List the built-in scenes and the emulators shipped for them."""
     from emulator.scenes import BUILT_IN
-    from emulator.surrogates import shipped
+    from emulator.surrogates.files import shipped_for
 
-    available = shipped()
     rows: list[dict[str, Any]] = []
     for name, make in sorted(BUILT_IN.items()):
         scene = make()
@@ -34,36 +36,44 @@ def run(arguments: argparse.Namespace) -> int:
                     {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "scale": p.scale}
                     for p in scene.parameters
                 ],
-                "emulator_shipped": name in available,
+                "emulator_shipped": name in shipped_for(name),
+                "emulators": shipped_for(name),
             }
         )
-    text = table(
-        ("scene", "nodes", "tetrahedra", "law", "parameters", "emulator"),
-        [
-            (
-                r["name"],
-                r["nodes"],
-                r["elements"],
-                r["law"],
-                _parameters(r["parameters"]),
-                "shipped" if r["emulator_shipped"] else "train it",
-            )
-            for r in rows
-        ],
-    )
-    emit(rows, as_json=arguments.json, text=text)
+    emit(rows, as_json=arguments.json, text=_text(rows))
     return DONE
 
 
-def _parameters(parameters: list[dict[str, Any]]) -> str:
+def _text(rows: list[dict[str, Any]]) -> str:
+    """A line a scene, and under it its parameters and the emulators shipped."""
+    head, *lines = table(
+        ("scene", "nodes", "tetrahedra", "law"),
+        [(r["name"], r["nodes"], r["elements"], r["law"]) for r in rows],
+    ).splitlines()
+    found = [head]
+    for line, row in zip(lines, rows, strict=True):
+        found += [line, *_wrapped("parameters", _parameters(row["parameters"]))]
+        found += _wrapped("emulators", row["emulators"] or ["none shipped; train one"])
+    return "\n".join(found)
+
+
+def _wrapped(name: str, entries: list[str]) -> list[str]:
+    """``entries`` after ``name``, on lines that fit a terminal, no entry on two."""
+    indent, joined = f"  {name}  ", ", ".join(each.replace(" ", "\0") for each in entries)
+    rest = " " * len(indent)
+    lines = textwrap.wrap(joined, _WIDTH, initial_indent=indent, subsequent_indent=rest)
+    return [line.replace("\0", " ") for line in lines]
+
+
+def _parameters(parameters: list[dict[str, Any]]) -> list[str]:
     """Names with their ranges; numbered ones of one range are given by the first and the last."""
     groups: dict[tuple[str, str], list[str]] = {}
     for p in parameters:
-        about = f"{p['low']:g}-{p['high']:g} {p['unit']}".strip()
+        about = f"{p['low']:g} to {p['high']:g} {p['unit']}".strip()
         base = p["name"].rstrip("0123456789")
         key = base if base.endswith("_") and base != p["name"] else p["name"]
         groups.setdefault((key, about), []).append(p["name"])
-    return ", ".join(
-        f"{names[0]} to {names[-1]} {about}" if len(names) > 1 else f"{names[0]} {about}"
+    return [
+        f"{names[0]} ... {names[-1]} {about}" if len(names) > 1 else f"{names[0]} {about}"
         for (_, about), names in groups.items()
-    )
+    ]

@@ -28,13 +28,13 @@ def register(commands: Any) -> None:
         choices=tuple(RECIPES),
         help="default hybrid: Taylor series, network trained on the energy, discrepancy model of "
         "FEM runs; mechanics: the same without the network, in a minute; modal: a network alone, "
-        "from values and slopes of FEM runs",
+        "from values and slopes of FEM runs; family: the network of --start, without FEM",
     )
     parser.add_argument(
         "--start",
         metavar="EMULATOR",
-        help="begin from the network of this emulator (a folder), whatever its mesh; the recipe "
-        "then is network unless another is given",
+        help="begin from the network of this emulator (folder or ventricle_family), whatever its "
+        "mesh; the recipe then is network, or family, unless another is given",
     )
     parser.add_argument(
         "--objective",
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_folder(arguments.out)
     given = _given(arguments)
     start = load(arguments.start) if arguments.start else None
-    plan = recipe(arguments.recipe or ("network" if start else "hybrid"))
+    plan = recipe(arguments.recipe or _default_recipe(start))
     fixed = arguments.resume or "steps" in given
     result = train_emulator(
         scene,
@@ -97,6 +97,13 @@ def run(arguments: argparse.Namespace) -> int:
     text = f"trained {scene.name}: {steps} steps, {record['seconds']:.0f} s, in {arguments.out}"
     emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
     return DONE
+
+
+def _default_recipe(start: Any) -> str:
+    """The recipe where none is asked for, by what training starts from."""
+    if start is None:
+        return "hybrid"
+    return "network" if start.family is None else "family"
 
 
 def _given(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -1,0 +1,197 @@
+"""``calibrate sensitivity``: which parameter moves which observation."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calibrate.cli.common import DONE, add_json, add_scene, emit, table
+from calibrate.cli.forward import add_forward, forward_options
+from emulator.errors import InputError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from emulator.scenes.scene import Scene
+
+_METHODS = ("sobol", "morris", "derivatives")
+_SAMPLES = {"sobol": 512, "morris": 64, "derivatives": 256}
+
+
+def register(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "sensitivity",
+        help="which parameter moves which observation",
+        description="Shares of each observation's variance over the prior (Sobol' indices), "
+        "screening of many parameters (Morris), or bounds from exact derivatives.",
+        epilog="example: calibrate sensitivity left_ventricle --observe volume --field --out DIR",
+    )
+    add_scene(parser)
+    parser.add_argument(
+        "--observe", metavar="WHAT", help="as for infer, e.g. volume or landmarks:24+volume"
+    )
+    parser.add_argument(
+        "--field", action="store_true", help="the displacement of every node, and a map of it"
+    )
+    parser.add_argument(
+        "--method",
+        choices=_METHODS,
+        default="sobol",
+        help="sobol (default): shares of the variance; morris: mean effects, for many parameters; "
+        "derivatives: bounds on the shares, and combinations of parameters that matter",
+    )
+    parser.add_argument(
+        "--samples",
+        type=int,
+        metavar="N",
+        help="sobol evaluates N (p + 2) theta, a power of two (default 512); morris N (p + 1) "
+        "(64); derivatives N (256)",
+    )
+    parser.add_argument(
+        "--prior",
+        default="box",
+        metavar="NAME|FILE",
+        help="box (uniform over the range, on its scale), or a population's .json file without "
+        "correlations",
+    )
+    parser.add_argument(
+        "--group",
+        nargs="+",
+        default=[],
+        metavar="NAME=A,B",
+        help="vary parameters together, e.g. matrix=a,b fibres=a_f,b_f",
+    )
+    add_forward(parser)
+    parser.add_argument("--emulator", metavar="NAME|DIR", help="default: the one shipped")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--out", metavar="DIR", help="write sensitivity.nc, figures, and the map as VTU"
+    )
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Analyse a scene's forward map."""
+    from calibrate.cli.model_words import emulator_word, prior_word
+    from calibrate.observations import parse_observation
+    from calibrate.population import prior_of
+    from calibrate.sensitivity_analysis import sensitivity
+    from emulator import Simulator
+    from emulator.catalogue import find_scene
+    from emulator.store import check_folder
+    from emulator.surrogates.kind import Ingredients
+    from emulator.surrogates.registry import build_forward
+
+    scene = find_scene(arguments.scene, arguments.root)
+    if arguments.out:
+        check_folder(arguments.out)
+    observe = arguments.observe and parse_observation(scene, arguments.observe, arguments.seed)
+    options = forward_options(arguments)
+    groups = _groups(arguments.group)
+    made_of = Ingredients(
+        scene, Simulator(scene), emulator_word(arguments.emulator), arguments.seed, progress=False
+    )
+    forward = build_forward(arguments.forward, made_of, options)
+    found = sensitivity(
+        forward,
+        observe or None,
+        prior=prior_of(prior_word(arguments.prior), scene),
+        method=arguments.method,
+        samples=arguments.samples or _SAMPLES[arguments.method],
+        groups=groups,
+        field=arguments.field,
+        seed=arguments.seed,
+    )
+    if arguments.out:
+        write(found, scene, Path(arguments.out))
+    report = {**found.attrs, **{name: _plain(node.to_dataset()) for name, node in found.items()}}
+    emit(report, as_json=arguments.json, text=summary(found))
+    return DONE
+
+
+def write(found: xr.DataTree, scene: Scene, folder: Path) -> None:
+    """The indices as netCDF, figures of them, and nodal ones as VTU."""
+    import numpy as np
+
+    from calibrate.figures.sensitivity import draw
+    from calibrate.sensitivity_analysis import FIELD
+    from emulator.geometry.io import write_nodal
+    from emulator.store import replacing
+
+    with replacing(folder / "sensitivity.nc") as temporary:
+        found.to_netcdf(temporary, engine="h5netcdf")
+    draw(found, scene, folder)
+    if FIELD in found.children:
+        data = found[FIELD].to_dataset()
+        nodal = {
+            f"{name} {label}": np.nan_to_num(np.asarray(data[name][k]))
+            for name in ("first", "total", "mu_star", "bound_on_total")
+            if name in data
+            for k, label in enumerate(data[data[name].dims[0]].values)
+        }
+        write_nodal(folder / "sensitivity.vtu", scene.mesh, nodal)
+
+
+def summary(found: xr.DataTree) -> str:
+    """A table for each observation."""
+    lines = []
+    for name, node in found.children.items():
+        data = node.to_dataset()
+        count = data.sizes["output"]
+        numbers = f"{count} numbers, " if count > 1 else ""
+        lines.append(f"{name} ({numbers}{data.attrs['unit']})")
+        if found.attrs["method"] == "sobol":
+            header = ("factor", "first", "+-", "total", "+-")
+            names = ("first_together", "first_together_half_width")
+            names += ("total_together", "total_together_half_width")
+        elif found.attrs["method"] == "morris":
+            header, names = ("factor", "mean absolute effect"), ("mu_star_together",)
+        else:
+            header, names = ("parameter", "total index at most"), ("bound_on_total_together",)
+        rows = [
+            (str(label), *(round(float(data[n][k]), 4) for n in names))
+            for k, label in enumerate(data[data[names[0]].dims[0]].values)
+        ]
+        lines.append(table(header, rows))
+        if found.attrs["method"] == "derivatives":
+            lines.append(_active(data))
+    return "\n".join(lines)
+
+
+def _active(data: xr.Dataset) -> str:
+    """The leading direction in words."""
+    values, vectors = data["active_value"].values, data["active_direction"].values
+    if not values.sum() > 0.0:
+        return "nothing changes along any direction"
+    terms = " ".join(
+        f"{weight:+.2f} {name}"
+        for name, weight in zip(data["parameter"].values, vectors[:, 0], strict=True)
+    )
+    share = 100.0 * values[0] / values.sum()
+    return f"{share:.0f} % of the squared slopes along {terms} (in the unit box)"
+
+
+def _plain(data: xr.Dataset) -> dict[str, Any]:
+    """Indices of all numbers together, and of each where they are few, as plain JSON."""
+    few = data.sizes["output"] <= 100
+    found: dict[str, Any] = {"unit": data.attrs["unit"], "evaluations": data.attrs["evaluations"]}
+    for name, values in data.variables.items():
+        if few or "output" not in values.dims:
+            found[str(name)] = values.values.tolist()
+    return found
+
+
+def _groups(words: list[str]) -> dict[str, list[str]]:
+    """``NAME=A,B`` by name."""
+    found = {}
+    for word in words:
+        name, mark, members = word.partition("=")
+        if not mark or not name or not all(members.split(",")):
+            raise InputError(f"--group {word}: write NAME=A,B, e.g. matrix=a,b")
+        if name in found:
+            raise InputError(f"--group {name} is given twice")
+        found[name] = members.split(",")
+    return found
