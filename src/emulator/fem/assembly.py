@@ -36,6 +36,7 @@ from emulator.fem.functional import (
     volume_ratio,
 )
 from emulator.fem.mixed import Condensed, consistent, linearise
+from emulator.fem.near import KeptFactor
 from emulator.fem.programs import compiled
 from emulator.fem.sparse import Factorisation, Pattern, block_pattern
 from emulator.scenes.local_terms import LocalForce, LocalTerm
@@ -230,9 +231,25 @@ class System:
         """The smallest ``J``, shape (): NaN if any is."""
         return jnp.min(volume_ratio(self.scene, u))
 
+    @compiled
     def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
         """Solve ``K x = rhs`` over the free degrees of freedom, shape (f,)."""
         return self.pattern.solve(tangent, rhs, self.factorisation)
+
+    def step(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
+        """:meth:`solve` for a step of Newton's method, with the factor of another one if it serves.
+
+        On a large mesh, where tangent and right-hand side are numbers.
+        """
+        traced = any(isinstance(x, jax.core.Tracer) for x in (tangent, rhs))
+        if self._kept is None or traced:
+            return self.solve(tangent, rhs)
+        return self._kept.solve(tangent, rhs)
+
+    @cached_property
+    def _kept(self) -> KeptFactor | None:
+        wanted = self.factorisation == "cholmod" and not self.mixed
+        return KeptFactor(self.pattern) if wanted and KeptFactor.pays(self.pattern) else None
 
 
 def relative_residual(

@@ -73,8 +73,9 @@ def newton_direction(system: System, theta: jax.Array, state: NewtonState) -> Di
         else _on_volumes(system, theta, state)
     )
     tangent, solvable, residual, pull, condensed = linearised
+    full = system.step(tangent, -(residual + pull))
     move, slope, singular = _full_step(
-        system, state.u, state.level, tangent, solvable, residual, pull, settled
+        system, state.u, state.level, tangent, solvable, residual, pull, settled, full
     )
     return Direction(move, residual, pull, slope, settled, singular, tangent, condensed)
 
@@ -89,12 +90,14 @@ def _full_step(
     residual: jax.Array,
     pull: jax.Array,
     settled: jax.Array,
+    move: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Step (n, 3), residual . step before any reversal, and whether the tangent is singular."""
-    force = residual + pull
-    move = system.solve(tangent, -force)
+    """Step (n, 3), residual . step before any reversal, and whether the tangent is singular.
+
+    move : (f,) solves for the residual.
+    """
     slope = jnp.vdot(residual, move)
-    endless = _endless(tangent, move, force)
+    endless = _endless(tangent, move, residual + pull)
     if not system.mixed:
         move = jnp.where(settled & (slope > 0.0), -move, move)
     move = system.extend(move) + support_offset(system, u, level)

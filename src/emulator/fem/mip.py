@@ -87,9 +87,11 @@ class MipNewton:
 
     def step(self, state: MipState, stiffening: jax.Array) -> MipState:
         """One iteration, with ``stiffening`` times the stiffness of the loads in its tangent."""
-        move, definite = _promised_step(
+        values, solvable, residual = _promised(
             self.system, state.u, state.measures, self.theta, self.level, stiffening
         )
+        full = self.system.step(values, -residual)
+        move, definite = _promised_step(self.system, values, solvable, residual, full)
         fraction = self._fraction(state.u, move)
         ahead, measures = _taken(self.system, state.u, state.measures, self.theta, move, fraction)
         _, error = balance(self.system, ahead, self.theta, self.level)
@@ -111,25 +113,35 @@ def _measures_of(system: System, u: jax.Array) -> jax.Array:
 
 
 @compiled
-def _promised_step(
+def _promised(
     system: System,
     u: jax.Array,
     measures: jax.Array,
     theta: jax.Array,
     level: jax.Array,
     stiffening: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """The full step (n, 3) mm, NaN where there is none, and whether its tangent is definite."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Tangent (nnz,), whether it is solvable, and residual (f,)."""
     point, grid = MaterialPoint(system.scene, theta), system.scene.discretisation
     H = displacement_gradient(system.scene, u)
     stress, tangent = _everywhere(system.scene, point.linearise, H, measures)
     force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
     residual = system.restrict(system.scatter(force) + system.others(u, theta, level))
     K = system.assemble(system.element_blocks(tangent), u, theta, stiffening)
-    values = system.pattern.safe_values(K)
-    move = system.solve(values, -residual)
+    return system.pattern.safe_values(K), system.pattern.solvable(K), residual
+
+
+@compiled
+def _promised_step(
+    system: System,
+    values: jax.Array,
+    solvable: jax.Array,
+    residual: jax.Array,
+    move: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The full step (n, 3) mm, NaN where there is none, and whether its tangent is definite."""
     definite = _definite(system, values, residual, move)
-    return system.extend(jnp.where(system.pattern.solvable(K), move, jnp.nan)), definite
+    return system.extend(jnp.where(solvable, move, jnp.nan)), definite
 
 
 @compiled

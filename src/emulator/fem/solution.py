@@ -45,7 +45,9 @@ class Solution(NamedTuple):
     displacement : (n, 3) mm; when not converged, the solution at ``load_reached``.
     status : a :class:`Status` as an integer.
     iterations : of Newton's method and of the stress iterates, over all routes and load levels.
-    factorisations : tangents factorised on the way; the other iterations kept the last one.
+    factorisations : tangents used on the way; the other iterations kept the last one. Each is
+        factorised, except on a large mesh where the factor of another serves
+        (:class:`emulator.fem.near.KeptFactor`).
     residual : norm of the residual relative to the internal and external forces.
     load_reached : largest fraction of the load with a converged solution.
     """

@@ -30,8 +30,13 @@ failure while waiting for the result, the second if the call itself fails. Both 
 
 # By default sparsax caches up to 32 UMFPACK and 8 CHOLMOD factors of each pattern, for matrices
 # that recur. Ours recur only in consecutive solves, and a factor of a large mesh takes a gigabyte.
-sparsax.set_umf_cache_size(2)
-sparsax.set_num_cache_size(2)
+def remember_factors(count: int) -> None:
+    """Let the solver keep so many factors of each pattern, of CHOLMOD and of UMFPACK each."""
+    sparsax.set_umf_cache_size(count)
+    sparsax.set_num_cache_size(count)
+
+
+remember_factors(2)
 
 
 def quiet_blas() -> None:

@@ -12,7 +12,9 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 import emulator as em
-from emulator.fem.near import NearSolver, conjugate_gradients
+from emulator.fem.assembly import System
+from emulator.fem.near import KeptFactor, NearSolver, conjugate_gradients
+from emulator.fem.sparse import REFUSALS
 from emulator.scenes.loads import FollowerPressure
 
 
@@ -97,3 +99,37 @@ def test_without_a_potential_there_is_no_reference(ventricle: em.Simulator) -> N
     follower = replace(scene, loads=(FollowerPressure("endocardium"),), origin={})
     simulator = em.Simulator(follower)
     assert simulator.near(simulator.rest, follower.centre).reference is None
+
+
+def test_a_kept_factor_leads_to_the_same_equilibrium(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a mesh large enough for it, and with fewer factorisations than tangents."""
+    scene = em.scenes.left_ventricle(5, 10, 1)
+    usual = em.Simulator(scene)
+    monkeypatch.setattr(KeptFactor, "pays", staticmethod(lambda pattern: True))
+    monkeypatch.setattr("emulator.fem.near._LARGE", 400)
+    monkeypatch.setattr("emulator.fem.near.remember_factors", lambda count: None)
+    keeping = em.Simulator(scene)
+    tangents = 0
+    for position in ([0.5] * 5, [0.55] * 5, [0.6, 0.5, 0.5, 0.5, 0.45], [0.0] * 5):
+        theta = scene.from_unit(jnp.asarray(position))
+        expected, found = usual.solve(theta), keeping.solve(theta)
+        assert found.converged
+        assert jnp.abs(found.displacement - expected.displacement).max() < 1e-7
+        tangents += int(found.factorisations)
+    kept = keeping._driver.definite._kept
+    assert kept is not None
+    assert 1 <= kept.factorisations < tangents
+
+
+def test_a_kept_factor_s_refusal_is_cholmod_s(ventricle: em.Simulator) -> None:
+    definite = System(ventricle.scene, "cholmod")
+    kept = KeptFactor(definite.pattern)
+    u = ventricle(ventricle.scene.centre)
+    K, _ = definite.safe_tangent(u, ventricle.scene.centre, 1.0)
+    b = jnp.asarray(np.random.default_rng(0).normal(size=definite.pattern.size))
+    x = kept.solve(K, b)
+    assert np.allclose(kept.solve(1.001 * K, b), x / 1.001, rtol=1e-6, atol=1e-9)
+    assert kept.factorisations == 1
+    diagonal = definite.pattern.rows == definite.pattern.columns
+    with pytest.raises(REFUSALS, match="not positive definite"):
+        kept.solve(K - K.max() * diagonal, b)
