@@ -24,6 +24,7 @@ Several outputs have indices each, and together those of their variances' sum (G
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -108,7 +109,7 @@ def _by_variance(factors: Factors, function: Function, samples: int, seed: int) 
             resampled[name] += variance[k] * told[f"{key}_conf_all"]
     kept = variance * _varies(outputs)
     dims = ("factor", "output")
-    data = {name: (dims, values) for name, values in found.items()}
+    data: dict[str, Any] = {name: (dims, values) for name, values in found.items()}
     data |= {f"{name}_half_width": (dims, values) for name, values in half.items()}
     width = 1.959964  # of a normal distribution's 95 %
     for name, values in found.items():
@@ -134,7 +135,7 @@ def _by_screening(factors: Factors, function: Function, samples: int, seed: int)
             ("mu_star", "mu_star"), ("sigma", "sigma"), ("mu_star_half_width", "mu_star_conf"),
         ):  # fmt: skip
             found[name][:, k] = np.ma.filled(np.ma.asarray(told[key], dtype=float), np.nan)
-    data = {name: (("factor", "output"), values) for name, values in found.items()}
+    data: dict[str, Any] = {name: (("factor", "output"), values) for name, values in found.items()}
     together = np.sqrt(np.mean(found["mu_star"] ** 2, axis=1))
     data["mu_star_together"] = ("factor", together)
     return _dataset(data, factors, evaluations=len(points), method="morris")
@@ -205,7 +206,7 @@ def _varies(outputs: np.ndarray) -> np.ndarray:
     return outputs.std(axis=0) > 1e-12 * np.where(size > 0.0, size, 1.0)
 
 
-def _dataset(data: dict, factors: Factors, **attributes: object) -> xr.Dataset:
+def _dataset(data: dict[str, Any], factors: Factors, **attributes: object) -> xr.Dataset:
     coords = (
         {"factor": list(factors.labels)} if any("factor" in d[0] for d in data.values()) else {}
     )

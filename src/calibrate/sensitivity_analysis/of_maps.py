@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import jax
@@ -13,7 +13,7 @@ import xarray as xr
 from calibrate.observations import Observation, Observations, observations
 from calibrate.prior_range import fit_to
 from calibrate.priors import Prior, box_prior
-from calibrate.sensitivity_analysis.analysis import analyse
+from calibrate.sensitivity_analysis.analysis import Function, analyse
 from calibrate.sensitivity_analysis.factors import Factors, check_independent, densities, quantiles
 from emulator.errors import InputError
 from emulator.surrogates.protocol import ForwardMap, evaluate_all
@@ -83,10 +83,10 @@ def sensitivity(
     for name, entries in outputs.places.items():
         data = analyse(
             factors,
-            lambda points, entries=entries: function(points)[:, entries],
+            _some(function, entries),
             method=method,
             samples=samples,
-            derivative=lambda points, entries=entries: derivative(points)[:, entries],
+            derivative=_some(derivative, entries),
             seed=seed,
         )
         unit = "mm" if name == FIELD else parts[name].unit
@@ -148,7 +148,12 @@ class _Outputs:
         return np.asarray(jax.jit(lambda t: jax.lax.map(slope, t))(thetas))
 
 
-def _remembered(function: Callable[[np.ndarray], np.ndarray]) -> Callable:
+def _some(function: Function, entries: slice) -> Function:
+    """Some of the outputs (n, m, ...) of ``function``."""
+    return lambda points: function(points)[:, entries]
+
+
+def _remembered(function: Function) -> Function:
     """``function`` that repeats its last answer to the same points."""
     last: dict[bytes, np.ndarray] = {}
 

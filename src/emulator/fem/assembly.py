@@ -35,8 +35,8 @@ from emulator.fem.functional import (
     strain_energy,
     volume_ratio,
 )
+from emulator.fem.kept import KeptFactor
 from emulator.fem.mixed import Condensed, consistent, linearise
-from emulator.fem.near import KeptFactor
 from emulator.fem.programs import compiled
 from emulator.fem.sparse import Factorisation, Pattern, block_pattern
 from emulator.scenes.local_terms import LocalForce, LocalTerm

@@ -97,9 +97,32 @@ def biventricular_directions(
 
 
 def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Depth:
-    """Harmonic depth, 0 on the facet sets ``inside`` and 1 on ``outside``.
+    """Harmonic depth, 0 on the facet sets ``inside`` and 1 on ``outside``."""
+    low, high = _nodes(mesh, inside), _nodes(mesh, outside)
+    if np.isin(low, high).any():
+        between = " and ".join(f"'{name}'" for name in (*inside, *outside))
+        raise InputError(f"fibres: facet sets {between} have nodes in common; there is no wall")
+    _, elements, value, normals = nodal_depth(mesh, low, high)
+    return Depth(value[elements].mean(axis=1), _unit(normals[elements].mean(axis=1)))
 
-    Gradients are averaged at the nodes first: an element's own is one order less accurate.
+
+class NodalDepth(NamedTuple):
+    """Depth in a wall at the k corner nodes of a mesh.
+
+    corners : (k,) the nodes. elements : (m, 4) rows of ``corners``.
+    value : (k,) from 0 to 1. normal : (k, 3) of length 1.
+    """
+
+    corners: np.ndarray
+    elements: np.ndarray
+    value: np.ndarray
+    normal: np.ndarray
+
+
+def nodal_depth(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> NodalDepth:
+    """The harmonic function that is 0 at the corner nodes ``low`` and 1 at ``high``.
+
+    Gradients are averaged at the nodes: an element's own is one order less accurate.
     """
     # Corner nodes alone: a quadratic mesh gives the same directions as the linear one it came from.
     corners, elements = np.unique(mesh.elements[:, :4], return_inverse=True)
@@ -107,10 +130,7 @@ def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Dept
     basis = Basis(
         MeshTet(mesh.nodes[corners].T.copy(), elements.T.copy(), sort_t=False), ElementTetP1()
     )
-    low, high = (np.searchsorted(corners, _nodes(mesh, names)) for names in (inside, outside))
-    if np.isin(low, high).any():
-        between = " and ".join(f"'{name}'" for name in (*inside, *outside))
-        raise InputError(f"fibres: facet sets {between} have nodes in common; there is no wall")
+    low, high = (np.searchsorted(corners, nodes) for nodes in (low, high))
     value = basis.zeros()
     value[high] = 1.0
     value = solve(*condense(laplace.assemble(basis), x=value, D=np.union1d(low, high)))
@@ -118,8 +138,7 @@ def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Dept
     volumes = basis.dx.sum(axis=1)
     at_nodes = np.zeros((len(corners), 3))
     np.add.at(at_nodes, elements, (volumes[:, None] * slope)[:, None])
-    at_nodes = _unit(at_nodes)
-    return Depth(value[elements].mean(axis=1), _unit(at_nodes[elements].mean(axis=1)))
+    return NodalDepth(corners, elements, value, _unit(at_nodes))
 
 
 def turned(wall: Depth, angles: Angles, axis: Axis) -> Directions:

@@ -36,6 +36,7 @@ def left_ventricle(
     angles: tuple[float, float] = HELIX,
     kappa: float = 25.0,
     wall: tuple[float, float, float, float, float] = astuple(HUMAN),
+    thicker: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:
     """Holzapfel-Ogden ventricle under cavity pressure, its base held.
 
@@ -55,8 +56,9 @@ def left_ventricle(
     angles : helix angle in degrees on the endocardium and on the epicardium.
     kappa : resistance to volume change, kPa.
     wall : the dimensions of an :class:`~emulator.geometry.bodies.ellipsoid.EllipsoidalWall`, mm.
+    thicker : by which fraction the wall is thicker at the base, and towards which angle in degrees.
     """
-    mesh = truncated_ellipsoid(EllipsoidalWall(*wall), rings, around, layers)
+    mesh = truncated_ellipsoid(EllipsoidalWall(*wall), rings, around, layers, thicker=thicker)
     return Scene(
         name="left_ventricle",
         mesh=mesh,
@@ -75,5 +77,6 @@ def left_ventricle(
             "kappa": kappa,
             # Not written for the default wall, so that files of older releases stay equal.
             **({} if wall == astuple(HUMAN) else {"wall": list(wall)}),
+            **({} if thicker == (0.0, 0.0) else {"thicker": list(thicker)}),
         },
     )

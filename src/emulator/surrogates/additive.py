@@ -26,6 +26,7 @@ import numpy as np
 
 from emulator.scenes.scene import Scene
 from emulator.surrogates.discrepancy import Discrepancy
+from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.part import Network
 from emulator.surrogates.part import CachedPart, Part
 from emulator.surrogates.protocol import (
@@ -41,6 +42,7 @@ from emulator.surrogates.taylor import Expansion
 KINDS: dict[str, type[Part]] = {
     "taylor": Expansion,
     "network": Network,
+    "family": FamilyNetwork,
     "discrepancy": Discrepancy,
 }
 """The kinds of parts, in the order they are summed, by the field of :class:`Emulator` that holds
@@ -56,6 +58,7 @@ class Emulator:
     scene : what it emulates.
     taylor : Taylor series of the equilibrium; of order 0, an offset.
     network : graph network.
+    family : network that has learned a family of bodies, on this one.
     discrepancy : model of what FEM runs showed the other parts to leave.
     record : how it was trained, plain JSON.
     """
@@ -63,6 +66,7 @@ class Emulator:
     scene: Scene
     taylor: Expansion | None = None
     network: Network | None = None
+    family: FamilyNetwork | None = None
     discrepancy: Discrepancy | None = None
     record: Mapping[str, Any] = field(default_factory=dict)
 

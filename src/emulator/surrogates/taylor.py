@@ -89,6 +89,30 @@ class Expansion:
         )
         return cls(centre, jnp.asarray(u), indices, jnp.asarray(derivatives))
 
+    def less(self, part: CachedPart) -> Expansion:
+        """What is left of the series without that of ``part``, over all nodes, about its centre.
+
+        Added to the part, it has the same derivatives there as FEM.
+        """
+        count = len(self.centre)
+        derivative = lambda x: part.coefficients(x)  # noqa: E731
+        known: dict[tuple[int, ...], jax.Array] = {(): part.coefficients(jnp.asarray(self.centre))}
+        for degree in range(1, self.order + 1):
+            derivative = jax.jacfwd(derivative)
+            tensor = jax.jit(derivative)(jnp.asarray(self.centre))
+            for term in combinations_with_replacement(range(count), degree):
+                known[term] = tensor[(slice(None), *term)]
+        modes = jnp.asarray(part.modes)
+        fields = [
+            jnp.tensordot(known[tuple(int(k) for k in row if k >= 0)], modes, axes=1)
+            for row in self.indices
+        ]
+        return replace(
+            self,
+            displacement=self.displacement - part.offset - jnp.tensordot(known[()], modes, axes=1),
+            derivatives=self.derivatives - jnp.stack(fields) if fields else self.derivatives,
+        )
+
     def rounded(self) -> Expansion:
         """The series in numbers float32 can hold, so that a file of half the size loses nothing."""
         u, derivatives = (rounded(a) for a in (self.displacement, self.derivatives))

@@ -14,19 +14,23 @@ from emulator.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.discrepancy import fit_discrepancy
-from emulator.surrogates.taylor import constant
+from emulator.surrogates.taylor import Expansion, constant
 
 _HELD_OUT = 5  # every fifth run is held out
 FEWEST = 10  # runs; of fewer, none is held out
 _OBSERVATIONS = 4000  # values and derivatives; their covariance matrix takes 128 MB
 
 
-def add_discrepancy(emulator: Emulator, runs: Runs) -> tuple[Emulator, dict[str, Any]]:
+def add_discrepancy(
+    emulator: Emulator, runs: Runs, series: Expansion | None = None
+) -> tuple[Emulator, dict[str, Any]]:
     """``emulator`` with a discrepancy model of ``runs``, and a record of how it was chosen.
 
     The model is fitted on top of nothing, of the Taylor series, and of series and network, and the
     sum with the least error at held-out runs is taken, then fitted to all runs: a network helps
     where runs are few and harms where they are many. Parts that are not in that sum are dropped.
+
+    series : FEM's own, where that in ``emulator`` is of what a family's network leaves.
 
     Raises
     ------
@@ -40,15 +44,17 @@ def add_discrepancy(emulator: Emulator, runs: Runs) -> tuple[Emulator, dict[str,
         raise InputError(
             "the discrepancy model needs FEM runs besides the centre's; give a larger budget"
         )
-    series = emulator.taylor or constant(
-        np.full(runs.theta.shape[1], 0.5), jnp.zeros(emulator.scene.held.shape)
+    series = (
+        series
+        or emulator.taylor
+        or constant(np.full(runs.theta.shape[1], 0.5), jnp.zeros(emulator.scene.held.shape))
     )
 
     def fitted(bare: Emulator, some: Runs) -> Emulator:
         model = fit_discrepancy(bare.scene, some, series, _mean(bare)).rounded()
         return replace(bare, discrepancy=model)
 
-    sums = _sums(emulator)
+    sums = _sums(emulator, series)
     errors: dict[str, float] = {}
     best = "taylor" if "taylor" in sums else "nothing"
     if count >= FEWEST:
@@ -63,10 +69,15 @@ def add_discrepancy(emulator: Emulator, runs: Runs) -> tuple[Emulator, dict[str,
     return whole, record
 
 
-def _sums(emulator: Emulator) -> dict[str, Emulator]:
+def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:
     """The sums of parts a discrepancy model may be added to, by name."""
     bare = replace(emulator, discrepancy=None)
-    candidates = [replace(bare, taylor=None, network=None), replace(bare, network=None), bare]
+    nothing = replace(bare, taylor=None, network=None, family=None)
+    if emulator.family is not None:
+        alone = replace(bare, taylor=None)
+        candidates = [nothing, replace(nothing, taylor=series), alone, bare]
+    else:
+        candidates = [nothing, replace(bare, network=None), bare]
     return {" + ".join(sum_.parts) or "nothing": sum_ for sum_ in candidates}
 
 

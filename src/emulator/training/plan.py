@@ -60,7 +60,8 @@ class Plan:
         if self.objective not in OBJECTIVES:
             *others, last = OBJECTIVES
             raise InputError(f"objective '{self.objective}': use {', '.join(others)} or {last}")
-        least = {"steps": 0 if self.discrepancy else 1, "batch": 1, "checkpoint_every": 1}
+        without = self.discrepancy or self.recipe == "family"
+        least = {"steps": 0 if without else 1, "batch": 1, "checkpoint_every": 1}
         for name, value in least.items():
             if getattr(self, name) < value:
                 raise InputError(
@@ -115,6 +116,7 @@ RECIPES: dict[str, Plan] = {
         simulations=60,
         steps=0,
     ),
+    "family": Plan(recipe="family", objective="energy", steps=0),
     "network": Plan(),
     "modal": Plan(
         recipe="modal",
@@ -139,7 +141,8 @@ RECIPES: dict[str, Plan] = {
 }
 """``hybrid``: a Taylor series, a network trained on the energy in mechanical modes, and a
 discrepancy model. ``mechanics``: the same without a network, from a mesh to an emulator in a
-minute. ``modal``: a network alone about the FEM solution at the centre, its modes by variable
+minute. ``family``: a network that has learned a family of bodies, on this one, without any FEM run.
+``modal``: a network alone about the FEM solution at the centre, its modes by variable
 projection, their coefficients from values and slopes of FEM runs. ``network``: Algorithm 1 about
 the FEM solution at the centre, trained on FEM runs and the energy. ``paper``: Algorithm 1 from
 zero, the energy at one theta a step, Adam at 1e-4 and then 1e-5, as released by Dalton et al.

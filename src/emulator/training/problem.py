@@ -18,13 +18,14 @@ from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.graph import augment
 from emulator.surrogates.network.part import Network, fresh
 from emulator.surrogates.network.pignn import Architecture
+from emulator.surrogates.protocol import all_nodes
 from emulator.surrogates.taylor import Expansion, constant, expand
 from emulator.training.basis import mechanical_modes
 from emulator.training.discrepancy_stage import FEWEST
 from emulator.training.modal import ARCHITECTURE, Modal
 from emulator.training.objectives import Scales, make_loss, mean_square_gradient
 from emulator.training.plan import Plan
-from emulator.training.start import architecture_from, with_network_of
+from emulator.training.start import architecture_from, family_on, with_network_of
 from emulator.training.step import Step, batch_descent, make_step
 
 # Standard deviation of the displacements as a fraction of the centre's, where no FEM run tells it.
@@ -40,6 +41,7 @@ class Problem:
     runs : FEM solutions, the centre's first.
     optimiser, step : of the network (:func:`~emulator.training.step.make_step`), or None.
     modal : what teaches the network modes and then coefficients, for plans that do.
+    series : FEM's own, where the emulator's is of what a family's network leaves.
     """
 
     plan: Plan
@@ -48,6 +50,7 @@ class Problem:
     optimiser: optax.GradientTransformation | None
     step: Step | None
     modal: Modal | None = None
+    series: Expansion | None = None
 
     @property
     def architecture(self) -> Architecture | None:
@@ -95,7 +98,10 @@ def prepare(
     deadline : of the performance counter, after which no FEM run is begun, except the fewest that
         a discrepancy model can be judged by.
     """
-    if start is not None:
+    family = None
+    if start is not None and start.family is not None:
+        family = family_on(start, scene, plan)
+    elif start is not None:
         architecture = architecture_from(start, scene, plan, architecture)
     simulator = Simulator(scene)
     # Rounded as a file stores it, so that the discrepancy is fitted to the series that is loaded.
@@ -105,6 +111,11 @@ def prepare(
         plan = replace(plan, simulations=len(runs.theta) - 1)
     if series is None and plan.centred:
         series = constant(np.asarray(scene.to_unit(scene.centre)), runs.displacement[0])
+    if family is not None:
+        assert series is not None, "its recipes have a series"
+        rest = series.less(family.cache(all_nodes(scene))).rounded()
+        emulator = Emulator(scene, taylor=rest, family=family)
+        return Problem(plan, emulator, runs, None, None, series=series)
     emulator = Emulator(scene, taylor=series)
     if plan.objective == "modes" and plan.freeze >= plan.steps:
         plan = replace(plan, freeze=plan.steps // 2)

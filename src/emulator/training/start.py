@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
+from emulator.surrogates.network.family import FamilyNetwork, on_body
 from emulator.surrogates.network.graph import node_inputs
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.plan import Plan
@@ -34,6 +35,23 @@ def with_network_of(emulator: Emulator, start: Emulator) -> Emulator:
     copies = [jnp.copy(leaf) for leaf in jax.tree.leaves(start.network.weights)]
     structure = jax.tree.structure(emulator.network.weights)
     return with_weights(emulator, jax.tree.unflatten(structure, copies))
+
+
+def family_on(start: Emulator, scene: Scene, plan: Plan) -> FamilyNetwork:
+    """The network that ``start`` has learned from a family, on ``scene``.
+
+    Raises
+    ------
+    InputError
+        A plan that would train it further, or a scene it cannot know.
+    """
+    assert start.family is not None, "asked only of a family's"
+    if plan.steps or not (plan.discrepancy or plan.recipe == "family"):
+        raise InputError(
+            f"recipe '{plan.recipe}' cannot start from a network that has learned a family of "
+            "bodies; use recipe family, without any FEM run, or mechanics"
+        )
+    return on_body(start.family.learned, scene)
 
 
 def start_record(start: Emulator) -> dict[str, Any]:

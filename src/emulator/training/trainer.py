@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.pignn import Architecture
@@ -18,7 +19,7 @@ from emulator.training.discrepancy_stage import add_discrepancy
 from emulator.training.loop import Bar, Hook, Keep, Steps, optimise, require_finite
 from emulator.training.plan import Plan
 from emulator.training.problem import Problem, prepare
-from emulator.training.start import start_record, with_weights
+from emulator.training.start import family_on, start_record, with_weights
 
 
 def train(
@@ -48,6 +49,8 @@ def train(
         interrupted; one on a budget keeps the number of steps it was aiming at.
     """
     path, began = Path(folder) / CHECKPOINT, time.perf_counter()
+    if plan.recipe == "family":
+        return _as_learned(scene, plan, start, began)
     saved = read_checkpoint(path, scene.fingerprint, scene.name) if resume else None
     source = {} if start is None else start_record(start)
     if saved is not None:
@@ -63,6 +66,23 @@ def train(
     emulator, record = _finish(problem, state, progress=progress)
     record |= {"start": source} if source else {}
     return replace(emulator, record={**record, "seconds": round(clock(), 1)})
+
+
+def _as_learned(scene: Scene, plan: Plan, start: Emulator | None, began: float) -> Emulator:
+    """The network of a family on ``scene``, as it is."""
+    if start is None or start.family is None:
+        raise InputError(
+            "recipe 'family' takes a network that has learned a family of bodies to a new one; "
+            "give it as the start, e.g. ventricle_family"
+        )
+    part = family_on(start, scene, plan)
+    record = {
+        "plan": asdict(plan),
+        "final_loss": None,
+        "start": start_record(start),
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+    return Emulator(scene, family=part, record=record)
 
 
 def _optimise(
@@ -91,7 +111,7 @@ def _finish(problem: Problem, state: State, *, progress: bool) -> tuple[Emulator
         emulator = with_weights(emulator, problem.finish(state.weights, progress=progress))
     record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
     if plan.discrepancy:
-        emulator, record["discrepancy"] = add_discrepancy(emulator, problem.runs)
+        emulator, record["discrepancy"] = add_discrepancy(emulator, problem.runs, problem.series)
     return emulator, record
 
 

@@ -13,7 +13,8 @@ from scipy.sparse.linalg import spsolve
 
 import emulator as em
 from emulator.fem.assembly import System
-from emulator.fem.near import KeptFactor, NearSolver, conjugate_gradients
+from emulator.fem.kept import KeptFactor, conjugate_gradients
+from emulator.fem.near import NearSolver
 from emulator.fem.sparse import REFUSALS
 from emulator.scenes.loads import FollowerPressure
 
@@ -106,8 +107,8 @@ def test_a_kept_factor_leads_to_the_same_equilibrium(monkeypatch: pytest.MonkeyP
     scene = em.scenes.left_ventricle(5, 10, 1)
     usual = em.Simulator(scene)
     monkeypatch.setattr(KeptFactor, "pays", staticmethod(lambda pattern: True))
-    monkeypatch.setattr("emulator.fem.near._LARGE", 400)
-    monkeypatch.setattr("emulator.fem.near.remember_factors", lambda count: None)
+    monkeypatch.setattr("emulator.fem.kept._LARGE", 400)
+    monkeypatch.setattr("emulator.fem.kept.remember_factors", lambda count: None)
     keeping = em.Simulator(scene)
     tangents = 0
     for position in ([0.5] * 5, [0.55] * 5, [0.6, 0.5, 0.5, 0.5, 0.45], [0.0] * 5):

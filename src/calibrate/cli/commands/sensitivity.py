@@ -16,6 +16,17 @@ if TYPE_CHECKING:
     from emulator.scenes.scene import Scene
 
 _METHODS = ("sobol", "morris", "derivatives")
+# By method: the heads of a table's columns, and what is in them; blanks keep heads apart.
+_COLUMNS = {
+    "sobol": {
+        "first": "first_together",
+        "+-": "first_together_half_width",
+        "total": "total_together",
+        "+- ": "total_together_half_width",
+    },
+    "morris": {"mean absolute effect": "mu_star_together"},
+    "derivatives": {"total index at most": "bound_on_total_together"},
+}
 _SAMPLES = {"sobol": 512, "morris": 64, "derivatives": 256}
 
 
@@ -107,7 +118,8 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.out:
         write(found, scene, Path(arguments.out))
-    report = {**found.attrs, **{name: _plain(node.to_dataset()) for name, node in found.items()}}
+    report: dict[str, Any] = {str(name): value for name, value in found.attrs.items()}
+    report |= {name: _plain(node.to_dataset()) for name, node in found.children.items()}
     emit(report, as_json=arguments.json, text=summary(found))
     return DONE
 
@@ -126,12 +138,12 @@ def write(found: xr.DataTree, scene: Scene, folder: Path) -> None:
     draw(found, scene, folder)
     if FIELD in found.children:
         data = found[FIELD].to_dataset()
-        nodal = {
-            f"{name} {label}": np.nan_to_num(np.asarray(data[name][k]))
-            for name in ("first", "total", "mu_star", "bound_on_total")
-            if name in data
-            for k, label in enumerate(data[data[name].dims[0]].values)
-        }
+        nodal: dict[str, np.ndarray] = {}
+        for name in {"first", "total", "mu_star", "bound_on_total"} & set(map(str, data)):
+            for label, values in zip(
+                data[data[name].dims[0]].values, data[name].values, strict=True
+            ):
+                nodal[f"{name} {label}"] = np.nan_to_num(values)
         write_nodal(folder / "sensitivity.vtu", scene.mesh, nodal)
 
 
@@ -143,14 +155,9 @@ def summary(found: xr.DataTree) -> str:
         count = data.sizes["output"]
         numbers = f"{count} numbers, " if count > 1 else ""
         lines.append(f"{name} ({numbers}{data.attrs['unit']})")
-        if found.attrs["method"] == "sobol":
-            header = ("factor", "first", "+-", "total", "+-")
-            names = ("first_together", "first_together_half_width")
-            names += ("total_together", "total_together_half_width")
-        elif found.attrs["method"] == "morris":
-            header, names = ("factor", "mean absolute effect"), ("mu_star_together",)
-        else:
-            header, names = ("parameter", "total index at most"), ("bound_on_total_together",)
+        columns = _COLUMNS[found.attrs["method"]]
+        names = list(columns.values())
+        header = [str(data[names[0]].dims[0]), *(head.rstrip() for head in columns)]
         rows = [
             (str(label), *(round(float(data[n][k]), 4) for n in names))
             for k, label in enumerate(data[data[names[0]].dims[0]].values)

@@ -20,6 +20,8 @@ from emulator.geometry.bodies.prisms import extrude, stacked
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import Midpoints
 
+_MOST_UNEVEN = 0.5  # beyond, the thin side of a thick-walled ventricle is too thin to mesh
+
 
 @dataclass(frozen=True)
 class EllipsoidalWall:
@@ -86,9 +88,14 @@ HUMAN = EllipsoidalWall(23.0, 58.0, 34.0, 65.0, base=20.0)
 
 
 def truncated_ellipsoid(
-    wall: EllipsoidalWall, rings: int, around: int, layers: int, order: int = 1
+    wall: EllipsoidalWall,
+    rings: int,
+    around: int,
+    layers: int,
+    order: int = 1,
+    thicker: tuple[float, float] = (0.0, 0.0),
 ) -> Mesh:
-    """The wall, meshed by prisms through a disc of rings; each prism is cut in three.
+    r"""The wall, meshed by prisms through a disc of rings; each prism is cut in three.
 
     Parameters
     ----------
@@ -97,6 +104,9 @@ def truncated_ellipsoid(
     around : points on a full ring; rings nearer the apex have fewer.
     layers : from endocardium to epicardium.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the true surfaces.
+    thicker : by which fraction the wall is thicker at the base towards an angle :math:`\phi_0`, in
+        degrees; at ``t`` = 1 lies what would lie at
+        :math:`t = 1 + \alpha\, r \cos(\phi - \phi_0)`.
 
     Returns
     -------
@@ -108,6 +118,7 @@ def truncated_ellipsoid(
     radius, angle, triangles = disc(rings, around)
     r, phi = np.tile(radius, layers + 1), np.tile(angle, layers + 1)
     t = np.repeat(np.arange(layers + 1) / layers, len(radius))
+    depth = t * _thickness(r, phi, *thicker)
     base = np.flatnonzero(r == 1.0)
     apex = np.flatnonzero(r == 0.0)
     surfaces = {
@@ -116,13 +127,23 @@ def truncated_ellipsoid(
         "base": base,
     }
     return body(
-        wall.position(r, phi, t),
+        wall.position(r, phi, depth),
         extrude(stacked(len(radius), layers), triangles),
         surfaces,
         {"base": base, "apex_endocardium": apex[:1], "apex_epicardium": apex[-1:]},
-        wall_midpoints(wall, r, phi, t),
+        wall_midpoints(wall, r, phi, depth),
         order,
     )
+
+
+def _thickness(r: np.ndarray, phi: np.ndarray, more: float, angle: float) -> np.ndarray:
+    """Thickness of the wall at ``r`` and ``phi``, 1 at the apex; linear in x and y there."""
+    if not 0.0 <= more <= _MOST_UNEVEN or not np.isfinite(angle):
+        raise InputError(
+            f"ellipsoid: a wall thicker by {more} towards {angle} degrees; expected a fraction of "
+            f"0 to {_MOST_UNEVEN} and an angle"
+        )
+    return 1.0 + more * r * np.cos(phi - np.radians(angle))
 
 
 def wall_midpoints(

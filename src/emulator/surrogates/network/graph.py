@@ -61,37 +61,59 @@ class GraphOptions:
 
 def augment(scene: Scene, options: GraphOptions = GraphOptions()) -> AugmentedGraph:
     """The augmented graph of a scene's mesh; equal for equal scenes."""
-    features = node_inputs(scene)
-    positions = scene.mesh.nodes
-    edges = [mesh_edges(scene.mesh.elements)]
-    all_positions, all_features, offset = [positions], [features], 0
-    while len(positions) // options.cluster >= options.smallest:
-        count = len(positions) // options.cluster
-        parent = KMeans(count, n_init=1, random_state=0).fit(positions).labels_
-        above = offset + len(positions)
-        edges.append(np.column_stack([offset + np.arange(len(positions)), above + parent]))
-        positions, features = (
-            _cluster_means(values, parent, count) for values in (positions, features)
-        )
-        last = count // options.cluster < options.smallest
-        edges.append(
-            above + (_all_pairs(count) if last else _nearest(positions, options.neighbours))
-        )
-        all_positions.append(positions)
-        all_features.append(features)
-        offset = above
-    pairs = np.unique(np.sort(np.concatenate(edges), axis=1), axis=0)
+    layers = hierarchy(scene.mesh.nodes, mesh_edges(scene.mesh.elements), options)
+    pairs = layers.pairs
     receivers, senders = pairs[:, 0], pairs[:, 1]
-    positions = np.concatenate(all_positions)
+    positions = layers.extend(scene.mesh.nodes)
     relative = positions[receivers] - positions[senders]
     length = np.linalg.norm(relative, axis=1, keepdims=True)
     return AugmentedGraph(
-        node_features=frozen_array(_normalise(np.concatenate(all_features)), np.float32),
+        node_features=frozen_array(_normalise(layers.extend(node_inputs(scene))), np.float32),
         edge_features=frozen_array(_normalise(np.hstack([relative, length])), np.float32),
         senders=frozen_array(senders, np.int32),
         receivers=frozen_array(receivers, np.int32),
         real=len(scene.mesh.nodes),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Hierarchy:
+    """Mesh nodes and the virtual layers above them.
+
+    pairs : (E, 2) joined nodes, receiver < sender, each pair once.
+    parents : of each layer but the last, the cluster above that each of its nodes lies in.
+    """
+
+    pairs: np.ndarray
+    parents: tuple[np.ndarray, ...]
+
+    def extend(self, values: np.ndarray) -> np.ndarray:
+        """``values`` (n, d) of the mesh nodes, and below them means over clusters, (N, d)."""
+        each = [values]
+        for parent in self.parents:
+            each.append(_cluster_means(each[-1], parent, int(parent.max()) + 1))
+        return np.concatenate(each)
+
+
+def hierarchy(
+    positions: np.ndarray, edges: np.ndarray, options: GraphOptions = GraphOptions()
+) -> Hierarchy:
+    """Virtual layers above the nodes at ``positions`` (n, 3), which ``edges`` (e, 2) join."""
+    joined, parents, offset = [edges], [], 0
+    while len(positions) // options.cluster >= options.smallest:
+        count = len(positions) // options.cluster
+        parent = KMeans(count, n_init=1, random_state=0).fit(positions).labels_
+        parents.append(parent)
+        above = offset + len(positions)
+        joined.append(np.column_stack([offset + np.arange(len(positions)), above + parent]))
+        positions = _cluster_means(positions, parent, count)
+        last = count // options.cluster < options.smallest
+        joined.append(
+            above + (_all_pairs(count) if last else _nearest(positions, options.neighbours))
+        )
+        offset = above
+    pairs = np.unique(np.sort(np.concatenate(joined), axis=1), axis=0)
+    return Hierarchy(pairs, tuple(parents))
 
 
 def node_inputs(scene: Scene) -> np.ndarray:

@@ -1,0 +1,309 @@
+r"""A network that has learned a family of ventricles, as a part of an emulator.
+
+.. math:: u(x) = \sum_v \Big[ s \sum_k c_k(x, g)\, \varphi_{kv}(z_i) \Big] V_{iv}
+
+with :math:`V_{iv}` the vectors of node i, mm, that turn with the body
+(:mod:`emulator.surrogates.network.ventricle_graph`), :math:`z_i` its state after the messages, and
+:math:`g` the states' mean over the wall: coefficients depend on the whole body as modes do on its
+places. The messages know no theta, so that on a body the part is a sum of modes like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from emulator.errors import InputError
+from emulator.scenes.parameter_space import Parameter, ParameterSpace
+from emulator.scenes.scene import Scene
+from emulator.store import fill_tree, inside, named_leaves
+from emulator.surrogates.network.graph import AugmentedGraph
+from emulator.surrogates.network.mlp import MLP
+from emulator.surrogates.network.pignn import Architecture, Processor
+from emulator.surrogates.network.ventricle_graph import Described, describe
+from emulator.surrogates.part import CachedPart
+
+_TO_UNIT_SD = 12.0**0.5  # positions in the box are uniform on [0, 1]
+_SLACK = 1e-9  # of a parameter's range, for round-off
+_BEYOND = 0.1  # of the family's range by which a body may lie outside it
+
+VECTORS = 7
+"""Vectors of a node that the output is a combination of."""
+
+
+class FamilyModule(nnx.Module):
+    """Processor, trunk and branch."""
+
+    def __init__(
+        self,
+        architecture: Architecture,
+        node_width: int,
+        edge_width: int,
+        parameters: int,
+        rngs: nnx.Rngs,
+    ) -> None:
+        states, hidden = 2 * architecture.latent, architecture.hidden
+        self.processor = Processor(architecture, node_width, edge_width, rngs)
+        self.branch = MLP(
+            (parameters, states),
+            architecture.branch or hidden,
+            architecture.modes,
+            layer_norm=False,
+            zero_last=True,
+            rngs=rngs,
+        )
+        self.trunk = MLP(
+            (states,),
+            architecture.trunk or hidden,
+            VECTORS * architecture.modes,
+            layer_norm=False,
+            rngs=rngs,
+        )
+
+    def prepare(
+        self, graph: AugmentedGraph, vectors: jax.Array, shares: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Modes (r, n, 3) in units of ``vectors`` (n, 7, 3), and the mean state (2M,).
+
+        shares : (n,) of the wall's volume, at the nodes.
+        """
+        states = self.processor(graph)
+        weights = self.trunk(states).reshape(len(states), -1, VECTORS)
+        modes = jnp.einsum("nkv,nvi->kni", weights, vectors.astype(weights.dtype))
+        return modes, shares.astype(states.dtype) @ states
+
+    def coefficients(self, theta: jax.Array, mean: jax.Array) -> jax.Array:
+        """Coefficients (..., r) at normalised ``theta`` (..., p) of a body with that mean state."""
+        return self.branch(theta, mean)
+
+
+def build_family(
+    architecture: Architecture, widths: tuple[int, int, int], seed: int
+) -> FamilyModule:
+    """A network with weights drawn from ``seed``; ``widths`` of nodes, edges and theta."""
+    return FamilyModule(architecture, *widths, nnx.Rngs(seed))
+
+
+class Standard(NamedTuple):
+    """Means and standard deviations of the features over a family, each (d,) or (4,)."""
+
+    node_mean: np.ndarray
+    node_sd: np.ndarray
+    edge_mean: np.ndarray
+    edge_sd: np.ndarray
+
+    def graph(self, body: Described) -> AugmentedGraph:
+        """The graph of ``body``, features standardised."""
+        return AugmentedGraph(
+            node_features=((body.nodes - self.node_mean) / self.node_sd).astype(np.float32),
+            edge_features=((body.edges - self.edge_mean) / self.edge_sd).astype(np.float32),
+            senders=body.senders.astype(np.int32),
+            receivers=body.receivers.astype(np.int32),
+            real=body.real,
+        )
+
+
+class Learned(NamedTuple):
+    """What a family has taught, none of it of one body.
+
+    weights : of :class:`FamilyModule`. scale : s, of displacements over the body's size.
+    parameters : theta's entries and the box they were drawn from. physics : law, constants, loads.
+    shapes : range of each number of :class:`Described`.shape over the family.
+    """
+
+    architecture: Architecture
+    weights: nnx.State
+    standard: Standard
+    scale: float
+    parameters: tuple[Parameter, ...]
+    physics: Mapping[str, Any]
+    shapes: Mapping[str, tuple[float, float]]
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """Features of a node and an edge, entries of theta."""
+        standard = self.standard
+        return len(standard.node_mean), len(standard.edge_mean), len(self.parameters)
+
+
+@dataclass(frozen=True, eq=False)
+class FamilyNetwork:
+    """What a family has taught, applied to one body.
+
+    learned : the network. space : theta of the scene, within the box the network was trained on.
+    graph : of the body. vectors : (n, 7, 3) mm. shares : (n,) of the wall's volume.
+    """
+
+    learned: Learned
+    space: ParameterSpace
+    graph: AugmentedGraph
+    vectors: np.ndarray
+    shares: np.ndarray
+
+    @cached_property
+    def _definition(self) -> nnx.GraphDef:
+        learned = self.learned
+        outline = nnx.eval_shape(lambda: build_family(learned.architecture, learned.widths, 0))
+        return nnx.split(outline)[0]
+
+    def _module(self) -> FamilyModule:
+        return nnx.merge(self._definition, self.learned.weights)
+
+    def _prepare(self) -> tuple[jax.Array, jax.Array]:
+        """Modes (r, n, 3) in mm and the mean state, from one processor pass."""
+        modes, mean = self._module().prepare(
+            self.graph, jnp.asarray(self.vectors), jnp.asarray(self.shares)
+        )
+        return self.learned.scale * modes, mean
+
+    def normalise(self, position: jax.Array) -> jax.Array:
+        """Positions (..., p) in the scene's box as the network takes them, float32."""
+        trained = ParameterSpace(self.learned.parameters)
+        if self.space != trained:
+            order = np.array([self.space.names.index(name) for name in trained.names])
+            position = trained.to_unit(self.space.from_unit(position)[..., order])
+        return standardised(position)
+
+    def __call__(self, position: jax.Array) -> jax.Array:
+        """Displacement (n, 3) in mm at ``position`` (p,), processor included."""
+        modes, mean = self._prepare()
+        coefficients = self._module().coefficients(self.normalise(position), mean)
+        return jnp.tensordot(coefficients, modes, axes=1).astype(jnp.float64)
+
+    def cache(self, nodes: np.ndarray) -> CachedPart:
+        """Run the processor and keep the modes at ``nodes`` (k,)."""
+        modes, mean = jax.jit(self._prepare)()
+        kept = np.asarray(modes, dtype=float)[:, nodes]
+        branch = nnx.merge(*nnx.split(self._module().branch))
+
+        def coefficients(position: jax.Array) -> jax.Array:
+            return branch(self.normalise(position), mean).astype(jnp.float64)
+
+        return CachedPart(np.zeros((len(nodes), 3)), kept, coefficients)
+
+    def arrays(self) -> dict[str, Any]:
+        """Weights, features and their standard, vectors and shares by name."""
+        return named_leaves(
+            {
+                "weights": nnx.to_pure_dict(self.learned.weights),
+                "standard": self.learned.standard._asdict(),
+                "graph": self.graph.arrays(),
+                "vectors": self.vectors.astype(np.float32),
+                "shares": self.shares.astype(np.float32),
+            }
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Architecture, scale, theta's box, physics and shapes."""
+        learned = self.learned
+        return {
+            "architecture": asdict(learned.architecture),
+            "scale": learned.scale,
+            "parameters": [parameter.to_json() for parameter in learned.parameters],
+            "physics": dict(learned.physics),
+            "shapes": {name: list(ends) for name, ends in learned.shapes.items()},
+        }
+
+    @classmethod
+    def restore(
+        cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> Self:
+        """The part with this description and these arrays."""
+        architecture = Architecture.from_json(description["architecture"])
+        standard = Standard(**inside(arrays, "standard"))
+        learned = Learned(
+            architecture=architecture,
+            weights=nnx.state(nnx.Dict()),
+            standard=standard,
+            scale=float(description["scale"]),
+            parameters=tuple(Parameter(**each) for each in description["parameters"]),
+            physics=description["physics"],
+            shapes={name: (low, high) for name, (low, high) in description["shapes"].items()},
+        )
+        learned = learned._replace(weights=_filled(learned, inside(arrays, "weights")))
+        graph = AugmentedGraph(**inside(arrays, "graph"), real=len(scene.mesh.nodes))
+        return cls(learned, scene.space, graph, arrays["vectors"], arrays["shares"])
+
+
+def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNetwork:
+    """The network for ``scene``, which is one it can have learned about.
+
+    strict : refuse a body outside the shapes of the family.
+
+    Raises
+    ------
+    InputError
+        Another law, constant or kind of load, a theta outside the box of the training, no fibres,
+        or a body unlike the family's.
+    """
+    _check_physics(learned, scene)
+    body = describe(scene)
+    if strict:
+        _check_shape(learned, scene, body.shape)
+    graph = learned.standard.graph(body)
+    # Rounded as a file stores them, so that an emulator read again predicts the same.
+    vectors, shares = body.vectors.astype(np.float32), body.shares.astype(np.float32)
+    return FamilyNetwork(learned, scene.space, graph, vectors, shares)
+
+
+def standardised(position: jax.Array) -> jax.Array:
+    """Positions in the unit box with mean 0 and standard deviation 1 over it, float32."""
+    return ((position - 0.5) * _TO_UNIT_SD).astype(jnp.float32)
+
+
+def physics_of(scene: Scene) -> dict[str, Any]:
+    """What a network can only know one of: law, constants, kinds of loads and supports."""
+    told = dict(scene.identity.description)
+    told["loads"] = sorted(load.to_json()[0] for load in scene.loads)
+    told["regions"] = scene.regions is not None
+    return told
+
+
+def _check_physics(learned: Learned, scene: Scene) -> None:
+    """Refuse a scene of other physics, or of a theta that no training reached."""
+    ours = physics_of(scene)
+    for name, theirs in learned.physics.items():
+        if ours[name] != theirs:
+            raise InputError(
+                f"scene '{scene.name}': its {name} are {ours[name]}, and the network was trained "
+                f"with {theirs}"
+            )
+    trained = {parameter.name: parameter for parameter in learned.parameters}
+    for parameter in scene.parameters:
+        box = trained[parameter.name]
+        slack = _SLACK * (box.high - box.low)
+        if parameter.low < box.low - slack or parameter.high > box.high + slack:
+            raise InputError(
+                f"scene '{scene.name}': {parameter.name} ranges from {parameter.low:g} to "
+                f"{parameter.high:g} {parameter.unit}; the network knows {box.low:g} to "
+                f"{box.high:g}"
+            )
+
+
+def _check_shape(learned: Learned, scene: Scene, shape: Mapping[str, float]) -> None:
+    """Refuse a body further outside the family than a tenth of its range."""
+    for name, (low, high) in learned.shapes.items():
+        slack = _BEYOND * (high - low)
+        if not low - slack <= shape[name] <= high + slack:
+            hint = "; are its coordinates in mm?" if name == "size" else ""
+            unit = " mm" if name == "size" else ""
+            raise InputError(
+                f"scene '{scene.name}' is unlike the ventricles the network has seen: its {name} "
+                f"is {shape[name]:.3g}{unit}, theirs {low:.3g} to {high:.3g}{hint}"
+            )
+
+
+def _filled(learned: Learned, weights: Mapping[str, np.ndarray]) -> nnx.State:
+    """The network's state with ``weights`` by name."""
+    outline = nnx.eval_shape(lambda: build_family(learned.architecture, learned.widths, 0))
+    state = nnx.state(outline)
+    pure = fill_tree(nnx.to_pure_dict(state), weights, "the family's network")
+    nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))
+    return state

@@ -1,0 +1,149 @@
+r"""What a network is told of a ventricle, so that it can be told of any.
+
+All features are products of vectors that turn with the body (:mod:`emulator.geometry.ventricle`),
+lengths over its size L and volumes over L^3. So a ventricle moved, turned or enlarged has the same
+features, and its displacement over L, with respect to its own vectors, is the same too, as it is in
+mechanics without gravity. Features are standardised by means and deviations of the family that the
+network was trained on, not of the body at hand.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.ventricle import Ventricle, ventricle
+from emulator.scenes.cavities import find_cavity
+from emulator.scenes.scene import Scene
+from emulator.surrogates.network.graph import hierarchy, mesh_edges
+
+_NEAREST = 1e-3  # of L: a shorter distance counts as this much in a logarithm
+
+
+class Described(NamedTuple):
+    """A ventricle as a network takes it, before standardisation.
+
+    nodes : (N, d) features, mesh nodes first, then virtual ones. edges : (E, 4).
+    senders, receivers : (E,). real : mesh nodes. vectors : (n, 7, 3) mm, what the output is a
+    combination of. shares : (n,) of the wall's volume, at the nodes. shape : of the whole body, by
+    name.
+    """
+
+    nodes: np.ndarray
+    edges: np.ndarray
+    senders: np.ndarray
+    receivers: np.ndarray
+    real: int
+    vectors: np.ndarray
+    shares: np.ndarray
+    shape: dict[str, float]
+
+
+def describe(scene: Scene) -> Described:
+    """The ventricle of ``scene``.
+
+    Raises
+    ------
+    InputError
+        No fibres, no cavity under pressure, or more than one; see
+        :func:`~emulator.geometry.ventricle.ventricle`.
+    """
+    if scene.fibres is None:
+        raise InputError(f"scene '{scene.name}' has no fibres; this network was trained with them")
+    cavity = find_cavity(scene).facet_set
+    try:
+        body = ventricle(scene.mesh, cavity, scene.held.all(axis=1))
+    except InputError as error:
+        raise InputError(f"scene '{scene.name}' is no ventricle to this network: {error}") from None
+    shape = _shape(body, scene)
+    local = np.column_stack([_places(body), _along_fibres(body, scene)])
+    whole = np.array([shape[name] for name in _TOLD])
+    layers = hierarchy(body.offset, mesh_edges(scene.mesh.elements))
+    nodes = layers.extend(np.column_stack([local, np.tile(whole, (len(local), 1))]))
+    receivers, senders = layers.pairs.T
+    vectors = body.vectors()
+    places, normals = layers.extend(body.offset), layers.extend(body.normal)
+    return Described(
+        nodes=nodes,
+        edges=_edges(places, normals, body.axis, layers.pairs),
+        senders=senders,
+        receivers=receivers,
+        real=len(scene.mesh.nodes),
+        vectors=vectors * body.size,
+        shares=body.volume / body.wall,
+        shape=shape,
+    )
+
+
+_TOLD = ("wall over cavity", "length", "radius", "helix", "helix gradient")
+"""Of the whole body, repeated at every node, so that no message has to carry it."""
+
+
+def _shape(body: Ventricle, scene: Scene) -> dict[str, float]:
+    """The body in numbers, with which a network is asked whether it knows its like."""
+    rim = body.inner & body.held
+    fibres, shares = _fibre_tensor(body, scene), body.volume / body.wall
+    helix = np.einsum("ni,nij,j->n", body.circumference, fibres, body.axis)
+    return {
+        "size": body.size,
+        "wall over cavity": float(np.log(body.wall / body.cavity)),
+        "length": float(-body.height[body.inner].min()),
+        "radius": float(np.linalg.norm(body.across[rim], axis=1).mean()),
+        "helix": float(shares @ helix),
+        "helix gradient": float(shares @ (helix * (body.depth - 0.5))),
+        "thicker": float(np.linalg.norm(body.lean)),
+        "spacing": float(np.log(len(body.depth))),
+    }
+
+
+def _places(body: Ventricle) -> np.ndarray:
+    """Where the nodes lie, (n, 13)."""
+    n, x, lean = body.normal, body.across, body.lean
+    return np.column_stack(
+        [
+            body.held,
+            body.inner,
+            body.depth,
+            body.depth**2,
+            body.height,
+            np.linalg.norm(x, axis=1),
+            n @ body.axis,
+            np.einsum("ni,ni->n", n, x),
+            n @ lean,
+            x @ lean,
+            np.cross(body.axis, x) @ lean,
+            np.cbrt(body.volume),
+            np.log(np.maximum(-body.height, _NEAREST)),
+        ]
+    )
+
+
+def _along_fibres(body: Ventricle, scene: Scene) -> np.ndarray:
+    """Products of the fibres with the node's vectors, (n, 6); a fibre has no sign."""
+    F, n, c = _fibre_tensor(body, scene), body.normal, body.circumference
+    k = np.broadcast_to(body.axis, n.shape)
+    pairs = ((k, k), (n, n), (c, c), (c, k), (n, k), (n, c))
+    return np.column_stack([np.einsum("ni,nij,nj->n", a, F, b) for a, b in pairs])
+
+
+def _fibre_tensor(body: Ventricle, scene: Scene) -> np.ndarray:
+    """Mean of f f^T over the elements at each node, weighted by volume, (n, 3, 3)."""
+    assert scene.fibres is not None, "checked before"
+    elements, weights = scene.mesh.elements, scene.discretisation.weights.sum(axis=1)
+    each = weights[:, None, None] * scene.fibres[:, :, None] * scene.fibres[:, None, :]
+    total = np.zeros((len(body.depth), 3, 3))
+    np.add.at(total, elements, each[:, None])
+    return total / np.trace(total, axis1=1, axis2=2)[:, None, None]
+
+
+def _edges(x: np.ndarray, normals: np.ndarray, axis: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Relative position from sender to receiver along n, c and k of their middle, and length."""
+    receivers, senders = pairs.T
+    relative = x[receivers] - x[senders]
+    n = 0.5 * (normals[receivers] + normals[senders])
+    c = np.cross(axis, n)
+    length = np.linalg.norm(relative, axis=1)
+    parts = [np.einsum("ei,ei->e", relative, direction) for direction in (n, c)]
+    return np.column_stack([*parts, relative @ axis, length])

@@ -1,0 +1,337 @@
+r"""Training one network on FEM runs of many ventricles, so that it predicts on one never seen.
+
+All bodies are padded to equal sizes and given as arguments, so that the step is compiled once. A
+step takes one body and all its runs and minimises, lengths relative to the body's size L,
+
+.. math:: \overline{|u - u^*|^2} / s^2
+    + \frac1{|\Omega|} \int_\Omega |F(u) - F(u^*)|^2\, dX / s_F^2
+
+over nodes, wall and runs (the objective ``gradients`` of :mod:`emulator.training.objectives`), with
+:math:`s` and :math:`s_F` the root mean squares over the family. Edges are turned round at random,
+since a message's sign on a mesh unknown follows from the numbering of its nodes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from tqdm import tqdm
+
+from emulator.errors import InputError
+from emulator.scenes.scene import Scene
+from emulator.surrogates.additive import Emulator
+from emulator.surrogates.network.family import (
+    FamilyModule,
+    Learned,
+    Standard,
+    build_family,
+    on_body,
+    physics_of,
+    standardised,
+)
+from emulator.surrogates.network.graph import AugmentedGraph
+from emulator.surrogates.network.pignn import Architecture
+from emulator.surrogates.network.ventricle_graph import Described, describe
+from emulator.training.checkpoint import CHECKPOINT, State, Writer, read_checkpoint
+from emulator.training.loop import Bar, Keep, optimise, require_finite
+from emulator.training.plan import Plan
+from emulator.training.step import learning_rate
+
+ARCHITECTURE = Architecture(
+    steps=4,
+    latent=32,
+    hidden=(64, 64),
+    decoder="separable",
+    modes=32,
+    trunk=(128, 128),
+    branch=(128, 128),
+)
+"""Sizes of the shipped network."""
+
+PLAN = Plan(
+    recipe="ventricles", objective="gradients", decoder="separable", steps=30_000, modes=0, freeze=0
+)
+
+_LEAST_SD = 1e-6  # a feature that varies less over the family is left at zero
+
+
+class BodyRuns(NamedTuple):
+    """FEM runs of one body. position : (T, p) in the unit box. displacement : (T, n, 3) mm."""
+
+    scene: Scene
+    position: np.ndarray
+    displacement: np.ndarray
+
+
+class _Body(NamedTuple):
+    """A body as the step takes it: N nodes with virtual ones, n mesh nodes, all padded.
+
+    free : (n, 3), zero where held or padded. share : (n,) of a mean over nodes.
+    gradients : (m, 4, 3) of the shape functions, times L. weights : (m,) of the wall's volume.
+    position : (T, p). u : (T, n, 3) over L.
+    """
+
+    node_features: jax.Array
+    edge_features: jax.Array
+    senders: jax.Array
+    receivers: jax.Array
+    vectors: jax.Array
+    shares: jax.Array
+    free: jax.Array
+    share: jax.Array
+    elements: jax.Array
+    gradients: jax.Array
+    weights: jax.Array
+    position: jax.Array
+    u: jax.Array
+
+
+@dataclass(frozen=True)
+class _Sizes:
+    """What bodies are padded to."""
+
+    real: int
+    virtual: int
+    edges: int
+    elements: int
+
+
+def train_family(
+    runs: Sequence[BodyRuns],
+    plan: Plan,
+    folder: str | Path,
+    home: Scene,
+    *,
+    architecture: Architecture = ARCHITECTURE,
+    progress: bool = False,
+    resume: bool = False,
+) -> Emulator:
+    """Train one network on all ``runs``; the emulator of ``home`` with it.
+
+    Parameters
+    ----------
+    runs : equally many of each body, of equal parameters and physics.
+    plan : its steps, learning rate, schedule, seed and checkpoints.
+    folder : where checkpoints go.
+    """
+    path, began = Path(folder) / CHECKPOINT, time.perf_counter()
+    fingerprint = _check(runs)
+    saved = read_checkpoint(path, fingerprint, f"{len(runs)} bodies") if resume else None
+    if saved is not None:
+        plan, architecture = saved.plan, saved.architecture or architecture
+    described = [describe(r.scene) for r in tqdm(runs, "describe", disable=not progress)]
+    standard = _standard(described)
+    sizes = _sizes(runs, described)
+    key = np.random.default_rng(plan.seed)
+    bodies = [_padded(r, d, standard, sizes, key) for r, d in zip(runs, described, strict=True)]
+    scale = float(np.sqrt(np.mean([np.mean(np.asarray(b.u) ** 2) for b in bodies])))
+    first = runs[0].scene
+    learned = Learned(
+        architecture=architecture,
+        weights=nnx.State({}),
+        standard=standard,
+        scale=scale,
+        parameters=first.parameters,
+        physics=physics_of(first),
+        shapes=_ranges(described),
+    )
+    module = build_family(architecture, learned.widths, plan.seed)
+    definition, weights = nnx.split(module)
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
+    step = _make_step(plan, definition, optimiser, scale, _gradient_scale(bodies), sizes.real)
+    order = _Order(len(bodies), plan.seed)
+
+    def advance(state: State, total: int) -> State:
+        body = bodies[order(state.done)]
+        weights, moments, loss = step(
+            state.weights, state.optimiser, jnp.asarray(state.done), jnp.asarray(total), body
+        )
+        return State(weights, moments, state.done + 1, loss)
+
+    spent = saved.seconds if saved is not None else 0.0
+    clock = lambda: spent + time.perf_counter() - began  # noqa: E731
+    state = State(weights, optimiser.init(weights))
+    state = state if saved is None else saved.restore(*state[:2])
+    keep = Keep(Writer(path, fingerprint, architecture), plan, clock)
+    with Bar("train", state, plan.steps, shown=progress) as bar:
+        state = optimise(state, plan.steps, advance, [bar, keep])
+    record: dict[str, Any] = {
+        "plan": asdict(plan),
+        "final_loss": require_finite(state),
+        "bodies": len(runs),
+        "seconds": round(clock(), 1),
+    }
+    part = on_body(learned._replace(weights=state.weights), home)
+    return Emulator(home, family=part, record=record)
+
+
+class _Order:
+    """Which body a step takes: all of them in an order of its own, epoch after epoch."""
+
+    def __init__(self, count: int, seed: int) -> None:
+        self._count, self._seed = count, seed
+
+    def __call__(self, done: int) -> int:
+        epoch, place = divmod(done, self._count)
+        return int(np.random.default_rng((self._seed, epoch)).permutation(self._count)[place])
+
+
+def _check(runs: Sequence[BodyRuns]) -> str:
+    """Fingerprint of all bodies; :class:`InputError` where they do not belong together."""
+    if not runs:
+        raise InputError("a family: no body is given")
+    first = runs[0]
+    for each in runs:
+        if (
+            each.scene.space != first.scene.space
+            or physics_of(each.scene) != physics_of(first.scene)
+            or each.position.shape != first.position.shape
+        ):
+            raise InputError(
+                f"a family: '{each.scene.name}' has other parameters, physics or number of runs "
+                "than the first body"
+            )
+    return "+".join(each.scene.fingerprint for each in runs)
+
+
+def _standard(described: Sequence[Described]) -> Standard:
+    """Means and deviations of all features over all bodies."""
+    nodes = np.concatenate([body.nodes for body in described])
+    edges = np.concatenate([body.edges for body in described])
+    edges = np.concatenate([edges, -edges * [1.0, 1.0, 1.0, -1.0]])  # either way round
+    return Standard(nodes.mean(axis=0), _sd(nodes), edges.mean(axis=0), _sd(edges))
+
+
+def _sd(values: np.ndarray) -> np.ndarray:
+    sd = values.std(axis=0)
+    return np.where(sd > _LEAST_SD, sd, np.inf)
+
+
+def _ranges(described: Sequence[Described]) -> dict[str, tuple[float, float]]:
+    """Range of each number that a whole body has."""
+    found = {name: [body.shape[name] for body in described] for name in described[0].shape}
+    return {name: (min(values), max(values)) for name, values in found.items()}
+
+
+def _sizes(runs: Sequence[BodyRuns], described: Sequence[Described]) -> _Sizes:
+    return _Sizes(
+        real=max(body.real for body in described),
+        virtual=max(len(body.nodes) - body.real for body in described) + 1,
+        edges=max(len(body.edges) for body in described),
+        elements=max(len(each.scene.mesh.elements) for each in runs),
+    )
+
+
+def _padded(
+    runs: BodyRuns,
+    body: Described,
+    standard: Standard,
+    sizes: _Sizes,
+    generator: np.random.Generator,
+) -> _Body:
+    """``runs`` with what its network is told, padded. The last virtual node belongs to no body."""
+    scene, graph = runs.scene, standard.graph(body)
+    size = scene_size(body)
+    total, real = sizes.real + sizes.virtual, body.real
+    features = np.zeros((total, graph.node_features.shape[1]), np.float32)
+    features[:real] = graph.node_features[:real]
+    features[sizes.real : sizes.real + len(body.nodes) - real] = graph.node_features[real:]
+    place = np.where(np.arange(len(body.nodes)) < real, 0, sizes.real - real)
+    ends = np.full((2, sizes.edges), total - 1, np.int32)
+    turned = generator.random(len(body.edges)) < 0.5
+    pair = np.stack([body.senders, body.receivers])
+    pair = pair + place[pair]
+    ends[:, : len(body.edges)] = np.where(turned, pair[::-1], pair)
+    signs = np.where(turned[:, None], [-1.0, -1.0, -1.0, 1.0], 1.0)
+    edges = np.zeros((sizes.edges, 4), np.float32)
+    edges[: len(body.edges)] = (signs * body.edges - standard.edge_mean) / standard.edge_sd
+    grid = scene.discretisation
+    weights = grid.weights.sum(axis=1)
+    free = (~scene.held).astype(np.float32)
+
+    def filled(values: np.ndarray, count: int, axis: int = 0) -> np.ndarray:
+        width = [(0, 0)] * values.ndim
+        width[axis] = (0, count - values.shape[axis])
+        kind = np.int32 if np.issubdtype(values.dtype, np.integer) else np.float32
+        return np.pad(values, width).astype(kind)
+
+    return _Body(
+        node_features=jnp.asarray(features),
+        edge_features=jnp.asarray(edges),
+        senders=jnp.asarray(ends[0]),
+        receivers=jnp.asarray(ends[1]),
+        vectors=jnp.asarray(filled(body.vectors / size, sizes.real)),
+        shares=jnp.asarray(filled(body.shares, sizes.real)),
+        free=jnp.asarray(filled(free, sizes.real)),
+        share=jnp.asarray(filled(np.full(real, 1.0 / real), sizes.real)),
+        elements=jnp.asarray(filled(grid.connectivity, sizes.elements)),
+        gradients=jnp.asarray(filled(grid.gradients[:, 0] * size, sizes.elements)),
+        weights=jnp.asarray(filled(weights / weights.sum(), sizes.elements)),
+        position=jnp.asarray(runs.position),
+        u=jnp.asarray(filled(runs.displacement / size, sizes.real, axis=1)),
+    )
+
+
+def scene_size(body: Described) -> float:
+    """L in mm."""
+    return body.shape["size"]
+
+
+def _gradient(body: _Body, field: jax.Array) -> jax.Array:
+    """Gradient (T, m, 3, 3) of ``field`` (T, n, 3) over L."""
+    return jnp.einsum("tmai,maj->tmij", field[:, body.elements], body.gradients)
+
+
+def _mean_square_gradient(body: _Body, field: jax.Array) -> jax.Array:
+    squares = jnp.sum(_gradient(body, field) ** 2, axis=(-2, -1))
+    return jnp.mean(squares @ body.weights)
+
+
+def _gradient_scale(bodies: Sequence[_Body]) -> float:
+    """Root mean square over the family of the gradients' size."""
+    square = jax.jit(lambda body: _mean_square_gradient(body, body.u))
+    return float(np.sqrt(np.mean([float(square(body)) for body in bodies])))
+
+
+def _make_step(
+    plan: Plan,
+    definition: Any,
+    optimiser: optax.GradientTransformation,
+    scale: float,
+    gradient_scale: float,
+    real: int,
+) -> Callable[..., tuple[Any, Any, jax.Array]]:
+    """``step(weights, moments, number, total, body)``, compiled; consumes the first two."""
+
+    def loss(weights: Any, body: _Body) -> jax.Array:
+        module: FamilyModule = nnx.merge(definition, weights)
+        nodes, edges, senders, receivers, *_ = cast(tuple[Any, ...], body)  # traced
+        graph = AugmentedGraph(nodes, edges, senders, receivers, real)
+        modes, mean = module.prepare(graph, body.vectors, body.shares)
+        coefficients = module.coefficients(standardised(body.position), mean)
+        u = scale * jnp.tensordot(coefficients, modes, axes=1) * body.free
+        wrong = u - body.u
+        misfit = jnp.mean(jnp.sum(wrong**2, axis=-1) @ body.share) / (3.0 * scale**2)
+        return misfit + _mean_square_gradient(body, wrong) / gradient_scale**2
+
+    def step(
+        weights: Any, moments: Any, number: jax.Array, total: jax.Array, body: _Body
+    ) -> tuple[Any, Any, jax.Array]:
+        value, gradient = jax.value_and_grad(loss)(weights, body)
+        updates, moved = optimiser.update(gradient, moments, weights)
+        rate = learning_rate(plan, number, total)
+        new = jax.tree.map(lambda w, d: (w - rate * d).astype(w.dtype), weights, updates)
+        finite = jnp.isfinite(optax.tree.norm(gradient))  # other steps are not taken
+        pick = lambda a, b: jnp.where(finite, a, b)  # noqa: E731
+        return *jax.tree.map(pick, (new, moved), (weights, moments)), value
+
+    return jax.jit(step, donate_argnums=(0, 1))
