@@ -8,7 +8,7 @@ OUT ?= demo-output
 # Of studies: what is called and imported exists, and takes these arguments.
 LENIENT := $(addprefix --disable-error-code ,import-untyped import-not-found index misc operator union-attr arg-type type-var)
 
-.PHONY: demo test test-slow lint format study clean
+.PHONY: demo test test-slow notebooks lint format study clean
 
 demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
@@ -18,6 +18,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
+
+notebooks: $(STAMP)
+	$(BIN)/python -m pytest tests/test_notebooks.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

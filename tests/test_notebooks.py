@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jupytext
 import nbformat
 import pytest
 from nbclient import NotebookClient
@@ -13,7 +14,22 @@ def test_there_are_notebooks():
     assert NOTEBOOKS
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_text_and_notebook_are_one():
+    """The text beside each notebook is what one reads, reviews and edits."""
+    for path in NOTEBOOKS:
+        text = jupytext.read(path.with_suffix(".py"))
+        cells = nbformat.read(path, as_version=4).cells
+        assert [cell.source for cell in text.cells] == [cell.source for cell in cells], path.name
+
+
+FAST = "first_posterior"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [p if p.stem == FAST else pytest.param(p, marks=pytest.mark.slow) for p in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 @pytest.mark.filterwarnings("default")  # Jupyter's own, in the process that runs it
 def test_notebook(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -20,14 +21,18 @@ if TYPE_CHECKING:
 
 
 def pyplot() -> Any:
-    """matplotlib.pyplot drawing to files; :class:`InputError` when it is not installed."""
+    """matplotlib.pyplot; :class:`InputError` when it is not installed.
+
+    It draws to files, unless somebody imported it before and shows figures, as in a notebook.
+    """
     try:
         import matplotlib as mpl
     except ImportError as error:
         raise InputError(
             "figures need matplotlib: pip install 'soft-tissue-calibrate[plot]'"
         ) from error
-    mpl.use("Agg")
+    if "matplotlib.pyplot" not in sys.modules:
+        mpl.use("Agg")
     import matplotlib.pyplot as plt
 
     return plt

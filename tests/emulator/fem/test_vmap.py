@@ -49,8 +49,8 @@ def run(name, options, count, limit):
     subprocess.run([sys.executable, "-c", code], check=True, timeout=limit)
 
 
-def test_a_coarse_ventricle_by_vmap():
-    run("left_ventricle", COARSE["left_ventricle"], 2, 300)
+def test_a_coarse_beam_by_vmap():
+    run("once_clamped_beam", COARSE["once_clamped_beam"], 2, 300)
 
 
 @pytest.mark.slow

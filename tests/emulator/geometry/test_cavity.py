@@ -27,16 +27,16 @@ def hollow(wall=HEMISPHERE, rings=4, around=12, order=1, **facet_sets):
 
 def test_hemisphere_at_the_rate_of_its_facets():
     exact = 2.0 / 3.0 * np.pi * 10.0**3 / 1000.0  # mL
-    sizes = np.array([4, 8, 16])
+    sizes = np.array([3, 6, 12])
     errors = {
         order: np.array(
             [exact - find_cavity(hollow(rings=n, around=3 * n, order=order)).rest for n in sizes]
         )
         for order in (1, 2)
     }
-    assert 0.0 < errors[1][-1] < 0.01 * exact  # an inscribed polyhedron
+    assert 0.0 < errors[1][-1] < 0.02 * exact  # an inscribed polyhedron
     assert slope(1.0 / sizes, errors[1]) == pytest.approx(2.0, abs=0.1)
-    assert abs(errors[2][-1]) < 2e-5 * exact
+    assert abs(errors[2][-1]) < 1e-4 * exact
     assert slope(1.0 / sizes, np.abs(errors[2])) > 3.5
 
 
