@@ -35,6 +35,7 @@ QUICK = {
     "sbc": "--replicates 20 --only map",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half",
+    "ventricle_family": "--quick",
     "transfer": "--quick --one --family 2 --pretrain 6 --steps 3 --longest 4 --runs 3 --tests 2",
 }
 FAST: tuple[str, ...] = ()
@@ -186,6 +187,13 @@ def transfer(results):
     assert scratch["err_u"]["median"] != family["err_u"]["median"]
 
 
+def ventricle_family(results):
+    (case,) = results["cases"]
+    before, nothing = case["before"]["err_u"], case["one_solution_everywhere"]["err_u"]
+    assert before["median"] < nothing["median"]
+    assert before["median"] < 0.2 * case["mean_u_mm"]
+
+
 CHECKS = {
     check.__name__: check
     for check in (
@@ -205,6 +213,7 @@ CHECKS = {
         sbc,
         stability,
         transfer,
+        ventricle_family,
     )
 }
 

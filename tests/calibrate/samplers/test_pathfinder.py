@@ -22,6 +22,7 @@ def starts(log_density, count=64, scale=2.0):
     return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), count)))
 
 
+@pytest.mark.slow
 def test_starts_of_a_sharp_gaussian_are_its_draws():
     mean, sd = jnp.array([7.0, -5.0]), jnp.array([0.01, 0.3])
     z = (starts(lambda x: -0.5 * jnp.sum(((x - mean) / sd) ** 2)) - mean) / sd

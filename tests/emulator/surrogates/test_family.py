@@ -12,14 +12,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import emulator as em
+from calibrate.cli import main
 from emulator.errors import InputError
+from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.surrogates import Emulator, load, save_emulator
 from emulator.surrogates.network.family import on_body
 from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.pignn import Architecture
+from emulator.surrogates.network.pignn import Architecture, Processor
 from emulator.surrogates.network.ventricle_graph import describe
 from emulator.training import recipe, train
 from emulator.training.ventricles import PLAN, BodyRuns, train_family
@@ -32,6 +34,28 @@ SHAPES = (
     {"rings": 5, "around": 9, "layers": 1, "thicker": (0.2, 50.0)},
     {"rings": 4, "around": 10, "layers": 2, "angles": (50.0, -50.0)},
 )
+
+
+SCENE = """
+law = "holzapfel_ogden"
+mesh = "mine.vtu"
+[fibres]
+rule = "helix"
+angles = [65.0, -55.0]
+[[supports]]
+node_set = "base"
+[[loads]]
+kind = "cavity_pressure"
+facet_set = "endocardium"
+[constants]
+kappa = 25.0
+"""
+PARAMETER = """
+[parameters.{name}]
+unit = "{unit}"
+range = [{low}, {high}]
+scale = "{scale}"
+"""
 
 
 def runs(shape: dict) -> BodyRuns:
@@ -50,7 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def family(folder: Path) -> Emulator:
-    home = em.scenes.left_ventricle(4, 9, 1)
+    home = em.scenes.left_ventricle(4, 8, 1)
     plan = replace(PLAN, steps=150, learning_rate=3e-3, checkpoint_every=100)
     return train_family([runs(s) for s in SHAPES], plan, folder, home, architecture=SMALL)
 
@@ -130,7 +154,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(family: Emulator, folder: P
 
 def test_a_start_for_other_recipes(family: Emulator, tmp_path: Path) -> None:
     """Without a run it is the network; with some, the network plus what FEM's series adds."""
-    scene = em.scenes.left_ventricle(4, 9, 1, kappa=25.0, thicker=(0.05, 10.0))
+    scene = em.scenes.left_ventricle(4, 8, 1)
     assert family.family is not None
     wide = family.family.learned
     wide = wide._replace(shapes=dict.fromkeys(wide.shapes, (-1000.0, 1000.0)))
@@ -138,10 +162,10 @@ def test_a_start_for_other_recipes(family: Emulator, tmp_path: Path) -> None:
     alone = train(scene, recipe("family"), tmp_path, start=start)
     assert list(alone.parts) == ["family"]
     assert alone.record["start"]["fingerprint"] == start.fingerprint
-    plan = replace(recipe("mechanics"), order=2, simulations=11, batch=1)
+    plan = replace(recipe("mechanics"), order=1, simulations=1, batch=1)
     from emulator.training.problem import prepare
 
-    problem = prepare(scene, replace(plan, simulations=1), start=start)
+    problem = prepare(scene, plan, start=start)
     u = em.Simulator(scene)(scene.centre)
     found = problem.emulator.cache()
     assert np.allclose(found(scene.centre), u, atol=1e-5)
@@ -166,7 +190,7 @@ def test_what_it_cannot_take(family: Emulator, tmp_path: Path) -> None:
     for other, words in (
         (metres, "its size is 0.0.* are its coordinates in mm"),
         (replace(scene, parameters=pressures, origin={}), "pressure ranges from 0.1 to 5 kPa"),
-        (em.scenes.left_ventricle(4, 9, 1, kappa=50.0), "constants"),
+        (em.scenes.left_ventricle(4, 8, 1, kappa=50.0), "constants"),
         (beam, "law"),
     ):
         with pytest.raises(InputError, match=words):
@@ -190,3 +214,45 @@ def test_bodies_that_do_not_belong_together(tmp_path: Path) -> None:
         train_family([first, first._replace(scene=other)], PLAN, tmp_path, first.scene)
     with pytest.raises(InputError, match="no body"):
         train_family([], PLAN, tmp_path, first.scene)
+
+
+def test_the_processor_runs_once(family: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs, call = [], Processor.__call__
+    monkeypatch.setattr(Processor, "__call__", lambda *a: runs.append(1) or call(*a))
+    forward = family.cache()
+    observed = forward.at(np.arange(5))
+    for k in range(3):
+        theta = family.scene.from_unit(jnp.full(5, 0.3 + 0.1 * k))
+        forward(theta)
+        jax.value_and_grad(lambda t: jnp.sum(observed(t) ** 2))(theta)
+    assert len(runs) == 1
+
+
+@pytest.mark.slow
+def test_the_shipped_one_on_a_ventricle_it_has_not_seen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the command line alone, from a mesh file: no FEM run, and not far from FEM."""
+    body = em.scenes.left_ventricle(
+        12, 24, 2, angles=(65.0, -55.0), wall=(21.0, 55.0, 31.0, 62.0, 17.0), thicker=(0.1, 30.0)
+    )
+    write_mesh(tmp_path / "mine.vtu", body.mesh)
+    path = tmp_path / "mine.toml"
+    path.write_text(SCENE + "".join(PARAMETER.format(**p.to_json()) for p in body.parameters))
+    words = ["train", str(path), "--start", "ventricle_family", "--out", str(tmp_path / "e")]
+    assert main(words) == 0
+    emulator = load(tmp_path / "e")
+    assert list(emulator.parts) == ["family"]
+    u = em.Simulator(emulator.scene)(emulator.scene.centre)
+    off = np.linalg.norm(emulator.cache()(emulator.scene.centre) - u, axis=-1)
+    assert np.median(off) < 0.15 * np.median(np.linalg.norm(u, axis=-1))
+    capsys.readouterr()
+    for scene_name, said in (
+        ("once_clamped_beam", "its law"),
+        ("left_ventricle_neo_hookean", "its law"),
+    ):
+        words[1] = scene_name
+        assert main(words) == 2
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1

@@ -1,0 +1,314 @@
+"""A network that has seen ventricles: what does it know of one it has not seen?
+
+    python studies/ventricle_family/run.py
+    python studies/ventricle_family/run.py --train --runs DIR --out DIR    # how it was trained
+    python studies/ventricle_family/run.py --quick --out DIR
+
+Twenty ventricles of the family that the shipped ``ventricle_family`` was not trained on, other in
+wall, length, radius, truncation, fibres, uneven thickness and mesh; five theta each, judged by FEM:
+before any FEM run, and after 1, 5 and 20 for an emulator that starts from the network, for the
+recipe mechanics, and for POD + GP. And the network's prediction as FEM's start. Writes
+results.json after each ventricle and family.png; ventricles that results.json holds are kept.
+"""
+
+import argparse
+import json
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import qmc
+
+import emulator as em
+from calibrate.figures.drawing import pyplot
+from calibrate.provenance import hardware, study_header, versions
+from emulator.error.comparison import case_errors, quantiles
+from emulator.fem.campaign import Runs, run_campaign
+from emulator.fem.designs import design, sobol
+from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.scene import Scene
+from emulator.scenes.ventricle_family import ventricles
+from emulator.store import read_arrays, replacing, save_arrays, write_json
+from emulator.surrogates import Emulator, load, save_emulator
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import all_nodes
+from emulator.surrogates.taylor import constant, expand_at
+from emulator.training import recipe
+from emulator.training import train as train_emulator
+from emulator.training.discrepancy_stage import add_discrepancy
+from emulator.training.ventricles import PLAN, BodyRuns, train_family
+
+HERE = Path(__file__).parent
+TRAINING_SEED, TEST_SEED, THETA_SEED = 0, 1, 90_210
+NETWORK = "ventricle_family"
+RUNS = (1, 5, 20)
+KEYS = ("err_u", "err_V")
+
+
+# How the network was trained.
+
+
+def solved(folder: Path, arguments: dict[str, Any], positions: np.ndarray, name: str) -> None:
+    """FEM runs of one ventricle, written as one file; those that fail are left out."""
+    path = folder / f"{name}.safetensors"
+    if path.is_file():
+        return
+    scene = left_ventricle(**arguments)
+    simulator = em.Simulator(scene)
+    found = [simulator.solve(scene.from_unit(jnp.asarray(x))) for x in positions]
+    converged = np.array([bool(s.converged) for s in found])
+    fields = np.stack([np.asarray(s.displacement, np.float32) for s in found])
+    save_arrays(path, {"position": positions[converged], "displacement": fields[converged]})
+    jax.clear_caches()
+    print(f"{name}: {len(scene.mesh.nodes)} nodes, {converged.sum()} of {len(found)}", flush=True)
+
+
+def solve_family(folder: Path, count: int, each: int, workers: int) -> list[BodyRuns]:
+    """FEM runs of ``count`` ventricles at ``each`` theta; what is there is kept."""
+    made = ventricles(count, TRAINING_SEED)
+    bits = (count * each - 1).bit_length()
+    points = qmc.Sobol(5, rng=TRAINING_SEED + 1000).random_base2(bits)[: count * each]
+    positions = points.reshape(count, each, 5)
+    names = [f"{k:04d}" for k in range(count)]
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        list(pool.map(solved, [folder] * count, made, positions, names))
+    runs = []
+    for arguments, name in zip(made, names, strict=True):
+        arrays, _ = read_arrays(folder / f"{name}.safetensors")
+        if len(arrays["position"]) == each:  # equally many of each ventricle
+            u = arrays["displacement"].astype(float)
+            runs.append(BodyRuns(left_ventricle(**arguments), arrays["position"], u))
+    return runs
+
+
+def train(arguments: argparse.Namespace) -> None:
+    """Train the network and write it, an emulator of the built-in ventricle, under --out."""
+    began = time.perf_counter()
+    arguments.runs.mkdir(parents=True, exist_ok=True)
+    runs = solve_family(arguments.runs, arguments.ventricles, arguments.each, arguments.workers)
+    solving = time.perf_counter() - began
+    plan = replace(PLAN, steps=arguments.steps)
+    folder = arguments.out / NETWORK
+    emulator = train_family(
+        runs, plan, folder, left_ventricle(), progress=True, resume=arguments.resume
+    )
+    record = {
+        **emulator.record,
+        "command": "python studies/ventricle_family/run.py --train --runs DIR --out DIR",
+        "fem_runs": sum(len(r.position) for r in runs),
+        "fem_seconds": round(solving, 1),
+        "hardware": hardware(),
+        "versions": versions(),
+    }
+    save_emulator(replace(emulator, record=record), folder)
+
+
+# What it knows of others.
+
+
+def judged(emulator: Any, known: Runs) -> dict[str, dict[str, float]]:
+    """Quantiles of the errors against FEM, over nodes and theta."""
+    fields = case_errors(emulator, known.theta, known.displacement).fields
+    return {key: quantiles(fields[key]) for key in KEYS}
+
+
+def first_prediction(scene: Scene, start: Emulator) -> tuple[Emulator, float]:
+    """The network on ``scene``, and the seconds to its first displacement."""
+    began = time.perf_counter()
+    emulator = train_emulator(scene, recipe("family"), "unused", start=start)
+    jax.block_until_ready(emulator.cache()(scene.centre))
+    return emulator, time.perf_counter() - began
+
+
+def after_runs(scene: Scene, network: Emulator, known: Runs) -> list[dict[str, Any]]:
+    """Errors of three ways to use 1, 5 and 20 FEM runs."""
+    simulator, rows = em.Simulator(scene), []
+    thetas = jnp.concatenate([scene.centre[None], design(scene, max(RUNS) - 1, 0)])
+    runs = run_campaign(simulator, thetas, sensitivities=True)
+    series = expand_at(simulator, runs.displacement[0], scene.centre, 3)
+    assert network.family is not None
+    rest = series.less(network.family.cache(all_nodes(scene)))
+    own = Emulator(scene, taylor=series)
+    started = replace(network, taylor=rest)
+    for count in RUNS:
+        some = runs.take(slice(0, count))
+        maps: dict[str, Any] = {"mechanics": own, "network": started}
+        if count > 1:
+            maps["mechanics"] = add_discrepancy(own, some)[0]
+            maps["network"], record = add_discrepancy(started, some, series)
+        errors = {name: judged(emulator.cache(), known) for name, emulator in maps.items()}
+        if count >= 3:
+            others = run_campaign(simulator, sobol(scene, count, 0))
+            errors["POD + GP"] = judged(fit_reduced(scene, others), known)
+        on = record["on"] if count > 1 else "family + taylor"
+        rows.append({"runs": count, "errors": errors, "network_on": on})
+    return rows
+
+
+def warm_starts(scene: Scene, network: Emulator, known: Runs) -> dict[str, Any]:
+    """Factorisations and iterations of FEM from rest, and from the network's prediction."""
+    simulator, predict = em.Simulator(scene), jax.jit(network.cache())
+    rest = [simulator.solve(theta) for theta in known.theta]
+    warm = [simulator.solve(theta, predict(theta)) for theta in known.theta]
+    same = [
+        float(jnp.max(jnp.abs(a.displacement - b.displacement)))
+        for a, b in zip(rest, warm, strict=True)
+    ]
+    return {
+        "factorisations_from_rest": [int(s.factorisations) for s in rest],
+        "factorisations_from_network": [int(s.factorisations) for s in warm],
+        "largest_difference_mm": max(same),
+        "converged": all(bool(s.converged) for s in [*rest, *warm]),
+    }
+
+
+def one(number: int, arguments: dict[str, Any], theta: int, few_runs: bool) -> dict[str, Any]:
+    """All about one ventricle."""
+    scene = left_ventricle(**arguments)
+    start = load(NETWORK)
+    first_prediction(left_ventricle(), start)  # imports, and programs that fit any mesh
+    network, seconds = first_prediction(scene, start)
+    known = run_campaign(em.Simulator(scene), sobol(scene, theta, THETA_SEED + number))
+    before = judged(network.cache(), known)
+    centre = Emulator(scene, taylor=constant(
+        np.full(5, 0.5), em.Simulator(scene)(scene.centre)))  # fmt: skip
+    size = jnp.linalg.norm(known.displacement, axis=-1)
+    row: dict[str, Any] = {
+        "name": f"ventricle {number}",
+        "status": "done",
+        "arguments": arguments,
+        "nodes": len(scene.mesh.nodes),
+        "mean_u_mm": float(size.mean()),
+        "before": before,
+        "one_solution_everywhere": judged(centre.cache(), known),
+        "warm_start": warm_starts(scene, network, known),
+        "after": after_runs(scene, network, known) if few_runs else [],
+        "seconds_to_first_prediction": round(seconds, 2),
+    }
+    jax.clear_caches()
+    return row
+
+
+def study(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """All rows; those there already are kept."""
+    path = arguments.out / "results.json"
+    cases = [] if arguments.again or not path.is_file() else json.loads(path.read_text())["cases"]
+    done = {case["name"] for case in cases}
+    made = ventricles(arguments.ventricles, TEST_SEED)
+    todo = [k for k in range(len(made)) if f"ventricle {k}" not in done]
+    with ProcessPoolExecutor(arguments.workers, get_context("spawn")) as pool:
+        told = [(k, made[k], arguments.tests, not arguments.quick) for k in todo]
+        for row in pool.map(one, *zip(*told, strict=True)) if told else ():
+            cases.append(row)
+            content = {**study_header(HERE, TEST_SEED), "cases": cases}
+            write_json(path, content | {"summary": summary(cases)})
+            err = {key: row["before"][key]["median"] for key in KEYS}
+            print(f"{row['name']}: {err['err_u']:.3f} mm, {err['err_V']:.2f} %", flush=True)
+    return cases
+
+
+def summary(cases: list[dict[str, Any]]) -> dict[str, Any]:
+    """Over ventricles, quantiles of each one's median."""
+
+    def over(values: list[float]) -> dict[str, float]:
+        return quantiles(np.array(values))
+
+    found: dict[str, Any] = {
+        "ventricles": len(cases),
+        "before": {k: over([c["before"][k]["median"] for c in cases]) for k in KEYS},
+        "one_solution_everywhere": {
+            k: over([c["one_solution_everywhere"][k]["median"] for c in cases]) for k in KEYS
+        },
+        "seconds_to_first_prediction": over([c["seconds_to_first_prediction"] for c in cases]),
+    }
+    starts = [c["warm_start"] for c in cases]
+    for name in ("factorisations_from_rest", "factorisations_from_network"):
+        found[name] = over([n for start in starts for n in start[name]])
+    for place, count in enumerate(RUNS):
+        rows = [case["after"][place]["errors"] for case in cases if case["after"]]
+        methods = list(rows[0]) if rows else []
+        found[f"after {count}"] = {
+            m: {k: over([row[m][k]["median"] for row in rows]) for k in KEYS} for m in methods
+        }
+    return found
+
+
+METHODS = {"network": ("o", "#0072B2"), "mechanics": ("s", "#D55E00"), "POD + GP": ("^", "#009E73")}
+
+
+def draw(cases: list[dict[str, Any]], path: Path) -> None:
+    """Errors against FEM runs, a mark a ventricle, and factorisations with and without a start."""
+    plt = pyplot()
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(10.0, 4.0), layout="constrained", width_ratios=(2, 1)
+    )
+    jitter = np.random.default_rng(0).uniform(-0.12, 0.12, len(cases))
+    before = [case["before"]["err_u"]["median"] for case in cases]
+    left.plot(jitter, before, "o", color=METHODS["network"][1], mfc="none", label="network")
+    for name, (mark, colour) in METHODS.items():
+        for place in range(len(RUNS)):
+            some = [
+                (place + 1 + x, c["after"][place]["errors"][name]["err_u"]["median"])
+                for x, c in zip(jitter, cases, strict=True)
+                if c["after"] and name in c["after"][place]["errors"]
+            ]
+            if some:
+                label = name if name != "network" and place == len(RUNS) - 1 else None
+                left.plot(*zip(*some, strict=True), mark, color=colour, mfc="none", label=label)
+    left.set(yscale="log", xlabel="FEM runs on the new ventricle", ylabel="median err_u, mm")
+    left.set_xticks(range(len(RUNS) + 1), [0, *RUNS])
+    left.grid(axis="y", color="0.9")
+    left.legend(frameon=False)
+    counts = [
+        [n for case in cases for n in case["warm_start"][f"factorisations_from_{start}"]]
+        for start in ("rest", "network")
+    ]
+    right.boxplot(counts, whis=(0, 100), medianprops={"color": "black"})
+    right.set_xticks((1, 2), ["from rest", "from the network"])
+    right.set(ylabel="factorisations of a solve", ylim=(0, None))
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=130)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Train, or run the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--train", action="store_true", help="solve the family and train on it")
+    parser.add_argument("--runs", type=Path, help="folder of the FEM runs to train on")
+    parser.add_argument("--each", type=int, default=10, help="FEM runs of a ventricle")
+    parser.add_argument("--steps", type=int, default=PLAN.steps)
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint")
+    parser.add_argument("--ventricles", type=int, help="200 to train on, 20 to judge by")
+    parser.add_argument("--tests", type=int, default=5, help="theta a ventricle")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--again", action="store_true", help="repeat what is there")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--out", type=Path, default=HERE)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.train:
+        if arguments.runs is None:
+            parser.error("--train wants --runs, the folder of the FEM runs")
+        arguments.ventricles = arguments.ventricles or 200
+        train(arguments)
+        return
+    if arguments.quick:
+        arguments.ventricles, arguments.tests, arguments.workers = 1, 2, 1
+    arguments.ventricles = arguments.ventricles or 20
+    cases = study(arguments)
+    draw(cases, arguments.out / "family.png")
+    assert all(case["warm_start"]["converged"] for case in cases)
+    assert all(case["warm_start"]["largest_difference_mm"] < 1e-5 for case in cases)
+
+
+if __name__ == "__main__":
+    main()
