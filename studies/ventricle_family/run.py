@@ -89,10 +89,8 @@ def solve_family(folder: Path, count: int, each: int, workers: int) -> list[Body
 
 def train(arguments: argparse.Namespace) -> None:
     """Train the network and write it, an emulator of the built-in ventricle, under --out."""
-    began = time.perf_counter()
     arguments.runs.mkdir(parents=True, exist_ok=True)
     runs = solve_family(arguments.runs, arguments.ventricles, arguments.each, arguments.workers)
-    solving = time.perf_counter() - began
     plan = replace(PLAN, steps=arguments.steps)
     folder = arguments.out / NETWORK
     emulator = train_family(
@@ -102,7 +100,6 @@ def train(arguments: argparse.Namespace) -> None:
         **emulator.record,
         "command": "python studies/ventricle_family/run.py --train --runs DIR --out DIR",
         "fem_runs": sum(len(r.position) for r in runs),
-        "fem_seconds": round(solving, 1),
         "hardware": hardware(),
         "versions": versions(),
     }
