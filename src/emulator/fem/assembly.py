@@ -236,15 +236,16 @@ class System:
         """Solve ``K x = rhs`` over the free degrees of freedom, shape (f,)."""
         return self.pattern.solve(tangent, rhs, self.factorisation)
 
-    def step(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
+    def step(self, tangent: jax.Array, rhs: jax.Array, *, near: bool = True) -> jax.Array:
         """:meth:`solve` for a step of Newton's method, with the factor of another one if it serves.
 
-        On a large mesh, where tangent and right-hand side are numbers.
+        On a large mesh, where tangent and right-hand side are numbers. ``near`` says whether the
+        tangent may be like that other one.
         """
         traced = any(isinstance(x, jax.core.Tracer) for x in (tangent, rhs))
         if self._kept is None or traced:
             return self.solve(tangent, rhs)
-        return self._kept.solve(tangent, rhs)
+        return self._kept.solve(tangent, rhs, near=near)
 
     @cached_property
     def _kept(self) -> KeptFactor | None:

@@ -62,9 +62,12 @@ class KeptFactor:
         """Whether the matrices are large enough."""
         return pattern.size >= _LARGE
 
-    def solve(self, tangent: jax.Array, b: jax.Array) -> jax.Array:
-        """``x`` (f,) with ``K x = b``; raises one of ``REFUSALS`` where K is seen not definite."""
-        if self._kept is not None:
+    def solve(self, tangent: jax.Array, b: jax.Array, *, near: bool = True) -> jax.Array:
+        """``x`` (f,) with ``K x = b``; raises one of ``REFUSALS`` where K is seen not definite.
+
+        near : whether the factor kept may serve; without, the tangent's own is made and kept.
+        """
+        if near and self._kept is not None:
             x, is_solution = self._beside(tangent, self._kept, b)
             if bool(is_solution):
                 return x

@@ -90,7 +90,8 @@ class MipNewton:
         values, solvable, residual = _promised(
             self.system, state.u, state.measures, self.theta, self.level, stiffening
         )
-        full = self.system.step(values, -residual)
+        # On the way from rest each tangent is unlike the one before.
+        full = self.system.step(values, -residual, near=False)
         move, definite = _promised_step(self.system, values, solvable, residual, full)
         fraction = self._fraction(state.u, move)
         ahead, measures = _taken(self.system, state.u, state.measures, self.theta, move, fraction)
