@@ -32,6 +32,7 @@ from SALib.analyze import morris as morris_analysis
 from SALib.analyze import sobol as sobol_analysis
 from SALib.sample import morris as morris_design
 from SALib.sample import sobol as sobol_design
+from scipy.stats import norm, qmc
 
 from calibrate.sensitivity_analysis.factors import Factors
 from emulator.errors import InputError
@@ -45,6 +46,7 @@ Derivative = Callable[[np.ndarray], np.ndarray]
 """Points (n, p) of the unit cube to derivatives (n, m, p)."""
 
 CONFIDENCE = 0.95
+_DEVIATIONS = norm.ppf(0.5 * (1.0 + CONFIDENCE))  # of a normal distribution, to either side
 _RESAMPLES = 100
 _LEVELS = 4  # of Morris' grid
 
@@ -111,12 +113,11 @@ def _by_variance(factors: Factors, function: Function, samples: int, seed: int) 
     dims = ("factor", "output")
     data: dict[str, Any] = {name: (dims, values) for name, values in found.items()}
     data |= {f"{name}_half_width": (dims, values) for name, values in half.items()}
-    width = 1.959964  # of a normal distribution's 95 %
     for name, values in found.items():
         total = np.nansum(values * kept, axis=1) / kept.sum() if kept.any() else values[:, 0]
         data[f"{name}_together"] = ("factor", total)
         spread = resampled[name].std(axis=0, ddof=1) / max(kept.sum(), np.finfo(float).tiny)
-        data[f"{name}_together_half_width"] = ("factor", width * spread)
+        data[f"{name}_together_half_width"] = ("factor", _DEVIATIONS * spread)
     data["variance"] = ("output", variance)
     return _dataset(data, factors, evaluations=len(points), method="sobol")
 
@@ -144,8 +145,6 @@ def _by_screening(factors: Factors, function: Function, samples: int, seed: int)
 def _by_derivatives(
     factors: Factors, function: Function, derivative: Derivative, samples: int, seed: int
 ) -> xr.Dataset:
-    from scipy.stats import qmc
-
     bits = (samples - 1).bit_length()
     points = qmc.Sobol(len(factors.names), rng=seed).random_base2(bits)[:samples]
     outputs, slopes = _evaluated(function, points), derivative(points)
@@ -165,7 +164,7 @@ def _by_derivatives(
     dims = ("parameter", "output")
     data = {
         "nu": (dims, square),
-        "nu_half_width": (dims, 1.959964 * spread),
+        "nu_half_width": (dims, _DEVIATIONS * spread),
         "bound_on_total": (dims, bound),
         "bound_on_total_together": (
             "parameter",

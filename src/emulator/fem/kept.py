@@ -8,6 +8,7 @@ Cholesky factor of one of them, replace factorisations for as long as they are f
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -80,20 +81,11 @@ class KeptFactor:
         self, tangent: jax.Array, kept: jax.Array, b: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         pattern = self._pattern
-        above = jnp.where(pattern.rows < pattern.columns, tangent, 0.0)
-
-        def product(x: jax.Array) -> jax.Array:
-            upper = jax.ops.segment_sum(
-                tangent * x[pattern.columns],
-                pattern.rows,
-                num_segments=pattern.size,
-                indices_are_sorted=True,
-            )
-            return upper.at[pattern.columns].add(above * x[pattern.rows])
 
         def precondition(residual: jax.Array) -> jax.Array:
             return pattern.solve(kept, residual, "cholmod")
 
+        product = partial(pattern.product, tangent)
         return conjugate_gradients(product, precondition, b, self._steps, TOLERANCE)
 
 

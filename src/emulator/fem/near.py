@@ -42,20 +42,10 @@ class NearSolver:
         if self.reference is None:
             return self.general.solve(tangent, rhs)
         return jax.lax.custom_linear_solve(
-            partial(self._product, tangent),
+            partial(self.general.pattern.product, tangent),
             rhs,
             lambda _, b: self._one_by_one(tangent, b),
             symmetric=True,
-        )
-
-    def _product(self, tangent: jax.Array, x: jax.Array) -> jax.Array:
-        """K x, (f,)."""
-        pattern = self.general.pattern
-        return jax.ops.segment_sum(
-            tangent * x[pattern.columns],
-            pattern.rows,
-            num_segments=pattern.size,
-            indices_are_sorted=True,
         )
 
     @property
@@ -76,7 +66,7 @@ class NearSolver:
     def _solve(self, tangent: jax.Array, b: jax.Array) -> jax.Array:
         reference = jnp.asarray(self.reference)
         found, is_solution = conjugate_gradients(
-            partial(self._product, tangent),
+            partial(self.general.pattern.product, tangent),
             lambda residual: self.definite.solve(reference, residual),
             b,
             _STEPS,

@@ -58,6 +58,7 @@ class Pattern:
     source : (k,) indices of the entries of the flattened element blocks that are used.
     target : (k,) index of the nonzero that each of these entries is added to.
     size : number of free degrees of freedom.
+    upper : whether only the upper triangle of a symmetric matrix is there.
     """
 
     rows: np.ndarray
@@ -65,6 +66,7 @@ class Pattern:
     source: np.ndarray
     target: np.ndarray
     size: int
+    upper: bool = False
 
     def sum(self, entries: jax.Array) -> jax.Array:
         """Values (nnz,) from the entries of all blocks, flattened one after the other."""
@@ -74,6 +76,19 @@ class Pattern:
         """``x`` with ``A x = rhs``, shape (size,); differentiable, usable under ``vmap``."""
         solver = sparsax.solve if method == "cholmod" else sparsax.umf_solve
         return solver(self.rows, self.columns, values, rhs)
+
+    def product(self, values: jax.Array, x: jax.Array) -> jax.Array:
+        """``A x``, shape (size,)."""
+        there = jax.ops.segment_sum(
+            values * x[self.columns],
+            self.rows,
+            num_segments=self.size,
+            indices_are_sorted=True,
+        )
+        if not self.upper:
+            return there
+        above = jnp.where(self.rows < self.columns, values, 0.0)
+        return there.at[self.columns].add(above * x[self.rows])
 
     def solvable(self, values: jax.Array) -> jax.Array:
         """Whether ``values`` are finite and leave no row empty, shape ()."""
@@ -116,6 +131,7 @@ def block_pattern(groups: list[np.ndarray], free_index: np.ndarray, *, symmetric
         source=source.astype(np.int32),
         target=target.astype(np.int32),
         size=size,
+        upper=symmetric,
     )
 
 

@@ -60,8 +60,8 @@ class Plan:
         if self.objective not in OBJECTIVES:
             *others, last = OBJECTIVES
             raise InputError(f"objective '{self.objective}': use {', '.join(others)} or {last}")
-        without = self.discrepancy or self.recipe == "family"
-        least = {"steps": 0 if without else 1, "batch": 1, "checkpoint_every": 1}
+        trains = not (self.discrepancy or self.as_learned)
+        least = {"steps": int(trains), "batch": 1, "checkpoint_every": 1}
         for name, value in least.items():
             if getattr(self, name) < value:
                 raise InputError(
@@ -85,6 +85,11 @@ class Plan:
                 f"training: recipe '{self.recipe}' cannot have the objective 'modes', which is for "
                 "a separable network alone about the centre's solution; use recipe modal"
             )
+
+    @property
+    def as_learned(self) -> bool:
+        """Whether a network is taken as another emulator has it: nothing is trained or fitted."""
+        return not self.steps and self.recipe == "family"
 
     @property
     def slopes(self) -> bool:

@@ -26,7 +26,7 @@ from emulator.training.modal import ARCHITECTURE, Modal
 from emulator.training.objectives import Scales, make_loss, mean_square_gradient
 from emulator.training.plan import Plan
 from emulator.training.start import architecture_from, family_on, with_network_of
-from emulator.training.step import Step, batch_descent, make_step
+from emulator.training.step import Step, batch_descent, clipped_adam, make_step
 
 # Standard deviation of the displacements as a fraction of the centre's, where no FEM run tells it.
 _GUESSED_SD = 0.2
@@ -127,7 +127,7 @@ def prepare(
     emulator = replace(emulator, network=network)
     if start is not None:
         emulator = with_network_of(emulator, start)
-    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
+    optimiser = clipped_adam()
     if plan.objective == "modes":
         assert emulator.network is not None, "it was given one"
         modal = Modal(scene, emulator.network, runs, scales)

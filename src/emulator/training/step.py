@@ -22,7 +22,9 @@ Weights = nnx.State
 Step = Callable[..., tuple[Weights, Any, jax.Array]]
 Loss = Callable[[jax.Array, Batch], jax.Array]
 Descent = Callable[..., tuple[jax.Array, Weights, Weights]]
-"""``descend(weights, number, *kept)``: loss, its gradient, and the weights that both are of."""
+"""``descend(weights, number, *given)``: loss, its gradient, and the weights that both are of."""
+Moves = Callable[..., Weights]
+"""``moves(updates, *given)``: the updates that are made."""
 
 
 def predictor(emulator: Emulator) -> Callable[..., jax.Array]:
@@ -60,24 +62,39 @@ def batch_descent(emulator: Emulator, plan: Plan, runs: Runs, loss: Loss) -> Des
     return descend
 
 
-def make_step(plan: Plan, descend: Descent, optimiser: optax.GradientTransformation) -> Step:
-    """``step(weights, state, number, total, *kept) -> (weights, state, loss)``, compiled.
+def clipped_adam() -> optax.GradientTransformation:
+    """Adam on gradients whose norm over all weights is at most 1."""
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
+
+
+def branch_alone(updates: Weights, *kept: jax.Array) -> Weights:
+    """``updates``; where the decoder's prepared part is kept, of the branch alone.
+
+    Adam's momentum would otherwise move the weights behind that part.
+    """
+    return jax.tree_util.tree_map_with_path(_branch_only, updates) if kept else updates
+
+
+def make_step(
+    plan: Plan,
+    descend: Descent,
+    optimiser: optax.GradientTransformation,
+    moves: Moves = branch_alone,
+) -> Step:
+    """``step(weights, state, number, total, *given) -> (weights, state, loss)``, compiled.
 
     Batch and learning rate follow from ``number`` and ``total`` alone, so that a resumed run
-    repeats them. With ``kept``, what no later step changes, only the branch is trained. The step
-    consumes the weights and the state it is given.
+    repeats them. The step consumes the weights and the state it is given.
     """
 
     def step(
-        weights: Weights, state: Any, number: jax.Array, total: jax.Array, *kept: jax.Array
+        weights: Weights, state: Any, number: jax.Array, total: jax.Array, *given: Any
     ) -> tuple[Weights, Any, jax.Array]:
-        value, gradient, weights = descend(weights, number, *kept)
+        value, gradient, weights = descend(weights, number, *given)
         updates, moved = optimiser.update(gradient, state, weights)
         rate = learning_rate(plan, number, total)
         updates = jax.tree.map(lambda d: (-rate * d).astype(d.dtype), updates)
-        if kept:
-            # Adam's momentum would otherwise move the weights behind the prepared part.
-            updates = jax.tree_util.tree_map_with_path(_branch_only, updates)
+        updates = moves(updates, *given)
         new = optax.apply_updates(weights, updates), moved
         # A step whose gradient is not finite is not taken.
         finite = jnp.isfinite(optax.tree.norm(gradient))

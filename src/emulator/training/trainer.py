@@ -49,7 +49,7 @@ def train(
         interrupted; one on a budget keeps the number of steps it was aiming at.
     """
     path, began = Path(folder) / CHECKPOINT, time.perf_counter()
-    if plan.recipe == "family":
+    if plan.as_learned:
         return _as_learned(scene, plan, start, began)
     saved = read_checkpoint(path, scene.fingerprint, scene.name) if resume else None
     source = {} if start is None else start_record(start)

@@ -22,7 +22,6 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import nnx
 from tqdm import tqdm
 
@@ -36,15 +35,15 @@ from emulator.surrogates.network.family import (
     build_family,
     on_body,
     physics_of,
-    standardised,
 )
 from emulator.surrogates.network.graph import AugmentedGraph
+from emulator.surrogates.network.part import standardised
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.network.ventricle_graph import Described, describe
 from emulator.training.checkpoint import CHECKPOINT, State, Writer, read_checkpoint
 from emulator.training.loop import Bar, Keep, optimise, require_finite
 from emulator.training.plan import Plan
-from emulator.training.step import learning_rate
+from emulator.training.step import clipped_adam, make_step
 
 ARCHITECTURE = Architecture(
     steps=4,
@@ -146,8 +145,9 @@ def train_family(
     )
     module = build_family(architecture, learned.widths, plan.seed)
     definition, weights = nnx.split(module)
-    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
-    step = _make_step(plan, definition, optimiser, scale, _gradient_scale(bodies), sizes.real)
+    optimiser = clipped_adam()
+    descend = _descent(definition, scale, _gradient_scale(bodies), sizes.real)
+    step = make_step(plan, descend, optimiser, moves=lambda updates, _: updates)
     order = _Order(len(bodies), plan.seed)
 
     def advance(state: State, total: int) -> State:
@@ -240,7 +240,7 @@ def _padded(
 ) -> _Body:
     """``runs`` with what its network is told, padded. The last virtual node belongs to no body."""
     scene, graph = runs.scene, standard.graph(body)
-    size = scene_size(body)
+    size = body.shape["size"]
     total, real = sizes.real + sizes.virtual, body.real
     features = np.zeros((total, graph.node_features.shape[1]), np.float32)
     features[:real] = graph.node_features[:real]
@@ -281,11 +281,6 @@ def _padded(
     )
 
 
-def scene_size(body: Described) -> float:
-    """L in mm."""
-    return body.shape["size"]
-
-
 def _gradient(body: _Body, field: jax.Array) -> jax.Array:
     """Gradient (T, m, 3, 3) of ``field`` (T, n, 3) over L."""
     return jnp.einsum("tmai,maj->tmij", field[:, body.elements], body.gradients)
@@ -302,15 +297,10 @@ def _gradient_scale(bodies: Sequence[_Body]) -> float:
     return float(np.sqrt(np.mean([float(square(body)) for body in bodies])))
 
 
-def _make_step(
-    plan: Plan,
-    definition: Any,
-    optimiser: optax.GradientTransformation,
-    scale: float,
-    gradient_scale: float,
-    real: int,
-) -> Callable[..., tuple[Any, Any, jax.Array]]:
-    """``step(weights, moments, number, total, body)``, compiled; consumes the first two."""
+def _descent(
+    definition: Any, scale: float, gradient_scale: float, real: int
+) -> Callable[..., tuple[jax.Array, Any, Any]]:
+    """``descend(weights, number, body)``: loss, its gradient and the weights."""
 
     def loss(weights: Any, body: _Body) -> jax.Array:
         module: FamilyModule = nnx.merge(definition, weights)
@@ -323,15 +313,7 @@ def _make_step(
         misfit = jnp.mean(jnp.sum(wrong**2, axis=-1) @ body.share) / (3.0 * scale**2)
         return misfit + _mean_square_gradient(body, wrong) / gradient_scale**2
 
-    def step(
-        weights: Any, moments: Any, number: jax.Array, total: jax.Array, body: _Body
-    ) -> tuple[Any, Any, jax.Array]:
-        value, gradient = jax.value_and_grad(loss)(weights, body)
-        updates, moved = optimiser.update(gradient, moments, weights)
-        rate = learning_rate(plan, number, total)
-        new = jax.tree.map(lambda w, d: (w - rate * d).astype(w.dtype), weights, updates)
-        finite = jnp.isfinite(optax.tree.norm(gradient))  # other steps are not taken
-        pick = lambda a, b: jnp.where(finite, a, b)  # noqa: E731
-        return *jax.tree.map(pick, (new, moved), (weights, moments)), value
+    def descend(weights: Any, _: jax.Array, body: _Body) -> tuple[jax.Array, Any, Any]:
+        return *jax.value_and_grad(loss)(weights, body), weights
 
-    return jax.jit(step, donate_argnums=(0, 1))
+    return descend

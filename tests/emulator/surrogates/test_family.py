@@ -105,7 +105,7 @@ def test_padding_changes_nothing(family: Emulator) -> None:
     graph = AugmentedGraph(*padded[:4], real=sizes.real)
     modes, mean = part._module().prepare(graph, padded.vectors, padded.shares)
     own_modes, own_mean = part._prepare()
-    size = learned.scale * ventricles.scene_size(told)
+    size = learned.scale * told.shape["size"]
     # Edges were turned round, which a network not yet trained for long minds a little.
     assert np.allclose(mean, own_mean, atol=0.2)
     assert modes.shape[1] == told.real + 7

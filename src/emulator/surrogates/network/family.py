@@ -23,14 +23,14 @@ from flax import nnx
 from emulator.errors import InputError
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.scene import Scene
-from emulator.store import fill_tree, inside, named_leaves
+from emulator.store import inside, named_leaves
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.mlp import MLP
+from emulator.surrogates.network.part import filled_state, standardised
 from emulator.surrogates.network.pignn import Architecture, Processor
 from emulator.surrogates.network.ventricle_graph import Described, describe
 from emulator.surrogates.part import CachedPart
 
-_TO_UNIT_SD = 12.0**0.5  # positions in the box are uniform on [0, 1]
 _SLACK = 1e-9  # of a parameter's range, for round-off
 _BEYOND = 0.1  # of the family's range by which a body may lie outside it
 
@@ -149,9 +149,7 @@ class FamilyNetwork:
 
     @cached_property
     def _definition(self) -> nnx.GraphDef:
-        learned = self.learned
-        outline = nnx.eval_shape(lambda: build_family(learned.architecture, learned.widths, 0))
-        return nnx.split(outline)[0]
+        return nnx.split(_outline(self.learned))[0]
 
     def _module(self) -> FamilyModule:
         return nnx.merge(self._definition, self.learned.weights)
@@ -227,7 +225,8 @@ class FamilyNetwork:
             physics=description["physics"],
             shapes={name: (low, high) for name, (low, high) in description["shapes"].items()},
         )
-        learned = learned._replace(weights=_filled(learned, inside(arrays, "weights")))
+        weights = filled_state(_outline(learned), inside(arrays, "weights"), "the family's network")
+        learned = learned._replace(weights=weights)
         graph = AugmentedGraph(**inside(arrays, "graph"), real=len(scene.mesh.nodes))
         return cls(learned, scene.space, graph, arrays["vectors"], arrays["shares"])
 
@@ -251,11 +250,6 @@ def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNet
     # Rounded as a file stores them, so that an emulator read again predicts the same.
     vectors, shares = body.vectors.astype(np.float32), body.shares.astype(np.float32)
     return FamilyNetwork(learned, scene.space, graph, vectors, shares)
-
-
-def standardised(position: jax.Array) -> jax.Array:
-    """Positions in the unit box with mean 0 and standard deviation 1 over it, float32."""
-    return ((position - 0.5) * _TO_UNIT_SD).astype(jnp.float32)
 
 
 def physics_of(scene: Scene) -> dict[str, Any]:
@@ -300,10 +294,6 @@ def _check_shape(learned: Learned, scene: Scene, shape: Mapping[str, float]) -> 
             )
 
 
-def _filled(learned: Learned, weights: Mapping[str, np.ndarray]) -> nnx.State:
-    """The network's state with ``weights`` by name."""
-    outline = nnx.eval_shape(lambda: build_family(learned.architecture, learned.widths, 0))
-    state = nnx.state(outline)
-    pure = fill_tree(nnx.to_pure_dict(state), weights, "the family's network")
-    nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))
-    return state
+def _outline(learned: Learned) -> FamilyModule:
+    """The network with shapes in place of weights."""
+    return nnx.eval_shape(lambda: build_family(learned.architecture, learned.widths, 0))

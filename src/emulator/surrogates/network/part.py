@@ -80,7 +80,7 @@ class Network:
         """Positions (..., p) in the unit box as the network takes them, float32."""
         if self.standardisation is not None:
             return self.standardisation(position).astype(jnp.float32)
-        return ((position - 0.5) * _TO_UNIT_SD).astype(jnp.float32)
+        return standardised(position)
 
     def prepare(self, weights: nnx.State) -> tuple[Decoder, jax.Array]:
         """The decoder, and its part that does not depend on theta, from one processor pass."""
@@ -154,10 +154,21 @@ def filled(
     weights: Mapping[str, np.ndarray],
 ) -> nnx.State:
     """The network's state with ``weights`` by name; :class:`InputError` where one does not fit."""
-    state = nnx.state(_outline(architecture, graph, parameters, len(basis)))
-    pure = fill_tree(nnx.to_pure_dict(state), weights, "the emulator's network")
+    outline = _outline(architecture, graph, parameters, len(basis))
+    return filled_state(outline, weights, "the emulator's network")
+
+
+def filled_state(outline: nnx.Module, weights: Mapping[str, np.ndarray], what: str) -> nnx.State:
+    """State of the network that ``outline`` has the shapes of, with ``weights`` by name."""
+    state = nnx.state(outline)
+    pure = fill_tree(nnx.to_pure_dict(state), weights, what)
     nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))
     return state
+
+
+def standardised(position: jax.Array) -> jax.Array:
+    """Positions in the unit box with mean 0 and standard deviation 1 over it, float32."""
+    return ((position - 0.5) * _TO_UNIT_SD).astype(jnp.float32)
 
 
 def fresh(

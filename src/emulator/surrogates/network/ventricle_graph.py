@@ -57,8 +57,9 @@ def describe(scene: Scene) -> Described:
         body = ventricle(scene.mesh, cavity, scene.held.all(axis=1))
     except InputError as error:
         raise InputError(f"scene '{scene.name}' is no ventricle to this network: {error}") from None
-    shape = _shape(body, scene)
-    local = np.column_stack([_places(body), _along_fibres(body, scene)])
+    fibres = _fibre_tensor(body, scene)
+    shape = _shape(body, fibres)
+    local = np.column_stack([_places(body), _along_fibres(body, fibres)])
     whole = np.array([shape[name] for name in _TOLD])
     layers = hierarchy(body.offset, mesh_edges(scene.mesh.elements))
     nodes = layers.extend(np.column_stack([local, np.tile(whole, (len(local), 1))]))
@@ -81,10 +82,10 @@ _TOLD = ("wall over cavity", "length", "radius", "helix", "helix gradient")
 """Of the whole body, repeated at every node, so that no message has to carry it."""
 
 
-def _shape(body: Ventricle, scene: Scene) -> dict[str, float]:
+def _shape(body: Ventricle, fibres: np.ndarray) -> dict[str, float]:
     """The body in numbers, with which a network is asked whether it knows its like."""
     rim = body.inner & body.held
-    fibres, shares = _fibre_tensor(body, scene), body.volume / body.wall
+    shares = body.volume / body.wall
     helix = np.einsum("ni,nij,j->n", body.circumference, fibres, body.axis)
     return {
         "size": body.size,
@@ -120,12 +121,12 @@ def _places(body: Ventricle) -> np.ndarray:
     )
 
 
-def _along_fibres(body: Ventricle, scene: Scene) -> np.ndarray:
+def _along_fibres(body: Ventricle, fibres: np.ndarray) -> np.ndarray:
     """Products of the fibres with the node's vectors, (n, 6); a fibre has no sign."""
-    F, n, c = _fibre_tensor(body, scene), body.normal, body.circumference
+    n, c = body.normal, body.circumference
     k = np.broadcast_to(body.axis, n.shape)
     pairs = ((k, k), (n, n), (c, c), (c, k), (n, k), (n, c))
-    return np.column_stack([np.einsum("ni,nij,nj->n", a, F, b) for a, b in pairs])
+    return np.column_stack([np.einsum("ni,nij,nj->n", a, fibres, b) for a, b in pairs])
 
 
 def _fibre_tensor(body: Ventricle, scene: Scene) -> np.ndarray:
