@@ -26,7 +26,7 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	MYPYPATH=src $(BIN)/mypy --explicit-package-bases $(LENIENT) studies/*/*.py
+	MYPYPATH=src:. $(BIN)/mypy --explicit-package-bases $(LENIENT) studies/*/*.py
 	$(BIN)/lint-imports
 
 format: $(STAMP)
@@ -34,7 +34,7 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 study: $(STAMP)
-	$(BIN)/python studies/accuracy_vs_time/run.py
+	$(BIN)/python -m studies.accuracy_vs_time
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null || { \

@@ -5,7 +5,6 @@ A new study is its folder and a line in ``QUICK``; ``CHECKS`` may say more of it
 
 import importlib.util
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -43,16 +42,14 @@ FAST: tuple[str, ...] = ()
 
 def run(name: str, *words: object) -> dict:
     out = words[words.index("--out") + 1]
-    command = [sys.executable, STUDIES / name / "run.py", *map(str, words)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, env=dict(os.environ), check=False
-    )
+    command = [sys.executable, "-m", f"studies.{name}", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=STUDIES.parent)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads((Path(out) / "results.json").read_text())
 
 
 @pytest.mark.parametrize(
-    "folder", sorted(p.parent for p in STUDIES.glob("*/run.py")), ids=lambda p: p.name
+    "folder", sorted(p.parent for p in STUDIES.glob("*/__main__.py")), ids=lambda p: p.name
 )
 def test_every_study_is_complete(folder):
     results = json.loads((folder / "results.json").read_text())
@@ -219,7 +216,7 @@ CHECKS = {
 
 
 def test_every_study_has_a_line():
-    assert {path.parent.name for path in STUDIES.glob("*/run.py")} == set(QUICK)
+    assert {path.parent.name for path in STUDIES.glob("*/__main__.py")} == set(QUICK)
     assert set(CHECKS) <= set(QUICK)
 
 

@@ -7,7 +7,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from problems import Map, Problem, by_quadrature, moments_of, posterior_of, sample_grid
+from studies.certificate.problems import (
+    Map,
+    Problem,
+    by_quadrature,
+    moments_of,
+    posterior_of,
+    sample_grid,
+)
 
 import calibrate as cal
 

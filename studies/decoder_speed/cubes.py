@@ -7,12 +7,12 @@ random.
 
 import time
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import Function, batched, loop, milliseconds, per_call, unseen
+from studies.common.timing import Function, batched, clocked, loop, milliseconds, per_call, unseen
 
 import emulator as em
 from calibrate.observations import Landmarks, landmarks, spread_landmarks
@@ -32,12 +32,6 @@ class Cube(NamedTuple):
     cached: CachedEmulator
     seen: Landmarks
     seconds: dict[str, float]
-
-
-def clocked(function: Any, *arguments: Any) -> tuple[float, Any]:
-    begin = time.perf_counter()
-    result = jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - begin, result
 
 
 def drawn(network: Network, seed: int) -> Network:

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import Function, batched, in_loop, milliseconds, per_call, unseen
+from studies.common.timing import Function, batched, in_loop, milliseconds, per_call, unseen
 
 import emulator as em
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
@@ -142,10 +142,10 @@ def study(calls: int, fem_calls: int, runs: int, batch: int, seed: int) -> list[
         seconds = (*_both(function, scene, calls), batched(function, scene, batch))
         cases.append(row(name, *seconds, **common, gradient_gap=gap(function, thetas, exact)))
     function = misfit.of(polished)
-    seconds = per_call(function, unseen(scene, fem_calls + 1))
+    polished_s = per_call(function, unseen(scene, fem_calls + 1))
     polish_gap = gap(function, thetas, exact)
     name = "emulator + 1 Newton step"
-    cases.append(row(name, seconds, None, None, **common, gradient_gap=polish_gap))
+    cases.append(row(name, polished_s, None, None, **common, gradient_gap=polish_gap))
     for case in cases:
         case["times_faster_than_fem"] = fem_s / case["call_s"]
     return [*cases, *stages(whole.at(misfit.observe.nodes), misfit, calls)]

@@ -4,7 +4,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from methods import LATE, Weighed
+from studies.fem_posterior.methods import LATE, Weighed
 
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.pool import effective, normalised

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from comparison import cost
-from methods import CHEAP, LATE, PLAIN, TUNED
+from studies.common.output import save
+from studies.fem_posterior.comparison import cost
+from studies.fem_posterior.methods import CHEAP, LATE, PLAIN, TUNED
 
 from calibrate.figures.drawing import pyplot
-from emulator.store import replacing
 
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
 MARKS = {
@@ -47,6 +47,4 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
         axes.grid(alpha=0.25)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)

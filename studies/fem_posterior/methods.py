@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
-from problems import Problem
+from studies.fem_posterior.problems import Problem
 
 import calibrate as cal
 from calibrate.fem_likelihood import FEMLikelihood

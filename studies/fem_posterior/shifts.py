@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from arviz_stats.base import array_stats
-from comparison import of_weights
-from methods import AXES, stacked, weigh
-from problems import Problem
+from studies.fem_posterior.comparison import of_weights
+from studies.fem_posterior.methods import AXES, stacked, weigh
+from studies.fem_posterior.problems import Problem
 
 import calibrate as cal
 from calibrate.certificate import examine

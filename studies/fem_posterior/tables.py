@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from comparison import cost
+from studies.fem_posterior.comparison import cost
 
 
 def tables(cases: list[dict[str, Any]]) -> str:

@@ -1,6 +1,6 @@
 """The pressurised body of this study in legacy FEniCS (dolfin 2019), as its users write it.
 
-Run by run.py with an interpreter that has dolfin, which need not be the one of this project:
+Run by the study with an interpreter that has dolfin, which need not be the one of this project:
 
     python3 fenics_ventricle.py problem.npz solutions.npz
 

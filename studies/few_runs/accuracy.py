@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from methods import (
+from studies.few_runs.methods import (
     RIVAL_MODES,
     clock,
     fit_rival,

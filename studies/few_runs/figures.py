@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from accuracy import OVER, PLAIN, POSITIONS, RIVAL, SERIES, VALUES
-from tables import WANTED, median, mesh_totals, rows, scenes
+from studies.common.output import save
+from studies.few_runs.accuracy import OVER, PLAIN, POSITIONS, RIVAL, SERIES, VALUES
+from studies.few_runs.tables import WANTED, median, mesh_totals, rows, scenes
 
 from calibrate.figures.drawing import pyplot
-from emulator.store import replacing
 
 STYLES = {
     SERIES: ("tab:blue", "*", 13),
@@ -40,9 +40,7 @@ def _panels(cases: list[dict]):
 def _finish(figure, axes, path: Path) -> None:
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    pyplot().close(figure)
+    save(figure, path)
 
 
 def draw_runs(cases: list[dict], path: Path) -> None:
@@ -101,6 +99,4 @@ def draw_meshes(cases: list[dict], path: Path) -> None:
     )  # fmt: skip
     axes.grid(alpha=0.25, which="both")
     axes.legend(frameon=False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)

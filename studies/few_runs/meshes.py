@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from accuracy import Court, design, scene_of, seconds
-from methods import clock, fit_rival, our_campaign
+from studies.few_runs.accuracy import Court, design, scene_of, seconds
+from studies.few_runs.methods import clock, fit_rival, our_campaign
 
 from emulator.surrogates.discrepancy import fit_discrepancy
 

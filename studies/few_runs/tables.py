@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from accuracy import OVER, PLAIN, RIVAL, SERIES
+from studies.few_runs.accuracy import OVER, PLAIN, RIVAL, SERIES
 
 BUDGETS = (60, 180, 600, 1800)  # seconds
 WANTED = 1e-2  # mm, median

@@ -1,8 +1,8 @@
 """Does a certificate say the truth? Posteriors made wrong in known ways, verdict against truth.
 
-    python studies/certificate/run.py
-    python studies/certificate/run.py --quick --out DIR    # three posteriors
-    python studies/certificate/run.py --fem --nuts         # the beam's: FEM judges what NUTS drew
+    python -m studies.certificate
+    python -m studies.certificate --quick --out DIR    # three posteriors
+    python -m studies.certificate --fem --nuts         # the beam's: FEM judges what NUTS drew
 
 Writes results.json and certificate.png (with --fem, --nuts or both: fem.json, nuts.json or
 fem_nuts.json), and asserts what the README of the study says.
@@ -15,16 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import problems
-from cases import cases
-from problems import ExactSimulator
+from studies.certificate import problems
+from studies.certificate.cases import cases
+from studies.certificate.problems import ExactSimulator
+from studies.common.output import save
 
 import calibrate as cal
 from calibrate.certificate import certify
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from emulator import Simulator
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 
 HERE = Path(__file__).parent
 NUTS = cal.NUTSOptions(500, 1000, chains=4)
@@ -115,9 +116,7 @@ def draw(rows, path: Path) -> None:
     axes.set(ylabel="largest true change of an sd")
     axes.legend(loc="lower right")
     axes.set_title("Verdicts: none accepted beyond the lines")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def main() -> None:

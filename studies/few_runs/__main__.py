@@ -1,7 +1,7 @@
 """How many FEM runs, and how much time, does a given error cost? Ours beside POD + GP.
 
-    python studies/few_runs/run.py --workers 2     # both ventricles, then other meshes
-    python studies/few_runs/run.py --parts left_ventricle --mesh 4 8 1 --runs 1 5 --out DIR
+    python -m studies.few_runs --workers 2     # both ventricles, then other meshes
+    python -m studies.few_runs --parts left_ventricle --mesh 4 8 1 --runs 1 5 --out DIR
 
 Each part runs in a process of its own, so that each pays for its own compilation. Writes
 results.json, runs.png, time.png and asserts what the README of the study says.
@@ -10,15 +10,15 @@ results.json, runs.png, time.png and asserts what the README of the study says.
 import argparse
 import json
 import subprocess
-import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from accuracy import SEED, accuracy
-from figures import draw_meshes, draw_runs, draw_time
-from meshes import mesh_case
-from tables import check, summary, tables
+from studies.common.processes import command, environment
+from studies.few_runs.accuracy import SEED, accuracy
+from studies.few_runs.figures import draw_meshes, draw_runs, draw_time
+from studies.few_runs.meshes import mesh_case
+from studies.few_runs.tables import check, summary, tables
 
 from calibrate.provenance import study_header
 from emulator.store import write_json
@@ -49,8 +49,8 @@ def part(name: str, arguments: argparse.Namespace) -> list[dict]:
 def in_own_process(name: str, words: list[str]) -> list[dict]:
     """:func:`part` in a fresh interpreter."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, __file__, *words, "--only", name, "--out", folder]
-        subprocess.run(command, check=True)
+        part = command("few_runs", *words, "--only", name, "--out", folder)
+        subprocess.run(part, check=True, env=environment())
         return json.loads((Path(folder) / "part.json").read_text())
 
 

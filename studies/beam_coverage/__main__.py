@@ -3,7 +3,7 @@
 For each of the 50 released OnceClampedBeam cases: the stored displacement at 20 nodes, Gaussian
 noise of 0.2 mm, the posterior of (mu, lam) with the shipped emulator, and its check against FEM.
 
-    python studies/beam_coverage/run.py PUBLISHED_DIR
+    python -m studies.beam_coverage PUBLISHED_DIR
 """
 
 import argparse

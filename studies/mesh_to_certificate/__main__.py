@@ -1,6 +1,6 @@
 """From a mesh and a data file to a certified posterior: seconds of each command.
 
-``python studies/mesh_to_certificate/run.py [--ventricles N] [--mesh RINGS AROUND LAYERS]``. Each
+``python -m studies.mesh_to_certificate [--ventricles N] [--mesh RINGS AROUND LAYERS]``. Each
 command is a process of its own, and the cache of compiled programs is empty before the first, as
 on the first day. Writes results.json and mesh_to_certificate.png beside itself, or under --out.
 """
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from studies.common.output import save
 
 from calibrate.data import write_data
 from calibrate.figures.drawing import pyplot
@@ -25,7 +26,7 @@ from calibrate.workflow import make_data
 from emulator.catalogue import find_scene
 from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.io import write_mesh
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 4
@@ -171,9 +172,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     axes.set(xlabel="s, start and compilation included", xlim=(0.0, 1.05 * max(AIM, left.max())))
     axes.invert_yaxis()
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Errors of a network after equally many steps of each training objective, against FEM.
 
-    python studies/objectives/run.py [--steps N] [--simulations N] [--tests N]
-    python studies/objectives/run.py --quick --out DIR    # a coarse beam, few steps
+    python -m studies.objectives [--steps N] [--simulations N] [--tests N]
+    python -m studies.objectives --quick --out DIR    # a coarse beam, few steps
 
 Each objective is trained in a process of its own, so that compilation and FEM runs count and no
 kept factor of another's runs is used. Processor time depends less than wall-clock time on other
@@ -11,7 +11,6 @@ load of the machine; both are kept. Writes results.json and objectives.png besid
 
 import argparse
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import asdict, replace
@@ -19,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
+from studies.common.output import save
+from studies.common.processes import command, environment
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -27,7 +28,7 @@ from calibrate.provenance import study_header
 from emulator.error.comparison import Errors, case_errors, quantiles
 from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.surrogates import Architecture, load, save_emulator
 from emulator.training import Plan, recipe, remove_checkpoint, train
 
@@ -70,7 +71,7 @@ def in_its_own_process(objective: str, folder: Path, arguments: argparse.Namespa
     words = ["--one", objective, "--out", str(folder), "--steps", str(arguments.steps)]
     words += ["--simulations", str(arguments.simulations)]
     words += ["--quick"] if arguments.quick else []
-    subprocess.run([sys.executable, __file__, *words], check=True)
+    subprocess.run(command("objectives", *words), check=True, env=environment())
 
 
 def fem_seconds(scene: Scene, plan: Plan) -> float:
@@ -154,9 +155,7 @@ def draw(errors: dict[str, Errors], path: Path, title: str) -> None:
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     figure.suptitle(title)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def check(cases: list[dict[str, Any]]) -> None:

@@ -1,7 +1,7 @@
 """How fast the finite elements are: the ventricle against scikit-fem and FEniCS, cubes by size.
 
-    python studies/fem_speed/run.py --published DIR [--fenics-python PYTHON]
-    python studies/fem_speed/run.py --quick --out DIR    # a small plate and two small cubes
+    python -m studies.fem_speed --published DIR [--fenics-python PYTHON]
+    python -m studies.fem_speed --quick --out DIR    # a small plate and two small cubes
 
 Writes results.json and speed.png, and asserts what the README of the study says.
 """
@@ -11,9 +11,7 @@ import dataclasses
 import json
 import os
 import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,8 +19,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from compiling import Compiling
-from plain_skfem import Body
+from studies.common.compiling import Compiling
+from studies.common.output import save
+from studies.common.processes import run
+from studies.common.timing import clocked
+from studies.fem_speed.plain_skfem import Body
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -35,7 +36,7 @@ from emulator.released.scenes import published_scene
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 7
@@ -106,16 +107,10 @@ def arrays(problem: Problem) -> dict[str, Any]:
 
 
 # ---- timing ----------------------------------------------------------------------------------
-def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    begin = time.perf_counter()
-    result = jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - begin, result
-
-
 def first_call(function: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
     """Seconds of the first call, and how many of them JAX spent compiling."""
     compiling = Compiling()
-    seconds, _ = timed(function, *arguments)
+    seconds, _ = clocked(function, *arguments)
     return seconds, compiling.so_far()
 
 
@@ -139,7 +134,7 @@ def row(name: str, seconds: Iterable[float], converged: Iterable[bool], **more: 
 def ours_cold(simulator: em.Simulator, thetas: jax.Array) -> tuple[dict, np.ndarray]:
     """From rest; the first theta pays for compilation and the symbolic factorisation."""
     first, compile_s = first_call(simulator.solve, thetas[0])
-    runs = [timed(simulator.solve, theta) for theta in thetas[1:]]
+    runs = [clocked(simulator.solve, theta) for theta in thetas[1:]]
     seconds = [run[0] for run in runs]
     solutions = [run[1] for run in runs]
     case = row(
@@ -163,7 +158,7 @@ def ours_warm(simulator: em.Simulator, thetas: jax.Array) -> dict:
     """Started from the solution at a neighbouring theta."""
     starts = [simulator.solve(theta).displacement for theta in neighbours(thetas)]
     first, compile_s = first_call(simulator.solve, thetas[0], starts[0])
-    runs = [timed(simulator.solve, *pair) for pair in zip(thetas[1:], starts[1:], strict=True)]
+    runs = [clocked(simulator.solve, *pair) for pair in zip(thetas[1:], starts[1:], strict=True)]
     seconds = [run[0] for run in runs]
     return row(
         "ours, warm",
@@ -199,7 +194,7 @@ def ours_gradient(simulator: em.Simulator, facet_set: str, thetas: jax.Array) ->
     both = jax.value_and_grad(value, has_aux=True)
     starts = [simulator.solve(theta).displacement for theta in neighbours(thetas)]
     first, compile_s = first_call(both, thetas[0], starts[0])
-    runs = [timed(both, *pair) for pair in zip(thetas[1:], starts[1:], strict=True)]
+    runs = [clocked(both, *pair) for pair in zip(thetas[1:], starts[1:], strict=True)]
     seconds = [run[0] for run in runs]
     return row(
         "ours, warm, volume and gradient",
@@ -236,7 +231,7 @@ def plain(problem: Problem, thetas: jax.Array, reference: np.ndarray) -> dict:
     steps = min(
         (1, 2, 3, 4, 6), key=lambda k: sum(body.solve(theta, k).iterations for theta in spare)
     )
-    runs = [timed(body.solve, np.asarray(theta), steps) for theta in thetas[1:]]
+    runs = [clocked(body.solve, np.asarray(theta), steps) for theta in thetas[1:]]
     return row(
         "scikit-fem + SciPy, cold",
         [run[0] for run in runs],
@@ -349,9 +344,8 @@ def compare(problem: Problem, count: int, python: str | None) -> list[dict]:
 def cube(cells: int) -> dict:
     """The twisting cube, in a process of its own."""
     failed = {"name": f"cube, {cells} cells an edge", "problem": "cube", "cells": cells}
-    command = [sys.executable, HERE / "cube_case.py", str(cells)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT)
+        done = run("fem_speed.cube_case", cells, limit=LIMIT)
     except subprocess.TimeoutExpired:
         return {**failed, "status": f"stopped after {LIMIT:g} s"}
     if done.returncode:
@@ -397,9 +391,7 @@ def draw(cases: list[dict], path: Path) -> None:
     right.set(xscale="log", yscale="log", xlabel="nodes", title="twisting cube")
     right.grid(alpha=0.25)
     right.legend(frameon=False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def table(cases: list[dict]) -> str:

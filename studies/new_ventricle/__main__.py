@@ -1,19 +1,20 @@
 """New ventricles: seconds from a mesh to a usable emulator, and its errors.
 
-``python studies/new_ventricle/run.py [--ventricles N] [--runs N] [--tests N]``. Each ventricle gets
+``python -m studies.new_ventricle [--ventricles N] [--runs N] [--tests N]``. Each ventricle gets
 a process of its own, so that imports and compilation count. Writes results.json and
 new_ventricle.png beside itself, or under --out, and asserts what the README says.
 """
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from studies.common.output import save
+from studies.common.processes import printed
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -23,7 +24,7 @@ from emulator.fem import run_campaign, sobol
 from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.scenes import Scene
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.training import recipe, train
 
 HERE = Path(__file__).parent
@@ -69,9 +70,7 @@ def one(name: str, began: float, runs: int, tests: int) -> dict[str, Any]:
 def in_its_own_process(name: str, runs: int, tests: int) -> dict[str, Any]:
     """:func:`one`, imports and compilation included in its seconds."""
     words = ["--one", name, "--began", repr(time.time()), "--runs", str(runs)]
-    command = [sys.executable, __file__, *words, "--tests", str(tests)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    case = json.loads(done.stdout.splitlines()[-1])
+    case = printed("new_ventricle", *words, "--tests", tests)
     print(
         f"{name:14s} {case['nodes']:5d} nodes  usable after {case['usable_s']:5.1f} s  "
         f"err_V median {case['err_V']['median']:.1e} %  err_u {case['err_u']['median']:.1e} mm",
@@ -98,9 +97,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     for axes in panels[:2]:
         axes.legend(frameon=False, fontsize=8)
     panels[0].invert_yaxis()
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def check(cases: list[dict[str, Any]]) -> None:

@@ -1,7 +1,7 @@
 """Is our network the published one, and what does its error do to a posterior?
 
-    python studies/released_networks/run.py --published DIR
-    python studies/released_networks/run.py --published DIR --quick --out DIR
+    python -m studies.released_networks --published DIR
+    python -m studies.released_networks --published DIR --quick --out DIR
 
 The released networks run in our code and are compared with what the released code predicted, with
 the stored solutions and energies, and with our FEM. Then material parameters of the released
@@ -18,6 +18,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from studies.common.output import save
 
 import calibrate as cal
 import emulator as em
@@ -26,7 +27,7 @@ from calibrate.observations import parse_observation
 from calibrate.provenance import study_header
 from emulator.released.files import units
 from emulator.released.scenes import published_tests
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.surrogates import Emulator
 from emulator.training import recipe, train
 
@@ -157,9 +158,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         axes.legend(frameon=False, fontsize=8)
         axes.grid(axis="y", alpha=0.25)
     panels[0, 0].set_ylabel("shift of the mean that FEM finds, posterior sd")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Simulation-based calibration of the shipped emulators, their noise models and NUTS.
 
-``python studies/sbc/run.py [--replicates N] [--only NAME ...]``. FEM makes the data, the emulator's
+``python -m studies.sbc [--replicates N] [--only NAME ...]``. FEM makes the data, the emulator's
 posterior is ranked. Writes results.json and a figure a case beside itself, or under --out, after
 each case; rows of other cases stay. Asserts what the README says.
 """

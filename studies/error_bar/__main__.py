@@ -1,21 +1,21 @@
 """How accurate is the error bar, and how fast do Newton steps reduce the error?
 
-    python studies/error_bar/run.py                       # the beam and the left ventricle
-    python studies/error_bar/run.py --scenes once_clamped_beam --cases 4 --out DIR
+    python -m studies.error_bar                       # the beam and the left ventricle
+    python -m studies.error_bar --scenes once_clamped_beam --cases 4 --out DIR
 
 Every shipped emulator of a scene is judged, and reduced models of 5, 10 and 30 FEM runs stand in
 for worse and better ones. Writes results.json and effectivity.png, asserts what the README says.
 """
 
 import argparse
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.output import save
+from studies.common.timing import clocked
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -23,7 +23,7 @@ from calibrate.provenance import study_header
 from emulator.error.estimate import error_bar
 from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.surrogates.corrected import newton_step
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.protocol import ForwardMap
@@ -70,12 +70,6 @@ def length(field: jax.Array) -> np.ndarray:
     return np.linalg.norm(np.asarray(field), axis=-1)
 
 
-def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    begin = time.perf_counter()
-    result = jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - begin, result
-
-
 class Judge:
     """A scene's simulator and everything compiled for it, shared by its maps."""
 
@@ -101,12 +95,12 @@ class Judge:
         """One prediction: its error, each estimate of it, and the errors after Newton steps."""
         error = length(u - exact)
         seconds: dict[str, float] = {}
-        seconds["error bar"], bar = timed(self.present.of_field, u, theta)
-        seconds["centre tangent"], rough = timed(self.centre.of_field, u, theta)
-        seconds["one step"], once = timed(self.newton, u, theta)
-        second, twice = timed(self.newton, once, theta)
+        seconds["error bar"], bar = clocked(self.present.of_field, u, theta)
+        seconds["centre tangent"], rough = clocked(self.centre.of_field, u, theta)
+        seconds["one step"], once = clocked(self.newton, u, theta)
+        second, twice = clocked(self.newton, once, theta)
         seconds["two steps"] = seconds["one step"] + second
-        seconds["converged"], solution = timed(self.simulator.solve, theta, u)
+        seconds["converged"], solution = clocked(self.simulator.solve, theta, u)
         fields = dict(zip(ESTIMATES, (bar.field, u - once, u - twice, rough.field), strict=True))
         polished = {"0": u, "1": once, "2": twice, "converged": solution.displacement}
         return {
@@ -236,9 +230,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
         axes.grid(alpha=0.25)
     panels[0, 0].set_ylabel("estimated / true largest error")
     panels[0, -1].legend(fontsize=8, frameon=False, loc="upper left")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 _ROUND_OFF = 1e-6  # mm, of which two Newton steps leave nothing that FEM's tolerance would show

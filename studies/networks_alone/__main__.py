@@ -1,7 +1,7 @@
 """Networks alone: how accurate are the shipped ones, and which idea gained how much?
 
-    python studies/networks_alone/run.py
-    python studies/networks_alone/run.py --quick --out DIR    # a coarse beam, few steps
+    python -m studies.networks_alone
+    python -m studies.networks_alone --quick --out DIR    # a coarse beam, few steps
 
 The shipped ``<scene>_pignn`` are judged by FEM at theta that none has seen. Then the beam's is
 trained again with one idea left out or exchanged at a time: equally many steps, FEM runs and test
@@ -21,13 +21,14 @@ from typing import Any
 import jax
 import numpy as np
 import optax
+from studies.common.output import save
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from emulator.error.comparison import case_errors, quantiles
 from emulator.fem import run_campaign, sobol
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.surrogates import Architecture, Emulator, load, shipped
 from emulator.training import Plan, recipe
 from emulator.training.checkpoint import State
@@ -215,9 +216,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     both[0].invert_yaxis()
     both[1].legend(frameon=False)
     figure.suptitle("The beam's network alone: equally many steps and FEM runs")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def medians(cases: list[dict[str, Any]], idea: str, key: str) -> list[float]:

@@ -1,7 +1,7 @@
 """What does the released pressure work do to parameters inferred from a real ventricle?
 
-    python studies/published_pressure/run.py
-    python studies/published_pressure/run.py --quick --out DIR
+    python -m studies.published_pressure
+    python -m studies.published_pressure --quick --out DIR
 
 Data of a left ventricle are made by FEM with the exact pressure. The material is inferred at known
 pressures with the exact load in the map, as a control, and with ``PublishedPressure``. Each
@@ -18,6 +18,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from studies.common.output import save
 
 import calibrate as cal
 from calibrate.figures.drawing import pyplot
@@ -28,7 +29,7 @@ from emulator.fem import Runs, Simulator, sobol
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, Load, PublishedPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.taylor import expand
 from emulator.training.discrepancy_stage import add_discrepancy
@@ -272,9 +273,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         axes.grid(axis="y", which="both", alpha=0.25)
     panels[0, 0].set_ylabel("inferred / true, mean and 90 % interval")
     panels[0, 0].legend(frameon=False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def main() -> None:

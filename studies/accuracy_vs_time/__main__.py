@@ -1,6 +1,6 @@
 """What accuracy costs in time on the once-clamped beam: FEM, emulator, polish, reduced model.
 
-Run from anywhere: ``python studies/accuracy_vs_time/run.py``. Writes results.json and pareto.png
+Run from anywhere: ``python -m studies.accuracy_vs_time``. Writes results.json and pareto.png
 beside itself and asserts what the README of the study says.
 """
 
@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.output import save
 
 from calibrate.figures.drawing import pyplot
 from calibrate.observations import spread_nodes
@@ -22,7 +23,7 @@ from emulator import Simulator, load
 from emulator.error.comparison import quantiles
 from emulator.fem import run_campaign, sobol, uniform
 from emulator.scenes import Scene
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.surrogates.corrected import corrected
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.pod_gp import fit_reduced
@@ -163,9 +164,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", frameon=False, fontsize=9)
     figure.suptitle("once-clamped beam, 390 nodes, 2 parameters: what accuracy costs in time")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def check(cases: list[dict[str, Any]]) -> None:

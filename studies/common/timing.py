@@ -54,5 +54,12 @@ def batched(function: Function, scene: Scene, size: int, repeats: int = 5) -> fl
     return per_call(jax.jit(jax.vmap(function)), batches) / size
 
 
+def clocked(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+    """Seconds of one call, and what it gave."""
+    begin = time.perf_counter()
+    result = jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - begin, result
+
+
 def milliseconds(seconds: float | None) -> str:
     return "" if seconds is None else f"{1e3 * seconds:.4f} ms"

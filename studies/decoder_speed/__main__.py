@@ -1,7 +1,7 @@
 """What an evaluation of a cached emulator costs: the ventricle against FEM, cubes by size of mesh.
 
-    python studies/decoder_speed/run.py
-    python studies/decoder_speed/run.py --quick --out DIR    # few calls, two small cubes
+    python -m studies.decoder_speed
+    python -m studies.decoder_speed --quick --out DIR    # few calls, two small cubes
 
 Writes results.json and decoder_speed.png, and asserts what the README of the study says.
 """
@@ -10,12 +10,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import cubes
-import ventricle
+from studies.common.output import save
+from studies.decoder_speed import cubes, ventricle
 
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 11
@@ -73,9 +73,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     for axes in (bars, lines):
         axes.grid(alpha=0.25)
         axes.legend(fontsize=8, frameon=False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def check(cases: list[dict[str, Any]]) -> None:

@@ -1,8 +1,8 @@
 """The emulator's posterior against FEM's, and what each way to FEM's posterior costs.
 
-    python studies/fem_posterior/run.py                       # some 45 minutes of processor time
-    python studies/fem_posterior/run.py --quick --out DIR     # the beam, short runs
-    python studies/fem_posterior/run.py --parts beam          # one part; the others' rows stay
+    python -m studies.fem_posterior                       # some 45 minutes of processor time
+    python -m studies.fem_posterior --quick --out DIR     # the beam, short runs
+    python -m studies.fem_posterior --parts beam          # one part; the others' rows stay
 
 Four ways to one posterior: NUTS with FEM as its forward map, the same tuned by the emulator's
 posterior, delayed acceptance, and the emulator with a certificate. Each problem runs in a process
@@ -12,17 +12,16 @@ README of the study says.
 
 import argparse
 import json
-import os
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from comparison import largest, of_weights, with_agreement
-from figure import draw
-from methods import (
+from studies.common.processes import command, environment
+from studies.fem_posterior.comparison import largest, of_weights, with_agreement
+from studies.fem_posterior.figure import draw
+from studies.fem_posterior.methods import (
     PLAIN,
     Outcome,
     Sizes,
@@ -32,9 +31,9 @@ from methods import (
     by_tuned_fem,
     weigh,
 )
-from problems import PROBLEMS, Problem
-from shifts import PAIRED, SHIFT, certificates
-from tables import tables
+from studies.fem_posterior.problems import PROBLEMS, Problem
+from studies.fem_posterior.shifts import PAIRED, SHIFT, certificates
+from studies.fem_posterior.tables import tables
 
 from calibrate.provenance import commit, study_header
 from emulator.store import write_json
@@ -95,9 +94,9 @@ def _say(run: Outcome) -> None:
 def in_own_process(name: str, *, quick: bool) -> dict[str, Any]:
     """:func:`examine` in a fresh interpreter, without a cache of compiled programs."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, __file__, "--only", name, "--out", folder]
-        fresh = {k: v for k, v in os.environ.items() if not k.startswith("JAX_COMPILATION_CACHE")}
-        subprocess.run([*command, "--quick"] if quick else command, check=True, env=fresh)
+        words = ["--quick"] if quick else []
+        part = command("fem_posterior", "--only", name, "--out", folder, *words)
+        subprocess.run(part, check=True, env=environment(compiled=False))
         return json.loads((Path(folder) / "part.json").read_text())
 
 

@@ -1,6 +1,6 @@
 """Hard cases for the simulator: each must converge or name its failure, never answer wrongly.
 
-Run from anywhere: ``python studies/stability/run.py``. Writes results.json and stability.png beside
+Run from anywhere: ``python -m studies.stability``. Writes results.json and stability.png beside
 itself and asserts what the README of the study says.
 """
 
@@ -16,14 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cases import CASES, SEED, Case, solve
-from judge import TOLERANCE, is_stable, judge
+from studies.common.output import save
+from studies.stability.cases import CASES, SEED, Case, solve
+from studies.stability.judge import TOLERANCE, is_stable, judge
 
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from emulator import Status
 from emulator.errors import InputError
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 
 HERE = Path(__file__).parent
 LIMIT = 120.0  # seconds for one case, compilation and judgement included
@@ -210,9 +211,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     right.axvline(TOLERANCE, color="tab:red", lw=1)
     right.set(xscale="log", xlabel="residual, judged independently (x: a saddle, not a minimum)")
     right.grid(alpha=0.25)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 NAMED = {status.name for status in Status} | {InputError.__name__}

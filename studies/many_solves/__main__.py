@@ -1,6 +1,6 @@
 """A thousand ventricle solves from rest in one process: success, leaks, hangs.
 
-``python studies/many_solves/run.py [--published DIR] [--solves N]``. Writes results.json and
+``python -m studies.many_solves [--published DIR] [--solves N]``. Writes results.json and
 many_solves.png beside itself, or under --out, and asserts what the README says.
 """
 
@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from studies.common.output import save
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -21,7 +22,7 @@ from emulator.fem import uniform
 from emulator.released.scenes import published_scene
 from emulator.scenes import Parameter, Scene
 from emulator.scenes.loads import CavityPressure
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 11
@@ -115,9 +116,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     below.set_ylim(bottom=0.0)
     below.set_ylabel("memory held in MB")
     below.set_xlabel("solve")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=150)
-    plt.close(figure)
+    save(figure, path, 150)
 
 
 def main() -> None:

@@ -1,8 +1,8 @@
 """A network that has seen ventricles: what does it know of one it has not seen?
 
-    python studies/ventricle_family/run.py
-    python studies/ventricle_family/run.py --train --runs DIR --out DIR    # how it was trained
-    python studies/ventricle_family/run.py --quick --out DIR
+    python -m studies.ventricle_family
+    python -m studies.ventricle_family --train --runs DIR --out DIR    # how it was trained
+    python -m studies.ventricle_family --quick --out DIR
 
 Twenty ventricles of the family that the shipped ``ventricle_family`` was not trained on, other in
 wall, length, radius, truncation, fibres, uneven thickness and mesh; five theta each, judged by FEM:
@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
+from studies.common.output import save
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -34,7 +35,7 @@ from emulator.fem.designs import design, sobol
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.scene import Scene
 from emulator.scenes.ventricle_family import ventricles
-from emulator.store import read_arrays, replacing, save_arrays, write_json
+from emulator.store import read_arrays, save_arrays, write_json
 from emulator.surrogates import Emulator, load, save_emulator
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.protocol import all_nodes
@@ -98,7 +99,7 @@ def train(arguments: argparse.Namespace) -> None:
     )
     record = {
         **emulator.record,
-        "command": "python studies/ventricle_family/run.py --train --runs DIR --out DIR",
+        "command": "python -m studies.ventricle_family --train --runs DIR --out DIR",
         "fem_runs": sum(len(r.position) for r in runs),
         "hardware": hardware(),
         "versions": versions(),
@@ -271,9 +272,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     right.set(ylabel="factorisations of a solve", ylim=(0, None))
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def main() -> None:

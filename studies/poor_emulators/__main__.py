@@ -1,8 +1,8 @@
 """Does the map's own error in the likelihood widen a poor emulator's posterior, or move it?
 
-    python studies/poor_emulators/run.py
-    python studies/poor_emulators/run.py --meshes coarse default --out DIR
-    python studies/poor_emulators/run.py --quick --out DIR
+    python -m studies.poor_emulators
+    python -m studies.poor_emulators --meshes coarse default --out DIR
+    python -m studies.poor_emulators --quick --out DIR
 
 Emulators of a left ventricle from 1, 5 and 20 FEM runs infer data sets made by FEM, once as if they
 were exact (``error_runs`` 0) and once with their error learned from 24 FEM runs. Their posteriors
@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from studies.common.output import save
 
 import calibrate as cal
 from calibrate.fem_likelihood import FEMLikelihood
@@ -30,7 +31,7 @@ from calibrate.samplers import NUTSOptions
 from emulator.catalogue import find_scene, scene_from_origin
 from emulator.fem import Simulator, design, run_campaign, sobol
 from emulator.scenes.scene import Scene
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.taylor import expand
 from emulator.training.discrepancy_stage import add_discrepancy
@@ -255,9 +256,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         right.axvline(share, color="black", lw=1.2, ls="--")
     right.set_title("dashed: FEM's own posteriors", fontsize=9)
     figure.legend(frameon=False, loc="outside upper left", ncols=2, fontsize=9)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def check(rows: list[dict[str, Any]]) -> None:

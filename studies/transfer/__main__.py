@@ -1,6 +1,6 @@
 """Transfer: a network trained on a family of ventricles, on a new one (App. E of the paper).
 
-``python studies/transfer/run.py [--quick] [--one]``. Trains one network on a family of ventricles,
+``python -m studies.transfer [--quick] [--one]``. Trains one network on a family of ventricles,
 then trains on a ventricle of another shape and another mesh, from scratch and from the family, each
 for several numbers of steps. Writes results.json and transfer.png beside itself, or under --out,
 and asserts what the README says.
@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.output import save
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -26,7 +27,7 @@ from emulator.fem import Runs, run_campaign, sobol
 from emulator.geometry.cavity import Cavity
 from emulator.scenes import Scene
 from emulator.scenes.cavities import cavity_sets
-from emulator.store import replacing, write_json
+from emulator.store import write_json
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import Plan, pretrain, recipe, train
 from emulator.training.problem import Problem, prepare
@@ -159,9 +160,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
         axes.set_ylabel(f"{key}, median over the held-out FEM runs ({unit})")
         axes.grid(alpha=0.25)
     panels[0].legend(frameon=False, fontsize=8)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-    plt.close(figure)
+    save(figure, path)
 
 
 def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
