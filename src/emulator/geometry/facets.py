@@ -26,9 +26,19 @@ def area_vectors(x: jax.Array, rule: FacetRule) -> jax.Array:
 
 def nodal_areas(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
     """Integral of each shape function over the facets ``corners`` (k, a, 3), (k, a) in mm2."""
-    along = np.einsum("qad,kai->kqdi", rule.derivatives, corners)
-    area = np.linalg.norm(np.cross(along[:, :, 0], along[:, :, 1]), axis=-1)
+    area = np.linalg.norm(_normals(corners, rule), axis=-1)
     return np.einsum("q,kq,qa->ka", rule.weights, area, rule.values)
+
+
+def nodal_area_vectors(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
+    """Integral of each shape function times the normal over ``corners`` (k, a, 3), (k, a, 3)."""
+    return np.einsum("q,kqi,qa->kai", rule.weights, _normals(corners, rule), rule.values)
+
+
+def _normals(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
+    """:func:`area_vectors` of all facets ``corners`` (k, a, 3) at rest, (k, q, 3) in mm2."""
+    along = np.einsum("qad,kai->kqdi", rule.derivatives, corners)
+    return np.cross(along[:, :, 0], along[:, :, 1])
 
 
 def cone_volume(x: jax.Array) -> jax.Array:

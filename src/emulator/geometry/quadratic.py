@@ -1,4 +1,4 @@
-"""Quadratic tetrahedra from linear ones: a node on every edge, straight or on the true surface."""
+"""Quadratic tetrahedra from linear ones, a node on every edge, and linear ones from quadratic."""
 
 from __future__ import annotations
 
@@ -56,3 +56,32 @@ def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
         {name: grown(nodes) for name, nodes in mesh.node_sets.items()},
         facets,
     )
+
+
+def to_linear(mesh: Mesh) -> Mesh:
+    """The linear tetrahedra between the corners of quadratic ones, its nodes numbered anew."""
+    if mesh.order != 2:
+        raise InputError("mesh: its tetrahedra are linear already")
+    corners, elements = np.unique(mesh.elements[:, :4], return_inverse=True)
+
+    def numbered(nodes: np.ndarray) -> np.ndarray:
+        return np.searchsorted(corners, nodes)
+
+    return Mesh(
+        mesh.nodes[corners],
+        elements.reshape(-1, 4),
+        {name: numbered(np.intersect1d(at, corners)) for name, at in mesh.node_sets.items()},
+        {name: numbered(rows[:, :3]) for name, rows in mesh.facet_sets.items()},
+    )
+
+
+def corner_parents(mesh: Mesh) -> np.ndarray:
+    """Nodes of :func:`to_linear` of ``mesh`` that each of its nodes lies between, (n, 2).
+
+    Both are the same for a corner.
+    """
+    corners = np.unique(mesh.elements[:, :4])
+    parents = np.zeros((len(mesh.nodes), 2), dtype=int)
+    parents[mesh.elements[:, 4:]] = np.searchsorted(corners, mesh.elements[:, EDGES])
+    parents[corners] = np.arange(len(corners))[:, None]
+    return parents

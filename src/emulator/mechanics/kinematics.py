@@ -105,6 +105,11 @@ class Strain:
         return jnp.where(shear < 0.0, 1.0 - limit(1.0 - shear), limit(1.0 + shear) - 1.0)
 
     @property
+    def small(self) -> jax.Array:
+        """``(H + H^T)/2``, the strain of small displacements, shape (3, 3)."""
+        return 0.5 * (self.H + self.H.T)
+
+    @property
     def green_lagrange(self) -> jax.Array:
         """``E = (C - I)/2``, shape (3, 3)."""
         return 0.5 * (self.H + self.H.T + self.H.T @ self.H)

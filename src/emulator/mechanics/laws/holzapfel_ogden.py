@@ -8,9 +8,11 @@ resist stretch only, :math:`\langle x \rangle = \max(x, 0)`:
     W = \frac{a}{2b}\left[e^{b(\bar I_1 - 3)} - 1\right]
       + \frac{a_f}{2b_f}\left[e^{b_f \langle \bar I_{4f} - 1 \rangle^2} - 1\right] + U(J)
 
-The released variant behind the paper's published solutions has no factors 1/2 and no switch; its
-``a`` and ``a_f`` are half the textbook's. Both have the volumetric part
-``quadratic_logarithmic`` (:mod:`~emulator.mechanics.laws.volumetric`) with the parameter kappa.
+Two effects can be left out: the switch, so that fibres resist being shortened as they do being
+stretched, and the fibres. The released variant behind the paper's published solutions has no
+factors 1/2 and no switch; its ``a`` and ``a_f`` are half the textbook's. All have the volumetric
+part ``quadratic_logarithmic`` (:mod:`~emulator.mechanics.laws.volumetric`) with the parameter
+kappa.
 """
 
 from __future__ import annotations
@@ -45,19 +47,54 @@ def energy_released(
     return matrix + fibres + quadratic_logarithmic(strain, kappa)
 
 
+def energy_unswitched(
+    strain: Strain, a: jax.Array, b: jax.Array, a_f: jax.Array, b_f: jax.Array, kappa: jax.Array
+) -> jax.Array:
+    """Strain energy density in kPa of fibres that resist compression, too."""
+    stretch = strain.isochoric_I4f_minus_1
+    fibres = a_f / (2.0 * b_f) * jnp.expm1(b_f * stretch**2)
+    return energy_isotropic(strain, a, b, kappa) + fibres
+
+
+def energy_isotropic(strain: Strain, a: jax.Array, b: jax.Array, kappa: jax.Array) -> jax.Array:
+    """Strain energy density in kPa without fibres."""
+    matrix = a / (2.0 * b) * jnp.expm1(b * strain.isochoric_I1_minus_3)
+    return matrix + quadratic_logarithmic(strain, kappa)
+
+
 _PARAMETERS = (modulus("a"), number("b"), modulus("a_f"), number("b_f"), modulus("kappa"))
-HOLZAPFEL_OGDEN = Law(
-    "holzapfel_ogden",
+HOLZAPFEL_OGDEN_ISOTROPIC = Law(
+    "holzapfel_ogden_isotropic",
+    (modulus("a"), number("b"), modulus("kappa")),
+    energy_isotropic,
+    shape_moduli=("a",),
+    exponential=True,
+)
+_WITHOUT_FIBRES = (("fibres", HOLZAPFEL_OGDEN_ISOTROPIC),)
+HOLZAPFEL_OGDEN_UNSWITCHED = Law(
+    "holzapfel_ogden_unswitched",
     _PARAMETERS,
-    energy,
+    energy_unswitched,
     fibres=True,
     shape_moduli=("a", "a_f"),
     exponential=True,
+    simpler=_WITHOUT_FIBRES,
+)
+HOLZAPFEL_OGDEN = replace(
+    HOLZAPFEL_OGDEN_UNSWITCHED,
+    name="holzapfel_ogden",
+    energy=energy,
+    simpler=(("tension switch", HOLZAPFEL_OGDEN_UNSWITCHED), *_WITHOUT_FIBRES),
 )
 HOLZAPFEL_OGDEN_RELEASED = replace(
-    HOLZAPFEL_OGDEN, name="holzapfel_ogden_released", energy=energy_released
+    HOLZAPFEL_OGDEN, name="holzapfel_ogden_released", energy=energy_released, simpler=()
 )
-LAWS = (HOLZAPFEL_OGDEN, HOLZAPFEL_OGDEN_RELEASED)
+LAWS = (
+    HOLZAPFEL_OGDEN,
+    HOLZAPFEL_OGDEN_UNSWITCHED,
+    HOLZAPFEL_OGDEN_ISOTROPIC,
+    HOLZAPFEL_OGDEN_RELEASED,
+)
 
 
 def textbook_from_released(a: float, a_f: float) -> tuple[float, float]:

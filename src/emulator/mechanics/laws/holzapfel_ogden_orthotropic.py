@@ -59,5 +59,6 @@ HOLZAPFEL_OGDEN_ORTHOTROPIC = Law(
     sheets=True,
     shape_moduli=("a", "a_f", "a_s", "a_fs"),
     exponential=True,
+    simpler=(("sheets", holzapfel_ogden.HOLZAPFEL_OGDEN),),
 )
 LAWS = (HOLZAPFEL_OGDEN_ORTHOTROPIC,)

@@ -27,6 +27,10 @@ class Law:
         have regions.
     exponential : whether stress grows exponentially with strain. It only affects how the solver
         starts, see :mod:`emulator.fem.mip`.
+    objective : whether a rotation of the body leaves the energy unchanged. A law of small strains
+        is not.
+    simpler : laws with one effect less, which take some of its parameters: the effect's name, and
+        the law without it.
     """
 
     name: str
@@ -36,6 +40,8 @@ class Law:
     sheets: bool = False
     shape_moduli: tuple[str, ...] = ()
     exponential: bool = False
+    objective: bool = True
+    simpler: tuple[tuple[str, Law], ...] = ()
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -3,11 +3,13 @@
 A new kind is a frozen dataclass derived from :class:`Load` in a file of its own, named here.
 """
 
+from emulator.scenes.loads.dead_pressure import DeadPressure
 from emulator.scenes.loads.follower import FollowerPressure
 from emulator.scenes.loads.gravity import Gravity, GravityVector
 from emulator.scenes.loads.load import Load
-from emulator.scenes.loads.pressure import KPA_PER_MMHG, CavityPressure, SurfacePressure
+from emulator.scenes.loads.pressure import CavityPressure
 from emulator.scenes.loads.published_pressure import PublishedPressure
+from emulator.scenes.loads.surface_pressure import KPA_PER_MMHG, SurfacePressure
 from emulator.scenes.loads.traction import Traction
 
 LOADS: dict[str, type[Load]] = {
@@ -18,6 +20,7 @@ LOADS: dict[str, type[Load]] = {
         Traction,
         CavityPressure,
         FollowerPressure,
+        DeadPressure,
         PublishedPressure,
     )
 }
@@ -26,6 +29,7 @@ __all__ = [
     "KPA_PER_MMHG",
     "LOADS",
     "CavityPressure",
+    "DeadPressure",
     "FollowerPressure",
     "Gravity",
     "GravityVector",

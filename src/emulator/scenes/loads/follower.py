@@ -19,7 +19,8 @@ import jax.numpy as jnp
 
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import area_vectors
-from emulator.scenes.loads.pressure import SurfacePressure
+from emulator.scenes.loads.dead_pressure import DeadPressure, at_rest
+from emulator.scenes.loads.surface_pressure import SurfacePressure
 from emulator.scenes.local_terms import LocalForce, Values
 
 
@@ -28,6 +29,11 @@ class FollowerPressure(SurfacePressure):
     """Pressure on a patch whose rim may move; positive pushes into the tissue."""
 
     kind: ClassVar[str] = "follower_pressure"
+
+    @property
+    def simpler(self) -> tuple[str, DeadPressure]:
+        """The pressure on the patch as it is at rest."""
+        return at_rest(self)
 
     @property
     def has_potential(self) -> bool:

@@ -44,6 +44,11 @@ class Gravity(Load):
         if len(self.direction) != 3 or not 0.0 < np.linalg.norm(self.direction) < np.inf:
             raise InputError(f"gravity: direction is {self.direction}; give 3 numbers, not all 0")
 
+    @property
+    def simpler(self) -> tuple[str, None]:
+        """No weight."""
+        return "gravity", None
+
     def to_json(self) -> list[Any]:
         """Kind and body force, the product of density, acceleration and direction."""
         return [self.kind, *(float(x) + 0.0 for x in np.round(self.body_force, 12))]
@@ -82,6 +87,11 @@ class GravityVector(Load):
     def quantities(self) -> tuple[Quantity, ...]:
         """Its three components."""
         return tuple(Quantity(f"{self.parameter}_{axis}", "m/s2", -np.inf) for axis in "xyz")
+
+    @property
+    def simpler(self) -> tuple[str, None]:
+        """No weight."""
+        return "gravity", None
 
     def to_json(self) -> list[Any]:
         """Kind, density and name."""

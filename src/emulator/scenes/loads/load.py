@@ -40,6 +40,11 @@ class Load(ABC):
         return None
 
     @property
+    def simpler(self) -> tuple[str, Load | None] | None:
+        """An effect that can be left out: its name, and the load without it, None for no load."""
+        return None
+
+    @property
     def has_potential(self) -> bool:
         """Whether the load's work is a potential of the displacement."""
         return True

@@ -14,7 +14,7 @@ potential: see :mod:`emulator.scenes.loads.follower`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -23,57 +23,9 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.facets import cone_volume, rim
 from emulator.geometry.mesh import Mesh
-from emulator.mechanics.quantity import Quantity
-from emulator.scenes.loads.load import Load
+from emulator.scenes.loads.dead_pressure import DeadPressure, at_rest
+from emulator.scenes.loads.surface_pressure import SurfacePressure
 from emulator.scenes.local_terms import LocalTerm, Values
-
-KPA_PER_MMHG = 0.133322
-
-
-@dataclass(frozen=True)
-class SurfacePressure(Load):
-    """A pressure on a facet set; subclasses define its virtual work.
-
-    Parameters
-    ----------
-    facet_set : the surface it acts on.
-    pressure : kPa, or ``None`` to make it a parameter of the scene.
-    parameter : name of that parameter; give each of several pressures its own.
-    """
-
-    facet_set: str
-    pressure: float | None = None
-    parameter: str = "pressure"
-
-    def __post_init__(self) -> None:
-        if self.pressure is not None and not np.isfinite(self.pressure):
-            raise InputError(f"pressure on '{self.facet_set}' is {self.pressure} kPa")
-
-    @property
-    def facet_sets(self) -> tuple[str, ...]:
-        """The facet set it acts on."""
-        return (self.facet_set,)
-
-    @property
-    def pressed(self) -> str:
-        """The facet set it acts on."""
-        return self.facet_set
-
-    @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        """The pressure, if it is a parameter; suction is negative."""
-        if self.pressure is not None:
-            return ()
-        return (Quantity(self.parameter, "kPa", -np.inf, hint=f"1 mmHg = {KPA_PER_MMHG} kPa"),)
-
-    def to_json(self) -> list[Any]:
-        """Kind, facet set, pressure, name of the parameter; one of the last two is None."""
-        by_name = self.parameter if self.pressure is None else None
-        return [self.kind, self.facet_set, self.pressure, by_name]
-
-    def value(self, values: Values) -> jax.Array | float:
-        """The pressure in kPa, taken from the scene's resolved parameters if it is one."""
-        return values[self.parameter] if self.pressure is None else self.pressure
 
 
 @dataclass(frozen=True)
@@ -81,6 +33,11 @@ class CavityPressure(SurfacePressure):
     """Pressure in a cavity, exact (``-p V``); the rim of its wall must be held."""
 
     kind: ClassVar[str] = "cavity_pressure"
+
+    @property
+    def simpler(self) -> tuple[str, DeadPressure]:
+        """The pressure on the wall as it is at rest."""
+        return at_rest(self)
 
     def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
         """Refuse a cavity whose rim is neither held nor slides in a plane through the origin."""

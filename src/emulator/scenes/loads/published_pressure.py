@@ -19,7 +19,7 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.kinematics import cofactor
-from emulator.scenes.loads.pressure import SurfacePressure
+from emulator.scenes.loads.surface_pressure import SurfacePressure
 from emulator.scenes.local_terms import LocalTerm, Values
 
 

@@ -44,6 +44,11 @@ class BoundaryCondition(ABC):
         """Facet sets the support acts on; they must be in the mesh."""
         return ()
 
+    @property
+    def simpler(self) -> tuple[str, BoundaryCondition | None] | None:
+        """An effect that can be left out: its name, and the support without it, None for none."""
+        return None
+
     def held(self, mesh: Mesh) -> Held | None:
         """Prescribed displacements, or None."""
         return None

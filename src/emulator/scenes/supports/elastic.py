@@ -56,6 +56,12 @@ class ElasticSupport(BoundaryCondition):
         """The facet set it acts on."""
         return (self.facet_set,)
 
+    @property
+    def simpler(self) -> tuple[str, None]:
+        """No springs."""
+        way = "springs on" if self.direction == "all" else "normal springs on"
+        return f"{way} '{self.facet_set}'", None
+
     def to_json(self) -> list[Any]:
         """Kind, facet set, stiffness and direction."""
         return [self.kind, self.facet_set, float(self.stiffness), self.direction]

@@ -1,0 +1,61 @@
+r"""Holzapfel-Ogden material whose fibres are dispersed about their mean direction.
+
+.. math::
+    W = \frac{a}{2b}\left[e^{b(\bar I_1 - 3)} - 1\right]
+      + \frac{a_f}{2b_f}\left[e^{b_f \langle \bar E \rangle^2} - 1\right] + U(J), \qquad
+    \bar E = d\, (\bar I_1 - 3) + (1 - 3 d)(\bar I_{4f} - 1)
+
+with the dispersion :math:`d` of Gasser, Ogden & Holzapfel (2006, Eq. 4.11), 0 for parallel fibres
+and 1/3 for fibres in all directions, and the switch of
+:mod:`~emulator.mechanics.laws.holzapfel_ogden`, here on their mean strain. For :math:`d = 0` it is
+that law.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.laws.holzapfel_ogden import (
+    HOLZAPFEL_OGDEN,
+    HOLZAPFEL_OGDEN_ISOTROPIC,
+    energy_isotropic,
+)
+from emulator.mechanics.laws.law import Law
+from emulator.mechanics.quantity import modulus, number
+
+
+def energy(
+    strain: Strain,
+    a: jax.Array,
+    b: jax.Array,
+    a_f: jax.Array,
+    b_f: jax.Array,
+    dispersion: jax.Array,
+    kappa: jax.Array,
+) -> jax.Array:
+    """Strain energy density in kPa; ``a``, ``a_f`` and ``kappa`` in kPa."""
+    along = (1.0 - 3.0 * dispersion) * strain.isochoric_I4f_minus_1
+    mean = jnp.maximum(dispersion * strain.isochoric_I1_minus_3 + along, 0.0)
+    fibres = a_f / (2.0 * b_f) * jnp.expm1(b_f * mean**2)
+    return energy_isotropic(strain, a, b, kappa) + fibres
+
+
+HOLZAPFEL_OGDEN_DISPERSED = Law(
+    "holzapfel_ogden_dispersed",
+    (
+        modulus("a"),
+        number("b"),
+        modulus("a_f"),
+        number("b_f"),
+        number("dispersion", 0.0, 1.0 / 3.0),
+        modulus("kappa"),
+    ),
+    energy,
+    fibres=True,
+    shape_moduli=("a", "a_f"),
+    exponential=True,
+    simpler=(("fibre dispersion", HOLZAPFEL_OGDEN), ("fibres", HOLZAPFEL_OGDEN_ISOTROPIC)),
+)
+LAWS = (HOLZAPFEL_OGDEN_DISPERSED,)
