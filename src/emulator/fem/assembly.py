@@ -243,12 +243,13 @@ class System:
         tangent may be like that other one.
         """
         traced = any(isinstance(x, jax.core.Tracer) for x in (tangent, rhs))
-        if self._kept is None or traced:
+        if self.kept is None or traced:
             return self.solve(tangent, rhs)
-        return self._kept.solve(tangent, rhs, near=near)
+        return self.kept.solve(tangent, rhs, near=near)
 
     @cached_property
-    def _kept(self) -> KeptFactor | None:
+    def kept(self) -> KeptFactor | None:
+        """The factor that steps keep while it serves; None where the matrices are small."""
         wanted = self.factorisation == "cholmod" and not self.mixed
         return KeptFactor(self.pattern) if wanted and KeptFactor.pays(self.pattern) else None
 

@@ -117,7 +117,7 @@ def test_a_kept_factor_leads_to_the_same_equilibrium(monkeypatch: pytest.MonkeyP
         assert found.converged
         assert jnp.abs(found.displacement - expected.displacement).max() < 1e-7
         tangents += int(found.factorisations)
-    kept = keeping._driver.definite._kept
+    kept = keeping._driver.definite.kept
     assert kept is not None
     assert 1 <= kept.factorisations < tangents
 
