@@ -1,0 +1,47 @@
+"""``calibrate report``: one page of a posterior."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from calibrate.cli.common import DONE, add_json, emit
+from emulator.errors import InputError
+
+
+def register(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "report",
+        help="one HTML page of a posterior that opens anywhere",
+        description="Verdict, data against prediction, parameters, the body in three dimensions "
+        "with a slider over draws, what the data determine, and how to repeat it, in one file "
+        "that needs no network.",
+        epilog="example: calibrate report DIR",
+    )
+    parser.add_argument("folder", metavar="DIR", help="of calibrate infer")
+    parser.add_argument(
+        "--out", metavar="FILE.html", help="where to write it (default DIR/report.html)"
+    )
+    parser.add_argument(
+        "--no-fem", action="store_true", help="without the FEM solve that shows the map's error"
+    )
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the page."""
+    if arguments.out and not arguments.out.endswith(".html"):
+        raise InputError(f"--out {arguments.out}: the file name must end in .html")
+    try:
+        from calibrate.report import write_report
+    except ModuleNotFoundError as error:
+        if error.name != "plotly":
+            raise
+        raise InputError(
+            "a report needs plotly: pip install 'soft-tissue-calibrate[plot]'"
+        ) from error
+    path = write_report(arguments.folder, arguments.out, fem=not arguments.no_fem)
+    emit({"out": str(path)}, as_json=arguments.json, text=f"written to {path}")
+    return DONE

@@ -1,0 +1,149 @@
+"""The body in three dimensions: draws of its shape, and what is known of it where."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plotly.graph_objects as go
+
+from calibrate.figures.evaluation import surface_triangles
+from calibrate.posterior import Posterior
+from emulator.fem import Simulator
+from emulator.fem.fields import element_fields
+from emulator.scenes.scene import Scene
+
+_DRAWS = 20
+_MOMENTS = 100  # draws for mean and sd
+_FIBRES = 400  # drawn, at most
+_DIGITS = 4
+
+
+def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
+    """The deformed surface with a slider over draws and a menu of colours.
+
+    simulator : to compare with at the mean theta; None leaves that out.
+    """
+    model = posterior.model
+    scene = model.forward.scene
+    thetas = posterior.thetas(model.states.states[-1])
+    rows = np.linspace(0, len(thetas) - 1, min(_MOMENTS, len(thetas))).astype(int)
+    predict = jax.jit(lambda t: jax.lax.map(model.full, t))
+    fields = np.asarray(predict(thetas[rows]))  # (s, n, 3)
+    mean = fields.mean(axis=0)
+    centre = thetas.mean(axis=0)
+    colours = _colours(scene, fields, mean, centre)
+    if simulator is not None:
+        colours |= _error(posterior, centre, simulator)
+    shown = fields[np.linspace(0, len(fields) - 1, min(_DRAWS, len(fields))).astype(int)]
+    nodes = np.unique(surface_triangles(scene.mesh))
+    place = {int(node): k for k, node in enumerate(nodes)}
+    triangles = np.vectorize(place.__getitem__)(surface_triangles(scene.mesh))
+    i, j, k = triangles.T.tolist()
+    first = next(iter(colours))
+    figure = go.Figure(
+        go.Mesh3d(
+            **_xyz(scene.mesh.nodes[nodes] + mean[nodes]), i=i, j=j, k=k,
+            **_coloured(colours[first][nodes], first), flatshading=True, name="deformed",
+        )
+    )  # fmt: skip
+    figure.add_mesh3d(
+        **_xyz(scene.mesh.nodes[nodes]), i=i, j=j, k=k, color="grey", opacity=0.12,
+        name="at rest", showlegend=True, hoverinfo="skip",
+    )  # fmt: skip
+    if scene.fibres is not None:
+        figure.add_trace(_fibres(scene, mean, centre))
+    frames = {"mean": mean} | {f"draw {n}": u for n, u in enumerate(shown, start=1)}
+    at_rest = scene.mesh.nodes[nodes]
+    figure.frames = [
+        go.Frame(name=name, traces=[0], data=[go.Mesh3d(**_xyz(at_rest + u[nodes]))])
+        for name, u in frames.items()
+    ]
+    _add_controls(figure, list(frames), {n: v[nodes] for n, v in colours.items()})
+    return figure
+
+
+def _colours(
+    scene: Scene,
+    fields: np.ndarray,
+    mean: np.ndarray,
+    theta: jax.Array,
+) -> dict[str, np.ndarray]:
+    """Values (n,) at the nodes, by what they are."""
+    found = {
+        "mean displacement (mm)": np.linalg.norm(mean, axis=1),
+        "sd of displacement (mm)": np.sqrt(fields.var(axis=0).sum(axis=1)),
+    }
+    told = element_fields(scene, jnp.asarray(mean), theta)
+    largest = np.linalg.eigvalsh(told["green_lagrange"])[:, -1]
+    found["largest principal strain"] = _nodal(scene, largest)
+    if "fibre_stretch" in told:
+        found["fibre stretch"] = _nodal(scene, told["fibre_stretch"])
+    return found
+
+
+def _error(posterior: Posterior, theta: jax.Array, simulator: Simulator) -> dict[str, np.ndarray]:
+    """The map's error (n,) at ``theta`` (p,); nothing where FEM does not converge."""
+    solution = simulator.solve(theta)
+    if not solution.converged:
+        return {}
+    wrong = np.asarray(posterior.model.full(theta) - solution.displacement)
+    return {"error against FEM at the mean theta (mm)": np.linalg.norm(wrong, axis=1)}
+
+
+def _nodal(scene: Scene, values: np.ndarray) -> np.ndarray:
+    """Element values (m,) as means at the nodes, weighted by volume, (n,)."""
+    elements, weights = scene.mesh.elements, scene.discretisation.weights.sum(axis=1)
+    ends = np.broadcast_to(weights[:, None], elements.shape)
+    total = np.bincount(elements.ravel(), (ends * values[:, None]).ravel())
+    return total / np.bincount(elements.ravel(), ends.ravel())
+
+
+def _xyz(points: np.ndarray) -> dict[str, list[float]]:
+    return dict(zip("xyz", np.round(points.T, _DIGITS).tolist(), strict=True))
+
+
+def _coloured(values: np.ndarray, title: str) -> dict[str, Any]:
+    return {
+        "intensity": np.array([f"{v:.4g}" for v in values], dtype=float).tolist(),
+        "colorscale": "Viridis",
+        "colorbar": {"title": {"text": title, "side": "right"}, "thickness": 14, "len": 0.8},
+        "hovertemplate": "%{intensity:.4g}<extra></extra>",
+    }
+
+
+def _fibres(scene: Scene, mean: np.ndarray, theta: jax.Array) -> go.Scatter3d:
+    """Short lines along the deformed fibres of some elements."""
+    told = element_fields(scene, jnp.asarray(mean), theta)["deformed_fibres"]
+    some = np.linspace(0, len(told) - 1, min(len(told), _FIBRES)).astype(int)
+    middle = (scene.mesh.nodes + mean)[scene.mesh.elements[some, :4]].mean(axis=1)
+    half = 0.5 * np.cbrt(scene.discretisation.weights.sum(axis=1)[some])[:, None] * told[some]
+    ends = np.stack([middle - half, middle + half, np.full_like(middle, np.nan)], axis=1)
+    lines = {name: [None if np.isnan(v) else round(float(v), _DIGITS) for v in ends[..., k].ravel()]
+             for k, name in enumerate("xyz")}  # fmt: skip
+    return go.Scatter3d(
+        **lines, mode="lines", line={"color": "black", "width": 3}, name="fibres",
+        visible="legendonly", hoverinfo="skip",
+    )  # fmt: skip
+
+
+def _add_controls(figure: go.Figure, names: list[str], colours: dict[str, np.ndarray]) -> None:
+    """A slider over the shapes and a menu of the colours."""
+    at_once = {"mode": "immediate", "frame": {"duration": 0, "redraw": True},
+               "transition": {"duration": 0}}  # fmt: skip
+    steps = [{"label": n, "method": "animate", "args": [[n], at_once]} for n in names]
+    buttons = []
+    for title, values in colours.items():
+        made = _coloured(values, title)
+        restyle = {"intensity": [made["intensity"]], "colorbar.title.text": [title]}
+        buttons.append({"label": title, "method": "restyle", "args": [restyle, [0]]})
+    figure.update_layout(
+        sliders=[{"steps": steps, "currentvalue": {"prefix": "shape: "}, "pad": {"t": 10}}],
+        updatemenus=[{"buttons": buttons, "x": 0.0, "xanchor": "left", "y": 1.12}],
+        scene_camera_eye={"x": 1.1, "y": 1.1, "z": 0.7},
+        scene={"aspectmode": "data", **{f"{a}axis": {"title": f"{a} (mm)"} for a in "xyz"}},
+        height=680,
+        legend={"x": 0.0, "y": 0.0},
+    )

@@ -1,0 +1,231 @@
+"""Charts of a posterior: data against prediction, draws, stress, pressure and volume."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+from scipy.stats import rankdata
+
+from calibrate.identifiability.stress import stress_band
+from calibrate.observations import CavityVolume, Observation
+from calibrate.posterior import Posterior
+from calibrate.state_names import split
+from emulator.errors import InputError
+
+BLUE, ORANGE, GREEN, PINK, YELLOW, SKY = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+)
+_CHAINS = (BLUE, ORANGE, GREEN, PINK, YELLOW, SKY)  # told apart by the colour-blind
+_BAND = "rgba(0, 114, 178, 0.22)"
+_MOST_TRACED = 500  # draws of a chain in a trace
+_MOST_PAIRED = 800  # draws in a pair plot
+_CURVES = 60  # draws of a pressure-volume band
+_PRESSURES = 12
+
+
+def names_with_units(posterior: Posterior) -> dict[str, str]:
+    """Label of each unknown, its unit included."""
+    units = {p.name: p.unit for p in posterior.model.forward.scene.parameters}
+    found = {}
+    for name in posterior.model.names:
+        unit = units.get(split(name)[0], "")
+        found[name] = f"{name} ({unit})" if unit else name
+    return found
+
+
+def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
+    """For each observation, what was measured against what the posterior predicts."""
+    tree = posterior.tree
+    if "posterior_predictive" not in tree.children:
+        return
+    for name, part in posterior.model.observe.parts.items():
+        values = np.asarray(tree["posterior_predictive"][name])
+        values = values.reshape(values.shape[0] * values.shape[1], -1)
+        measured = np.ravel(np.asarray(posterior.data[name]))
+        if values.shape[1] == 1:
+            yield name, _one_number(name, part, values[:, 0], float(measured[0]))
+        else:
+            yield name, _many_numbers(name, part, values, measured)
+
+
+def _one_number(name: str, part: Observation, values: np.ndarray, measured: float) -> go.Figure:
+    figure = go.Figure(
+        go.Histogram(
+            x=values, histnorm="probability density", marker_color=BLUE, opacity=0.75,
+            name="predicted, with noise",
+        )
+    )  # fmt: skip
+    figure.add_vline(x=measured, line={"color": ORANGE, "width": 3}, annotation_text="measured")
+    figure.update_layout(xaxis_title=f"{name} ({part.unit})", yaxis={"showticklabels": False})
+    return figure
+
+
+def _many_numbers(
+    name: str, part: Observation, values: np.ndarray, measured: np.ndarray
+) -> go.Figure:
+    low, middle, high = np.nanquantile(values, [0.05, 0.5, 0.95], axis=0)
+    there = np.isfinite(measured)
+    inside = float(np.mean(((measured >= low) & (measured <= high))[there]))
+    ends = [float(np.nanmin(measured)), float(np.nanmax(measured))]
+    figure = go.Figure()
+    figure.add_scatter(
+        x=ends, y=ends, mode="lines", line={"color": "grey", "dash": "dot"}, name="equal",
+        hoverinfo="skip",
+    )  # fmt: skip
+    figure.add_scatter(
+        x=measured[there],
+        y=middle[there],
+        mode="markers",
+        marker={"color": BLUE, "size": 6},
+        error_y={
+            "type": "data",
+            "symmetric": False,
+            "array": (high - middle)[there],
+            "arrayminus": (middle - low)[there],
+            "thickness": 1,
+        },
+        name=f"median and 90 %; {100 * inside:.0f} % of the data lie within",
+    )
+    figure.update_layout(
+        xaxis_title=f"{name} measured ({part.unit})", yaxis_title=f"predicted ({part.unit})"
+    )
+    return figure
+
+
+def traces(posterior: Posterior) -> go.Figure:
+    """Each unknown's draws by chain: their densities, their order, and their ranks."""
+    labels = names_with_units(posterior)
+    figure = make_subplots(
+        len(labels), 3, column_titles=["posterior", "trace", "ranks by chain"],
+        horizontal_spacing=0.06, vertical_spacing=0.25 / max(len(labels), 2),
+    )  # fmt: skip
+    for row, (name, label) in enumerate(labels.items(), start=1):
+        draws = np.asarray(posterior.tree["posterior"][name])
+        ranks = rankdata(draws).reshape(draws.shape)
+        edges = np.linspace(0.5, draws.size + 0.5, 21)
+        step = max(1, draws.shape[1] // _MOST_TRACED)
+        for chain, values in enumerate(draws):
+            colour = _CHAINS[chain % len(_CHAINS)]
+            style: dict[str, Any] = {
+                "marker": {"color": colour},
+                "name": f"chain {chain + 1}",
+                "legendgroup": str(chain),
+                "showlegend": False,
+            }
+            density = {"histnorm": "probability density", "opacity": 0.5, "nbinsx": 40}
+            counts = np.histogram(ranks[chain], edges)[0]
+            line = {"mode": "lines", **style}
+            density = go.Histogram(
+                x=values, histnorm="probability density", opacity=0.5, nbinsx=40,
+                **{**style, "showlegend": row == 1},
+            )  # fmt: skip
+            trace = go.Scatter(y=values[::step], line_width=1, **line)
+            rank = go.Scatter(x=edges, y=[*counts, counts[-1]], line_shape="hv", **line)
+            for column, drawn in enumerate((density, trace, rank), start=1):
+                figure.add_trace(drawn, row, column)
+        even = draws.shape[1] / 20.0
+        figure.add_hline(y=even, line={"color": "grey", "dash": "dot"}, row=row, col=3)
+        figure.update_yaxes(title_text=label, showticklabels=False, row=row, col=1)
+        figure.update_yaxes(rangemode="tozero", row=row, col=3)
+    figure.update_layout(barmode="overlay", height=120 + 170 * len(labels))
+    return figure
+
+
+def pairs(posterior: Posterior) -> go.Figure:
+    """Draws of every two unknowns."""
+    labels, draws = names_with_units(posterior), posterior.draws()
+    count = len(next(iter(draws.values())))
+    rows = np.linspace(0, count - 1, min(count, _MOST_PAIRED)).astype(int)
+    figure = go.Figure(
+        go.Splom(
+            dimensions=[{"label": labels[n], "values": draws[n][rows]} for n in labels],
+            marker={"size": 3, "color": BLUE, "opacity": 0.35},
+            showupperhalf=False,
+            diagonal_visible=False,
+        )
+    )
+    figure.update_layout(height=160 + 140 * len(labels))
+    return figure
+
+
+def stress(posterior: Posterior) -> go.Figure:
+    """The stress that a stretch takes, 90 % band."""
+    figure = go.Figure()
+    fibres = posterior.model.forward.scene.law.fibres
+    for direction, colour in (("fibre", BLUE), ("cross-fibre", ORANGE))[: 2 if fibres else 1]:
+        band = stress_band(posterior, direction)
+        label = f"along the {direction}" if fibres else "in any direction"
+        fill = f"rgba({int(colour[1:3], 16)}, {int(colour[3:5], 16)}, {int(colour[5:], 16)}, 0.2)"
+        figure.add_scatter(
+            x=[*band.stretch, *band.stretch[::-1]], y=[*band.high, *band.low[::-1]], fill="toself",
+            fillcolor=fill, line_width=0, name=f"90 %, {label}", hoverinfo="skip",
+        )  # fmt: skip
+        figure.add_scatter(
+            x=band.stretch, y=band.median, line_color=colour, name=f"median, {label}"
+        )
+    figure.update_layout(xaxis_title="stretch", yaxis_title="Cauchy stress difference (kPa)")
+    return figure
+
+
+def pressure_volume(posterior: Posterior) -> go.Figure | None:
+    """Cavity volume over the range of its pressure; None without such a parameter or cavity."""
+    model = posterior.model
+    scene = model.forward.scene
+    loads = [load for load in scene.loads if load.pressed and load.quantities]
+    names = [load.quantities[0].name for load in loads if load.quantities]
+    wanted = [(load, name) for load, name in zip(loads, names, strict=True)
+              if name in scene.parameter_names]  # fmt: skip
+    if not wanted:
+        return None
+    load, name = wanted[0]
+    try:
+        volume = CavityVolume(scene, load.pressed)
+    except InputError:  # a flat wall encloses nothing
+        return None
+    column = scene.parameter_names.index(name)
+    parameter = scene.parameters[column]
+    pressures = jnp.linspace(parameter.low, parameter.high, _PRESSURES)
+    state = model.states.states[-1]
+    thetas = posterior.thetas(state)
+    rows = np.linspace(0, len(thetas) - 1, min(_CURVES, len(thetas))).astype(int)
+    every = jnp.repeat(thetas[rows][:, None], _PRESSURES, axis=1).at[:, :, column].set(pressures)
+    wall = model.full.at(volume.nodes)
+    curve = jax.jit(lambda t: jax.lax.map(lambda theta: volume(wall(theta), theta), t))
+    volumes = np.asarray(curve(every.reshape(-1, every.shape[-1]))).reshape(len(rows), -1)
+    low, middle, high = np.nanquantile(volumes, [0.05, 0.5, 0.95], axis=0)
+    p = np.asarray(pressures)
+    figure = go.Figure()
+    figure.add_scatter(
+        x=[*low, *high[::-1]], y=[*p, *p[::-1]], fill="toself", fillcolor=_BAND, line_width=0,
+        name="90 % of the posterior", hoverinfo="skip",
+    )  # fmt: skip
+    figure.add_scatter(x=middle, y=p, line_color=BLUE, name="median")
+    for seen, part in model.observe.parts.items():
+        if isinstance(part, CavityVolume) and part.facet_set == volume.facet_set:
+            _add_measured(figure, posterior, seen, name)
+    figure.update_layout(xaxis_title="cavity volume (mL)", yaxis_title=f"{name} ({parameter.unit})")
+    return figure
+
+
+def _add_measured(figure: go.Figure, posterior: Posterior, seen: str, pressure: str) -> None:
+    """The measured volume at the pressure of its load state, inferred or known."""
+    state = split(seen)[1]
+    column = posterior.model.forward.scene.parameter_names.index(pressure)
+    values = np.asarray(posterior.thetas(state)[:, column])
+    figure.add_scatter(
+        x=[float(posterior.data[seen])], y=[float(values.mean())], mode="markers",
+        marker={"color": ORANGE, "size": 11, "symbol": "x"},
+        error_y={"type": "data", "array": [float(values.std())]},
+        name=f"{seen} measured; pressure {'known' if values.std() == 0.0 else 'inferred'}",
+    )  # fmt: skip

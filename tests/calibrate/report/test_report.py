@@ -1,0 +1,171 @@
+"""The page of a posterior: what it says, that it needs no network, and that a browser shows it."""
+
+import json
+import os
+import re
+import shutil
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+
+import calibrate as cal
+import emulator as em
+from calibrate.cli import main
+from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
+from calibrate.report import charts
+from calibrate.report.body import body_figure
+from calibrate.report.page import html_of
+from calibrate.run import Run
+from calibrate.samplers.laplace import LaplaceOptions
+from calibrate.workflow import infer
+
+TINY = LaplaceOptions(draws=60, chains=2, starts=2)
+CERTIFICATE = {"verdict": "accepted", "findings": ["no mean moves <b>"], "reason": "", "k_hat": 0.1}
+
+
+@pytest.fixture(scope="module")
+def ventricle_posterior():
+    """Of the shipped ventricle, 6 landmarks and the volume in one load state."""
+    emulator = em.load("left_ventricle")
+    scene = emulator.scene
+    parts = {
+        "displacement": landmarks(scene, spread_landmarks(scene, 6, 0)),
+        "volume": CavityVolume(scene),
+    }
+    forward = emulator.cache()
+    model = cal.model(forward, Observations(parts), {n: cal.GaussianNoise(sd=1.0) for n in parts})
+    u = forward(scene.centre)[model.observe.nodes]
+    data = model.observe(u[None], scene.centre[None])
+    return cal.sample(model, data, sampler="laplace", options=TINY, seed=0)
+
+
+@pytest.fixture(scope="module")
+def page(ventricle_posterior):
+    return html_of(Run("left_ventricle"), ventricle_posterior, CERTIFICATE, fem=False)
+
+
+def test_the_verdict_comes_first_and_all_sections_follow(page):
+    order = [
+        "<b>accepted</b>",
+        "Data against prediction",
+        "Parameters",
+        "The body",
+        "What the data determine",
+        "Draws",
+        "how to repeat it",
+    ]
+    body = page[page.index("</head>") :]
+    places = [body.index(word) for word in order]
+    assert places == sorted(places)
+    assert "no mean moves &lt;b&gt;" in page  # text, not markup
+    assert "a_f (kPa)" in page
+    assert "LogUniform" in page
+
+
+def test_it_needs_no_network(page):
+    body = page[page.index("</head>") :]
+    assert not re.search(r"<(script|link|img)[^>]*\s(src|href)=", page[: page.index("<style>")])
+    assert not re.search(r"<(script|link|img)[^>]*\s(src|href)=", body)
+    assert page.count("<!DOCTYPE html>") == 1
+
+
+def test_without_a_certificate_it_says_so(ventricle_posterior):
+    text = html_of(Run("left_ventricle"), ventricle_posterior, None, fem=False)
+    assert "<b>not certified</b>" in text
+    assert "run calibrate certify" in text
+
+
+def test_the_body_deforms_by_the_draws(ventricle_posterior):
+    figure = body_figure(ventricle_posterior, None)
+    scene = ventricle_posterior.model.forward.scene
+    assert [step.label for step in figure.layout.sliders[0].steps][:2] == ["mean", "draw 1"]
+    mean = np.asarray(ventricle_posterior.model.full(scene.centre))
+    nodes = np.unique(scene.mesh.surface)
+    shown = np.stack([figure.data[0][axis] for axis in "xyz"], axis=1)
+    # Near the data's truth; nothing else has been seen.
+    assert np.abs(shown - scene.mesh.nodes[nodes] - mean[nodes]).max() < 2.0
+    draws = [np.asarray(frame.data[0].z) for frame in figure.frames[1:]]
+    assert len(draws) == 20
+    assert np.std(draws, axis=0).max() > 1e-3
+    menu = [button.label for button in figure.layout.updatemenus[0].buttons]
+    assert menu == [
+        "mean displacement (mm)",
+        "sd of displacement (mm)",
+        "largest principal strain",
+        "fibre stretch",
+    ]
+    at_rest = figure.data[1]
+    assert np.asarray(at_rest.z).shape == (len(nodes),)
+    assert figure.data[2].name == "fibres"
+
+
+def test_charts_say_what_was_drawn(ventricle_posterior):
+    named = dict(charts.against_data(ventricle_posterior))
+    assert set(named) == {"displacement", "volume"}
+    assert len(named["displacement"].data[1].x) == 18
+    curve = charts.pressure_volume(ventricle_posterior)
+    median = curve.data[1]
+    assert (np.diff(median.x) > 0.0).all()  # a stiffer pressure, a larger cavity
+    assert curve.data[2].x[0] == pytest.approx(float(ventricle_posterior.data["volume"]))
+    ranks = [
+        t for t in charts.traces(ventricle_posterior).data if t.type == "scatter" and t.line.shape
+    ]
+    assert len(ranks) == 2 * 5
+    assert sum(ranks[0].y[:-1]) == 60
+    assert isinstance(charts.stress(ventricle_posterior), go.Figure)
+
+
+def test_a_law_without_fibres_and_a_body_without_cavity(tmp_path, capsys):
+    truth = {"mu": 70.0, "lam": 70.0}
+    run = Run(
+        "once_clamped_beam", truth=truth, observe="landmarks:6", noise=0.5, draws=60, chains=2,
+        sampler="laplace",
+    )  # fmt: skip
+    posterior = infer(run, tmp_path / "run")
+    assert charts.pressure_volume(posterior) is None
+    assert len(charts.stress(posterior).data) == 2
+    assert main(["report", str(tmp_path / "run"), "--no-fem", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    text = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert told == {"out": str(tmp_path / "run" / "report.html")}
+    assert "truth" in text
+    assert "not certified" in text
+    assert "once_clamped_beam" in text
+    assert main(["report", str(tmp_path / "run"), "--out", "page.pdf"]) == 2
+    assert "must end in .html" in capsys.readouterr().err
+    assert main(["report", str(tmp_path / "none")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_in_a_browser(page, tmp_path):
+    """The slider moves the mesh, and nothing complains or calls out."""
+    sync = pytest.importorskip("playwright.sync_api", reason="no playwright here")
+    browser = os.environ.get("CALIBRATE_BROWSER") or shutil.which("chromium")
+    if not browser:
+        pytest.skip("no browser: set CALIBRATE_BROWSER to a Chromium")
+    path = tmp_path / "page.html"
+    path.write_text(page, encoding="utf-8")
+    arguments = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
+    with sync.sync_playwright() as engine:
+        chromium = engine.chromium.launch(
+            executable_path=browser, args=[*arguments, "--enable-unsafe-swiftshader"]
+        )
+        shown, complaints = chromium.new_page(), []
+        shown.on("pageerror", lambda error: complaints.append(str(error)))
+        shown.on("console", lambda m: m.type == "error" and complaints.append(m.text))
+        shown.on(
+            "request",
+            lambda r: r.url.startswith(("file:", "blob:", "data:")) or complaints.append(r.url),
+        )
+        shown.goto(path.as_uri())
+        find = "[...document.querySelectorAll('.js-plotly-plot')].find(d => d.layout.sliders)"
+        shown.wait_for_selector(".slider-rail-touch-rect")
+        before = shown.evaluate(f"{find}.data[0].z.slice(0, 50)")
+        box = shown.query_selector(".slider-rail-touch-rect").bounding_box()
+        shown.mouse.click(box["x"] + 0.8 * box["width"], box["y"] + 0.5 * box["height"])
+        shown.wait_for_function(f"{find}.layout.sliders[0].active > 10")
+        shown.wait_for_timeout(500)
+        assert shown.evaluate(f"{find}.data[0].z.slice(0, 50)") != before
+        assert complaints == []
+        chromium.close()
