@@ -18,11 +18,13 @@ QUICK = {
     "beam_coverage": "PUBLISHED --cases 2",
     "certificate": "--quick",
     "decoder_speed": "--quick",
+    "effects": "--quick",
     "error_bar": "--scenes once_clamped_beam --cases 3 --outside 1",
     "fem_posterior": "--quick",
     # No dolfin here: compiling its forms alone takes longer than all the rest.
     "fem_speed": "--quick --fenics-python ABSENT",
     "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
+    "large_meshes": "--quick",
     "many_solves": "--solves 3",
     "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
     "networks_alone": "--quick",
@@ -32,9 +34,11 @@ QUICK = {
     "published_pressure": "--quick",
     "released_networks": "--quick --published PUBLISHED",
     "sbc": "--replicates 20 --only map",
+    "sensitivity": "--quick",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half",
     "ventricle_family": "--quick",
+    "verification": "--quick",
     "transfer": "--quick --one --family 2 --pretrain 6 --steps 3 --longest 4 --runs 3 --tests 2",
 }
 FAST: tuple[str, ...] = ()
@@ -79,6 +83,13 @@ def decoder_speed(results):  # the study asserts equal gradients
     assert results["summary"]["times_faster_than_fem"] > 1.0
 
 
+def effects(results):
+    cases = {case["effect"]: case for case in results["cases"]}
+    assert set(cases) == {"", "gravity", "quadratic elements"}
+    assert cases[""]["changes"]["displacement"] == 0.0
+    assert 0.0 < cases["gravity"]["changes"]["displacement"] < 1.0
+
+
 def error_bar(results):
     cases = {case["name"]: case for case in results["cases"]}
     inside = cases["once_clamped_beam, shipped 'once_clamped_beam', inside"]
@@ -110,6 +121,12 @@ def few_runs(results):
     ratio = results["summary"]["left_ventricle"]["residual over the series / POD + GP"]["5"]
     assert ratio == errors["residual over the series", 5] / errors["POD + GP", 5] < 1.0 / 3.0
     assert 0.0 < errors["Taylor series", 1] < 0.2
+
+
+def large_meshes(results):
+    linear, quadratic = results["cases"]
+    assert linear["from_rest"]["status"] == quadratic["from_rest"]["status"] == "converged"
+    assert 0.0 < linear["share_of_factorisation"] < 1.0
 
 
 def many_solves(results):
@@ -165,6 +182,11 @@ def sbc(results):
     assert case["replicates"] == 20
 
 
+def sensitivity(results):  # the study asserts known indices and FEM's
+    cases = {case["name"]: case for case in results["cases"]}
+    assert cases["ventricle, FEM"]["volume"]["evaluations"] == 56
+
+
 def stability(results):
     status = {case["name"]: case["status"] for case in results["cases"]}
     assert status == {
@@ -191,16 +213,24 @@ def ventricle_family(results):
     assert before["median"] < 0.2 * case["mean_u_mm"]
 
 
+def verification(results):
+    (case,) = results["cases"]
+    assert case["sets"] == 10
+    assert max(case["sd_over_prior"].values()) < 1.0
+
+
 CHECKS = {
     check.__name__: check
     for check in (
         accuracy_vs_time,
         certificate,
         decoder_speed,
+        effects,
         error_bar,
         fem_posterior,
         fem_speed,
         few_runs,
+        large_meshes,
         many_solves,
         new_ventricle,
         objectives,
@@ -208,9 +238,11 @@ CHECKS = {
         published_pressure,
         released_networks,
         sbc,
+        sensitivity,
         stability,
         transfer,
         ventricle_family,
+        verification,
     )
 }
 
@@ -223,6 +255,7 @@ def test_every_study_has_a_line():
 # Figures that need more than the few cases.
 FULL_ONLY = {
     "few_runs": {"meshes.png"},
+    "sensitivity": {"segments.png"},
     "sbc": {"beam.png", "ventricle.png", "noise.png", "prior.png"},
 }
 

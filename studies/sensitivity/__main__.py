@@ -154,7 +154,7 @@ def draw_indices(cases: dict[str, Case], path: Path) -> None:
     shown = {
         "ventricle, FEM": ("FEM, total", "#009E73"),
         "ventricle, emulator": ("emulator, total", "#0072B2"),
-        "ventricle, prior of 10 %": ("emulator, prior of 10 %, total", "#E69F00"),
+        "ventricle, prior of 10 %": ("emulator, total, prior of 10 %", "#E69F00"),
     }
     for axes, name in zip(panels, ("displacement", "volume"), strict=True):
         factors = cases["ventricle, FEM"][name]["factors"]
@@ -166,11 +166,13 @@ def draw_indices(cases: dict[str, Case], path: Path) -> None:
                 color=colour, label=label, error_kw={"lw": 0.8},
             )  # fmt: skip
         bound = cases["ventricle, bounds by derivatives"][name]["bound"]
-        axes.plot(bound, y, "|", color="black", ms=22, mew=1.6, label="bound by derivatives")
+        axes.vlines(
+            bound, y - 0.39, y + 0.13, color="black", lw=1.8, label="bound on both by derivatives"
+        )
         axes.set(yticks=y, yticklabels=factors, xlabel="share of the variance", title=name)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].invert_yaxis()
-    panels[1].legend(frameon=False, fontsize="small")
+    panels[1].legend(frameon=False, fontsize="small", loc="upper right")
     save(figure, path)
 
 

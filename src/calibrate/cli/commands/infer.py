@@ -75,6 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not (arguments.no_certify or find_sampler(plan.sampler).solves_fem):
         certificate = certify_and_keep(posterior, folder, progress=progress)
     result = report(plan, posterior, certificate)
-    text = f"{summary(result)}\nwritten to {arguments.out}; its page: calibrate report {arguments.out}"
+    text = (
+        f"{summary(result)}\nwritten to {arguments.out}; its page: calibrate report {arguments.out}"
+    )
     emit(result, as_json=arguments.json, text=text)
     return DONE if certificate is None or certificate.verdict == "accepted" else FAILED
