@@ -1,0 +1,247 @@
+"""A first scene file for a mesh: what its names suggest, commented, and what was guessed.
+
+Sets are recognised by their names (base, fixed, endocardium, ...), the unit of length by the
+size of the body. The draft is a scene that can be simulated; what nothing in the mesh says, such as
+parameters' ranges, is a place to change and marked as one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.io import Body, read_body, write_mesh
+from emulator.geometry.mesh import Mesh
+from emulator.mechanics.laws import Law, find_law
+from emulator.mechanics.quantity import Quantity
+from emulator.scenes.file import read_scene
+from emulator.scenes.scene import Scene
+
+UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+_METRES = 0.6  # a body smaller than this in all directions is not in mm
+_SMALL = 25.0  # one smaller than this might be in cm
+_HELD = ("base", "fix", "clamp", "held", "hold", "support", "ligament", "left", "bottom")
+_INSIDE = ("endo", "cavity", "lumen", "inner", "inside")
+_OUTSIDE = ("epi", "outer", "outside", "pericard")
+# Ranges of known parameters: the paper's, textbook form.
+_RANGES = {
+    "a": (0.2, 0.52),
+    "b": (1.0, 4.2),
+    "a_f": (3.0, 10.36),
+    "b_f": (1.0, 4.46),
+    "mu": (3.5, 10.0),
+    "lam": (3.5, 10.0),
+    "C": (1.0, 4.0),
+    "pressure": (0.53, 1.33),
+}
+_CONSTANTS = {"kappa": 25.0}
+_MODULUS, _NUMBER = (1.0, 10.0), (1.0, 5.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A scene file that was written.
+
+    path : of the file. scene : it describes. notes : what was guessed, a sentence each.
+    """
+
+    path: Path
+    scene: Scene
+    notes: tuple[str, ...]
+
+
+def draft(
+    mesh_path: str | Path, out: str | Path, *, unit: str | None = None, law: str | None = None
+) -> Draft:
+    """Write a scene file for a mesh file.
+
+    Parameters
+    ----------
+    unit : of the file's coordinates, a key of :data:`UNITS`; guessed from the size by default. A
+        mesh that is not in mm is written again in mm, beside the scene file.
+    law : its name; Holzapfel-Ogden where the mesh has fibres or names that fibres can be laid by,
+        else Neo-Hookean.
+
+    Raises
+    ------
+    InputError
+        A mesh that cannot be read, an unknown law or unit, a file that is there already, or a mesh
+        without anything to hold it by.
+    """
+    mesh_path, out = Path(mesh_path), Path(out)
+    if out.suffix != ".toml":
+        raise InputError(f"--out {out}: the file name must end in .toml")
+    if out.exists():
+        raise InputError(f"{out} is there already; remove it or give --out another name")
+    if unit is not None and unit not in UNITS:
+        raise InputError(f"unit '{unit}' is unknown; known: {', '.join(UNITS)}")
+    body = read_body(mesh_path)
+    notes: list[str] = []
+    unit = unit or _guessed_unit(body.mesh, notes)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    body, mesh_name = _in_mm(body, mesh_path, out, unit, notes)
+    chosen = _law(body, law, notes)
+    support = _support(body.mesh, notes)
+    for load in _loads(body.mesh, notes):
+        text = _text(body, mesh_name, chosen, (support, *load), notes)
+        out.write_text(text, encoding="utf-8")
+        try:
+            return Draft(out, read_scene(out), tuple(notes))
+        except InputError as error:
+            out.unlink()
+            failure = error
+        notes.append(f"not the load '{load[0]}': {failure}")
+    raise failure
+
+
+def _guessed_unit(mesh: Mesh, notes: list[str]) -> str:
+    extent = float(np.ptp(mesh.nodes, axis=0).max())
+    unit = "mm" if extent >= _METRES else "m"
+    said = f"the body is {extent:.4g} long: taken to be {unit}"
+    if unit == "mm" and extent < _SMALL:
+        said += "; if it is in cm, give --unit cm"
+    notes.append(said)
+    return unit
+
+
+def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tuple[Body, str]:
+    """The body in mm and the name of its file, seen from the scene file."""
+    if unit == "mm":
+        folder = out.resolve().parent
+        inside = path.resolve().is_relative_to(folder)
+        name = path.resolve().relative_to(folder) if inside else path.resolve()
+        return body, name.as_posix()
+    mesh = replace(body.mesh, nodes=UNITS[unit] * body.mesh.nodes)
+    target = out.with_name(f"{path.stem}_mm.vtu")
+    if target.exists():
+        raise InputError(f"{target}, the mesh in mm, is there already; remove it")
+    write_mesh(target, mesh, body.fibres, body.sheets)
+    notes.append(f"written again in mm as {target.name}")
+    return replace(body, mesh=mesh), target.name
+
+
+def _named(sets: Mapping[str, np.ndarray], words: tuple[str, ...]) -> str | None:
+    """The first set whose name has one of ``words`` in it, the likeliest word first."""
+    for word in words:
+        for name in sets:
+            if word in name.lower():
+                return name
+    return None
+
+
+def _law(body: Body, name: str | None, notes: list[str]) -> Law:
+    if name is not None:
+        return find_law(name)
+    fibres = body.fibres is not None or _helix(body.mesh) is not None
+    law = find_law("holzapfel_ogden" if fibres else "neo_hookean")
+    why = "the mesh has fibres" if body.fibres is not None else "its walls are named"
+    notes.append(f"law {law.name}: {why if fibres else 'the mesh has no fibres'}")
+    return law
+
+
+def _helix(mesh: Mesh) -> tuple[str, str] | None:
+    """Facet sets between which fibres can be laid."""
+    inner, outer = (_named(mesh.facet_sets, words) for words in (_INSIDE, _OUTSIDE))
+    return (inner, outer) if inner and outer else None
+
+
+def _loads(mesh: Mesh, notes: list[str]) -> list[tuple[str, str]]:
+    """Kinds of load to try, each with its lines."""
+    found = []
+    wall = _named(mesh.facet_sets, _INSIDE)
+    if wall is not None:
+        for kind in ("cavity_pressure", "follower_pressure"):
+            lines = f'[[loads]]\nkind = "{kind}"\nfacet_set = "{wall}"\n'
+            found.append((kind, lines + "# pressure = 0.8   # kPa; without it, a parameter\n"))
+        notes.append(f"pressure on '{wall}'")
+    gravity = '[[loads]]\nkind = "gravity"\ndensity = 1.06   # g/cm3\n'
+    return [*found, ("gravity", gravity + "direction = [0.0, 0.0, -1.0]\n")]
+
+
+def _support(mesh: Mesh, notes: list[str]) -> str:
+    """Lines of what holds the body."""
+    name = _named(mesh.node_sets, _HELD)
+    if name is not None:
+        notes.append(f"held at '{name}'")
+        return f'[[supports]]\nnode_set = "{name}"   # all components; see components = "z"\n'
+    axis = int(np.argmax(np.ptp(mesh.nodes, axis=0)))
+    at = float(mesh.nodes[:, axis].min())
+    sets = ", ".join(mesh.node_sets) or "none"
+    letter = "xyz"[axis]
+    notes.append(
+        f"no set is named like a support ({sets}): held where {letter} is least, {at:.6g} mm; "
+        "change it"
+    )
+    return (
+        f'[node_sets.held]   # CHANGE: no set is named like a support\naxis = "{letter}"\n'
+        f'at = {at!r}\n\n[[supports]]\nnode_set = "held"\n'
+    )
+
+
+def _text(
+    body: Body, mesh_name: str, law: Law, forces: tuple[str, str, str], notes: list[str]
+) -> str:
+    """The scene file; ``forces`` are lines of a support, the kind of a load, and its lines."""
+    mesh = body.mesh
+    support, kind, load = forces
+    quantities = list(law.quantities)
+    if "pressure" in kind:
+        quantities.append(Quantity("pressure", "kPa"))
+    parts = [
+        "# A first scene file; lengths in mm, stresses in kPa. What is marked CHANGE was guessed.",
+        *(f"# - {note}" for note in notes),
+        "# Sets of the mesh:",
+        *_sets(mesh),
+        "",
+        f'law = "{law.name}"   # see docs/extending.md for others',
+        f'mesh = "{mesh_name}"',
+        '# order = 2, dilatation = "mean": quadratic elements that do not lock',
+        "",
+    ]
+    walls = _helix(mesh)
+    if law.fibres and body.fibres is None:
+        if walls is None:
+            parts += ["[fibres]   # CHANGE", 'rule = "uniform"', "direction = [1.0, 0.0, 0.0]", ""]
+        else:
+            parts += [
+                "[fibres]",
+                'rule = "helix"',
+                "angles = [60.0, -60.0]   # degrees, inside and outside",
+                f'endocardium = "{walls[0]}"',
+                f'epicardium = "{walls[1]}"',
+                "axis = [0.0, 0.0, 1.0]   # CHANGE: from apex to base",
+                "",
+            ]
+    parts += [support, load]
+    for quantity in quantities:
+        if quantity.name not in _CONSTANTS:
+            parts += _parameter(quantity)
+    fixed = [q for q in quantities if q.name in _CONSTANTS]
+    if fixed:
+        parts += ["[constants]", *(f"{q.name} = {_CONSTANTS[q.name]}" for q in fixed), ""]
+    return "\n".join(parts)
+
+
+def _sets(mesh: Mesh) -> list[str]:
+    lines = [f"#   {name}: {len(nodes)} nodes" for name, nodes in mesh.node_sets.items()]
+    lines += [f"#   {name}: {len(rows)} facets" for name, rows in mesh.facet_sets.items()]
+    return lines or ["#   none"]
+
+
+def _parameter(quantity: Quantity) -> list[str]:
+    low, high = _RANGES.get(quantity.name, _MODULUS if quantity.unit else _NUMBER)
+    if not quantity.low < low < high < quantity.high:
+        span = quantity.high - quantity.low
+        low, high = quantity.low + 0.25 * span, quantity.low + 0.75 * span
+    scale = ['scale = "log"'] if low > 0.0 and quantity.name != "pressure" else []
+    return [
+        f"[parameters.{quantity.name}]",
+        f'unit = "{quantity.unit}"',
+        f"range = [{low}, {high}]   # CHANGE: what you think possible",
+        *scale,
+        "",
+    ]

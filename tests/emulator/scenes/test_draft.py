@@ -1,0 +1,97 @@
+"""First scene files: what is recognised, what is guessed and said, what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import emulator as em
+from calibrate.cli import main
+from emulator.errors import InputError
+from emulator.geometry.bodies.box import box
+from emulator.geometry.bodies.ellipsoid import human_ventricle
+from emulator.geometry.io import write_mesh
+from emulator.scenes.draft import draft
+from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity
+
+
+@pytest.fixture
+def ventricle_file(tmp_path):
+    write_mesh(tmp_path / "lv.msh", human_ventricle(4, 8, 1))
+    return tmp_path / "lv.msh"
+
+
+def test_a_ventricle_of_named_groups(ventricle_file):
+    made = draft(ventricle_file, ventricle_file.with_suffix(".toml"))
+    scene = made.scene
+    assert scene.law.name == "holzapfel_ogden"
+    assert scene.loads == (CavityPressure("endocardium"),)
+    assert scene.parameter_names == ("a", "b", "a_f", "b_f", "pressure")
+    reference = em.scenes.left_ventricle(4, 8, 1)
+    # Coordinates go through a file of text.
+    np.testing.assert_allclose(np.abs(scene.fibres), np.abs(reference.fibres), atol=1e-6)
+    assert "its walls are named" in " ".join(made.notes)
+    text = made.path.read_text()
+    assert "# CHANGE: what you think possible" in text
+    assert "#   endocardium: " in text
+
+
+def test_metres_are_seen_and_written_in_mm(tmp_path):
+    mesh = human_ventricle(4, 8, 1)
+    write_mesh(tmp_path / "lv.vtu", replace(mesh, nodes=0.001 * mesh.nodes))
+    made = draft(tmp_path / "lv.vtu", tmp_path / "new" / "lv.toml")
+    assert "taken to be m" in made.notes[0]
+    np.testing.assert_allclose(made.scene.mesh.nodes, mesh.nodes, rtol=1e-6, atol=1e-9)
+    assert (tmp_path / "new" / "lv_mm.vtu").is_file()
+    write_mesh(tmp_path / "cm.vtu", replace(mesh, nodes=0.1 * mesh.nodes))
+    said = draft(tmp_path / "cm.vtu", tmp_path / "cm.toml")
+    assert "if it is in cm, give --unit cm" in said.notes[0]
+    in_cm = draft(tmp_path / "cm.vtu", tmp_path / "cm2.toml", unit="cm")
+    np.testing.assert_allclose(in_cm.scene.mesh.nodes, mesh.nodes, rtol=1e-6, atol=1e-9)
+
+
+def test_a_rim_that_is_not_held_takes_a_follower_pressure(tmp_path):
+    mesh = human_ventricle(4, 8, 1)
+    walls = {name: rows for name, rows in mesh.facet_sets.items() if name != "base"}
+    sets = {"apex fixed": np.array([int(np.argmin(mesh.nodes[:, 2])), 0, 5, 20, 30])}
+    write_mesh(tmp_path / "lv.vtu", replace(mesh, node_sets=sets, facet_sets=walls))
+    made = draft(tmp_path / "lv.vtu", tmp_path / "lv.toml")
+    assert made.scene.loads == (FollowerPressure("endocardium"),)
+    assert any("not the load 'cavity_pressure'" in note for note in made.notes)
+
+
+def test_a_bare_block_hangs_by_its_end(tmp_path):
+    mesh = replace(box((40.0, 10.0, 10.0), (4, 2, 2)), node_sets={}, facet_sets={})
+    write_mesh(tmp_path / "block.vtu", mesh)
+    made = draft(tmp_path / "block.vtu", tmp_path / "block.toml")
+    assert made.scene.law.name == "neo_hookean"
+    assert isinstance(made.scene.loads[0], Gravity)
+    assert any("held where x is least, 0 mm; change it" in note for note in made.notes)
+    assert made.scene.held[:, 0].sum() == 9
+    other = draft(tmp_path / "block.vtu", tmp_path / "other.toml", law="neo_hookean_E_nu")
+    nu = other.scene.parameters[1]
+    assert (nu.name, nu.low < nu.high < 0.5) == ("nu", True)
+
+
+def test_command_and_bad_input(ventricle_file, capsys):
+    assert main(["init", str(ventricle_file), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["parameters"] == ["a", "b", "a_f", "b_f", "pressure"]
+    assert set(told["facet_sets"]) == {"endocardium", "epicardium", "base"}
+    folder = ventricle_file.parent
+    for words, message in (
+        ([str(ventricle_file)], "is there already"),
+        ([str(folder / "none.msh")], "none.msh"),
+        ([str(ventricle_file), "--out", "scene.json"], "must end in .toml"),
+        ([str(ventricle_file), "--out", str(folder / "b.toml"), "--unit", "ft"], "known: mm, cm"),
+        ([str(ventricle_file), "--out", str(folder / "c.toml"), "--law", "hooke"], "is unknown"),
+    ):
+        assert main(["init", *words]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert not (folder / "b.toml").exists()
+    assert not (folder / "c.toml").exists()
+    with pytest.raises(InputError, match="unit 'ft'"):
+        draft(ventricle_file, folder / "d.toml", unit="ft")
