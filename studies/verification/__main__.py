@@ -156,7 +156,7 @@ def examine(study: Study) -> Case:
     noise = {name: cal.GaussianNoise(sd[name.split("@")[0]]) for name in observe.parts}
     known = {f"pressure@{k + 1}": p for k, p in enumerate(PRESSURES[-study.states :])}
     known = known if study.states else {}
-    model = cal.model(emulator.cache(observe.nodes), observe, noise, known=known)
+    model = cal.model(emulator.cache(), observe, noise, known=known)
     scene, thetas, fields = fields_of(study.body, study.truth, study.states, study.sets)
     true = observed(study, scene, at)
     shared = [n for n in scene.parameter_names if n in model.names] if study.right else (
