@@ -16,7 +16,7 @@ from calibrate.identifiability.stress import stress_band
 from calibrate.observations import CavityVolume, Observation
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
-from emulator.errors import InputError
+from emulator.scenes.cavities import cavity_sets
 
 BLUE, ORANGE, GREEN, PINK, YELLOW, SKY = (
     "#0072B2",
@@ -184,15 +184,16 @@ def pressure_volume(posterior: Posterior) -> go.Figure | None:
     scene = model.forward.scene
     loads = [load for load in scene.loads if load.pressed and load.quantities]
     names = [load.quantities[0].name for load in loads if load.quantities]
-    wanted = [(load, name) for load, name in zip(loads, names, strict=True)
-              if name in scene.parameter_names]  # fmt: skip
+    closed = cavity_sets(scene)
+    wanted = [
+        (load, name)
+        for load, name in zip(loads, names, strict=True)
+        if name in scene.parameter_names and load.pressed in closed
+    ]
     if not wanted:
         return None
     load, name = wanted[0]
-    try:
-        volume = CavityVolume(scene, load.pressed)
-    except InputError:  # a flat wall encloses nothing
-        return None
+    volume = CavityVolume(scene, load.pressed)
     column = scene.parameter_names.index(name)
     parameter = scene.parameters[column]
     pressures = jnp.linspace(parameter.low, parameter.high, _PRESSURES)

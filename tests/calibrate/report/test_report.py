@@ -1,9 +1,7 @@
 """The page of a posterior: what it says, that it needs no network, and that a browser shows it."""
 
 import json
-import os
 import re
-import shutil
 
 import numpy as np
 import plotly.graph_objects as go
@@ -11,6 +9,7 @@ import pytest
 
 import calibrate as cal
 import emulator as em
+from browser_support import opened
 from calibrate.cli import main
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.report import charts
@@ -140,26 +139,10 @@ def test_a_law_without_fibres_and_a_body_without_cavity(tmp_path, capsys):
 
 def test_in_a_browser(page, tmp_path):
     """The slider moves the mesh, and nothing complains or calls out."""
-    sync = pytest.importorskip("playwright.sync_api", reason="no playwright here")
-    browser = os.environ.get("CALIBRATE_BROWSER") or shutil.which("chromium")
-    if not browser:
-        pytest.skip("no browser: set CALIBRATE_BROWSER to a Chromium")
     path = tmp_path / "page.html"
     path.write_text(page, encoding="utf-8")
-    arguments = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
-    with sync.sync_playwright() as engine:
-        chromium = engine.chromium.launch(
-            executable_path=browser, args=[*arguments, "--enable-unsafe-swiftshader"]
-        )
-        shown, complaints = chromium.new_page(), []
-        shown.on("pageerror", lambda error: complaints.append(str(error)))
-        shown.on("console", lambda m: m.type == "error" and complaints.append(m.text))
-        shown.on(
-            "request",
-            lambda r: r.url.startswith(("file:", "blob:", "data:")) or complaints.append(r.url),
-        )
-        shown.goto(path.as_uri())
-        find = "[...document.querySelectorAll('.js-plotly-plot')].find(d => d.layout.sliders)"
+    find = "[...document.querySelectorAll('.js-plotly-plot')].find(d => d.layout.sliders)"
+    with opened(path.as_uri()) as (shown, complaints):
         shown.wait_for_selector(".slider-rail-touch-rect")
         before = shown.evaluate(f"{find}.data[0].z.slice(0, 50)")
         box = shown.query_selector(".slider-rail-touch-rect").bounding_box()
@@ -168,4 +151,3 @@ def test_in_a_browser(page, tmp_path):
         shown.wait_for_timeout(500)
         assert shown.evaluate(f"{find}.data[0].z.slice(0, 50)") != before
         assert complaints == []
-        chromium.close()

@@ -1,0 +1,56 @@
+"""``calibrate explore``: the body under your sliders."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import webbrowser
+from typing import Any
+
+from calibrate.cli.common import DONE, add_json, emit
+from emulator.errors import InputError
+
+
+def register(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "explore",
+        help="a local page with a slider for every parameter",
+        description="The body deforms live, by the cached emulator; cavity volume, pressure-volume "
+        "curve and error bar beside it, and FEM on request. The page is served to this machine "
+        "only; end with Ctrl-C.",
+        epilog="example: calibrate explore left_ventricle",
+    )
+    parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
+    parser.add_argument("--port", type=int, default=0, help="default: a free one")
+    parser.add_argument("--no-browser", action="store_true", help="print the address alone")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve until interrupted."""
+    try:
+        from calibrate.explorer import LOOPBACK, Explorer, serve
+    except ModuleNotFoundError as error:
+        if error.name != "plotly":
+            raise
+        raise InputError(
+            "exploring needs plotly: pip install 'soft-tissue-calibrate[plot]'"
+        ) from error
+    from emulator.surrogates import load
+
+    explorer = Explorer(load(arguments.emulator))
+    with serve(explorer, arguments.port) as server:
+        address = f"http://{LOOPBACK}:{server.server_address[1]}/"
+        told = {"scene": explorer.scene.name, "address": address}
+        text = f"{explorer.scene.name}: {address} (Ctrl-C ends it)"
+        emit(told, as_json=arguments.json, text=text)
+        sys.stdout.flush()
+        if not arguments.no_browser:
+            webbrowser.open(address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            print("ended", file=sys.stderr)
+    return DONE

@@ -1,0 +1,251 @@
+"""What the page asks for, and the server that listens on the loopback address alone."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Mapping
+from functools import cached_property
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from typing import Any
+from urllib.parse import parse_qsl, urlsplit
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from plotly.offline import get_plotlyjs
+
+from calibrate.figures.evaluation import surface_triangles
+from emulator.error.estimate import error_bar
+from emulator.errors import InputError
+from emulator.fem import Simulator, Status
+from emulator.geometry.cavity import Cavity
+from emulator.scenes.cavities import cavity_sets
+from emulator.surrogates.additive import Emulator
+
+LOOPBACK = "127.0.0.1"
+_PRESSURES = 12  # of a pressure-volume curve
+
+
+class Explorer:
+    """Answers of an emulator about its scene, by theta's position in the unit box.
+
+    Calls may come from several threads; FEM and the error bar take one at a time.
+    """
+
+    def __init__(self, emulator: Emulator) -> None:
+        self.scene = emulator.scene
+        self._forward = emulator.cache()
+        self._triangles = surface_triangles(self.scene.mesh)
+        self._nodes = np.unique(self._triangles)
+        self._cavities = {name: Cavity(self.scene.mesh, name) for name in cavity_sets(self.scene)}
+        self._slow = threading.Lock()
+
+    @cached_property
+    def page(self) -> bytes:
+        """The page, with all that it needs."""
+        text = files("calibrate.explorer").joinpath("page.html").read_text(encoding="utf-8")
+        told = json.dumps(self.about()).replace("</", "<\\/")
+        return text.replace("{{plotly}}", get_plotlyjs()).replace("{{about}}", told).encode()
+
+    def about(self) -> dict[str, Any]:
+        """The scene: parameters, the surface at rest, cavities."""
+        place = {int(node): k for k, node in enumerate(self._nodes)}
+        triangles = np.vectorize(place.__getitem__)(self._triangles)
+        return {
+            "name": self.scene.name,
+            "parameters": [
+                {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "scale": p.scale}
+                for p in self.scene.parameters
+            ],
+            "nodes": np.round(self.scene.mesh.nodes[self._nodes], 4).tolist(),
+            "triangles": triangles.tolist(),
+            "cavities": list(self._cavities),
+            "pressure": self._pressure,
+        }
+
+    def theta(self, position: Mapping[str, str]) -> jax.Array:
+        """Theta (p,) from a position in [0, 1] of every parameter.
+
+        Raises
+        ------
+        InputError
+            A parameter that is missing, unknown, or not in the box.
+        """
+        names = self.scene.parameter_names
+        unknown = set(position) - set(names)
+        if unknown:
+            raise InputError(f"'{min(unknown)}' is no parameter; there are {', '.join(names)}")
+        found = []
+        for name in names:
+            try:
+                value = float(position[name])
+            except KeyError:
+                raise InputError(f"no position for '{name}'") from None
+            except ValueError:
+                raise InputError(f"{name} = '{position[name]}' is no number") from None
+            if not 0.0 <= value <= 1.0:
+                raise InputError(f"{name} = {value:g} is not between 0 and 1")
+            found.append(value)
+        return self.scene.from_unit(jnp.array(found))
+
+    def at(self, position: Mapping[str, str]) -> bytes:
+        """Displacement of the surface, then the cavities' volumes in mL: little-endian float32."""
+        u, volumes = self._fast(self.theta(position))
+        both = np.concatenate([np.asarray(u, "<f4").ravel(), np.asarray(volumes, "<f4")])
+        return both.tobytes()
+
+    def curve(self, position: Mapping[str, str]) -> dict[str, Any]:
+        """Volume of the first cavity over the range of its pressure, all else at ``position``."""
+        if self._pressure is None:
+            raise InputError(f"scene '{self.scene.name}' has no cavity whose pressure varies")
+        volumes = self._volumes(self.theta(position))
+        parameter = self.scene.parameters[self._column]
+        pressures = np.linspace(parameter.low, parameter.high, _PRESSURES)
+        return {"pressure": pressures.tolist(), "volume": np.asarray(volumes).tolist()}
+
+    def error(self, position: Mapping[str, str]) -> dict[str, Any]:
+        """The guard's verdict, and the estimated error in mm and mL."""
+        theta = self.theta(position)
+        with self._slow:
+            estimate = self._bar.of_field(self._forward(theta), theta)
+        told: dict[str, Any] = {
+            "trusted": bool(estimate.guard.trusted),
+            "guard": estimate.guard.sentence(self.scene),
+            "valid": bool(estimate.valid),
+        }
+        if told["valid"]:
+            told |= {"median_mm": float(estimate.median), "max_mm": float(estimate.max)}
+            for name, cavity in self._cavities.items():
+                told[f"{name} mL"] = float(estimate.of(lambda u, c=cavity: c(u[c.nodes])))
+        return told
+
+    def fem(self, position: Mapping[str, str]) -> dict[str, Any]:
+        """FEM at the same theta: how far the emulator is from it."""
+        theta = self.theta(position)
+        with self._slow:
+            solution = self._simulator.solve(theta, self._forward(theta))
+        status = Status(int(solution.status))
+        if status is not Status.CONVERGED:
+            return {"status": status.text}
+        wrong = np.linalg.norm(self._forward(theta) - solution.displacement, axis=1)
+        moved = np.linalg.norm(solution.displacement, axis=1)
+        volumes = {n: float(c(solution.displacement[c.nodes])) for n, c in self._cavities.items()}
+        return {
+            "status": status.text,
+            "median_mm": float(np.median(wrong)),
+            "max_mm": float(wrong.max()),
+            "moved_mm": float(moved.max()),
+            "volumes": volumes,
+        }
+
+    # ---- compiled once ------------------------------------------------------------------------
+    @cached_property
+    def _simulator(self) -> Simulator:
+        return Simulator(self.scene)
+
+    @cached_property
+    def _bar(self) -> Any:
+        return error_bar(self._forward, self._simulator)
+
+    @cached_property
+    def _fast(self) -> Any:
+        def both(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+            u = self._forward(theta)
+            volumes = [cavity(u[cavity.nodes]) for cavity in self._cavities.values()]
+            return u[self._nodes], jnp.stack(volumes) if volumes else jnp.zeros(0)
+
+        return jax.jit(both)
+
+    @cached_property
+    def _pressure(self) -> str | None:
+        """The parameter that is the first cavity's pressure."""
+        for load in self.scene.loads:
+            if load.pressed in self._cavities and load.quantities:
+                name = load.quantities[0].name
+                if name in self.scene.parameter_names:
+                    return name
+        return None
+
+    @property
+    def _column(self) -> int:
+        assert self._pressure is not None, "asked for a curve only"
+        return self.scene.parameter_names.index(self._pressure)
+
+    @cached_property
+    def _volumes(self) -> Any:
+        load = next(load for load in self.scene.loads if load.pressed in self._cavities)
+        cavity = self._cavities[str(load.pressed)]
+        wall = self._forward.at(cavity.nodes)
+        parameter, column = self.scene.parameters[self._column], self._column
+        pressures = jnp.linspace(parameter.low, parameter.high, _PRESSURES)
+
+        def along(theta: jax.Array) -> jax.Array:
+            return jax.lax.map(lambda p: cavity(wall(theta.at[column].set(p))), pressures)
+
+        return jax.jit(along)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers one request; the explorer is the server's."""
+
+    server: _Server
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        """The page, or an answer."""
+        address = urlsplit(self.path)
+        # A page elsewhere that has its name resolved to this machine sends its own name.
+        if self.headers.get("Host", "").split(":")[0] not in (LOOPBACK, "localhost"):
+            self._send(403, b"this page is for this machine only\n", "text/plain")
+            return
+        if address.path == "/":
+            self._send(200, self.server.explorer.page, "text/html; charset=utf-8")
+            return
+        name = address.path.removeprefix("/")
+        if name not in ("at", "curve", "error", "fem"):
+            self._send(404, b"there are /, /at, /curve, /error and /fem\n", "text/plain")
+            return
+        try:
+            found = getattr(self.server.explorer, name)(dict(parse_qsl(address.query)))
+        except InputError as fault:
+            self._send(400, f"{fault}\n".encode(), "text/plain; charset=utf-8")
+            return
+        if isinstance(found, bytes):
+            self._send(200, found, "application/octet-stream")
+        else:
+            self._send(200, json.dumps(found).encode(), "application/json")
+
+    def _send(self, code: int, content: bytes, kind: str) -> None:
+        self.send_response(code)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing of each request."""
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self, explorer: Explorer, port: int) -> None:
+        self.explorer = explorer
+        super().__init__((LOOPBACK, port), _Handler)
+
+
+def serve(explorer: Explorer, port: int = 0) -> ThreadingHTTPServer:
+    """A server on the loopback address, ready for ``serve_forever``; port 0 takes a free one.
+
+    Raises
+    ------
+    InputError
+        A port that is taken, or none.
+    """
+    try:
+        return _Server(explorer, port)
+    except (OSError, OverflowError) as error:
+        raise InputError(f"port {port}: {error}; give another, or 0 for a free one") from error
