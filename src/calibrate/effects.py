@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from calibrate.observations import Observation, Observations, observations
-from emulator.errors import InputError, SolverError
+from emulator.errors import InputError, SolverError, check_seed
 from emulator.fem import Simulator, Status, sobol
 from emulator.fem.functional import potential_energy
 from emulator.scenes.effects import Effect, Onto, effects_of, leave_out
@@ -111,6 +111,7 @@ def recommend(
             raise InputError(f"effects: the tolerance of {name} is {limit:g}; it must be above 0")
     if samples < 2:
         raise InputError(f"effects: {samples} samples; give 2 or more")
+    check_seed(seed, "effects")
     effects = effects_of(scene)
     if not effects:
         raise InputError(f"scene '{scene.name}' has no effect that it can do without")
@@ -155,7 +156,10 @@ def tolerances(words: Sequence[str], observe: Observations) -> dict[str, float]:
             value = float("nan")
         if found is None or not np.isfinite(value):
             raise InputError(f"tolerance '{word}': write a number and its unit, e.g. 0.5mm")
-        by_unit[found[2] or "1"] = value
+        unit = found[2] or "1"
+        if unit in by_unit:
+            raise InputError(f"tolerance: two are given in {unit}; give one for each unit")
+        by_unit[unit] = value
     units = {name: part.unit for name, part in observe.parts.items()}
     for unit in by_unit:
         if unit not in units.values():

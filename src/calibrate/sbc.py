@@ -32,7 +32,7 @@ from calibrate import predictions
 from calibrate.arviz import ecdf_utils
 from calibrate.posterior import sample
 from calibrate.statistical_model import Model
-from emulator.errors import InputError
+from emulator.errors import InputError, check_seed
 
 LOG_LIKELIHOOD = "log likelihood"
 """Name of the quantity that depends on the data."""
@@ -213,6 +213,7 @@ def sbc(
         ``truth`` does not have the unknowns and observations of ``model``.
     """
     _check_count(replicates)
+    check_seed(seed, "calibration")
     truth = model if truth is None else truth
     if (truth.names, truth.observe.shapes) != (model.names, model.observe.shapes):
         raise InputError(

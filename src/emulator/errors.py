@@ -7,3 +7,9 @@ class InputError(ValueError):
 
 class SolverError(RuntimeError):
     """A simulation did not converge; the message names how it failed."""
+
+
+def check_seed(seed: int, what: str) -> None:
+    """Raise :class:`InputError` for a seed below 0; ``what`` begins the message."""
+    if seed < 0:
+        raise InputError(f"{what}: seed {seed} is below 0")

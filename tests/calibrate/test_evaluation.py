@@ -34,6 +34,7 @@ def reference(folder):
     return fem_reference(em.Simulator(load(folder).scene), 3)
 
 
+@pytest.mark.slow
 def test_newton_steps_square_the_error(folder, reference, monkeypatch):
     monkeypatch.setattr("calibrate.evaluation.fem_reference", lambda *_, **__: reference)
     base = run_evaluation(Evaluation(folder)).report

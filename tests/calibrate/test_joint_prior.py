@@ -199,6 +199,7 @@ def test_a_run_takes_names_files_and_numbers(tmp_path, beam):
         read_population(path)
 
 
+@pytest.mark.slow
 def test_the_command_line_keeps_the_prior(tmp_path):
     from calibrate.cli import main
     from calibrate.workflow import read_posterior

@@ -35,7 +35,7 @@ from SALib.sample import sobol as sobol_design
 from scipy.stats import norm, qmc
 
 from calibrate.sensitivity_analysis.factors import Factors
-from emulator.errors import InputError
+from emulator.errors import InputError, check_seed
 
 METHODS = ("sobol", "morris", "derivatives")
 """Variance-based indices, screening, and what exact derivatives say."""
@@ -80,6 +80,7 @@ def analyse(
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; known: {', '.join(METHODS)}")
+    check_seed(seed, "sensitivity")
     if samples < 2 or (method == "sobol" and samples & (samples - 1)):
         raise InputError(
             f"sensitivity: {samples} samples; give 2 or more, for sobol a power of two"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from emulator.errors import InputError
+from emulator.errors import InputError, check_seed
 
 Objective = Literal["energy", "simulations", "gradients", "both", "modes"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
@@ -67,8 +67,11 @@ class Plan:
                 raise InputError(
                     f"training: {name} is {getattr(self, name)}; it must be {value} or more"
                 )
-        if self.seed < 0:
-            raise InputError(f"training: seed {self.seed} is below 0")
+        check_seed(self.seed, "training")
+        if self.simulations < (1 if self.discrepancy else 0):
+            raise InputError(
+                f"training: {self.simulations} simulations; a discrepancy model needs 1 or more"
+            )
         if self.objective != "energy" and self.simulations < self.batch:
             raise InputError(
                 f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"

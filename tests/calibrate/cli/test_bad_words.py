@@ -120,6 +120,87 @@ def test_bad_meshes_in_scene_files(capsys, block):
         (["verify", "published"], "give the folder of the released data"),
         (["verify", "patches"], "case 'patches' is unknown; known: patch"),
         (["certify", "/no/where"], "run.json does not exist"),
+        (["sensitivity", "once_clamped_beam"], "give something to observe, or ask for the field"),
+        (["sensitivity", "liver", "--field", "--method", "luck"], "invalid choice: 'luck'"),
+        (["sensitivity", "liver", "--field", "--seed", "-1"], "sensitivity: seed -1 is below 0"),
+        (["sensitivity", "liver", "--field", "--group", "x"], "--group x: write NAME=A,B"),
+        *(
+            (["sensitivity", "once_clamped_beam", "--field", *words], message)
+            for words, message in (
+                (["--samples", "3"], "3 samples; give 2 or more, for sobol a power of two"),
+                (["--samples", "0"], "0 samples; give 2 or more"),
+                (["--group", "m=mu", "n=mu"], "'mu' is in two groups"),
+                (["--group", "m=nu"], "'nu' is none of mu, lam"),
+                (["--prior", "nowhere"], "prior 'nowhere' is unknown; known: box, ventricles"),
+            )
+        ),
+        (["sensitivity", "once_clamped_beam", "--observe", "volume"], "has 0 cavities"),
+        (["effects", "once_clamped_beam", "--tolerance", "1mm"], "are required: --observe"),
+        *(
+            (["effects", "once_clamped_beam", "--observe", "landmarks:4", *words], message)
+            for words, message in (
+                (["--tolerance", "1"], "tolerance in 1: nothing observed has that unit"),
+                (["--tolerance", "mm"], "tolerance 'mm': write a number and its unit"),
+                (["--tolerance", "1mm", "2mm"], "two are given in mm; give one for each unit"),
+                (["--tolerance", "1mm", "--samples", "1"], "1 samples; give 2 or more"),
+                (["--tolerance", "1mm", "--seed", "-1"], "effects: seed -1 is below 0"),
+            )
+        ),
+        (["report", "/no/where"], "run.json does not exist"),
+        (["report", ".", "--out", "page.pdf"], "the file name must end in .html"),
+        (["explore", "nowhere"], "emulator 'nowhere' is neither shipped nor a folder"),
+        (["explore", "once_clamped_beam", "--port", "70000"], "give another, or 0 for a free one"),
+        (["init", "none.msh"], "mesh file none.msh does not exist"),
+        (["compare", "nowhere"], "posterior.nc does not exist"),
+        (["compare", "nowhere", "nowhere"], "a folder is given twice"),
+        (["identify", "before", "once_clamped_beam", "--observe", "apex"], "observe 'apex': give"),
+        (["identify", "after", "nowhere"], "run.json does not exist"),
+        (["check", "sbc", "once_clamped_beam", "--observe", "nodes:20"], "are required: --out"),
+        (["check", "sbc", "liver", "--seed", "-1", "--out", "x"], "seed is -1; it must be 0 or"),
+        (
+            ["check", "prior", "once_clamped_beam", "--observe", "volume", "--out", "x"],
+            "0 cavities",
+        ),
+        (["predict", "nothing"], "emulator 'nothing' is neither shipped"),
+        (["predict", "once_clamped_beam", "--theta", "mu=nan", "lam=60"], "give a finite number"),
+        (["predict", "once_clamped_beam", "--theta", "nu=3"], "has no parameter 'nu'"),
+        (["predict", "once_clamped_beam", "--out", "u.txt"], "must end in .vtu"),
+        (["train", "liver", "--recipe", "luck", "--out", "x"], "invalid choice: 'luck'"),
+        (["train", "liver", "--recipe", "family", "--out", "x"], "give it as the start, e.g. vent"),
+        (
+            ["train", "liver", "--simulations", "0", "--out", "x"],
+            "0 simulations; a discrepancy mod",
+        ),
+        (["train", "liver", "--simulations", "-3", "--out", "x"], "-3 simulations"),
+        (["train", "nowhere", "--out", "x"], "scene 'nowhere' is unknown; built in:"),
+        (["train", "liver"], "are required: --out"),
+        (["evaluate", "once_clamped_beam"], "are required: --against"),
+        (["scenes", "luck"], "unrecognized arguments: luck"),
+        (["simulate", "once_clamped_beam", "--load-steps", "0"], "0 load steps; give 1 or more"),
+        (["simulate", "once_clamped_beam", "--theta", "mu=inf", "lam=60"], "mu' is inf kPa; scene"),
+        (["demo", "--scene", "luck"], "invalid choice: 'luck'"),
+        (["released", "nowhere"], "are required: --root, --out"),
+        (["infer", "once_clamped_beam", "--out", "x"], "no value for parameter 'mu'"),
+        *(
+            (["infer", "once_clamped_beam", "--truth", "mu=73", "lam=61", *words, "--out", "x"], m)
+            for words, m in (
+                (["--sampler", "luck"], "invalid choice: 'luck'"),
+                (["--draws", "0"], "draws is 0; it must be 1 or more"),
+                (["--chains", "0"], "chains is 0; it must be 1 or more"),
+                (["--seed", "-1"], "seed is -1; it must be 0 or more"),
+                (["--sampler-options", "luck=1"], "has no option 'luck'; it has warmup, draws"),
+                (["--forward", "luck"], "invalid choice: 'luck'"),
+                (["--fem-runs", "9"], "--fem-runs has no effect without --forward reduced"),
+                (
+                    ["--forward", "reduced", "--fem-runs", "0"],
+                    "fem_runs is 0; it must be 3 or more",
+                ),
+                (["--error-runs", "-1"], "error_runs is -1; it must be 0 or more"),
+                (["--known", "E=3"], "has no parameter 'E'; it has mu, lam"),
+                (["--prior", "luck"], "prior 'luck' is unknown; known: box, ventricles"),
+                (["--data", "data.csv"], "data.csv does not exist"),
+            )
+        ),
     ],
 )
 def test_bad_calls(capsys, monkeypatch, tmp_path, words, message):

@@ -47,7 +47,9 @@ def run(arguments: argparse.Namespace) -> int:
     from calibrate.effects import recommend, tolerances
     from calibrate.observations import observations, parse_observation
     from emulator.catalogue import find_scene
+    from emulator.errors import check_seed
 
+    check_seed(arguments.seed, "effects")
     scene = find_scene(arguments.scene, arguments.root)
     observe = observations(parse_observation(scene, arguments.observe, arguments.seed))
     quiet = arguments.json or not sys.stderr.isatty()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import DONE, add_json, add_scene, emit, table
 from calibrate.cli.forward import add_forward, forward_options
-from emulator.errors import InputError
+from emulator.errors import InputError, check_seed
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -96,6 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.surrogates.kind import Ingredients
     from emulator.surrogates.registry import build_forward
 
+    check_seed(arguments.seed, "sensitivity")
     scene = find_scene(arguments.scene, arguments.root)
     if arguments.out:
         check_folder(arguments.out)
@@ -111,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
         observe or None,
         prior=prior_of(prior_word(arguments.prior), scene),
         method=arguments.method,
-        samples=arguments.samples or _SAMPLES[arguments.method],
+        samples=_SAMPLES[arguments.method] if arguments.samples is None else arguments.samples,
         groups=groups,
         field=arguments.field,
         seed=arguments.seed,
