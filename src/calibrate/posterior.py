@@ -26,11 +26,12 @@ from calibrate.statistical_model import Data, Model
 from calibrate.tree import make_tree
 from emulator.errors import InputError
 from emulator.fem import Simulator
+from emulator.shown import Row, Shown
 from emulator.store import replacing
 
 
-@dataclass(frozen=True, eq=False)
-class Posterior:
+@dataclass(frozen=True, eq=False, repr=False)
+class Posterior(Shown):
     """Draws, with the model and the data they came from.
 
     tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; with
@@ -43,6 +44,15 @@ class Posterior:
     tree: xr.DataTree
     model: Model
     data: Data
+
+    def shown(self) -> tuple[str, list[Row]]:
+        """Mean and sd of every unknown, draws, and what is wrong with them."""
+        table, sizes = self.summary(), self.tree["posterior"].sizes
+        rows = [(name, f"{row['mean']:.4g} +- {row['sd']:.2g}") for name, row in table.items()]
+        worst = max(row["r_hat"] for row in table.values())
+        rows.append(("draws", f"{sizes['chain']} x {sizes['draw']}, R-hat at most {worst:.3f}"))
+        rows += [("warning", sentence) for sentence in self.warnings()]
+        return f"Posterior of '{self.model.forward.scene.name}'", rows
 
     def draws(self) -> dict[str, np.ndarray]:
         """All draws by name, chains joined, each (s,)."""

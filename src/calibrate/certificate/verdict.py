@@ -14,6 +14,7 @@ import numpy as np
 
 from calibrate.certificate.evidence import Evidence, Figure, Physics, Sampling
 from calibrate.certificate.misfit import Misfit
+from emulator.shown import Row, Shown
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
 
@@ -29,8 +30,8 @@ LARGEST_SPREAD = 1.5
 SMALLEST_POOL = 200.0  # effective points under the corrected map
 
 
-@dataclass(frozen=True)
-class Certificate:
+@dataclass(frozen=True, repr=False)
+class Certificate(Shown):
     """Outcome of a check against FEM.
 
     verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use the reweighted one),
@@ -47,6 +48,11 @@ class Certificate:
     def __str__(self) -> str:
         """Verdict, every finding, and what they cost."""
         return f"{self.verdict}: {'; '.join(self.findings)} ({self.evidence.physics.runs} FEM runs)"
+
+    def shown(self) -> tuple[str, list[Row]]:
+        """Verdict, findings, and what they cost."""
+        rows = [("verdict", str(self.verdict)), *(("finding", each) for each in self.findings)]
+        return "Certificate", [*rows, ("FEM runs", str(self.evidence.physics.runs))]
 
     @property
     def k_hat(self) -> float:

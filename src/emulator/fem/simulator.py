@@ -29,10 +29,11 @@ from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
 from emulator.scenes.scene import Scene
+from emulator.shown import Row, Shown
 
 
-@dataclass(frozen=True, eq=False)
-class Simulator:
+@dataclass(frozen=True, eq=False, repr=False)
+class Simulator(Shown):
     """Finite elements for a scene; use it alone, under ``jit``, ``vmap`` or ``grad``.
 
     Parameters
@@ -50,6 +51,13 @@ class Simulator:
 
     def __post_init__(self) -> None:
         quiet_blas()
+
+    def shown(self) -> tuple[str, list[Row]]:
+        """What it simulates and how."""
+        unknowns = int((~self.scene.held).sum())
+        _, rows = self.scene.shown()
+        how = [("unknowns", str(unknowns)), ("factorisation", self.factorisation)]
+        return f"Simulator of '{self.scene.name}'", [*rows, *how]
 
     @cached_property
     def system(self) -> System:

@@ -24,10 +24,11 @@ from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.regions import Tissue, checked_regions, region_quantities
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
 from emulator.scenes.supports.dirichlet import free_motions, prescribe
+from emulator.shown import Row, Shown
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene(Shown):
     """Geometry, law, loads, supports and parameters of one problem.
 
     Frozen, arrays included, so that compiled functions of it never go stale.
@@ -282,6 +283,21 @@ class Scene:
     def held_displacement(self) -> np.ndarray:
         """Known displacement in mm, zero elsewhere, (n, 3)."""
         return self.prescribed[1]
+
+    def shown(self) -> tuple[str, list[Row]]:
+        """Name, mesh, law, loads, supports, theta."""
+        mesh = self.mesh
+        order = "linear" if mesh.order == 1 else f"quadratic, {self.dilatation} dilatation"
+        kinds = (", ".join(part.kind for part in parts) for parts in (self.loads, self.supports))
+        loads, supports = kinds
+        ranges = [f"{p.name} {p.low:.4g} to {p.high:.4g} {p.unit}".strip() for p in self.parameters]
+        return f"Scene '{self.name}'", [
+            ("mesh", f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra, {order}"),
+            ("law", self.law.name),
+            ("loads", loads or "none"),
+            ("supports", supports),
+            ("theta", ", ".join(ranges)),
+        ]
 
     # ---- identity ------------------------------------------------------------------------------
     @cached_property

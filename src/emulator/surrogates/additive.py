@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.scenes.scene import Scene
+from emulator.shown import Row, Shown
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.part import Network
@@ -49,8 +50,8 @@ KINDS: dict[str, type[Part]] = {
 them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Emulator:
+@dataclass(frozen=True, eq=False, repr=False)
+class Emulator(Shown):
     """An emulator of a scene; without any part it predicts no displacement where free.
 
     Parameters
@@ -69,6 +70,15 @@ class Emulator:
     family: FamilyNetwork | None = None
     discrepancy: Discrepancy | None = None
     record: Mapping[str, Any] = field(default_factory=dict)
+
+    def shown(self) -> tuple[str, list[Row]]:
+        """What it emulates, what it is made of, how it was trained."""
+        _, rows = self.scene.shown()
+        plan = self.record.get("plan", {})
+        made = [("parts", " + ".join(self.parts) or "none")]
+        if plan:
+            made.append(("recipe", f"{plan['recipe']}, {self.record.get('seconds', 0):.0f} s"))
+        return f"Emulator of '{self.scene.name}'", [*made, rows[0], rows[-1]]
 
     @property
     def parts(self) -> dict[str, Part]:
