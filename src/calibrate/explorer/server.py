@@ -121,7 +121,7 @@ class Explorer:
                 told[f"{name} mL"] = float(estimate.of(lambda u, c=cavity: c(u[c.nodes])))
         return told
 
-    def fem(self, position: Mapping[str, str]) -> dict[str, Any]:
+    def compare(self, position: Mapping[str, str]) -> dict[str, Any]:
         """FEM at the same theta: how far the emulator is from it."""
         theta = self.theta(position)
         with self._slow:
@@ -204,8 +204,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(200, self.server.explorer.page, "text/html; charset=utf-8")
             return
         name = address.path.removeprefix("/")
-        if name not in ("at", "curve", "error", "fem"):
-            self._send(404, b"there are /, /at, /curve, /error and /fem\n", "text/plain")
+        if name not in ("at", "curve", "error", "compare"):
+            self._send(404, b"there are /, /at, /curve, /error and /compare\n", "text/plain")
             return
         try:
             found = getattr(self.server.explorer, name)(dict(parse_qsl(address.query)))

@@ -213,7 +213,7 @@ def pressure_volume(posterior: Posterior) -> go.Figure | None:
     )  # fmt: skip
     figure.add_scatter(x=middle, y=p, line_color=BLUE, name="median")
     for seen, part in model.observe.parts.items():
-        if isinstance(part, CavityVolume) and part.facet_set == volume.facet_set:
+        if part.to_json() == volume.to_json():
             _add_measured(figure, posterior, seen, name)
     figure.update_layout(xaxis_title="cavity volume (mL)", yaxis_title=f"{name} ({parameter.unit})")
     return figure

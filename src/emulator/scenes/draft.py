@@ -19,6 +19,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.file import read_scene
+from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity
 from emulator.scenes.scene import Scene
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -154,12 +155,12 @@ def _loads(mesh: Mesh, notes: list[str]) -> list[tuple[str, str]]:
     found = []
     wall = _named(mesh.facet_sets, _INSIDE)
     if wall is not None:
-        for kind in ("cavity_pressure", "follower_pressure"):
+        for kind in (load.kind for load in (CavityPressure, FollowerPressure)):
             lines = f'[[loads]]\nkind = "{kind}"\nfacet_set = "{wall}"\n'
             found.append((kind, lines + "# pressure = 0.8   # kPa; without it, a parameter\n"))
         notes.append(f"pressure on '{wall}'")
-    gravity = '[[loads]]\nkind = "gravity"\ndensity = 1.06   # g/cm3\n'
-    return [*found, ("gravity", gravity + "direction = [0.0, 0.0, -1.0]\n")]
+    gravity = f'[[loads]]\nkind = "{Gravity.kind}"\ndensity = 1.06   # g/cm3\n'
+    return [*found, (Gravity.kind, gravity + "direction = [0.0, 0.0, -1.0]\n")]
 
 
 def _support(mesh: Mesh, notes: list[str]) -> str:

@@ -97,14 +97,16 @@ def test_the_page_holds_all_it_needs(address):
 def test_bad_requests_are_told_in_one_line(address, what, position, message):
     with pytest.raises(urllib.error.HTTPError) as refused:
         ask(address, what, position)
-    assert refused.value.code in (400, 404)
-    assert message in refused.value.read().decode()
+    with refused.value as answer:
+        assert answer.code in (400, 404)
+        assert message in answer.read().decode()
 
 
 def test_only_this_machine(explorer, address):
     with pytest.raises(urllib.error.HTTPError) as refused:
         ask(address, "at", CENTRE, Host="elsewhere.example")
-    assert refused.value.code == 403
+    with refused.value as answer:
+        assert answer.code == 403
     with serve(explorer) as server:
         assert server.server_address[0] == "127.0.0.1"
         with pytest.raises(InputError, match=r"port \d+: .*; give another, or 0"):
@@ -127,7 +129,7 @@ def test_error_bar_and_fem(explorer):
     told = explorer.error(CENTRE)
     assert told["trusted"]
     assert told["max_mm"] < 0.01
-    against = explorer.fem(CENTRE)
+    against = explorer.compare(CENTRE)
     assert against["status"] == "converged"
     assert against["max_mm"] < 0.01
     assert against["volumes"]["endocardium"] > 100.0
