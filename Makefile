@@ -8,7 +8,7 @@ OUT ?= demo-output
 # Of studies: what is called and imported exists, and takes these arguments.
 LENIENT := $(addprefix --disable-error-code ,import-untyped import-not-found index misc operator union-attr arg-type type-var)
 
-.PHONY: demo test test-slow notebooks lint format study clean
+.PHONY: demo test test-slow notebooks docs lint format study clean
 
 demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
@@ -21,6 +21,10 @@ test-slow: $(STAMP)
 
 notebooks: $(STAMP)
 	$(BIN)/python -m pytest tests/test_notebooks.py
+
+docs: $(STAMP)
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
+	@echo docs/_build/index.html
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

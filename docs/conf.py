@@ -1,0 +1,110 @@
+"""The documentation site: ``make docs``.
+
+Pages about public names and about studies are generated into ``docs/generated`` from docstrings and
+READMEs, so that they cannot say anything else.
+"""
+
+import inspect
+import re
+import shutil
+from pathlib import Path
+
+import calibrate
+import emulator
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+GENERATED = HERE / "generated"
+
+project = "soft-tissue-calibrate"
+author = "The soft-tissue-calibrate authors"
+release = emulator.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = project
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+napoleon_numpy_docstring = True
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+# Pages are read in the repository, too, where they link to sources and folders.
+suppress_warnings = ["myst.xref_missing", "myst.header"]
+
+
+def _public(package: object) -> list[str]:
+    """Lines of a page about every public name of a package."""
+    title = f"``{package.__name__}``"
+    lines = [title, "=" * len(title), "", f".. module:: {package.__name__}", ""]
+    for name in sorted(package.__all__, key=str.lower):
+        thing = getattr(package, name)
+        path = f"{package.__name__}.{name}"
+        if inspect.ismodule(thing):
+            lines += [f"- ``{path}``: {thing.__doc__.strip().splitlines()[0]}", ""]
+            continue
+        kind = "class" if inspect.isclass(thing) else "function" if callable(thing) else "data"
+        lines += [f".. auto{kind}:: {path}"]
+        lines += ["   :members:"] if kind == "class" else []
+        lines.append("")
+    return lines
+
+
+def _study(folder: Path) -> None:
+    """A study's README with its pictures beside it."""
+    target = GENERATED / "studies" / folder.name
+    target.mkdir(parents=True)
+    for picture in folder.glob("*.png"):
+        shutil.copy(picture, target)
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    # Links to sources lead nowhere on the site; their words stay.
+    text = re.sub(r"(?<!!)\[([^\]]+)\]\((?!https?:)[^)]*\)", r"\1", text)
+    (target / "index.md").write_text(text, encoding="utf-8")
+
+
+def _generate() -> None:
+    shutil.rmtree(GENERATED, ignore_errors=True)
+    GENERATED.mkdir()
+    for package in (emulator, calibrate):
+        page = GENERATED / f"{package.__name__}.rst"
+        page.write_text("\n".join(_public(package)), encoding="utf-8")
+    studies = sorted(path.parent for path in ROOT.glob("studies/*/README.md"))
+    for folder in studies:
+        _study(folder)
+    entries = "\n".join(f"studies/{folder.name}/index" for folder in studies)
+    (GENERATED / "studies.md").write_text(
+        "# Studies\n\nEach asks one question, and is repeated by `python -m studies.<name>`.\n\n"
+        f"```{{toctree}}\n:maxdepth: 1\n\n{entries}\n```\n",
+        encoding="utf-8",
+    )
+
+
+_generate()
+
+_ENTRY = re.compile(r"[A-Za-z_][\w, /()]* : ")
+
+
+def _entries(_app, _what, _name, _thing, _options, lines):
+    """Write ``name : meaning`` entries outside a section, with their indented rest, as a list."""
+    found, inside, section = [], False, False
+    for k, line in enumerate(lines):
+        below = lines[k + 1] if k + 1 < len(lines) else ""
+        section = section or (bool(below) and set(below) == {"-"})
+        begins = not section and bool(_ENTRY.match(line))
+        rest = inside and line.startswith(" ")
+        if begins and not inside:
+            found.append("")
+        if inside and not begins and not rest and line:
+            found.append("")
+        inside = begins or rest
+        name, _, meaning = line.partition(" : ")
+        found.append(
+            f"- **{name}** : {meaning}" if begins else f"  {line.strip()}" if rest else line
+        )
+    lines[:] = found
+
+
+def setup(app):
+    """Sphinx calls this."""
+    app.connect("autodoc-process-docstring", _entries, priority=1)  # before napoleon

@@ -1,0 +1,47 @@
+"""The documentation: every public name is on it, and it builds without a warning."""
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import calibrate
+import emulator
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("package", [emulator, calibrate], ids=lambda p: p.__name__)
+def test_every_public_name_is_documented(package):
+    bare = [n for n in package.__all__ if not inspect.getdoc(getattr(package, n))]
+    assert not bare
+
+
+def test_pages_are_reached():
+    text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^[a-z_/]+$", text, flags=re.MULTILINE))
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"}
+    assert pages <= listed
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    pytest.importorskip("sphinx", reason="no sphinx here")
+    words = ["-W", "--keep-going", "-q", "-b", "html", ROOT / "docs", tmp_path]
+    command = [sys.executable, "-m", "sphinx", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    page = (tmp_path / "generated" / "calibrate.html").read_text(encoding="utf-8")
+    for name in calibrate.__all__:
+        assert f'id="calibrate.{name}"' in page
+
+
+@pytest.mark.slow
+def test_the_quick_start_runs(capsys):
+    text = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    exec(compile(code, "quickstart.md", "exec"), {})
+    assert "accepted" in capsys.readouterr().out
