@@ -86,22 +86,21 @@ _ENTRY = re.compile(r"[A-Za-z_][\w, /()]* : ")
 
 
 def _entries(_app, _what, _name, _thing, _options, lines):
-    """Write ``name : meaning`` entries outside a section, with their indented rest, as a list."""
+    """Write ``name : meaning`` entries as numpydoc has them, or as a list outside a section."""
     found, inside, section = [], False, False
     for k, line in enumerate(lines):
         below = lines[k + 1] if k + 1 < len(lines) else ""
         section = section or (bool(below) and set(below) == {"-"})
-        begins = not section and bool(_ENTRY.match(line))
-        rest = inside and line.startswith(" ")
-        if begins and not inside:
-            found.append("")
-        if inside and not begins and not rest and line:
+        begins, rest = bool(_ENTRY.match(line)), inside and line.startswith(" ")
+        name, _, meaning = line.partition(" : ")
+        if section:
+            found += [name, f"    {meaning}"] if begins else [line]
+            continue
+        if (begins and not inside) or (inside and not begins and not rest and line):
             found.append("")
         inside = begins or rest
-        name, _, meaning = line.partition(" : ")
-        found.append(
-            f"- **{name}** : {meaning}" if begins else f"  {line.strip()}" if rest else line
-        )
+        other = f"  {line.strip()}" if rest else line
+        found.append(f"- **{name}** : {meaning}" if begins else other)
     lines[:] = found
 
 
