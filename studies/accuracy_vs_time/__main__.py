@@ -5,9 +5,7 @@ beside itself and asserts what the README of the study says.
 """
 
 import argparse
-import itertools
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.common.output import save
+from studies.common.timing import per_call, unseen
 
 from calibrate.figures.drawing import pyplot
 from calibrate.observations import spread_nodes
 from calibrate.provenance import study_header
 from emulator import Simulator, load
 from emulator.error.comparison import quantiles
-from emulator.fem import run_campaign, sobol, uniform
-from emulator.scenes import Scene
+from emulator.fem import run_campaign, sobol
 from emulator.store import write_json
 from emulator.surrogates.corrected import corrected
 from emulator.surrogates.fem import fem_forward
@@ -31,26 +29,6 @@ from emulator.surrogates.protocol import ForwardMap
 
 HERE = Path(__file__).parent
 SEED = 4
-
-
-def timed(function: Callable[[jax.Array], Any], thetas: jax.Array) -> float:
-    """Median seconds of one call.
-
-    No theta may have been solved before: direct solvers keep factors of values they have seen, and
-    a repeated theta would take a tenth of the time.
-    """
-    jax.block_until_ready(function(thetas[0]))
-    durations = []
-    for theta in thetas[1:]:
-        begin = time.perf_counter()
-        jax.block_until_ready(function(theta))
-        durations.append(time.perf_counter() - begin)
-    return float(np.median(durations))
-
-
-def fresh(scene: Scene, count: int, *, keys: Iterator[int] = itertools.count()) -> jax.Array:
-    """Theta (count, p) that no call has had before."""
-    return uniform(scene, count, jax.random.key(1000 + next(keys)))
 
 
 def measure(
@@ -72,8 +50,8 @@ def measure(
         "nodes": len(forward.nodes),
         "fem_runs": fem_runs,
         "err_u_mm": quantiles(jnp.sqrt(jnp.sum(error**2, axis=-1))),
-        "value_s": timed(value, fresh(forward.scene, len(tests))),
-        "gradient_s": timed(gradient, fresh(forward.scene, len(tests))),
+        "value_s": per_call(value, unseen(forward.scene, len(tests))),
+        "gradient_s": per_call(gradient, unseen(forward.scene, len(tests))),
         "offline_s": offline,
     }
     print(
