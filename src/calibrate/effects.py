@@ -20,11 +20,12 @@ import numpy as np
 
 from calibrate.observations import Observation, Observations, observations
 from emulator.errors import InputError, SolverError, check_seed
-from emulator.fem import Simulator, Status, sobol
+from emulator.fem import Simulator, Solution, Status, sobol
 from emulator.fem.functional import potential_energy
 from emulator.scenes.effects import Effect, Onto, effects_of, leave_out
 from emulator.scenes.scene import Scene
 
+_ASIDE = 1e-7
 _SAVES = 0.97  # of the time, below which leaving an effect out is worth it
 _HELD_OUT = 1_000_003  # added to the seed for theta that judge
 _WORD = re.compile(r"([0-9.+-]+(?:[eE][+-]?[0-9]+)?)\s*(\S*)")
@@ -35,7 +36,8 @@ class Measured:
     """What a scene without some effects gives and takes.
 
     changes : of each observation, the largest over theta and points; infinite where FEM failed.
-    ratio : median over theta of the time of a solve from rest over the whole scene's.
+    seconds : of processor time, median of a solve from rest. ratio : median over theta of that time
+    over the whole scene's, solved just before it, so that other work on the machine hits both.
     first_s : of the first solve, compilation included. operations : floating-point, of the energy
     and its gradient; None for a load without a potential.
     """
@@ -193,7 +195,6 @@ class Comparison:
         self.simulators = {} if simulators is None else simulators
         self._known: dict[tuple[str, ...], Measured] = {}
         self._values: list[dict[str, np.ndarray]] = []
-        self._times = np.ones(samples)
 
     def without(self, names: tuple[str, ...]) -> Measured:
         """What the scene without these effects gives, measured once."""
@@ -214,38 +215,39 @@ class Comparison:
         simpler = simulator.scene
         onto = Onto(self._scene, simpler)
         thetas = onto.theta(self._thetas)
-        began = time.perf_counter()
-        jax.block_until_ready(simulator.solve(simpler.centre))
-        first = time.perf_counter() - began
-        values, times = [], []
+        first, _ = _clocked(simulator, simpler.centre)
+        whole = self.simulators[()]
+        values, times, ratios = [], [], []
         for own, theta in zip(thetas, self._thetas, strict=True):
-            began = time.perf_counter()
-            solution = jax.block_until_ready(simulator.solve(own))
-            times.append(time.perf_counter() - began)
+            # Solvers keep factors of values they have seen: not the theta of the comparison again.
+            beside = _clocked(whole, theta * (1.0 + _ASIDE))[0] if names else None
+            seconds, solution = _clocked(simulator, own)
+            times.append(seconds)
+            ratios.append(1.0 if beside is None else seconds / beside)
             status = Status(int(solution.status))
             if status is not Status.CONVERGED:
                 if not names:
                     raise SolverError(f"effects: FEM of scene '{simpler.name}': {status.text}")
                 never = dict.fromkeys(self._observe.parts, float("inf"))
-                return self._row(names, status.text, never, times, first, simulator)
+                return self._row(names, status.text, never, (times, ratios), first, simulator)
             u = onto.field(solution.displacement)[self._observe.nodes]
             seen = self._observe(u[None], theta[None])
             values.append({name: np.asarray(value) for name, value in seen.items()})
         if not names:
-            self._values, self._times = values, np.array(times)
+            self._values = values
         pairs = list(zip(values, self._values, strict=True))
         changes = {
             name: max(_largest(mine[name] - its[name]) for mine, its in pairs)
             for name in self._observe.parts
         }
-        return self._row(names, Status.CONVERGED.text, changes, times, first, simulator)
+        return self._row(names, Status.CONVERGED.text, changes, (times, ratios), first, simulator)
 
     def _row(
         self,
         names: tuple[str, ...],
         status: str,
         changes: Mapping[str, float],
-        times: list[float],
+        times: tuple[list[float], list[float]],
         first: float,
         simulator: Simulator,
     ) -> Measured:
@@ -253,12 +255,19 @@ class Comparison:
             left_out=names,
             status=status,
             changes=changes,
-            seconds=float(np.median(times)),
-            ratio=float(np.median(np.array(times) / self._times[: len(times)])),
+            seconds=float(np.median(times[0])),
+            ratio=float(np.median(times[1])),
             first_s=first,
             unknowns=int((~simulator.scene.held).sum()),
             operations=operations(simulator.scene),
         )
+
+
+def _clocked(simulator: Simulator, theta: jax.Array) -> tuple[float, Solution]:
+    """Processor seconds of a solve from rest, and its solution."""
+    began = time.process_time()
+    solution = jax.block_until_ready(simulator.solve(theta))
+    return time.process_time() - began, solution
 
 
 def operations(scene: Scene) -> float | None:
