@@ -40,8 +40,13 @@ RUNS = 15  # FEM runs of a posterior's emulator, the centre's included
 ORDER = 2  # of its series
 NOISE = {"displacement": 0.2, "volume": 1.0}  # mm, mL
 TRUTH = (0.55, 0.45, 0.5, 0.5, 0.6)  # in the unit box
-ADVISED = ("left_ventricle", "traction_beam_holzapfel_ogden", "liver")
-TOLERANCE = {"displacement": 0.5, "volume": 1.0}  # mm, mL
+# Tolerance of a landmark in mm, of a volume in mL, of scenes to recommend for.
+ADVISED = {
+    "left_ventricle": (0.5, 1.0),
+    "traction_beam_holzapfel_ogden": (0.5, 1.0),
+    "liver": (0.5, 1.0),
+    "sheet": (1.0, 1.0),
+}
 OPTIONS = NUTSOptions(warmup=300, draws=500, chains=2, rounds=2)
 
 
@@ -128,12 +133,13 @@ def one_scene(name: str, results: Results, *, quick: bool) -> None:
 
 
 def advise(name: str) -> Case:
-    """What ``calibrate effects`` recommends for a built-in scene."""
-    scene = BUILT_IN[name]()
+    """What ``calibrate effects`` recommends for a built-in scene, or one of the study's."""
+    scene = (BUILT_IN.get(name) or SCENES[name])()
     parts: dict[str, Any] = {"displacement": landmarks(scene, spread_landmarks(scene, 24, SEED))}
     if cavity_sets(scene):
         parts["volume"] = CavityVolume(scene)
-    limits = {part: TOLERANCE[part] for part in parts}
+    tolerance = dict(zip(("displacement", "volume"), ADVISED[name], strict=True))
+    limits = {part: tolerance[part] for part in parts}
     given = recommend(scene, Observations(parts), limits, samples=SAMPLES, seed=SEED + 1)
     alone = [plain(each) for each in given.alone]
     found = {"scene": name, "effect": "recommended", "tolerance": limits, "alone": alone}
@@ -149,6 +155,8 @@ def shifts(case: Case, whole: Case) -> dict[str, float]:
 def with_shifts(cases: list[Case]) -> None:
     """Add to each case how far it moves the posterior."""
     for case in cases:
+        for old in ("shift_in_sd", "largest_shift"):
+            case.pop(old, None)
         # Data of quadratic elements: on linear ones both pressures are wrong.
         if "posterior" not in case or "published" in case["effect"]:
             continue
@@ -171,7 +179,7 @@ def draw(cases: list[Case], path: Path) -> None:
     scenes = list(dict.fromkeys(c["scene"] for c in rows))
     values = {
         "largest change of a landmark, mm": lambda c: c["changes"]["displacement"],
-        "largest shift of a mean, posterior sd": lambda c: c.get("largest_shift"),
+        "largest shift of a mean, whole posterior sd": lambda c: c.get("largest_shift"),
         "time of a solve without it, over with it": lambda c: c["ratio"],
     }
     figure, panels = plt.subplots(
@@ -212,7 +220,7 @@ def check(cases: list[Case], *, quick: bool) -> None:
         for name, change in advised["changes"].items():
             assert change <= advised["tolerance"][name]
     if not quick:
-        assert found["left_ventricle, recommended"]["ratio"] < 0.9
+        assert found["sheet, recommended"]["ratio"] < 0.5
 
 
 def main() -> None:

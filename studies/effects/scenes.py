@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 import emulator as em
-from calibrate.observations import CavityVolume, Observations, landmarks, spread_nodes
+from calibrate.observations import (
+    CavityVolume,
+    Observation,
+    Observations,
+    landmarks,
+    spread_nodes,
+)
 from emulator.geometry.bodies.box import box
 from emulator.geometry.quadratic import to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
@@ -79,7 +85,7 @@ def points(scene: Scene) -> np.ndarray:
 
 def observed(scene: Scene, at: np.ndarray) -> Observations:
     """Landmarks ``at`` (d, 3) mm, and the volume of each cavity."""
-    parts = {"displacement": landmarks(scene, at)}
+    parts: dict[str, Observation] = {"displacement": landmarks(scene, at)}
     for load in scene.loads:
         if load.pressed is not None and scene.name != FLAT:
             parts[f"volume of {load.pressed}"] = CavityVolume(scene, load.pressed)
