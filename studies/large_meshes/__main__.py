@@ -194,7 +194,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
             "d",
             "#56B4E9",
         ),
-        "tangent": (lambda r: r["tangent_s"], ".", "black"),
+        "tangent": (lambda r: r["tangent_s"], "x", "black"),
     }
     for order, style in ((1, "-"), (2, "--")):
         rows = [case for case in cases if case["order"] == order]
