@@ -84,9 +84,23 @@ def neo_hookean(stretches: np.ndarray, values: Values) -> np.ndarray:
 
 def neo_hookean_engineering(stretches: np.ndarray, values: Values) -> np.ndarray:
     """:func:`neo_hookean` from Young's modulus ``E`` in kPa and Poisson's ratio ``nu``, (3,)."""
+    return neo_hookean(stretches, _lame(values))
+
+
+def _lame(values: Values) -> Values:
     E, nu = values["E"], values["nu"]
-    lame = {"mu": E / 2.0 / (1.0 + nu), "lam": E * nu / (1.0 + nu) / (1.0 - 2.0 * nu)}
-    return neo_hookean(stretches, lame)
+    return {"mu": E / 2.0 / (1.0 + nu), "lam": E * nu / (1.0 + nu) / (1.0 - 2.0 * nu)}
+
+
+def small_strain(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r""":math:`P_i = 2\mu\, \varepsilon_i + \lambda \sum_k \varepsilon_k` in kPa, (3,)."""
+    strain = stretches - 1.0
+    return 2.0 * values["mu"] * strain + values["lam"] * np.sum(strain)
+
+
+def small_strain_engineering(stretches: np.ndarray, values: Values) -> np.ndarray:
+    """:func:`small_strain` from Young's modulus ``E`` in kPa and Poisson's ratio ``nu``, (3,)."""
+    return small_strain(stretches, _lame(values))
 
 
 def neo_hookean_split(stretches: np.ndarray, values: Values) -> np.ndarray:
@@ -119,11 +133,42 @@ def holzapfel_ogden(stretches: np.ndarray, values: Values) -> np.ndarray:
           + a_f x\, e^{b_f x^2} \partial_i \bar I_4 + 2\kappa (J^2 - 1)/\lambda_i,
         \quad x = \max(\bar I_4 - 1, 0)
     """
-    a, b, a_f, b_f, kappa = (values[name] for name in ("a", "b", "a_f", "b_f", "kappa"))
-    I1, I4, d_I1, d_I4 = _isochoric(stretches)
-    x = max(float(I4), 0.0)
+    _, I4, _, d_I4 = _isochoric(stretches)
+    return holzapfel_ogden_isotropic(stretches, values) + _fibres(max(float(I4), 0.0), d_I4, values)
+
+
+def holzapfel_ogden_unswitched(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r""":func:`holzapfel_ogden` with :math:`x = \bar I_4 - 1`, in kPa, (3,)."""
+    _, I4, _, d_I4 = _isochoric(stretches)
+    return holzapfel_ogden_isotropic(stretches, values) + _fibres(float(I4), d_I4, values)
+
+
+def holzapfel_ogden_isotropic(stretches: np.ndarray, values: Values) -> np.ndarray:
+    """:func:`holzapfel_ogden` without its second term, in kPa, (3,)."""
+    a, b, kappa = (values[name] for name in ("a", "b", "kappa"))
+    I1, _, d_I1, _ = _isochoric(stretches)
     volume = 2.0 * kappa * (np.prod(stretches) ** 2 - 1.0) / stretches
-    return a / 2.0 * np.exp(b * I1) * d_I1 + a_f * x * np.exp(b_f * x**2) * d_I4 + volume
+    return a / 2.0 * np.exp(b * I1) * d_I1 + volume
+
+
+def holzapfel_ogden_dispersed(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r"""Dispersion d, in kPa, (3,).
+
+    .. math::
+        P_i = P_i^{iso} + a_f x\, e^{b_f x^2} \left[d\, \partial_i \bar I_1
+          + (1 - 3d)\, \partial_i \bar I_4\right], \quad
+        x = \max(d (\bar I_1 - 3) + (1 - 3d)(\bar I_4 - 1), 0)
+    """
+    d = values["dispersion"]
+    I1, I4, d_I1, d_I4 = _isochoric(stretches)
+    x = max(float(d * I1 + (1.0 - 3.0 * d) * I4), 0.0)
+    slope = d * d_I1 + (1.0 - 3.0 * d) * d_I4
+    return holzapfel_ogden_isotropic(stretches, values) + _fibres(x, slope, values)
+
+
+def _fibres(x: float, slope: np.ndarray, values: Values) -> np.ndarray:
+    r""":math:`a_f x\, e^{b_f x^2} \partial_i x` in kPa, (3,)."""
+    return values["a_f"] * x * np.exp(values["b_f"] * x**2) * slope
 
 
 def holzapfel_ogden_released(stretches: np.ndarray, values: Values) -> np.ndarray:
@@ -165,7 +210,12 @@ PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
     "neo_hookean": neo_hookean,
     "neo_hookean_E_nu": neo_hookean_engineering,
     "neo_hookean_split": neo_hookean_split,
+    "small_strain": small_strain,
+    "small_strain_E_nu": small_strain_engineering,
     "holzapfel_ogden": holzapfel_ogden,
+    "holzapfel_ogden_unswitched": holzapfel_ogden_unswitched,
+    "holzapfel_ogden_isotropic": holzapfel_ogden_isotropic,
+    "holzapfel_ogden_dispersed": holzapfel_ogden_dispersed,
     "holzapfel_ogden_released": holzapfel_ogden_released,
     "holzapfel_ogden_orthotropic": holzapfel_ogden_orthotropic,
     "guccione": guccione,
@@ -176,7 +226,19 @@ PARAMETERS: dict[str, dict[str, float]] = {
     "neo_hookean": {"mu": 10.0, "lam": 30.0},
     "neo_hookean_E_nu": {"E": 30.0, "nu": 0.4},
     "neo_hookean_split": {"mu": 10.0, "kappa": 60.0},
+    "small_strain": {"mu": 10.0, "lam": 30.0},
+    "small_strain_E_nu": {"E": 30.0, "nu": 0.4},
     "holzapfel_ogden": {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "kappa": 50.0},
+    "holzapfel_ogden_unswitched": {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "kappa": 50.0},
+    "holzapfel_ogden_isotropic": {"a": 2.0, "b": 3.0, "kappa": 50.0},
+    "holzapfel_ogden_dispersed": {
+        "a": 2.0,
+        "b": 3.0,
+        "a_f": 5.0,
+        "b_f": 4.0,
+        "dispersion": 0.1,
+        "kappa": 50.0,
+    },
     "holzapfel_ogden_released": {"a": 1.0, "b": 3.0, "a_f": 2.5, "b_f": 4.0, "kappa": 50.0},
     "holzapfel_ogden_orthotropic": {
         "a": 2.0,

@@ -1,6 +1,5 @@
 """The page of a posterior: what it says, that it needs no network, and that a browser shows it."""
 
-import json
 import re
 
 import numpy as np
@@ -10,14 +9,14 @@ import pytest
 import calibrate as cal
 import emulator as em
 from browser_support import opened
-from calibrate.cli import main
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.report import charts
 from calibrate.report.body import body_figure
 from calibrate.report.page import html_of
 from calibrate.run import Run
 from calibrate.samplers.laplace import LaplaceOptions
-from calibrate.workflow import infer
+
+pytestmark = pytest.mark.slow  # compiling for a ventricle; test_command.py is quick
 
 TINY = LaplaceOptions(draws=60, chains=2, starts=2)
 CERTIFICATE = {"verdict": "accepted", "findings": ["no mean moves <b>"], "reason": "", "k_hat": 0.1}
@@ -113,28 +112,6 @@ def test_charts_say_what_was_drawn(ventricle_posterior):
     assert len(ranks) == 2 * 5
     assert sum(ranks[0].y[:-1]) == 60
     assert isinstance(charts.stress(ventricle_posterior), go.Figure)
-
-
-def test_a_law_without_fibres_and_a_body_without_cavity(tmp_path, capsys):
-    truth = {"mu": 70.0, "lam": 70.0}
-    run = Run(
-        "once_clamped_beam", truth=truth, observe="landmarks:6", noise=0.5, draws=60, chains=2,
-        sampler="laplace",
-    )  # fmt: skip
-    posterior = infer(run, tmp_path / "run")
-    assert charts.pressure_volume(posterior) is None
-    assert len(charts.stress(posterior).data) == 2
-    assert main(["report", str(tmp_path / "run"), "--no-fem", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    text = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert told == {"out": str(tmp_path / "run" / "report.html")}
-    assert "truth" in text
-    assert "not certified" in text
-    assert "once_clamped_beam" in text
-    assert main(["report", str(tmp_path / "run"), "--out", "page.pdf"]) == 2
-    assert "must end in .html" in capsys.readouterr().err
-    assert main(["report", str(tmp_path / "none")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_in_a_browser(page, tmp_path):

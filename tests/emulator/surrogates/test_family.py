@@ -152,6 +152,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(family: Emulator, folder: P
     assert np.array_equal(u, v)
 
 
+@pytest.mark.slow
 def test_a_start_for_other_recipes(family: Emulator, tmp_path: Path) -> None:
     """Without a run it is the network; with some, the network plus what FEM's series adds."""
     scene = em.scenes.left_ventricle(4, 8, 1)

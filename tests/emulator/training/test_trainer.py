@@ -28,7 +28,7 @@ def tests(beam, simulator):
 @pytest.mark.parametrize(
     ("objective", "factor"),
     [
-        ("energy", 0.8),
+        pytest.param("energy", 0.8, marks=pytest.mark.slow),
         pytest.param("simulations", 0.5, marks=pytest.mark.slow),
         pytest.param("gradients", 0.5, marks=pytest.mark.slow),
         pytest.param("both", 0.5, marks=pytest.mark.slow),
