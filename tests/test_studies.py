@@ -293,6 +293,23 @@ def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
     assert module.judge(beam, u, theta, "a claim that fails").wrong == "a claim that fails"
 
 
+def test_cases_that_are_there_are_not_repeated(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(STUDIES.parent))
+    from studies.common.output import Results
+
+    made = []
+    case = lambda name: lambda: made.append(name) or {"value": len(made)}
+    Results(tmp_path, 0, settings={"n": 1}).case("a", case("a"))
+    again = Results(tmp_path, 0, settings={"n": 1})
+    assert again.case("a", case("a")) == {"name": "a", "status": "done", "value": 1}
+    again.case("b", case("b"))
+    assert made == ["a", "b"]
+    # Cases of other settings are not these, and one may ask for all of them again.
+    Results(tmp_path, 0, settings={"n": 2}).case("a", case("a"))
+    Results(tmp_path, 0, settings={"n": 2}, again=True).case("a", case("a"))
+    assert made == ["a", "b", "a", "a"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["accuracy_vs_time", "decoder_speed", "error_bar", "few_runs", "stability"]

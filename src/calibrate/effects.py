@@ -127,15 +127,15 @@ def recommend(
         trial = court.without((*chosen, *each.left_out))
         if trial.within(limits) and trial.ratio < _SAVES * best.ratio:
             chosen, best = (*chosen, *each.left_out), trial
-    whole = court.without(())
+    whole = found = court.without(())
     trials = 0
-    while True:
+    while chosen:
         trials += 1
         judge = Comparison(scene, seen, samples, seed + trials * _HELD_OUT, say, court.simulators)
         found = judge.without(chosen)
         if found.within(limits):
             break
-        chosen = chosen[:-1]
+        chosen, found = chosen[:-1], whole
     return Recommendation(
         limits,
         {name: part.unit for name, part in seen.parts.items()},

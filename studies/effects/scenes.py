@@ -16,12 +16,12 @@ from emulator.geometry.bodies.box import box
 from emulator.geometry.quadratic import to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Scene, Support
+from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.left_ventricle import MYOCARDIUM, PRESSURE
 from emulator.scenes.loads import CavityPressure, Gravity, PublishedPressure
 from emulator.scenes.supports import ElasticSupport
 
 SEED = 7
-FLAT = "inflated sheet"  # encloses no volume
 DISPERSION = 0.08  # of Gasser, Ogden & Holzapfel; 1/3 is isotropy
 PERICARDIUM = 0.02  # kPa/mm along the normal; 0.2 is stiff (Pfaller et al. 2019)
 TISSUE = 0.005  # kPa/mm in all directions, fat around
@@ -62,7 +62,7 @@ def sheet() -> Scene:
     at_rim = np.isclose(np.abs(mesh.nodes[:, :2] - 20.0), 20.0).any(axis=1)
     mesh = replace(mesh, node_sets={**mesh.node_sets, "rim": np.flatnonzero(at_rim)})
     plain = Scene(
-        name=FLAT,
+        name="inflated sheet",
         mesh=mesh,
         law=find_law("holzapfel_ogden"),
         parameters=(*MYOCARDIUM, PRESSURE),
@@ -86,9 +86,8 @@ def points(scene: Scene) -> np.ndarray:
 def observed(scene: Scene, at: np.ndarray) -> Observations:
     """Landmarks ``at`` (d, 3) mm, and the volume of each cavity."""
     parts: dict[str, Observation] = {"displacement": landmarks(scene, at)}
-    for load in scene.loads:
-        if load.pressed is not None and scene.name != FLAT:
-            parts[f"volume of {load.pressed}"] = CavityVolume(scene, load.pressed)
+    for name in cavity_sets(scene):
+        parts[f"volume of {name}"] = CavityVolume(scene, name)
     return Observations(parts)
 
 

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from plotly.offline import get_plotlyjs
 
-from calibrate.figures.evaluation import surface_triangles
+from calibrate.figures.evaluation import surface_mesh
 from emulator.error.estimate import error_bar
 from emulator.errors import InputError
 from emulator.fem import Simulator, Status
 from emulator.geometry.cavity import Cavity
-from emulator.scenes.cavities import cavity_sets
+from emulator.scenes.cavities import cavity_sets, inflated_cavity
 from emulator.surrogates.additive import Emulator
 
 LOOPBACK = "127.0.0.1"
@@ -37,8 +37,7 @@ class Explorer:
     def __init__(self, emulator: Emulator) -> None:
         self.scene = emulator.scene
         self._forward = emulator.cache()
-        self._triangles = surface_triangles(self.scene.mesh)
-        self._nodes = np.unique(self._triangles)
+        self._nodes, self._triangles = surface_mesh(self.scene.mesh)
         self._cavities = {name: Cavity(self.scene.mesh, name) for name in cavity_sets(self.scene)}
         self._slow = threading.Lock()
 
@@ -51,8 +50,6 @@ class Explorer:
 
     def about(self) -> dict[str, Any]:
         """The scene: parameters, the surface at rest, cavities."""
-        place = {int(node): k for k, node in enumerate(self._nodes)}
-        triangles = np.vectorize(place.__getitem__)(self._triangles)
         return {
             "name": self.scene.name,
             "parameters": [
@@ -60,9 +57,9 @@ class Explorer:
                 for p in self.scene.parameters
             ],
             "nodes": np.round(self.scene.mesh.nodes[self._nodes], 4).tolist(),
-            "triangles": triangles.tolist(),
+            "triangles": self._triangles.tolist(),
             "cavities": list(self._cavities),
-            "pressure": self._pressure,
+            "pressure": None if self._inflated is None else self._inflated[1],
         }
 
     def theta(self, position: Mapping[str, str]) -> jax.Array:
@@ -97,12 +94,11 @@ class Explorer:
         return both.tobytes()
 
     def curve(self, position: Mapping[str, str]) -> dict[str, Any]:
-        """Volume of the first cavity over the range of its pressure, all else at ``position``."""
-        if self._pressure is None:
+        """Volume of a cavity over the range of its pressure, all else at ``position``."""
+        if self._inflated is None:
             raise InputError(f"scene '{self.scene.name}' has no cavity whose pressure varies")
         volumes = self._volumes(self.theta(position))
-        parameter = self.scene.parameters[self._column]
-        pressures = np.linspace(parameter.low, parameter.high, _PRESSURES)
+        pressures = self._pressures()
         return {"pressure": pressures.tolist(), "volume": np.asarray(volumes).tolist()}
 
     def error(self, position: Mapping[str, str]) -> dict[str, Any]:
@@ -159,27 +155,21 @@ class Explorer:
         return jax.jit(both)
 
     @cached_property
-    def _pressure(self) -> str | None:
-        """The parameter that is the first cavity's pressure."""
-        for load in self.scene.loads:
-            if load.pressed in self._cavities and load.quantities:
-                name = load.quantities[0].name
-                if name in self.scene.parameter_names:
-                    return name
-        return None
+    def _inflated(self) -> tuple[str, str] | None:
+        return inflated_cavity(self.scene)
 
-    @property
-    def _column(self) -> int:
-        assert self._pressure is not None, "asked for a curve only"
-        return self.scene.parameter_names.index(self._pressure)
+    def _pressures(self) -> np.ndarray:
+        assert self._inflated is not None, "asked for a curve only"
+        column = self.scene.parameter_names.index(self._inflated[1])
+        parameter = self.scene.parameters[column]
+        return np.linspace(parameter.low, parameter.high, _PRESSURES)
 
     @cached_property
     def _volumes(self) -> Any:
-        load = next(load for load in self.scene.loads if load.pressed in self._cavities)
-        cavity = self._cavities[str(load.pressed)]
-        wall = self._forward.at(cavity.nodes)
-        parameter, column = self.scene.parameters[self._column], self._column
-        pressures = jnp.linspace(parameter.low, parameter.high, _PRESSURES)
+        assert self._inflated is not None, "asked for a curve only"
+        name, pressure = self._inflated
+        cavity, column = self._cavities[name], self.scene.parameter_names.index(pressure)
+        wall, pressures = self._forward.at(cavity.nodes), jnp.asarray(self._pressures())
 
         def along(theta: jax.Array) -> jax.Array:
             return jax.lax.map(lambda p: cavity(wall(theta.at[column].set(p))), pressures)

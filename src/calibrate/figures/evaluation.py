@@ -215,6 +215,13 @@ def surface_triangles(mesh: Mesh) -> np.ndarray:
     return facets if facets.shape[1] == 3 else facets[:, _QUARTERS].reshape(-1, 3)
 
 
+def surface_mesh(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (s,) of the surface, and its flat triangles (k, 3) by their place among these."""
+    triangles = surface_triangles(mesh)
+    nodes, places = np.unique(triangles, return_inverse=True)
+    return nodes, places.reshape(triangles.shape)
+
+
 def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
     """The undeformed body's surface coloured by ``error`` (n,) mm at its nodes, from two sides."""
     from matplotlib.cm import ScalarMappable

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import plotly.graph_objects as go
 
-from calibrate.figures.evaluation import surface_triangles
+from calibrate.figures.evaluation import surface_mesh
 from calibrate.posterior import Posterior
 from emulator.fem import Simulator
 from emulator.fem.fields import element_fields
@@ -38,9 +38,7 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     if simulator is not None:
         colours |= _error(posterior, centre, simulator)
     shown = fields[np.linspace(0, len(fields) - 1, min(_DRAWS, len(fields))).astype(int)]
-    nodes = np.unique(surface_triangles(scene.mesh))
-    place = {int(node): k for k, node in enumerate(nodes)}
-    triangles = np.vectorize(place.__getitem__)(surface_triangles(scene.mesh))
+    nodes, triangles = surface_mesh(scene.mesh)
     i, j, k = triangles.T.tolist()
     first = next(iter(colours))
     figure = go.Figure(

@@ -16,7 +16,7 @@ from calibrate.identifiability.stress import stress_band
 from calibrate.observations import CavityVolume, Observation
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
-from emulator.scenes.cavities import cavity_sets
+from emulator.scenes.cavities import inflated_cavity
 
 BLUE, ORANGE, GREEN, PINK, YELLOW, SKY = (
     "#0072B2",
@@ -182,18 +182,11 @@ def pressure_volume(posterior: Posterior) -> go.Figure | None:
     """Cavity volume over the range of its pressure; None without such a parameter or cavity."""
     model = posterior.model
     scene = model.forward.scene
-    loads = [load for load in scene.loads if load.pressed and load.quantities]
-    names = [load.quantities[0].name for load in loads if load.quantities]
-    closed = cavity_sets(scene)
-    wanted = [
-        (load, name)
-        for load, name in zip(loads, names, strict=True)
-        if name in scene.parameter_names and load.pressed in closed
-    ]
-    if not wanted:
+    found = inflated_cavity(scene)
+    if found is None:
         return None
-    load, name = wanted[0]
-    volume = CavityVolume(scene, load.pressed)
+    wall_set, name = found
+    volume = CavityVolume(scene, wall_set)
     column = scene.parameter_names.index(name)
     parameter = scene.parameters[column]
     pressures = jnp.linspace(parameter.low, parameter.high, _PRESSURES)

@@ -20,6 +20,17 @@ def cavity_sets(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name in names if encloses(scene.mesh, name))
 
 
+def inflated_cavity(scene: Scene) -> tuple[str, str] | None:
+    """Wall and pressure of the first cavity whose pressure is a parameter; None without any."""
+    closed = cavity_sets(scene)
+    for load in scene.loads:
+        if load.pressed in closed:
+            for quantity in load.quantities:
+                if quantity.name in scene.parameter_names:
+                    return str(load.pressed), quantity.name
+    return None
+
+
 def find_cavity(scene: Scene, facet_set: str | None = None) -> Cavity:
     """The cavity whose wall is ``facet_set``; by default the only one the scene has.
 

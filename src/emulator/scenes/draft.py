@@ -19,7 +19,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.file import read_scene
-from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity
+from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load
 from emulator.scenes.scene import Scene
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -88,14 +88,14 @@ def draft(
     chosen = _law(body, law, notes)
     support = _support(body.mesh, notes)
     for load in _loads(body.mesh, notes):
-        text = _text(body, mesh_name, chosen, (support, *load), notes)
+        text = _text(body, mesh_name, chosen, support, load, notes)
         out.write_text(text, encoding="utf-8")
         try:
             return Draft(out, read_scene(out), tuple(notes))
         except InputError as error:
             out.unlink()
             failure = error
-        notes.append(f"not the load '{load[0]}': {failure}")
+        notes.append(f"not the load '{load[0].kind}': {failure}")
     raise failure
 
 
@@ -150,17 +150,18 @@ def _helix(mesh: Mesh) -> tuple[str, str] | None:
     return (inner, outer) if inner and outer else None
 
 
-def _loads(mesh: Mesh, notes: list[str]) -> list[tuple[str, str]]:
-    """Kinds of load to try, each with its lines."""
-    found = []
+def _loads(mesh: Mesh, notes: list[str]) -> list[tuple[Load, str]]:
+    """Loads to try, each with its lines."""
+    found: list[tuple[Load, str]] = []
     wall = _named(mesh.facet_sets, _INSIDE)
     if wall is not None:
-        for kind in (load.kind for load in (CavityPressure, FollowerPressure)):
-            lines = f'[[loads]]\nkind = "{kind}"\nfacet_set = "{wall}"\n'
-            found.append((kind, lines + "# pressure = 0.8   # kPa; without it, a parameter\n"))
+        for kind in (CavityPressure, FollowerPressure):
+            lines = f'[[loads]]\nkind = "{kind.kind}"\nfacet_set = "{wall}"\n'
+            lines += "# pressure = 0.8   # kPa; without it, a parameter\n"
+            found.append((kind(wall), lines))
         notes.append(f"pressure on '{wall}'")
     gravity = f'[[loads]]\nkind = "{Gravity.kind}"\ndensity = 1.06   # g/cm3\n'
-    return [*found, (Gravity.kind, gravity + "direction = [0.0, 0.0, -1.0]\n")]
+    return [*found, (Gravity(), gravity + "direction = [0.0, 0.0, -1.0]\n")]
 
 
 def _support(mesh: Mesh, notes: list[str]) -> str:
@@ -184,14 +185,11 @@ def _support(mesh: Mesh, notes: list[str]) -> str:
 
 
 def _text(
-    body: Body, mesh_name: str, law: Law, forces: tuple[str, str, str], notes: list[str]
+    body: Body, mesh_name: str, law: Law, support: str, load: tuple[Load, str], notes: list[str]
 ) -> str:
-    """The scene file; ``forces`` are lines of a support, the kind of a load, and its lines."""
+    """The scene file; ``support`` and the load's second entry are lines of it."""
     mesh = body.mesh
-    support, kind, load = forces
-    quantities = list(law.quantities)
-    if "pressure" in kind:
-        quantities.append(Quantity("pressure", "kPa"))
+    quantities = [*law.quantities, *load[0].quantities]
     parts = [
         "# A first scene file; lengths in mm, stresses in kPa. What is marked CHANGE was guessed.",
         *(f"# - {note}" for note in notes),
@@ -217,7 +215,7 @@ def _text(
                 "axis = [0.0, 0.0, 1.0]   # CHANGE: from apex to base",
                 "",
             ]
-    parts += [support, load]
+    parts += [support, load[1]]
     for quantity in quantities:
         if quantity.name not in _CONSTANTS:
             parts += _parameter(quantity)

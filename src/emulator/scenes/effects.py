@@ -50,18 +50,24 @@ def leave_out(scene: Scene, names: Iterable[str]) -> Scene:
     InputError
         An effect that ``scene`` does not have, or cannot do without.
     """
-    known = effects_of(scene)
+    names = tuple(names)
     for name in names:
-        if name not in known:
+        if _without(scene, name) is None:
             raise InputError(
                 f"scene '{scene.name}' has no effect '{name}' that it can do without; it has "
-                f"{', '.join(known) or 'none'}"
+                f"{', '.join(effects_of(scene)) or 'none'}"
             )
-    simpler = scene
     for name in names:
-        left = effects_of(simpler)
-        simpler = left[name].without if name in left else simpler
-    return simpler
+        scene = _without(scene, name) or scene
+    return scene
+
+
+def _without(scene: Scene, wanted: str) -> Scene | None:
+    """``scene`` without the effect; None where it has none of that name, or needs it."""
+    for name, changes, _ in _changes(scene):
+        if name == wanted:
+            return _changed(scene, **changes)
+    return None
 
 
 @dataclass(frozen=True, eq=False)

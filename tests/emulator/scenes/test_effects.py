@@ -12,6 +12,7 @@ from emulator.geometry.bodies.box import box
 from emulator.geometry.quadratic import corner_parents, to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter
+from emulator.scenes.cavities import inflated_cavity
 from emulator.scenes.effects import Onto, effects_of, leave_out
 from emulator.scenes.loads import CavityPressure, DeadPressure, FollowerPressure, Gravity, Traction
 from emulator.scenes.supports import ElasticSupport
@@ -156,3 +157,16 @@ def test_cavities_keep_their_pressure():
         DeadPressure("endocardium"),
     )
     assert isinstance(scene.loads[0], CavityPressure)
+
+
+def test_the_inflated_cavity_is_the_one_whose_pressure_varies():
+    scene = em.scenes.biventricle(4, 8, (1, 1))
+    assert inflated_cavity(scene) == ("lv_endocardium", "pressure")
+    known = {"pressure": 1.0, "kappa": 25.0}
+    *material, pressure = scene.parameters
+    right = replace(pressure, name="right_pressure")
+    other = replace(scene, parameters=(*material, right), constants=known)
+    assert inflated_cavity(other) == ("rv_endocardium", "right_pressure")
+    fixed = replace(scene, parameters=tuple(material), constants={**known, "right_pressure": 0.3})
+    assert inflated_cavity(fixed) is None
+    assert inflated_cavity(block(loads=(Gravity(),))) is None

@@ -32,10 +32,8 @@ def energy(
     strain: Strain, a: jax.Array, b: jax.Array, a_f: jax.Array, b_f: jax.Array, kappa: jax.Array
 ) -> jax.Array:
     """Strain energy density in kPa, textbook form; ``a``, ``a_f``, ``kappa`` in kPa."""
-    matrix = a / (2.0 * b) * jnp.expm1(b * strain.isochoric_I1_minus_3)
     stretch = jnp.maximum(strain.isochoric_I4f_minus_1, 0.0)
-    fibres = a_f / (2.0 * b_f) * jnp.expm1(b_f * stretch**2)
-    return matrix + fibres + quadratic_logarithmic(strain, kappa)
+    return energy_isotropic(strain, a, b, kappa) + energy_of_fibres(stretch, a_f, b_f)
 
 
 def energy_released(
@@ -52,14 +50,18 @@ def energy_unswitched(
 ) -> jax.Array:
     """Strain energy density in kPa of fibres that resist compression, too."""
     stretch = strain.isochoric_I4f_minus_1
-    fibres = a_f / (2.0 * b_f) * jnp.expm1(b_f * stretch**2)
-    return energy_isotropic(strain, a, b, kappa) + fibres
+    return energy_isotropic(strain, a, b, kappa) + energy_of_fibres(stretch, a_f, b_f)
 
 
 def energy_isotropic(strain: Strain, a: jax.Array, b: jax.Array, kappa: jax.Array) -> jax.Array:
     """Strain energy density in kPa without fibres."""
     matrix = a / (2.0 * b) * jnp.expm1(b * strain.isochoric_I1_minus_3)
     return matrix + quadratic_logarithmic(strain, kappa)
+
+
+def energy_of_fibres(stretch: jax.Array, a_f: jax.Array, b_f: jax.Array) -> jax.Array:
+    """Strain energy density in kPa of fibres at ``stretch``, squared and less 1, shape ()."""
+    return a_f / (2.0 * b_f) * jnp.expm1(b_f * stretch**2)
 
 
 _PARAMETERS = (modulus("a"), number("b"), modulus("a_f"), number("b_f"), modulus("kappa"))

@@ -21,6 +21,7 @@ from emulator.mechanics.laws.holzapfel_ogden import (
     HOLZAPFEL_OGDEN,
     HOLZAPFEL_OGDEN_ISOTROPIC,
     energy_isotropic,
+    energy_of_fibres,
 )
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import modulus, number
@@ -38,8 +39,7 @@ def energy(
     """Strain energy density in kPa; ``a``, ``a_f`` and ``kappa`` in kPa."""
     along = (1.0 - 3.0 * dispersion) * strain.isochoric_I4f_minus_1
     mean = jnp.maximum(dispersion * strain.isochoric_I1_minus_3 + along, 0.0)
-    fibres = a_f / (2.0 * b_f) * jnp.expm1(b_f * mean**2)
-    return energy_isotropic(strain, a, b, kappa) + fibres
+    return energy_isotropic(strain, a, b, kappa) + energy_of_fibres(mean, a_f, b_f)
 
 
 HOLZAPFEL_OGDEN_DISPERSED = Law(
