@@ -1,179 +1,135 @@
-"""What accuracy costs in time on the once-clamped beam: FEM, emulator, polish, reduced model.
+"""What accuracy costs in time: every way from theta to displacements, on five bodies.
 
-Run from anywhere: ``python -m studies.accuracy_vs_time``. Writes results.json and pareto.png
-beside itself and asserts what the README of the study says.
+    python -m studies.accuracy_vs_time               # an hour on 2 idle cores
+    python -m studies.accuracy_vs_time --quick --out DIR
+    python -m studies.accuracy_vs_time --only liver  # one part; cases that are there are kept
+
+FEM, emulators, networks and reduced models on the beam, the cube, the liver, the ventricle and a
+ventricle of 20 000 nodes: their error, their time, and what was done before. Then the posterior of
+the ventricle: its error against the time from mesh and data. Writes results.json, pareto.png and
+posteriors.png beside itself.
 """
 
-import argparse
-import time
+import json
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from studies.common.output import save
-from studies.common.timing import per_call, unseen
-
-from calibrate.figures.drawing import pyplot
-from calibrate.observations import spread_nodes
-from calibrate.provenance import study_header
-from emulator import Simulator, load
-from emulator.error.comparison import quantiles
-from emulator.fem import run_campaign, sobol
-from emulator.store import write_json
-from emulator.surrogates.corrected import corrected
-from emulator.surrogates.fem import fem_forward
-from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.protocol import ForwardMap
+from studies.accuracy_vs_time import posteriors
+from studies.accuracy_vs_time.bodies import BODIES
+from studies.accuracy_vs_time.figures import draw, draw_posteriors, front
+from studies.accuracy_vs_time.rungs import examine
+from studies.common.output import Case, Results, parser
+from studies.common.processes import printed
 
 HERE = Path(__file__).parent
 SEED = 4
+SAMPLED = "posteriors"
+PARTS = (*BODIES, SAMPLED)
 
 
-def measure(
-    name: str,
-    forward: ForwardMap,
-    tests: jax.Array,
-    reference: jax.Array,
-    offline: float,
-    fem_runs: int,
-) -> dict[str, Any]:
-    """Error at the nodes ``forward`` returns, time of a value and of a value with gradient."""
-    value = jax.jit(lambda theta: forward(theta))
-    # A sampler needs one scalar and its gradient in theta.
-    gradient = jax.jit(jax.value_and_grad(lambda theta: jnp.sum(forward(theta) ** 2)))
-    error = jnp.stack([value(theta) for theta in tests]) - reference[:, forward.nodes]
-    case = {
-        "name": name,
-        "status": "done",
-        "nodes": len(forward.nodes),
-        "fem_runs": fem_runs,
-        "err_u_mm": quantiles(jnp.sqrt(jnp.sum(error**2, axis=-1))),
-        "value_s": per_call(value, unseen(forward.scene, len(tests))),
-        "gradient_s": per_call(gradient, unseen(forward.scene, len(tests))),
-        "offline_s": offline,
-    }
-    print(
-        f"{name:38s} err_u median {case['err_u_mm']['median']:.2e} mm   "
-        f"value {1e3 * case['value_s']:8.3f} ms   gradient {1e3 * case['gradient_s']:8.3f} ms   "
-        f"offline {offline:7.1f} s",
-        flush=True,
-    )
-    return case
+def of_body(results: Results, name: str, *, quick: bool) -> None:
+    """All rungs of a body, in a process of their own."""
+    if any(case.get("body") == name for case in results.cases):
+        return
+    words = ["--quick"] if quick else []
+    for case in printed("accuracy_vs_time", "--part", name, *words, compiled=False):
+        results.case(case["name"], lambda case=case: case)
 
 
-def study(count: int) -> list[dict[str, Any]]:
-    """Every method at ``count`` theta that none was fitted to."""
-    trained = load("once_clamped_beam")
-    scene, cached = trained.scene, trained.cache()
-    simulator = Simulator(scene)
-    tests = sobol(scene, count, seed=90_210)
-    # The reference is FEM taken two Newton steps beyond its own tolerance.
-    exact = corrected(fem_forward(simulator), simulator, steps=2)
-    reference = jnp.stack([jax.jit(exact)(theta) for theta in tests])
-    observed = spread_nodes(scene, 20, SEED)
-    seconds = float(trained.record["seconds"])
-    runs_used = trained.record["plan"]["simulations"] + 1
-    cases = [
-        measure("FEM from rest", fem_forward(simulator), tests, reference, 0.0, 0),
-        measure(
-            "FEM started by the emulator",
-            fem_forward(simulator, start=cached),
-            tests,
-            reference,
-            seconds,
-            runs_used,
-        ),
-        measure("emulator, full field", cached, tests, reference, seconds, runs_used),
-        measure(
-            "emulator, 20 observed nodes", cached.at(observed), tests, reference, seconds, runs_used
-        ),
-        measure(
-            "emulator + 1 Newton step",
-            corrected(cached, simulator, steps=1),
-            tests,
-            reference,
-            seconds,
-            runs_used,
-        ),
+def table(cases: list[Case]) -> str:
+    """A table of a body's rungs for the README."""
+    rows = [
+        "| rung | FEM runs | before | error, same mesh | error, fine mesh | value | + gradient |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for runs in (10, 30, 60):
-        begin = time.perf_counter()
-        campaign = run_campaign(simulator, sobol(scene, runs, SEED))
-        reduced = fit_reduced(scene, campaign)
-        offline = time.perf_counter() - begin
-        cases.append(
-            measure(f"POD + GP, {runs} FEM runs", reduced, tests, reference, offline, runs)
+    for c in cases:
+        own = f"{c['own_mm']['median']:.1e} mm" if c["own_mm"] else ""
+        nodes = "" if c["own_mm"] else f" ({c['nodes']} nodes)"
+        rows.append(
+            f"| {c['rung']}{nodes} | {c['fem_runs']} | {c['offline_s']:.0f} s | {own} | "
+            f"{c['truth_mm']['median']:.1e} mm | {1e3 * c['value_s']:.3g} ms | "
+            f"{1e3 * c['gradient_s']:.3g} ms |"
         )
-    cases.append(
-        measure("POD + GP (60), 20 nodes", reduced.at(observed), tests, reference, offline, 60)
-    )
-    return cases
+    return "\n".join(rows)
 
 
-def pareto(points: np.ndarray) -> np.ndarray:
-    """Pareto front, (c,) bool: the rows (time, error) that no other row beats in both."""
-    return np.array([not (points < row).all(axis=1).any() for row in points])
+def break_even(cases: list[Case]) -> dict[str, float]:
+    """Values with gradient after which a rung and its preparation beat FEM from rest."""
+    rest = next(c for c in cases if c["rung"] == "FEM from rest")
+    return {
+        c["rung"]: c["offline_s"] / (rest["gradient_s"] - c["gradient_s"])
+        for c in cases
+        if c["offline_s"] and c["gradient_s"] < rest["gradient_s"]
+    }
 
 
-def draw(cases: list[dict[str, Any]], path: Path) -> None:
-    """Error against time of a value and of a gradient, the fronts joined."""
-    plt = pyplot()
-    figure, panels = plt.subplots(1, 2, figsize=(14, 5.2), sharey=True, layout="constrained")
-    colours = {"FEM": "tab:green", "emu": "tab:blue", "POD": "tab:orange"}
-    for axes, key, title in zip(
-        panels, ("value_s", "gradient_s"), ("one value", "one value with its gradient"), strict=True
-    ):
-        points = np.array([[1e3 * case[key], case["err_u_mm"]["median"]] for case in cases])
-        best = points[pareto(points)]
-        best = best[np.argsort(best[:, 0])]
-        axes.step(best[:, 0], best[:, 1], where="post", color="0.6", lw=1, label="Pareto front")
-        for number, (case, (x, y)) in enumerate(zip(cases, points, strict=True), start=1):
-            colour = colours[case["name"][:3]]
-            name = f"{number}  {case['name']}, offline {case['offline_s']:.0f} s"
-            axes.plot(x, y, "o", color=colour, ms=6, label=name)
-            # Labels of neighbouring points are put on different sides.
-            side = [(7, 5), (7, -12), (-12, -12), (-12, 5)][number % 4]
-            axes.annotate(str(number), (x, y), xytext=side, textcoords="offset points")
-        axes.set(xscale="log", yscale="log", xlabel=f"time of {title} (ms)")
-        axes.grid(alpha=0.25)
-    panels[0].set_ylabel("median displacement error (mm)")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", frameon=False, fontsize=9)
-    figure.suptitle("once-clamped beam, 390 nodes, 2 parameters: what accuracy costs in time")
-    save(figure, path)
+def of(cases: list[Case], body: str) -> dict[str, Case]:
+    """A body's cases by rung."""
+    return {case["rung"]: case for case in cases if case.get("body") == body}
 
 
-def check(cases: list[dict[str, Any]]) -> None:
-    """The claims of the study's README."""
-    by_name = {case["name"]: case for case in cases}
-    error = {name: case["err_u_mm"]["median"] for name, case in by_name.items()}
-    assert error["FEM from rest"] < 1e-6
-    assert error["emulator, full field"] < 1e-6
-    assert error["emulator + 1 Newton step"] < error["emulator, full field"]
-    assert error["emulator, full field"] < 0.1 * error["POD + GP, 60 FEM runs"]
+def check(cases: list[Case], *, quick: bool) -> None:
+    """The README's claims."""
+    for body in {case["body"] for case in cases if "body" in case}:
+        found = of(cases, body)
+        own = {n: c["own_mm"]["median"] for n, c in found.items() if c["own_mm"]}
+        assert own["FEM from rest"] < 1e-6, body
+        assert own["emulator + 2 Newton steps"] < max(1e-9, own["emulator, full field"]), body
+        best = front(np.array([(c["gradient_s"], c["truth_mm"]["median"]) for c in found.values()]))
+        assert (np.diff(best[:, 0]) >= 0.0).all(), body
+        assert (np.diff(best[:, 1]) <= 0.0).all(), body
+        if quick:
+            continue
+        # An emulator better than its mesh buys nothing.
+        emulator, mesh = found["emulator, full field"], found["FEM from rest"]["truth_mm"]["median"]
+        assert emulator["own_mm"]["median"] < 0.1 * mesh, body
+        assert emulator["gradient_s"] < 0.1 * found["FEM from rest"]["gradient_s"], body
+    if not quick:
+        ways = {case["posterior"]: case for case in cases if "posterior" in case}
+        assert ways["series + discrepancy, 60 FEM runs, NUTS"]["largest_shift"] < 0.15
 
 
-def check_times(cases: list[dict[str, Any]]) -> None:
-    """The claims about time, which need enough cases for a median."""
-    gradient = {case["name"]: case["gradient_s"] for case in cases}
-    fast = gradient["emulator, 20 observed nodes"]
-    assert fast < 0.1 * gradient["FEM started by the emulator"]
-    assert fast < gradient["emulator, full field"]
+def summary(cases: list[Case]) -> dict[str, Any]:
+    """Break-even of every body."""
+    bodies = dict.fromkeys(case["body"] for case in cases if "body" in case)
+    return {body: break_even(list(of(cases, body).values())) for body in bodies}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=50, help="test theta")
-    parser.add_argument("--out", type=Path, default=HERE)
-    arguments = parser.parse_args()
-    cases = study(arguments.cases)
-    write_json(arguments.out / "results.json", {**study_header(HERE, SEED), "cases": cases})
-    draw(cases, arguments.out / "pareto.png")
-    check(cases)
-    if arguments.cases >= 20:
-        check_times(cases)
+    """Run the study."""
+    arguments = parser(__doc__, HERE)
+    arguments.add_argument("--only", nargs="+", choices=PARTS, help="parts to run")
+    arguments.add_argument("--part", help="print one part's cases as JSON; for the study itself")
+    arguments = arguments.parse_args()
+    if arguments.part in BODIES:
+        print(json.dumps(list(examine(arguments.part, quick=arguments.quick))))
+        return
+    if arguments.part:
+        print(json.dumps(posteriors.examine(arguments.part)))
+        return
+    results = Results(
+        arguments.out, SEED, again=arguments.again, settings={"quick": arguments.quick}
+    )
+    parts = arguments.only or (["beam"] if arguments.quick else PARTS)
+    for name in parts:
+        if name in BODIES:
+            of_body(results, name, quick=arguments.quick)
+            continue
+        for way in posteriors.WAYS:
+            results.case(
+                f"posterior: {way}",
+                lambda way=way: printed("accuracy_vs_time", "--part", way, compiled=False),
+            )
+    bodies = [case for case in results.cases if "body" in case]
+    sampled = [case for case in results.cases if "posterior" in case]
+    results.write(summary=summary(results.cases))
+    for body in dict.fromkeys(case["body"] for case in bodies):
+        print(f"\n{body}\n{table(list(of(bodies, body).values()))}")
+    draw(bodies, arguments.out / "pareto.png")
+    if sampled:
+        draw_posteriors(sampled, arguments.out / "posteriors.png")
+    check(results.cases, quick=arguments.quick)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,86 @@
+"""The study's figures: errors against time on five bodies, and the posterior's error."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from studies.common.output import Case, save
+
+from calibrate.figures.drawing import pyplot
+
+# Colours and shapes that differ for every reader (Okabe and Ito 2008).
+STYLES = {
+    "FEM": ("#009E73", "s"),
+    "polished": ("#56B4E9", "D"),
+    "emulator": ("#0072B2", "o"),
+    "series": ("#E69F00", "^"),
+    "network": ("#CC79A7", "P"),
+    "POD + GP": ("#D55E00", "v"),
+}
+LEAST = 1e-12  # mm; a smaller error is drawn here
+LABELS = {"own_mm": "from FEM on the same mesh", "truth_mm": "from a much finer mesh"}
+
+
+def front(points: np.ndarray) -> np.ndarray:
+    """Pareto front: the rows (time, error) that no other row beats in both, by time."""
+    best = [row for row in points if not ((points <= row).all(1) & (points < row).any(1)).any()]
+    return np.array(sorted(map(tuple, best)))
+
+
+def draw(cases: list[Case], path: Path) -> None:
+    """Error against the time of a value with gradient; a column a body, a row an error."""
+    bodies = list(dict.fromkeys(case["body"] for case in cases))
+    figure, panels = pyplot().subplots(
+        2, len(bodies), figsize=(3.4 * len(bodies), 7.4), layout="constrained", squeeze=False
+    )
+    for column, body in zip(panels.T, bodies, strict=True):
+        found = [case for case in cases if case["body"] == body]
+        for axes, key in zip(column, LABELS, strict=True):
+            _panel(axes, [case for case in found if case[key]], key)
+        nodes = next(case["nodes"] for case in found if case["own_mm"])
+        column[0].set_title(f"{body}, {nodes} nodes")
+        column[1].set_xlabel("value and gradient (ms)")
+    for axes, label in zip(panels[:, 0], LABELS.values(), strict=True):
+        axes.set_ylabel(f"error, median over theta (mm)\n{label}")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False)
+    save(figure, path)
+
+
+def _panel(axes: Any, cases: list[Case], key: str) -> None:
+    points = np.array([(1e3 * c["gradient_s"], max(c[key]["median"], LEAST)) for c in cases])
+    best = front(points)
+    axes.step(best[:, 0], best[:, 1], where="post", color="0.6", lw=1, label="Pareto front")
+    for kind, (colour, mark) in STYLES.items():
+        rows = [k for k, case in enumerate(cases) if case["kind"] == kind]
+        axes.plot(*points[rows].T, mark, color=colour, mfc="none", ms=7, ls="", label=kind)
+    axes.set(xscale="log", yscale="log")
+    axes.grid(color="0.92")
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw_posteriors(cases: list[Case], path: Path) -> None:
+    """Largest shift of a mean, and largest change of an sd, against the whole time."""
+    figure, panels = pyplot().subplots(1, 2, figsize=(11, 5.2), layout="constrained")
+    for number, case in enumerate(cases, start=1):
+        colour, mark = STYLES[case["kind"]]
+        total = case["offline_s"] + case["sampling_s"]
+        sampler = case["posterior"].rpartition(", ")[2]
+        fill = "none" if sampler == "NUTS" else colour
+        for axes, value in zip(
+            panels, (case["largest_shift"], np.expm1(case["largest_log_sd"])), strict=True
+        ):
+            label = f"{number}  {case['posterior']}"
+            axes.plot(total, value, mark, color=colour, mfc=fill, ms=8, ls="", label=label)
+            axes.annotate(str(number), (total, value), xytext=(6, 4), textcoords="offset points")
+    panels[0].set_ylabel("largest shift of a mean (posterior sd)")
+    panels[1].set_ylabel("largest relative change of an sd")
+    for axes in panels:
+        # Monte Carlo error of a thousand effective draws.
+        axes.axhspan(0, 2.0 / np.sqrt(1000), color="0.93")
+        axes.set(xscale="log", yscale="log", xlabel="seconds from mesh and data to draws")
+        axes.grid(color="0.92")
+        axes.spines[["top", "right"]].set_visible(False)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    save(figure, path)

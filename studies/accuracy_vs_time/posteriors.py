@@ -1,0 +1,104 @@
+"""What the posterior costs: its error against FEM's, and the time from mesh and data to draws.
+
+Data and FEM's posterior are those of ``studies/inverse_benchmark``: the ventricle, displacements,
+strains and volume. Each forward map and sampler is made and run in a process of its own, without a
+cache of compiled programs.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from studies.accuracy_vs_time.rungs import SEED, mechanics
+from studies.common.output import Case
+from studies.inverse_benchmark import entries, reference, tables
+from studies.inverse_benchmark.problems import PROBLEMS, data_of, model, scene_of
+from studies.inverse_benchmark.score import score
+
+from emulator.fem import Simulator, run_campaign, sobol
+from emulator.scenes import Scene
+from emulator.surrogates.additive import Emulator
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import ForwardMap
+from emulator.surrogates.taylor import expand
+
+PROBLEM = PROBLEMS["all_mid"]
+NUTS = entries.sampler("nuts", warmup=500, draws=1000, chains=4)
+
+
+def _series(order: int) -> Callable[[Scene], ForwardMap]:
+    return lambda scene: Emulator(scene, taylor=expand(Simulator(scene), order=order)).cache()
+
+
+def _mechanics(runs: int) -> Callable[[Scene], ForwardMap]:
+    return lambda scene: mechanics(scene, runs).cache()
+
+
+def _reduced(runs: int) -> Callable[[Scene], ForwardMap]:
+    return lambda scene: fit_reduced(
+        scene, run_campaign(Simulator(scene), sobol(scene, runs, SEED))
+    )
+
+
+def _network(scene: Scene) -> ForwardMap:  # noqa: ARG001 - it is shipped
+    return entries.network()[0]
+
+
+@dataclass(frozen=True)
+class Way:
+    """A forward map, made from the scene, and a sampler. before_s : of training what is loaded."""
+
+    kind: str
+    make: Callable[[Scene], ForwardMap]
+    sampler: entries.Method = NUTS
+    before_s: Callable[[], float] = lambda: 0.0
+
+
+WAYS = {
+    **{f"series of order {n}, NUTS": Way("series", _series(n)) for n in (1, 2, 3)},
+    **{
+        f"series + discrepancy, {n} FEM runs, NUTS": Way("emulator", _mechanics(n))
+        for n in (5, 20, 60)
+    },
+    **{f"POD + GP, {n} FEM runs, NUTS": Way("POD + GP", _reduced(n)) for n in (10, 30, 60)},
+    "network alone, NUTS": Way("network", _network, before_s=lambda: entries.network()[1]),
+    "series + discrepancy, 20 FEM runs, MCLMC": Way(
+        "emulator", _mechanics(20), entries.sampler("mclmc")
+    ),
+    "series + discrepancy, 20 FEM runs, SMC": Way(
+        "emulator", _mechanics(20), entries.sampler("smc")
+    ),
+    "series + discrepancy, 20 FEM runs, Laplace": Way(
+        "emulator", _mechanics(20), entries.sampler("laplace")
+    ),
+    "series + discrepancy, 5 FEM runs, delayed acceptance": Way(
+        "FEM", _mechanics(5), entries.sampler("delayed_acceptance")
+    ),
+}
+
+
+def examine(name: str) -> Case:
+    """One way: its error, and its time from the mesh and from the map."""
+    way, scene = WAYS[name], scene_of()
+    began = time.perf_counter()
+    forward = way.make(scene)
+    forward(jnp.asarray(scene.centre)).block_until_ready()
+    offline = time.perf_counter() - began + way.before_s()
+    began = time.perf_counter()
+    draws, solves = way.sampler(model(PROBLEM, forward), data_of(PROBLEM))
+    sampling = time.perf_counter() - began
+    names = scene.parameter_names
+    columns = np.column_stack([draws[each] for each in names])
+    table = tables.Table(columns, np.full(len(columns), 1.0 / len(columns)))
+    found = score(table, tables.read(reference.path_of(PROBLEM), names))
+    kept = ("sliced", "largest_shift", "largest_log_sd", "draws")
+    return {
+        "kind": way.kind,
+        "posterior": name,
+        "offline_s": offline,
+        "sampling_s": sampling,
+        "fem_solves": solves,
+        **{key: found[key] for key in kept},
+    }

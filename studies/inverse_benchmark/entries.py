@@ -1,0 +1,180 @@
+"""Entries of our own and of two outside samplers: a forward map, and what draws with it.
+
+``entries/<entry>/<problem>.csv`` holds draws, ``entries/<entry>/entry.json`` what they took.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from studies.inverse_benchmark.problems import PROBLEMS, SCENE, Problem, data_of, model, scene_of
+
+import calibrate as cal
+import emulator as em
+from calibrate.samplers import density_of, find_sampler
+from calibrate.statistical_model import Model
+from emulator.fem import Simulator, run_campaign, sobol
+from emulator.surrogates.pod_gp import fit_reduced
+from emulator.surrogates.protocol import ForwardMap
+
+ENTRIES = Path(__file__).parent / "entries"
+KEPT = 500  # draws of an entry that are written
+RUNS = 60  # FEM runs of the reduced model
+Draws = dict[str, np.ndarray]
+Method = Callable[[Model, Draws], tuple[Draws, int]]
+"""``method(model, data)``: draws by name, and FEM solves of the sampler."""
+
+
+@lru_cache
+def shipped() -> tuple[ForwardMap, float, int]:
+    """The shipped emulator, the seconds of its training, and its FEM runs."""
+    trained = em.load(SCENE)
+    return trained.cache(), trained.record["seconds"], trained.record["plan"]["simulations"] + 1
+
+
+@lru_cache
+def network() -> tuple[ForwardMap, float, int]:
+    """The shipped network alone."""
+    trained = em.load(f"{SCENE}_pignn")
+    return trained.cache(), trained.record["seconds"], trained.record["plan"]["simulations"] + 1
+
+
+@lru_cache
+def reduced() -> tuple[ForwardMap, float, int]:
+    """POD + Gaussian processes of a campaign of their own."""
+    began, scene = time.process_time(), scene_of()
+    fitted = fit_reduced(scene, run_campaign(simulator(), sobol(scene, RUNS, 5)))
+    return fitted, time.process_time() - began, RUNS
+
+
+@lru_cache
+def simulator() -> Simulator:
+    """FEM on the benchmark's scene."""
+    return Simulator(scene_of())
+
+
+def sampler(name: str, **options: Any) -> Method:
+    """One of the toolkit's samplers."""
+
+    def draw(statistical: Model, data: Draws) -> tuple[Draws, int]:
+        chosen = find_sampler(name)
+        posterior = cal.sample(
+            statistical, data, sampler=name, options=chosen.options(**options), seed=3,
+            predictions=False, simulator=simulator() if chosen.solves_fem else None,
+        )  # fmt: skip
+        return posterior.draws(), int(posterior.tree["sample_stats"].attrs.get("fem_solves", 0))
+
+    return draw
+
+
+def by_emcee(statistical: Model, data: Draws) -> tuple[Draws, int]:
+    """Goodman and Weare's ensemble by emcee (Foreman-Mackey et al. 2013): 64 walkers."""
+    import emcee
+
+    density, walkers, steps = density_of(statistical), 64, 3000
+    log_density = jax.jit(jax.vmap(lambda z: density.log_density(z, data)))
+    start = jax.vmap(density.prior_draw)(jax.random.split(jax.random.key(3), walkers))
+    ensemble = emcee.EnsembleSampler(
+        walkers,
+        density.dimension,
+        lambda z: np.asarray(log_density(jnp.asarray(z))),
+        vectorize=True,
+    )
+    ensemble.random_state = np.random.RandomState(3).get_state()
+    ensemble.run_mcmc(np.asarray(start), steps)
+    z = ensemble.get_chain(discard=steps // 2, flat=True)
+    return {n: np.asarray(v) for n, v in density.constrain(jnp.asarray(z)).items()}, 0
+
+
+def by_pymc(statistical: Model, data: Draws) -> tuple[Draws, int]:
+    """PyMC's NUTS on our log density and its gradient, as a PyTensor operation."""
+    import pymc as pm
+    import pytensor.tensor as pt
+    from pytensor.graph.op import Apply, Op
+
+    density = density_of(statistical)
+    both = jax.jit(jax.value_and_grad(lambda z: density.log_density(z, data)))
+
+    class Gradient(Op):
+        def make_node(self, z):
+            return Apply(self, [pt.as_tensor(z)], [pt.dvector()])
+
+        def perform(self, _, inputs, outputs):
+            outputs[0][0] = np.asarray(both(jnp.asarray(inputs[0]))[1])
+
+    class LogDensity(Op):
+        def make_node(self, z):
+            return Apply(self, [pt.as_tensor(z)], [pt.dscalar()])
+
+        def perform(self, _, inputs, outputs):
+            outputs[0][0] = np.asarray(both(jnp.asarray(inputs[0]))[0])
+
+        def pullback(self, inputs, _, cotangents):
+            return [cotangents[0] * Gradient()(inputs[0])]
+
+        grad = L_op = lambda self, inputs, outputs, cotangents=None: self.pullback(
+            inputs, outputs, outputs if cotangents is None else cotangents
+        )
+
+    with pm.Model():
+        z = pm.Flat("z", shape=density.dimension)
+        pm.Potential("posterior", LogDensity()(z))
+        trace = pm.sample(
+            1000, tune=1000, chains=4, cores=1, random_seed=3, progressbar=False,
+            compute_convergence_checks=False,
+            initvals=[{"z": np.asarray(density.prior_draw(jax.random.key(k)))} for k in range(4)],
+        )  # fmt: skip
+    z = np.asarray(trace.posterior["z"]).reshape(-1, density.dimension)
+    return {n: np.asarray(v) for n, v in density.constrain(jnp.asarray(z)).items()}, 0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the leaderboard.
+
+    forward : makes the map, and tells the seconds and FEM runs it took. problems : their names.
+    """
+
+    name: str
+    forward: Callable[[], tuple[ForwardMap, float, int]]
+    method: Method
+    problems: tuple[str, ...] = tuple(PROBLEMS)
+
+
+_MID = tuple(name for name, problem in PROBLEMS.items() if problem.level == "mid")
+_LONG = {"warmup": 500, "draws": 1000, "chains": 4}
+OURS = {
+    "emulator_nuts": Entry("emulator, NUTS", shipped, sampler("nuts", **_LONG)),
+    "emulator_mclmc": Entry("emulator, MCLMC", shipped, sampler("mclmc")),
+    "emulator_smc": Entry("emulator, SMC", shipped, sampler("smc")),
+    "emulator_laplace": Entry("emulator, Laplace", shipped, sampler("laplace")),
+    "network_nuts": Entry("network alone, NUTS", network, sampler("nuts", **_LONG)),
+    "pod_gp_nuts": Entry(f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_LONG)),
+    "delayed_acceptance": Entry(
+        "emulator and FEM, delayed acceptance", shipped,
+        sampler("delayed_acceptance", draws=125), _MID,
+    ),
+    "emcee": Entry("emulator, emcee", shipped, by_emcee),
+    "pymc": Entry("emulator, PyMC's NUTS", shipped, by_pymc),
+}  # fmt: skip
+
+
+def draw(entry: Entry, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
+    """Draws (n, p) of one problem, at most ``KEPT``, and what they took."""
+    forward, _, _ = entry.forward()
+    data, began, wall = data_of(problem), time.process_time(), time.perf_counter()
+    draws, solves = entry.method(model(problem, forward), data)
+    took = {
+        "processor_s": time.process_time() - began,
+        "wall_s": time.perf_counter() - wall,
+        "fem_solves": solves,
+    }
+    columns = np.column_stack([draws[name] for name in scene_of().parameter_names])
+    rows = np.linspace(0, len(columns) - 1, min(KEPT, len(columns))).astype(int)
+    return columns[rows], took
