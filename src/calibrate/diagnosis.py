@@ -35,6 +35,7 @@ def diagnose(
         _too_few(summary),
         _rejections(statistics.get("accepted")),
         _approximation(attributes.get("pareto_k"), attributes.get("importance_efficiency")),
+        _rival(attributes.get("rival_mode")),
     ]
     return [sentence for sentence in found if sentence]
 
@@ -110,4 +111,13 @@ def _approximation(pareto_k: float | None, efficiency: float | None) -> str:
         f"the Gaussian approximation is poor, Pareto k {pareto_k:.2f} (at most {_LARGEST_K}) and "
         f"{100.0 * efficiency:.2g} % of the draws effective (at least "
         f"{100.0 * _LOWEST_EFFICIENCY:.0f} %): use a sampler, such as nuts"
+    )
+
+
+def _rival(lower: float | None) -> str:
+    if lower is None:
+        return ""
+    return (
+        f"the posterior has another mode, {float(lower):.2g} nats lower than the one the Gaussian "
+        "is at: use a sampler for several modes, such as smc"
     )

@@ -17,6 +17,7 @@ import xarray as xr
 from calibrate.arviz import stats
 from calibrate.diagnosis import diagnose
 from calibrate.fem_likelihood import FEMLikelihood
+from calibrate.fit import misfits
 from calibrate.observations.present import missing_values
 from calibrate.provenance import versions
 from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws, r_hat
@@ -99,14 +100,14 @@ class Posterior(Shown):
         return int(statistics["diverging"].sum()) if "diverging" in statistics else 0
 
     def warnings(self) -> list[str]:
-        """What is wrong with the run and what to do, a sentence each; empty where nothing is."""
+        """What is wrong with run or data and what to do, a sentence each; empty if nothing is."""
         groups = [self.tree[name].to_dataset() for name in ("posterior", "sample_stats")]
         draws, statistics = (
             {str(name): np.asarray(values) for name, values in group.data_vars.items()}
             for group in groups
         )
         attributes = {str(name): value for name, value in self.tree.attrs.items()}
-        return diagnose(draws, statistics, self.summary(), attributes)
+        return diagnose(draws, statistics, self.summary(), attributes) + misfits(self.tree)
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""

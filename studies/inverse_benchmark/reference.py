@@ -5,8 +5,9 @@ nearly independent, are weighted by FEM,
 
 .. math:: w_k \propto L_\mathrm{FEM}(\theta_k) / L_\mathrm{emulator}(\theta_k).
 
-One solve a draw. Weights far from equal, a Pareto exponent above 0.5, a solve that fails, or
-R-hat above 1.01 refuse the reference.
+One solve a draw. Less than 80 % of the weights in effect, a solve that fails, or R-hat above 1.01
+refuse the reference. The Pareto exponent is recorded; of weights that are all but equal it says
+nothing.
 """
 
 import time
@@ -25,8 +26,8 @@ from emulator.surrogates.protocol import ForwardMap
 
 REFERENCES = Path(__file__).parent / "references"
 DRAWS = 1000
-OPTIONS = cal.NUTSOptions(warmup=500, draws=1500, chains=4, rounds=4)
-LARGEST_K, LARGEST_R_HAT, SMALLEST_ESS = 0.5, 1.01, 0.8
+OPTIONS = cal.NUTSOptions(warmup=500, draws=1000, chains=4, rounds=6)
+LARGEST_R_HAT, SMALLEST_ESS = 1.01, 0.8
 
 
 def path_of(problem: Problem) -> Path:
@@ -68,7 +69,7 @@ def make(problem: Problem, forward: ForwardMap, simulator: Simulator, draws: int
         "seconds": time.process_time() - began,
     }
     sound = case["r_hat"] < LARGEST_R_HAT and case["weights_ess"] > SMALLEST_ESS
-    if failed or not sound or case["pareto_k"] > LARGEST_K:
+    if failed or not sound:
         raise SystemExit(f"{problem.name}: no reference to trust: {case}")
     scene = simulator.scene
     columns = np.column_stack([all_draws[name][rows] for name in scene.parameter_names])

@@ -1,176 +1,30 @@
-"""Hard cases for the simulator: each must converge or name its failure, never answer wrongly.
+"""Hard cases: each must end well or name its failure, never answer wrongly.
 
 Run from anywhere: ``python -m studies.stability``. Writes results.json and stability.png beside
 itself and asserts what the README of the study says.
 """
 
 import argparse
-import multiprocessing
-import queue
-import threading
-import time
 from collections import Counter
-from collections.abc import Iterable
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from studies.common.output import save
-from studies.stability.cases import CASES, SEED, Case, solve
-from studies.stability.judge import TOLERANCE, is_stable, judge
+from studies.stability.cases import CASES
+from studies.stability.judge import TOLERANCE
+from studies.stability.solver.case import SEED
+from studies.stability.workers import study
 
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from emulator import Status
-from emulator.errors import InputError
 from emulator.store import write_json
 
 HERE = Path(__file__).parent
 LIMIT = 120.0  # seconds for one case, compilation and judgement included
 
 
-def outcome(name: str) -> dict[str, Any]:
-    """Solve one case and judge its answer."""
-    family, make = CASES[name]
-    row: dict[str, Any] = {
-        "name": name,
-        "family": family,
-        "status": "",
-        "silent_wrong": False,
-        "residual": None,
-        "time_s": 0.0,
-        "iterations": None,
-        "load_reached": None,
-        "stable": None,
-        "note": "",
-    }
-    case = make()
-    begin = time.perf_counter()
-    try:
-        simulator, solution = solve(case)
-    except Exception as error:  # whatever it is, it is the outcome
-        named = isinstance(error, InputError)
-        status = type(error).__name__
-        text = str(error).splitlines()[0][:160]
-        return row | {
-            "status": status if named else f"exception {status}",
-            "time_s": time.perf_counter() - begin,
-            "note": text,
-        }
-    row["time_s"] = time.perf_counter() - begin
-    row |= {
-        "status": Status(int(solution.status)).name,
-        "iterations": int(solution.iterations),
-        "load_reached": float(solution.load_reached),
-    }
-    return row | verdict(case, simulator, solution)
-
-
-def verdict(case: Case, simulator: Any, solution: Any) -> dict[str, Any]:
-    """Judge an answer by what its status claims."""
-    u = np.asarray(solution.displacement)
-    if not np.isfinite(u).all():
-        return {"silent_wrong": True, "note": "displacement not finite"}
-    if solution.status != Status.CONVERGED:
-        return {}
-    claim = case.claim(u)
-    try:
-        found = judge(case.scene, u, np.asarray(case.theta), claim)
-        stable = is_stable(simulator, solution.displacement, np.asarray(case.theta))
-    except Exception as error:  # an answer to a question that makes no sense
-        return {"silent_wrong": True, "note": claim or f"cannot be judged: {error}"}
-    return {
-        "silent_wrong": bool(found.wrong),
-        "residual": found.residual,
-        "independent": found.independent,
-        "smallest_J": found.smallest_J,
-        "stable": stable,
-        "note": found.wrong,
-    }
-
-
-# ---- workers -----------------------------------------------------------------------------------
-def work(pipe: Connection) -> None:
-    """Receive names of cases and send their outcomes, until ``None`` is received."""
-    while (name := pipe.recv()) is not None:
-        pipe.send(outcome(name))
-
-
-class Worker:
-    """A process that is killed when a case hangs; the next case gets a new one."""
-
-    def __init__(self) -> None:
-        self.process: Any = None
-
-    def start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, other = context.Pipe()
-        self.process = context.Process(target=work, args=(other,), daemon=True)
-        self.process.start()
-        other.close()
-
-    def stop(self) -> None:
-        if self.process is not None:
-            self.process.kill()
-            self.process.join()
-            self.process = None
-
-    def run(self, name: str, limit: float) -> dict[str, Any]:
-        """The outcome of ``name``; its status is ``hang`` or ``crash`` where there is none."""
-        if self.process is None:
-            self.start()
-        begin = time.perf_counter()
-        self.pipe.send(name)
-        try:
-            if self.pipe.poll(limit):
-                return self.pipe.recv()
-            status = "hang"
-        except EOFError:
-            status = "crash"
-        self.stop()
-        lost = dict.fromkeys(("residual", "iterations", "load_reached", "stable"))
-        return lost | {
-            "name": name,
-            "family": CASES[name][0],
-            "status": status,
-            "silent_wrong": False,
-            "time_s": time.perf_counter() - begin,
-            "note": "",
-        }
-
-
-def study(names: Iterable[str], workers: int, limit: float) -> list[dict[str, Any]]:
-    """Every case, in the order of ``names``."""
-    names = list(names)
-    waiting: queue.SimpleQueue[str] = queue.SimpleQueue()
-    for name in names:
-        waiting.put(name)
-    rows: dict[str, dict[str, Any]] = {}
-
-    def drain() -> None:
-        worker = Worker()
-        while True:
-            try:
-                name = waiting.get_nowait()
-            except queue.Empty:
-                return worker.stop()
-            row = rows[name] = worker.run(name, limit)
-            print(
-                f"{len(rows):3d}/{len(names)} {name:44s} {row['status']:18s} "
-                f"{row['time_s']:6.1f} s  {row['iterations'] or '':>4} {row['note'][:70]}",
-                flush=True,
-            )
-
-    threads = [threading.Thread(target=drain) for _ in range(workers)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return [rows[name] for name in names]
-
-
-# ---- figure and claims ---------------------------------------------------------------------------
 COLOURS = {
     "CONVERGED": "tab:green",
     "ITERATION_LIMIT": "tab:orange",
@@ -179,6 +33,12 @@ COLOURS = {
     "SINGULAR_TANGENT": "tab:brown",
     "INVALID_INPUT": "0.5",
     "InputError": "0.2",
+    "SolverError": "0.35",
+    "TRAINED": "tab:green",
+    "PREDICTED": "tab:green",
+    "AGREES": "tab:green",
+    "OUTSIDE": "tab:cyan",
+    "WARNED": "tab:olive",
 }
 
 
@@ -214,7 +74,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     save(figure, path)
 
 
-NAMED = {status.name for status in Status} | {InputError.__name__}
+NAMED = {status.name for status in Status} | set(COLOURS)
 
 
 def check(rows: list[dict[str, Any]]) -> None:

@@ -36,7 +36,7 @@ from emulator.scenes.left_ventricle import HELIX, PRESSURE
 HERE = Path(__file__).parent
 SEED = 17
 LEVEL = 0.9
-OPTIONS = NUTSOptions(warmup=200, draws=250, chains=2, rounds=1)
+OPTIONS = NUTSOptions(warmup=200, draws=250, chains=2, rounds=4, r_hat=1.03, ess=100.0)
 CERTIFIED = 2  # posteriors of a case, where it asks for them
 PRESSURES = (0.6, 0.9, 1.2)  # kPa, known, of several states
 
@@ -163,7 +163,7 @@ def examine(name: str, study: Study) -> Case:
         [n for n in scene.parameter_names if n in model.names and study.truth != "law"]
         or ["pressure"])  # fmt: skip
     width = prior_sd(model)
-    rows, verdicts, reasons = [], [], []
+    rows, verdicts, reasons, agreement = [], [], [], []
     for r in range(study.sets):
         exact = true(jnp.asarray(fields[r][:, true.nodes]), jnp.asarray(thetas[r]))
         rng = np.random.default_rng([SEED, r, *name.encode()])
@@ -175,6 +175,7 @@ def examine(name: str, study: Study) -> Case:
             options=NUTSOptions() if certified else OPTIONS,
         )  # fmt: skip
         draws = posterior.draws()
+        agreement.append(max(each["r_hat"] for each in posterior.summary().values()))
         row = {}
         for n in shared:
             truth = thetas[r, 0, scene.parameter_names.index(n)]
@@ -193,6 +194,7 @@ def examine(name: str, study: Study) -> Case:
         "bias_sd": {n: float(np.mean([row[n][1] for row in rows])) for n in shared},
         "z_rms": {n: float(np.sqrt(np.mean([row[n][1] ** 2 for row in rows]))) for n in shared},
         "sd_over_prior": {n: float(np.median([row[n][2] for row in rows])) for n in shared},
+        "r_hat": {"median": float(np.median(agreement)), "largest": max(agreement)},
         "verdicts": dict(Counter(verdicts)),
         "reasons": reasons,
     }

@@ -6,7 +6,9 @@ r"""The Laplace approximation: a Gaussian at the posterior's mode, in unconstrai
 (Gelman et al. 2013, Sec. 4.1, 13.3). Draws are independent, so R-hat and effective sample size say
 nothing of the error. The ratios :math:`p(z \mid y) / q(z)` do: the Pareto shape k of their tail is
 recorded, and above 0.7 the Gaussian should not be trusted (Yao et al. 2018). A Gaussian that is too
-wide has no such tail; few of its draws then count, and what fraction is recorded too.
+wide has no such tail; few of its draws then count, and what fraction is recorded too. Neither sees
+another mode, where no draw is; so the modes that the optimiser's other starts ended in are compared
+with the highest, and one that is nearly as high is recorded.
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ from emulator.errors import SolverError
 _STEP = 1e-4  # of central differences of the gradient; coordinates are about 1 wide
 _EQUAL = 1e-3  # log ratios closer together than this have no tail to fit
 _AWAY = 0.05  # sd that the optimiser may stop from the mode
+_RIVAL = 3.0  # nats below the highest mode; a mode of its width there has a twentieth of the mass
+_APART = 4.0  # sd from the highest mode; the optimiser's stops are closer to their mode
 _BARRIER = 1e30  # minus the log density where it is zero, for the optimiser
 
 
@@ -59,10 +63,11 @@ class LaplaceOptions:
 
 
 class _Gaussian(NamedTuple):
-    """Mode (p,) and precision H (p, p)."""
+    """Mode (p,), precision H (p, p), and by how much the next mode is lower, () nats."""
 
     mode: Any
     precision: Any
+    rival: Any  # infinite where no other mode was found
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,8 @@ class Laplace:
 
         The statistic ``log_ratio`` is log p(z, y) - log q(z). The attribute ``pareto_k`` is the
         shape of its tail, ``importance_efficiency`` the effective fraction of the draws, were they
-        weighted by the ratios: 1 where the posterior is Gaussian.
+        weighted by the ratios: 1 where the posterior is Gaussian. ``rival_mode``, where there is
+        one, is by how much the log density of another mode is lower.
 
         Raises
         ------
@@ -96,12 +102,13 @@ class Laplace:
         """
         programs = _compile(density)
         start_key, key = jax.random.split(jax.random.key(seed))
-        empty = _Gaussian(np.zeros(density.dimension), np.zeros((density.dimension,) * 2))
+        empty = _Gaussian(np.zeros(density.dimension), np.zeros((density.dimension,) * 2), 0.0)
         gaussian = context.checkpoint.restore(lambda: empty)
         if gaussian is None:
             starts = programs.starts(jax.random.split(start_key, options.starts))
-            mode = _mode(programs, np.asarray(starts), data)
-            gaussian = _Gaussian(mode, _precision(programs, mode, data))
+            modes, heights = _modes(programs, np.asarray(starts), data)
+            precision = _precision(programs, modes[0], data)
+            gaussian = _Gaussian(modes[0], precision, _rival(modes, heights, precision))
             context.checkpoint.keep(lambda: gaussian)
         z, lp, log_q = _draw(programs, gaussian, data, options, key)
         shape = (options.chains, options.draws)
@@ -111,6 +118,8 @@ class Laplace:
             "pareto_k": pareto_k(lp - log_q),
             "importance_efficiency": efficiency(lp - log_q),
         }
+        if np.isfinite(gaussian.rival):
+            attributes["rival_mode"] = float(gaussian.rival)
         return Draws(z.reshape(*shape, -1), statistics, attributes)
 
 
@@ -129,8 +138,8 @@ def _compile(density: Density) -> _Programs:
     )
 
 
-def _mode(programs: _Programs, starts: np.ndarray, data: Data) -> np.ndarray:
-    """The highest of the modes that L-BFGS finds."""
+def _modes(programs: _Programs, starts: np.ndarray, data: Data) -> tuple[np.ndarray, np.ndarray]:
+    """Where L-BFGS ends from each start (s, p), and log densities there (s,); the highest first."""
 
     def negative(z: np.ndarray) -> tuple[float, np.ndarray]:
         height, slope = programs.value_and_gradient(jnp.asarray(z), data)
@@ -142,10 +151,18 @@ def _mode(programs: _Programs, starts: np.ndarray, data: Data) -> np.ndarray:
         minimize(negative, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-12})
         for start in starts
     ]
-    best = min(tries, key=lambda found: found.fun)
-    if not best.fun < _BARRIER:
+    tries = sorted(tries, key=lambda found: found.fun)
+    if not tries[0].fun < _BARRIER:
         raise SolverError("the posterior density is zero wherever the optimiser could start")
-    return best.x
+    return np.array([found.x for found in tries]), np.array([-found.fun for found in tries])
+
+
+def _rival(modes: np.ndarray, heights: np.ndarray, precision: np.ndarray) -> float:
+    """By how much the next mode is lower, in nats; infinite where no other is nearly as high."""
+    steps = modes - modes[0]
+    apart = np.einsum("si,ij,sj->s", steps, precision, steps) > _APART**2
+    lower = (heights[0] - heights)[apart]
+    return float(min((gap for gap in lower if gap < _RIVAL), default=np.inf))
 
 
 def _precision(programs: _Programs, mode: np.ndarray, data: Data) -> np.ndarray:

@@ -77,6 +77,34 @@ def test_the_efficiency_of_two_weights():
     assert efficiency(np.log([1.0, 3.0]) - 700.0) == pytest.approx(0.8)
 
 
+@dataclass(frozen=True, eq=False)
+class Even(LinearForward):
+    """Only the square of mu's distance from 75 kPa is seen, ``slope`` sd higher on one side."""
+
+    slope: float = 0.0
+
+    def __call__(self, theta):
+        x = (theta[0] - 75.0) / 5.0
+        y = (theta[1] - 75.0) / 5.0
+        return jnp.ones((len(self.nodes), 3)) * jnp.array([x**2 - 1.0, self.slope * x, y])
+
+
+@pytest.mark.parametrize(("slope", "told"), [(0.0, True), (0.02, True), (0.5, False)])
+def test_a_second_mode_nearly_as_high_is_told(beam, slope, told):
+    """At x = -1 the log density is (2 slope / 0.1)^2 / 2 below that at x = 1: 0.08 and 50 nats."""
+    forward = Even(**vars(linear_forward(beam)), slope=slope)
+    prior = {name: dist.Normal(75.0, 10.0) for name in beam.parameter_names}
+    observe = cal.nodal_displacements(beam, [3])
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), prior, check_scale=False)
+    data = np.array([[0.0, slope, 0.0]])
+    posterior = cal.sample(model, data, sampler="laplace", options=LaplaceOptions(draws=500))
+    found = [line for line in posterior.warnings() if "another mode" in line]
+    assert bool(found) is told
+    if told:
+        lower = posterior.tree.attrs["rival_mode"]
+        assert lower == pytest.approx((2.0 * slope / 0.1) ** 2 / 2.0, abs=0.02)
+
+
 def test_pareto_k_of_known_tails():
     rng = np.random.default_rng(0)
     assert pareto_k(np.zeros(100)) == 0.0
