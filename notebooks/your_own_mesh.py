@@ -173,7 +173,7 @@ for name, colour in colours.items():
     left.plot([], [], "s", color=colour, label=name)
 left.add_collection3d(Poly3DCollection(triangles, facecolors=shades, edgecolor="0.3", lw=0.2))
 view(left, scene.mesh.nodes, "groups, front half cut away")
-left.legend(loc="upper left", fontsize=8, frameon=False)
+left.legend(loc="lower left", fontsize=8, frameon=False)
 right = figure.add_subplot(122)
 right.plot([0, 1], [60, -60], color="0.6", lw=3, label="asked for")
 right.plot(deep.value, angle, ".", color="#0072B2", ms=3, label="elements")
