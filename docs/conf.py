@@ -1,10 +1,12 @@
 """The documentation site: ``make docs``.
 
-Pages about public names and about studies are generated into ``docs/generated`` from docstrings and
-READMEs, so that they cannot say anything else.
+Pages about public names, studies and notebooks are generated into ``docs/generated`` from
+docstrings, READMEs and the notebooks with their outputs, so that they cannot say anything else.
 """
 
+import base64
 import inspect
+import json
 import re
 import shutil
 from pathlib import Path
@@ -63,12 +65,34 @@ def _study(folder: Path) -> None:
     (target / "index.md").write_text(text, encoding="utf-8")
 
 
+def _notebook(path: Path) -> None:
+    """A notebook's text, code and outputs, as they are in the repository."""
+    target = GENERATED / "notebooks"
+    target.mkdir(exist_ok=True)
+    parts = []
+    for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if "image/png" in data:
+                picture = f"{path.stem}_{number}.png"
+                (target / picture).write_bytes(base64.b64decode("".join(data["image/png"])))
+                parts.append(f"![Figure of the cell above]({picture})")
+                continue
+            text = "".join(output.get("text", data.get("text/plain", "")))
+            parts.append(f"```text\n{text.rstrip()}\n```")
+    (target / f"{path.stem}.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
 def _generate() -> None:
     shutil.rmtree(GENERATED, ignore_errors=True)
     GENERATED.mkdir()
     for package in (emulator, calibrate):
         page = GENERATED / f"{package.__name__}.rst"
         page.write_text("\n".join(_public(package)), encoding="utf-8")
+    for path in sorted(ROOT.glob("notebooks/*.ipynb")):
+        _notebook(path)
     studies = sorted(path.parent for path in ROOT.glob("studies/*/README.md"))
     for folder in studies:
         _study(folder)
