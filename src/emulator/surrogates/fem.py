@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.fem.campaign import Solver, solve_rows
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 from emulator.store import to_json
@@ -52,8 +53,13 @@ class FEMForward:
 
     def evaluate_all(self, thetas: jax.Array) -> Prediction:
         """Predictions at many theta (c, p), one after the other."""
-        found = [self.evaluate(theta) for theta in thetas]
-        return Prediction(*(jnp.stack(values) for values in zip(*found, strict=True)))
+        solver = Solver(self.simulator, from_rest_again=False)
+        starts = (lambda _: ()) if self.start is None else (lambda theta: (self.start(theta),))
+        rows = [row.solution for row in solve_rows(solver, thetas, starts=starts)]
+        return Prediction(
+            jnp.stack([solution.displacement[self.nodes] for solution in rows]),
+            jnp.stack([solution.converged for solution in rows]),
+        )
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (k, 3) in mm."""
