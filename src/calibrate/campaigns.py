@@ -115,7 +115,7 @@ def fill(
     progress: bool = False,
 ) -> int:
     """Solve what the store at ``out`` lacks; the number of rows that were solved."""
-    with writing(out, asked) as rows, _executor(scheduler) as execute:
+    with _executor(scheduler) as execute, writing(out, asked) as rows:
         return _solve_missing(rows, asked.solver, execute, progress)
 
 

@@ -8,7 +8,7 @@ the order they are finished, which are kept in memory (:mod:`.memory`) or in a Z
 
 from emulator.fem.campaign.engine import Executor, Solver, in_process, solve_rows, solve_together
 from emulator.fem.campaign.row import Row, Task
-from emulator.fem.campaign.runs import Runs, run_campaign
+from emulator.fem.campaign.runs import Runs, StoredRuns, run_campaign
 from emulator.fem.campaign.starts import Neighbours, Predictor
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "Row",
     "Runs",
     "Solver",
+    "StoredRuns",
     "Task",
     "in_process",
     "run_campaign",

@@ -34,6 +34,25 @@ class Runs(NamedTuple):
         sensitivities = None if self.sensitivities is None else self.sensitivities[rows]
         return Runs(self.theta[rows], self.displacement[rows], self.energy[rows], sensitivities)
 
+    def followed_by(self, others: Runs) -> Runs:
+        """These runs and ``others``; with sensitivities where both have them."""
+        slopes = None
+        if self.sensitivities is not None and others.sensitivities is not None:
+            slopes = jnp.concatenate([self.sensitivities, others.sensitivities])
+        return Runs(
+            jnp.concatenate([self.theta, others.theta]),
+            jnp.concatenate([self.displacement, others.displacement]),
+            jnp.concatenate([self.energy, others.energy]),
+            slopes,
+        )
+
+
+class StoredRuns(NamedTuple):
+    """Converged rows of a campaign's store. ``digest`` : short hash of which rows they are."""
+
+    runs: Runs
+    digest: str
+
 
 def run_campaign(
     simulator: Simulator,

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.fem.campaign.runs import Runs
+from emulator.fem.campaign.runs import Runs, StoredRuns
 from emulator.fem.campaign.zarr_rows import MISSING, read, require_store
 from emulator.fem.solution import Status
 from emulator.scenes.scene import Scene
-
-
-@dataclass(frozen=True)
-class StoredRuns:
-    """Converged rows of a campaign. ``digest`` : short hash of which rows they are."""
-
-    runs: Runs
-    digest: str
 
 
 def read_runs(path: str | Path, scene: Scene) -> StoredRuns:
