@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
 
 import jax.numpy as jnp
 import numpy as np
@@ -187,7 +188,7 @@ def cluster():
     """Two worker processes, started again when they die."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as found:
         yield found
 
@@ -208,19 +209,43 @@ def test_on_a_cluster_with_a_worker_killed(scene, cluster, tmp_path):
     )
 
 
+@pytest.fixture
+def lonely():
+    """A scheduler and one worker that nobody starts again: address, and both processes."""
+    with ExitStack() as stack:
+
+        def start(*words):
+            command = [sys.executable, "-m", *words, "--no-dashboard"]
+            process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+            stack.callback(process.stderr.close)
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            return process
+
+        scheduler = start("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+        line = next(line for line in scheduler.stderr if "Scheduler at:" in line)
+        address = line.split("Scheduler at:")[1].strip()
+        worker = start("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny")
+        yield address, scheduler, worker
+
+
 @pytest.mark.slow
-def test_a_cluster_that_is_lost(scene, tmp_path, monkeypatch):
-    """Without workers, or without its scheduler, a campaign ends in one line and keeps its rows."""
-    distributed = pytest.importorskip("distributed")
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [("worker", "has had no worker for 1 s"), ("scheduler", "does not answer")],
+)
+def test_a_cluster_that_is_lost(scene, lonely, tmp_path, monkeypatch, lost, message):
+    """A campaign ends in one line and keeps its rows."""
     from emulator.fem.campaign import cluster as module
 
-    monkeypatch.setattr(module, "WORKERS_S", 1.0)
+    address, *processes = lonely
     path = tmp_path / "runs.zarr"
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as found:
-        retire = lambda: found.scale(0)
-        when(path, 3, retire)
-        with pytest.raises(SolverError, match="has had no worker for 1 s"):
-            cal.campaign(scene, 5000, out=path, scheduler=found.scheduler_address)
+
+    def lose():
+        monkeypatch.setattr(module, "WORKERS_S", 1.0)
+        processes[lost == "worker"].kill()
+
+    when(path, 3, lose)
+    with pytest.raises(SolverError, match=message):
+        cal.campaign(scene, 5000, out=path, scheduler=address)
     assert solved_rows(path) >= 3

@@ -97,7 +97,7 @@ def test_training_takes_its_runs(capsys, block, tmp_path):
     assert taken["command"].endswith("--campaign STORE.zarr --out DIR")
     assert own["discrepancy"]["on"] == taken["discrepancy"]["on"]
     predicted = [
-        answer(capsys, "predict", block, "--emulator", tmp_path / name, "--theta", "mu=7")[1]
+        answer(capsys, "predict", tmp_path / name, "--theta", "mu=7")[1]
         for name in ("own", "taken")
     ]
     heights = [found["max_displacement"] for found in predicted]

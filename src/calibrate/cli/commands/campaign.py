@@ -55,12 +55,10 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.errors import InputError
     from emulator.fem import NewtonOptions
     from emulator.fem.campaign.zarr_rows import WORDS, read, require_store
-    from emulator.store import check_folder
 
     began = time.perf_counter()
     if not arguments.out.endswith(".zarr"):
         raise InputError(f"--out {arguments.out}: the store's name must end in .zarr")
-    check_folder(arguments.out)
     asked = question(
         find_scene(arguments.scene, arguments.root),
         arguments.samples,

@@ -193,7 +193,7 @@ def _check_question(path: Path, group: zarr.Group, question: Question) -> None:
             )
     theta = read(group, "theta")
     same = theta.shape == question.thetas.shape
-    if not same or not np.allclose(theta, question.thetas, rtol=_CLOSE, atol=0.0):
+    if not same or not np.allclose(theta, question.thetas, rtol=_CLOSE, atol=0.0, equal_nan=True):
         raise InputError(f"campaign {path} has other theta; give another --out")
     if question.hashes(theta) != read(group, "hash").tolist():
         raise InputError(f"campaign {path}: its hashes are not those of its theta; it was changed")
