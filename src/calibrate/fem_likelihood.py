@@ -73,7 +73,7 @@ class FEMLikelihood:
         cheap = float(self._cheap(dict(draw), data))
         solved = []
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
-        for row in solve_rows(self._solver, thetas, starts=lambda theta: (self._start(theta),)):
+        for row in solve_rows(self._solver, thetas, starts=lambda k: (self._start(thetas[k]),)):
             if not row.converged:
                 return Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
             solved.append(row.solution.displacement)

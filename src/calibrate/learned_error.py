@@ -43,7 +43,8 @@ def with_error(
         values = {name: draw[k] for name, draw in draws.items()}
         thetas = model.states.thetas(values)
         means, valid = data(values)
-        rows = list(solve_rows(solver, thetas, starts=lambda theta: (start(theta),)))
+        starts = [(start(theta),) for theta in thetas]
+        rows = list(solve_rows(solver, thetas, starts=starts.__getitem__))
         if bool(valid) and all(row.converged for row in rows):
             fields = jnp.stack([r.solution.displacement[model.observe.nodes] for r in rows])
             exact = model.observe(fields, thetas)

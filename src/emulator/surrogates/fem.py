@@ -71,7 +71,7 @@ class FEMForward:
     def _rows(self, thetas: jax.Array, *, sensitivities: bool = False) -> Iterator[Row]:
         solver = Solver(self.simulator, sensitivities=sensitivities, from_rest_again=False)
         start = self.start
-        starts = (lambda _: ()) if start is None else (lambda theta: (start(theta),))
+        starts = (lambda _: ()) if start is None else (lambda number: (start(thetas[number]),))
         return solve_rows(solver, thetas, starts=starts)
 
     def __call__(self, theta: jax.Array) -> jax.Array:

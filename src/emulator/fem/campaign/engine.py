@@ -20,8 +20,8 @@ from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
 from emulator.fem.sparse import REFUSALS
 
-Starts = Callable[[Any], Sequence[Any]]
-"""Maps theta (p,) to displacements (n, 3) mm that a solve may start from; none for rest."""
+Starts = Callable[[int], Sequence[Any]]
+"""Displacements (n, 3) mm that the solve of that number may start from; none for rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def solve_rows(
         rows so far.
     """
     chosen = range(len(thetas)) if numbers is None else numbers
-    tasks = (Task(number, thetas[number], tuple(starts(thetas[number]))) for number in chosen)
+    tasks = (Task(number, thetas[number], tuple(starts(number))) for number in chosen)
     return execute(solver, tasks)
 
 
@@ -140,8 +140,7 @@ def solve_together(
     """
     if starts is not None and len(thetas) != len(starts):
         raise InputError(f"campaign: {len(thetas)} theta, but {len(starts)} starts")
-    given = iter(() if starts is None else starts)
     solver = Solver(simulator, from_rest_again=False)
-    one = (lambda _: ()) if starts is None else (lambda _: (next(given),))
+    one = (lambda _: ()) if starts is None else (lambda number: (starts[number],))
     solutions = [row.solution for row in solve_rows(solver, np.asarray(thetas), starts=one)]
     return jax.tree.map(lambda *fields: jnp.stack(fields), *solutions)

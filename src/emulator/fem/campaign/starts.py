@@ -48,9 +48,9 @@ class Neighbours:
     solved: Solved
     predictor: Predictor | None = None
 
-    def __call__(self, theta: jax.Array) -> list[jax.Array]:
-        """Displacements (n, 3) mm."""
-        position, starts = np.asarray(self.scene.to_unit(theta)), list[jax.Array]()
+    def __call__(self, number: int) -> list[jax.Array]:
+        """Displacements (n, 3) mm for the theta of that number."""
+        position, starts = self._positions[number], list[jax.Array]()
         numbers = self.solved.converged()
         if numbers:
             steps = position - self._positions[numbers]
@@ -65,10 +65,12 @@ class Neighbours:
         there, slopes = self.solved.field(number)
         if slopes is None:
             return [there]
-        theta = jnp.asarray(self.solved.thetas[number])
-        moved = self.scene.space.unit_sensitivities(theta[None], jnp.asarray(slopes)[None])[0]
-        return [there, there + jnp.tensordot(step, moved, axes=1)]
+        return [there, there + jnp.tensordot(step * self._rates[number], slopes, axes=1)]
 
     @cached_property
     def _positions(self) -> np.ndarray:
         return np.asarray(self.scene.to_unit(jnp.asarray(self.solved.thetas)))
+
+    @cached_property
+    def _rates(self) -> np.ndarray:
+        return np.asarray(self.scene.space.rates(jnp.asarray(self.solved.thetas)))

@@ -46,6 +46,7 @@ from emulator.store import check_folder
 MISSING = -1
 _FORMAT = 1
 _TOGETHER = 1024  # rows whose numbers are one file
+_NUMBERS = ("energy", "iterations", "seconds", "status")
 _CLOSE = 1e-9  # relative; theta of one design differ by round-off between machines
 WORDS = {MISSING: "not_solved"} | {
     int(s): s.name.lower() for s in Status if s is not Status.RUNNING
@@ -89,12 +90,13 @@ class ZarrRows:
 
     def __init__(self, group: zarr.Group) -> None:
         self._group = group
-        self.thetas, self.status = read(group, "theta"), read(group, "status")
-        self._converged = np.flatnonzero(self.status == Status.CONVERGED).tolist()
+        self.thetas = read(group, "theta")
+        self._numbers = {name: read(group, name) for name in _NUMBERS}
+        self._converged = np.flatnonzero(self._numbers["status"] == Status.CONVERGED).tolist()
 
     def missing(self) -> list[int]:
         """Numbers of the theta that have no row."""
-        return np.flatnonzero(self.status == MISSING).tolist()
+        return np.flatnonzero(self._numbers["status"] == MISSING).tolist()
 
     def converged(self) -> list[int]:
         """Numbers of the rows that did; those solved by this process in the order they were."""
@@ -111,19 +113,22 @@ class ZarrRows:
         """Write a row, its status last."""
         row = row.as_numpy()
         number, solution = row.number, row.solution
-        values = {
-            "displacement": solution.displacement if row.converged else np.nan,
-            "energy": row.energy,
-            "iterations": solution.iterations,
-            "seconds": row.seconds,
-        }
+        self._arrays["displacement"][number] = solution.displacement if row.converged else np.nan
         if row.sensitivities is not None:
-            values["sensitivities"] = row.sensitivities
-        for name, value in values.items():
-            self._arrays[name][number] = value
-        self._arrays["status"][number] = self.status[number] = int(solution.status)
+            self._arrays["sensitivities"][number] = row.sensitivities
+        self._set("energy", number, row.energy)
+        self._set("iterations", number, solution.iterations)
+        self._set("seconds", number, row.seconds)
+        self._set("status", number, solution.status)
         if row.converged:
             self._converged.append(number)
+
+    def _set(self, name: str, number: int, value: Any) -> None:
+        """Write one number with all that are in its file, so that nothing need be read first."""
+        self._numbers[name][number] = value
+        first = number - number % _TOGETHER
+        part = slice(first, first + _TOGETHER)
+        self._arrays[name][part] = self._numbers[name][part]
 
     @cached_property
     def _arrays(self) -> dict[str, Any]:
