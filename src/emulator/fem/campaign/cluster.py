@@ -16,6 +16,7 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -63,9 +64,11 @@ class Cluster:
             was given to; all other rows come first.
         """
         name = f"campaign-{uuid.uuid4().hex}"
-        self.client.register_plugin(Bench(solver), name=name)
         try:
+            self.client.register_plugin(Bench(solver), name=name)
             yield from self._rows(name, tasks)
+        except (OSError, CancelledError) as error:  # an error of the solve itself is neither
+            raise self._gone(error) from error
         finally:
             self._forget(name)
 
@@ -95,7 +98,7 @@ class Cluster:
         """Number of workers; waits for the first."""
         began = time.monotonic()
         while True:
-            count = len(self._asked(self.client.nthreads))
+            count = self._count()
             if count:
                 return count
             if time.monotonic() - began > WORKERS_S:
@@ -116,20 +119,21 @@ class Cluster:
             if done:
                 return done
 
-    def _asked(self, ask: Any) -> Any:
+    def _count(self) -> int:
         try:
-            return ask()
-        except (OSError, RuntimeError, ValueError) as error:
+            return len(self.client.nthreads())
+        except (RuntimeError, ValueError) as error:  # the client has given up
             raise self._gone(error) from error
 
     def _gone(self, error: Exception) -> SolverError:
-        return SolverError(f"campaign: the scheduler {self.address} does not answer ({error})")
+        said = " ".join(str(error).split())
+        return SolverError(f"campaign: the scheduler {self.address} does not answer ({said})")
 
     def _forget(self, name: str) -> None:
         """Let the workers forget the scene, where there still are any."""
         try:
             self.client.unregister_worker_plugin(name)
-        except (OSError, RuntimeError, ValueError, KeyError):
+        except (OSError, CancelledError, RuntimeError, ValueError, KeyError):
             return
 
 
