@@ -82,8 +82,11 @@ class Cluster:
             if not under_way:
                 break
             for future in self._finished(under_way):
+                try:
+                    row = _result(future)
+                except TimeoutError:  # it went with its worker, and is solved again
+                    continue
                 number = under_way.pop(future)
-                row = _result(future)
                 if row is None:
                     deadly.append(number)
                 else:
@@ -202,7 +205,7 @@ def _solve(name: str, task: Task) -> Row:
 def _result(future: Future) -> Row | None:
     """The row, or None where its theta killed workers."""
     try:
-        return future.result()
+        return future.result(timeout=_LOOK_S)
     except KilledWorker:
         return None
 
