@@ -1,3 +1,4 @@
+from .campaigns import campaign
 from .certificate import Certificate, certify, reweight
 from .comparison import compare
 from .joint_prior import Dependence, JointPrior
@@ -36,6 +37,7 @@ __all__ = [
     "Posterior",
     "StudentTNoise",
     "box_prior",
+    "campaign",
     "certify",
     "compare",
     "landmarks",

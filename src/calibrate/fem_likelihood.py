@@ -19,6 +19,7 @@ import numpy as np
 from calibrate.statistical_model import Data, Model
 from emulator.errors import InputError
 from emulator.fem import Simulator
+from emulator.fem.campaign import Solver, solve_rows
 from emulator.fem.functional import volume_ratio
 
 
@@ -71,12 +72,11 @@ class FEMLikelihood:
         noise = self.model.noise_values(draw)
         cheap = float(self._cheap(dict(draw), data))
         solved = []
-        for theta in thetas:
-            # Not under jit: there the solver cannot use CHOLMOD, which is faster.
-            solution = self.simulator.solve(theta, self._start(theta))
-            if not bool(solution.converged):
+        # Not under jit: there the solver cannot use CHOLMOD, which is faster.
+        for row in solve_rows(self._solver, thetas, starts=lambda k: (self._start(thetas[k]),)):
+            if not row.converged:
                 return Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
-            solved.append(solution.displacement)
+            solved.append(row.solution.displacement)
         fem, means, smallest = self._fem(jnp.stack(solved), thetas, noise, data)
         stable = self._stable(solved, thetas) if stability else None
         return Likelihoods(float(fem), cheap, True, float(smallest), means, stable)
@@ -88,6 +88,10 @@ class FEMLikelihood:
         return all(
             self.simulator.is_stable(u, theta) for u, theta in zip(solved, thetas, strict=True)
         )
+
+    @cached_property
+    def _solver(self) -> Solver:
+        return Solver(self.simulator, from_rest_again=False)
 
     @cached_property
     def _start(self):  # noqa: ANN202 - a compiled program, private

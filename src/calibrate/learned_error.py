@@ -15,6 +15,7 @@ from calibrate.noise.information import information_about_means
 from calibrate.statistical_model import Model
 from emulator.errors import InputError
 from emulator.fem import Simulator
+from emulator.fem.campaign import Solver, solve_rows
 
 FEWEST = 8
 
@@ -35,15 +36,17 @@ def with_error(
     """
     _check(model, simulator, runs)
     start, data = jax.jit(model.full), jax.jit(model.predict)
+    solver = Solver(simulator, from_rest_again=False)
     draws = model.prior_draws(jax.random.key(seed), runs)
     unknowns, errors = [], []
     for k in tqdm(range(runs), "error of the map", disable=not progress, unit="run"):
         values = {name: draw[k] for name, draw in draws.items()}
         thetas = model.states.thetas(values)
         means, valid = data(values)
-        solutions = [simulator.solve(theta, start(theta)) for theta in thetas]
-        if bool(valid) and all(bool(solution.converged) for solution in solutions):
-            fields = jnp.stack([s.displacement[model.observe.nodes] for s in solutions])
+        starts = [(start(theta),) for theta in thetas]
+        rows = list(solve_rows(solver, thetas, starts=starts.__getitem__))
+        if bool(valid) and all(row.converged for row in rows):
+            fields = jnp.stack([r.solution.displacement[model.observe.nodes] for r in rows])
             exact = model.observe(fields, thetas)
             errors.append(ravel_pytree(exact)[0] - ravel_pytree(means)[0])
             unknowns.append([float(values[name]) for name in model.states.unknowns])

@@ -10,7 +10,8 @@ program, so they follow any observation and noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from dataclasses import dataclass, fields
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ from numpyro import handlers
 from calibrate.noise.spatial import SpatialNormal
 from calibrate.samplers.density import sum_log_likelihood, trace_of
 from calibrate.statistical_model import Data, Model
+from emulator.surrogates.protocol import Prediction, evaluate_all, solves_itself
 
 REPLICATES = 500  # draws of the posterior, and of the prior, that data is replicated at
 
@@ -62,7 +64,9 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
     A tenth more is drawn; draws where the forward map has no answer are left out.
     """
     keys = jax.random.split(rng_key, count + count // 10)
-    draws, data, valid = jax.tree.map(np.asarray, _programs(model).prior(keys))
+    made = _solved_prior(model, keys) if solves_itself(model.forward) else None
+    made = _programs(model).prior(keys) if made is None else made
+    draws, data, valid = jax.tree.map(np.asarray, made)
     rows = np.flatnonzero(valid)[:count]
     return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))
 
@@ -73,6 +77,52 @@ def spread(draws: Draws, count: int = REPLICATES) -> tuple[np.ndarray, Draws]:
     kept = min(length, -(-count // chains))
     rows = np.linspace(0, length - 1, kept).astype(int)
     return rows, {name: np.asarray(values)[:, rows] for name, values in draws.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Told(Model):
+    """A model that is told its predictions. ``told`` : displacement (S, k, 3) mm and validity."""
+
+    told: Prediction | None = None
+
+    def evaluate(self, thetas: jax.Array) -> Prediction:  # noqa: ARG002 - it knows their answers
+        """What it was told."""
+        assert self.told is not None
+        return self.told
+
+
+def _solved_prior(model: Model, keys: jax.Array) -> Any:
+    """What the program ``prior`` gives, by solves that are driven from Python.
+
+    The theta of all draws first, then every solve, then the data: keys decide on all of them alike.
+    """
+    parts = {each.name: getattr(model, each.name) for each in fields(Model)}
+    states = model.states
+
+    def given(told: Prediction, rng_key: jax.Array) -> Any:
+        return _prior(_Told(**parts, told=told), rng_key)
+
+    nowhere = Prediction(
+        jnp.zeros((len(states.states), len(model.observe.nodes), 3)), jnp.array(True)
+    )
+    draws = jax.jit(jax.vmap(lambda key: given(nowhere, key)[0]))(keys)
+    thetas = jax.jit(jax.vmap(states.thetas))({name: draws[name] for name in states.unknowns})
+    solved = evaluate_all(model.forward, thetas.reshape(-1, thetas.shape[-1]))
+    shape = thetas.shape[:2]
+    told = Prediction(
+        solved.displacement.reshape(*shape, *solved.displacement.shape[1:]),
+        jnp.all(solved.valid.reshape(shape), axis=1),
+    )
+    return jax.jit(jax.vmap(given))(told, keys)
+
+
+def _prior(model: Model, rng_key: jax.Array) -> Any:
+    """A draw of the prior, data replicated there, and whether the forward map has an answer."""
+    trace = handlers.trace(handlers.seed(model, rng_key)).get_trace()
+    draw = {name: trace[name]["value"] for name in model.names}
+    data = {name: trace[_site(name)]["value"] for name in model.observe.parts}
+    # Without data, the only thing observed is that the forward map has an answer.
+    return draw, data, jnp.isfinite(sum_log_likelihood(trace))
 
 
 class _Programs(NamedTuple):
@@ -87,24 +137,16 @@ def _programs(model: Model) -> _Programs:
         trace = trace_of(model, draw, data)
         return {name: _pointwise(trace[_site(name)]) for name in model.observe.parts}
 
-    def replicated(trace: dict[str, Any]) -> dict[str, jax.Array]:
-        return {name: trace[_site(name)]["value"] for name in model.observe.parts}
-
     def replicate(draw: dict[str, jax.Array], rng_key: jax.Array) -> dict[str, jax.Array]:
         seeded = handlers.substitute(handlers.seed(model, rng_key), data=draw)
-        return replicated(handlers.trace(seeded).get_trace())
-
-    def prior(rng_key: jax.Array) -> Any:
-        trace = handlers.trace(handlers.seed(model, rng_key)).get_trace()
-        draw = {name: trace[name]["value"] for name in model.names}
-        # Without data, the only thing observed is that the forward map has an answer.
-        return draw, replicated(trace), jnp.isfinite(sum_log_likelihood(trace))
+        trace = handlers.trace(seeded).get_trace()
+        return {name: trace[_site(name)]["value"] for name in model.observe.parts}
 
     # One draw after the other: maps that solve gain nothing from being vectorised.
     return _Programs(
         jax.jit(lambda draws, data: jax.lax.map(lambda d: log_likelihood(d, data), draws)),
         jax.jit(lambda draws, keys: jax.lax.map(lambda pair: replicate(*pair), (draws, keys))),
-        jax.jit(lambda keys: jax.lax.map(prior, keys)),
+        jax.jit(lambda keys: jax.lax.map(partial(_prior, model), keys)),
     )
 
 

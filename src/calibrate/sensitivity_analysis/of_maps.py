@@ -16,7 +16,7 @@ from calibrate.priors import Prior, box_prior
 from calibrate.sensitivity_analysis.analysis import Function, analyse
 from calibrate.sensitivity_analysis.factors import Factors, check_independent, densities, quantiles
 from emulator.errors import InputError
-from emulator.surrogates.protocol import ForwardMap, evaluate_all
+from emulator.surrogates.protocol import ForwardMap, Prediction, evaluate_all, slopes_of
 
 FIELD = "field"
 """The name under which the whole body's displacement is analysed, node by node."""
@@ -134,18 +134,34 @@ class _Outputs:
     def values(self, thetas: jax.Array) -> np.ndarray:
         """Numbers (n, m) at ``thetas`` (n, p)."""
         predicted = evaluate_all(self._map, thetas)
-        invalid = ~np.asarray(predicted.valid)
-        if invalid.any():
-            raise InputError(
-                f"sensitivity: {self._map.label} has no answer at {invalid.sum()} of "
-                f"{len(thetas)} theta"
-            )
+        self._require(predicted)
         return np.asarray(jax.jit(jax.vmap(self.of))(predicted.displacement, thetas))
 
     def slopes(self, thetas: jax.Array) -> np.ndarray:
         """Derivatives (n, m, p) at ``thetas`` (n, p)."""
-        slope = jax.jacfwd(lambda theta: self.of(self._map(theta), theta))
-        return np.asarray(jax.jit(lambda t: jax.lax.map(slope, t))(thetas))
+        solved = slopes_of(self._map, thetas)
+        if solved is None:
+            slope = jax.jacfwd(lambda theta: self.of(self._map(theta), theta))
+            return np.asarray(jax.jit(lambda t: jax.lax.map(slope, t))(thetas))
+        predicted, moved = solved
+        self._require(predicted)
+        return np.asarray(jax.jit(jax.vmap(self._along))(predicted.displacement, moved, thetas))
+
+    def _along(self, u: jax.Array, moved: jax.Array, theta: jax.Array) -> jax.Array:
+        """Derivatives (m, p) at ``theta`` (p,), from ``u`` (k, 3) and du/dtheta (p, k, 3)."""
+
+        def along(du: jax.Array, direction: jax.Array) -> jax.Array:
+            return jax.jvp(self.of, (u, theta), (du, direction))[1]
+
+        return jax.vmap(along, out_axes=-1)(moved, jnp.eye(len(theta)))
+
+    def _require(self, predicted: Prediction) -> None:
+        invalid = ~np.asarray(predicted.valid)
+        if invalid.any():
+            raise InputError(
+                f"sensitivity: {self._map.label} has no answer at {invalid.sum()} of "
+                f"{len(invalid)} theta"
+            )
 
 
 def _some(function: Function, entries: slice) -> Function:

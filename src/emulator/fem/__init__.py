@@ -1,6 +1,6 @@
 """Finite elements: the reference every other forward map is judged by."""
 
-from emulator.fem.campaign import Runs, run_campaign
+from emulator.fem.campaign import Runs, run_campaign, solve_together
 from emulator.fem.designs import design, sobol, uniform
 from emulator.fem.options import NewtonOptions
 from emulator.fem.simulator import Simulator
@@ -15,5 +15,6 @@ __all__ = [
     "design",
     "run_campaign",
     "sobol",
+    "solve_together",
     "uniform",
 ]

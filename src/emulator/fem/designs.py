@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import jax
@@ -18,12 +19,19 @@ _MOST_CORNERED = 6  # parameters; the box of more has too many corners, and none
 
 def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
     """``count`` theta (count, p) of a scrambled Sobol sequence over the box, on its scales."""
-    if count < 1 or seed < 0:
-        raise InputError(
-            f"{count} samples with seed {seed} asked for; give 1 or more, seed 0 or more"
-        )
+    _check(count, seed)
     bits = max(count - 1, 1).bit_length()
     points = qmc.Sobol(len(scene.parameters), rng=seed).random_base2(bits)[:count]
+    return scene.from_unit(jnp.asarray(points))
+
+
+def latin_hypercube(scene: Scene, count: int, seed: int) -> jax.Array:
+    """``count`` theta (count, p) of a Latin hypercube over the box, on its scales.
+
+    Each parameter is spread evenly by itself; a shorter design is not part of a longer one.
+    """
+    _check(count, seed)
+    points = qmc.LatinHypercube(len(scene.parameters), rng=seed).random(count)
     return scene.from_unit(jnp.asarray(points))
 
 
@@ -51,3 +59,18 @@ def design(scene: Scene, count: int, seed: int) -> jax.Array:
     positions[places] = ends
     positions[np.setdiff1d(np.arange(count), places)] = inside[: count - len(ends)]
     return scene.from_unit(jnp.asarray(positions))
+
+
+DESIGNS: dict[str, Callable[[Scene, int, int], jax.Array]] = {
+    "sobol": sobol,
+    "latin_hypercube": latin_hypercube,
+    "sobol_corners": design,
+}
+"""Designs of a campaign by name; the last is the one that emulators are trained on."""
+
+
+def _check(count: int, seed: int) -> None:
+    if count < 1 or seed < 0:
+        raise InputError(
+            f"{count} samples with seed {seed} asked for; give 1 or more, seed 0 or more"
+        )

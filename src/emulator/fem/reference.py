@@ -10,7 +10,8 @@ import numpy as np
 from tqdm import tqdm
 
 from emulator.errors import InputError
-from emulator.fem.campaign import run_campaign
+from emulator.fem.campaign import Neighbours, Solver, run_campaign, solve_rows
+from emulator.fem.campaign.memory import MemoryRows
 from emulator.fem.designs import sobol
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
@@ -77,19 +78,18 @@ def outside_reference(
     """
     scene = simulator.scene
     thetas = sample_outside(scene, cases, fraction)
-    positions = list(np.asarray(scene.to_unit(inside.thetas)))
-    fields, solved = list(inside.displacement), []
-    for k, theta in enumerate(tqdm(thetas, "FEM outside", disable=not progress, unit="run")):
-        position = np.asarray(scene.to_unit(theta))
-        nearest = int(np.argmin(np.sum((np.array(positions) - position) ** 2, axis=1)))
-        solution = simulator.solve(theta, fields[nearest])
-        if not solution.converged:
-            solution = simulator.solve(theta)
-        if solution.converged:
-            solved.append(k)
-            positions.append(position)
-            fields.append(solution.displacement)
-    displacement = (
-        jnp.stack(fields[len(inside.thetas) :]) if solved else jnp.zeros((0, *scene.held.shape))
+    known = len(inside.thetas)
+    rows = MemoryRows(jnp.concatenate([inside.thetas, thetas]))
+    for number, field in enumerate(inside.displacement):
+        rows.know(number, field)
+    numbers = range(known, known + cases)
+    starts = Neighbours(scene, rows)
+    found = solve_rows(Solver(simulator), rows.thetas, numbers=numbers, starts=starts)
+    for row in tqdm(found, "FEM outside", total=cases, disable=not progress, unit="run"):
+        rows.write(row)
+    solved = [number for number in numbers if number in rows.converged()]
+    fields = [rows.field(number).displacement for number in solved]
+    displacement = jnp.stack(fields) if solved else jnp.zeros((0, *scene.held.shape))
+    return Reference(
+        rows.thetas[np.array(solved, int)], displacement, "our FEM", cases - len(solved)
     )
-    return Reference(thetas[np.array(solved, int)], displacement, "our FEM", cases - len(solved))

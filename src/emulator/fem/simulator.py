@@ -204,18 +204,6 @@ class Simulator(Shown):
             return solution.displacement
         return solution.require_converged().displacement
 
-    def campaign(self, thetas: jax.Array, starts: jax.Array | None = None) -> Solution:
-        """Solutions for many theta (c, p), one after the other; fields gain a leading axis."""
-        if starts is None:
-            starts = jnp.zeros((len(thetas), *self.scene.held.shape))
-        thetas, starts = jnp.asarray(thetas, dtype=float), jnp.asarray(starts, dtype=float)
-        if len(thetas) != len(starts):
-            raise InputError(f"campaign: {len(thetas)} theta, but {len(starts)} starts")
-        if isinstance(thetas, jax.core.Tracer) or isinstance(starts, jax.core.Tracer):
-            return jax.lax.map(lambda each: self._equilibrium(*each), (thetas, starts))
-        solutions = [self.solve(*each) for each in zip(thetas, starts, strict=True)]
-        return jax.tree.map(lambda *fields: jnp.stack(fields), *solutions)
-
     @cached_property
     def _equilibrium(self):  # noqa: ANN202 - closures, private
         closed = jax.jit(_one_by_one(partial(find_equilibrium, self.system, self.options)))

@@ -64,6 +64,11 @@ class Parameter:
             return self.low * (self.high / self.low) ** position
         return self.low + (self.high - self.low) * position
 
+    def rate(self, value: jax.Array) -> jax.Array:
+        """Derivative of :meth:`from_unit` where it gives ``value``."""
+        span = self.high - self.low
+        return value * math.log(self.high / self.low) if self.scale == "log" else 0.0 * value + span
+
     def to_json(self) -> dict[str, Any]:
         """Plain JSON, the constructor's arguments."""
         return asdict(self)
@@ -121,11 +126,12 @@ class ParameterSpace:
         -------
         (c, p, n, 3) mm.
         """
-        rates = [
-            jax.vmap(jax.grad(parameter.from_unit))(parameter.to_unit(theta[:, k]))
-            for k, parameter in enumerate(self.parameters)
-        ]
-        return du_dtheta * jnp.stack(rates, axis=1)[:, :, None, None]
+        return du_dtheta * self.rates(theta)[:, :, None, None]
+
+    def rates(self, theta: jax.Array) -> jax.Array:
+        """Derivatives (c, p) of each entry of ``theta`` (c, p) in its position in the box."""
+        columns = [p.rate(theta[:, k]) for k, p in enumerate(self.parameters)]
+        return jnp.stack(columns, axis=1)
 
     def contains(self, theta: jax.Array) -> jax.Array:
         """Whether ``theta`` (..., p) lies in the box, (...) bool; NaN does not."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
 
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.fem.campaign import Row, Solver, solve_rows
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 from emulator.store import to_json
@@ -52,8 +54,25 @@ class FEMForward:
 
     def evaluate_all(self, thetas: jax.Array) -> Prediction:
         """Predictions at many theta (c, p), one after the other."""
-        found = [self.evaluate(theta) for theta in thetas]
-        return Prediction(*(jnp.stack(values) for values in zip(*found, strict=True)))
+        return self._predicted(list(self._rows(thetas)))
+
+    def slopes_all(self, thetas: jax.Array) -> tuple[Prediction, jax.Array]:
+        """Predictions at many theta (c, p), and du/dtheta (c, p, k, 3) from the solves' factors."""
+        rows = list(self._rows(thetas, sensitivities=True))
+        slopes = jnp.stack([row.sensitivities[:, self.nodes] for row in rows])
+        return self._predicted(rows), slopes
+
+    def _predicted(self, rows: list[Row]) -> Prediction:
+        return Prediction(
+            jnp.stack([row.solution.displacement[self.nodes] for row in rows]),
+            jnp.stack([row.solution.converged for row in rows]),
+        )
+
+    def _rows(self, thetas: jax.Array, *, sensitivities: bool = False) -> Iterator[Row]:
+        solver = Solver(self.simulator, sensitivities=sensitivities, from_rest_again=False)
+        start = self.start
+        starts = (lambda _: ()) if start is None else (lambda number: (start(thetas[number]),))
+        return solve_rows(solver, thetas, starts=starts)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (k, 3) in mm."""

@@ -65,6 +65,20 @@ class ForwardMap(Protocol):
 _AT_ONCE = 64  # theta evaluated side by side
 
 
+def solves_itself(forward: ForwardMap) -> bool:
+    """Whether the map has its own way to many theta: FEM, which is faster driven from Python."""
+    return getattr(forward, "evaluate_all", None) is not None
+
+
+def slopes_of(forward: ForwardMap, thetas: jax.Array) -> tuple[Prediction, jax.Array] | None:
+    """Predictions at many theta (c, p) and du/dtheta (c, p, k, 3), from a map that has its own way.
+
+    Others are differentiated by JAX; for them None.
+    """
+    own = getattr(forward, "slopes_all", None)
+    return None if own is None else own(thetas)
+
+
 def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
     """Predictions at many theta (c, p); fields gain a leading axis.
 

@@ -36,6 +36,8 @@ class Plan:
     discrepancy : fit a discrepancy model to the FEM runs and their sensitivities.
     checkpoint_every : steps between checkpoints.
     seed : of the weights, the FEM runs' theta, and the batches.
+    campaign : digest of the campaign whose first ``simulations`` rows are the FEM runs; empty where
+        training makes them.
     """
 
     recipe: str = "network"
@@ -55,6 +57,7 @@ class Plan:
     discrepancy: bool = False
     checkpoint_every: int = 500
     seed: int = 0
+    campaign: str = ""
 
     def __post_init__(self) -> None:
         if self.objective not in OBJECTIVES:

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from emulator.errors import InputError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Runs, run_campaign
+from emulator.fem.campaign import Runs, StoredRuns, run_campaign
 from emulator.fem.designs import design, sobol
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
@@ -86,6 +87,7 @@ def prepare(
     architecture: Architecture | None = None,
     *,
     start: Emulator | None = None,
+    campaign: StoredRuns | None = None,
     deadline: float = np.inf,
     progress: bool = False,
 ) -> Problem:
@@ -95,6 +97,7 @@ def prepare(
     ----------
     start : the emulator whose network to begin from, on any mesh; its architecture then is the
         default.
+    campaign : FEM runs that are there already; the centre's alone is then solved.
     deadline : of the performance counter, after which no FEM run is begun, except the fewest that
         a discrepancy model can be judged by.
     """
@@ -106,7 +109,10 @@ def prepare(
     simulator = Simulator(scene)
     # Rounded as a file stores it, so that the discrepancy is fitted to the series that is loaded.
     series = expand(simulator, order=plan.order).rounded() if plan.order else None
-    runs = _run(simulator, plan, series, deadline, progress)
+    if campaign is None:
+        runs = _run(simulator, plan, series, deadline, progress)
+    else:
+        runs = _taken(simulator, plan, series, campaign)
     if plan.runs:
         plan = replace(plan, simulations=len(runs.theta) - 1)
     if series is None and plan.centred:
@@ -156,6 +162,24 @@ def _run(
         at_least=FEWEST + 1,
         progress=progress,
     )
+
+
+def _taken(
+    simulator: Simulator, plan: Plan, series: Expansion | None, campaign: StoredRuns
+) -> Runs:
+    """The centre's solution, and those of a campaign that a plan needs."""
+    scene, there = simulator.scene, len(campaign.runs.theta)
+    if plan.runs > there:
+        raise InputError(
+            f"training: {plan.runs} simulations of a campaign with {there} that converged"
+        )
+    if plan.slopes and campaign.runs.sensitivities is None:
+        raise InputError(
+            f"training: recipe '{plan.recipe}' needs slopes, which the campaign lacks; make one "
+            "with --slopes"
+        )
+    first = run_campaign(simulator, scene.centre[None], sensitivities=plan.slopes, predictor=series)
+    return first.followed_by(campaign.runs.take(slice(plan.runs)))
 
 
 def _network(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.fem.campaign import StoredRuns
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.pignn import Architecture
@@ -29,6 +30,7 @@ def train(
     *,
     architecture: Architecture | None = None,
     start: Emulator | None = None,
+    campaign: StoredRuns | None = None,
     budget: float | None = None,
     progress: bool = False,
     resume: bool = False,
@@ -40,6 +42,8 @@ def train(
     folder : where checkpoints go. The finished emulator is returned, not written; remove the last
         checkpoint with :func:`remove_checkpoint` once it is safe.
     start : begin from the network of this emulator, which may be of another geometry.
+    campaign : FEM runs to take the first ``plan.simulations`` of, instead of making them; needed
+        again to resume.
     budget : seconds for everything (FEM runs, compilation, training, the discrepancy model). It
         replaces ``plan.steps`` by as many as fit, estimated again as the machine gets busier or
         less so, and ``plan.simulations`` by as many as were done in its first third. Where a
@@ -48,17 +52,29 @@ def train(
         the network it holds. For a plan in steps the result equals that of a run never
         interrupted; one on a budget keeps the number of steps it was aiming at.
     """
+    if campaign is not None and not (plan.runs or resume):
+        raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
     path, began = Path(folder) / CHECKPOINT, time.perf_counter()
     if plan.as_learned:
         return _as_learned(scene, plan, start, began)
     saved = read_checkpoint(path, scene.fingerprint, scene.name) if resume else None
     source = {} if start is None else start_record(start)
+    plan = replace(plan, campaign="" if campaign is None else campaign.digest)
     if saved is not None:
+        _check_campaign(saved.plan, plan)
         plan, architecture, source = saved.plan, saved.architecture or architecture, saved.start
         start = budget = None  # both are in the checkpoint
     limit = None if budget is None else Budget(budget, began)
     deadline = np.inf if limit is None else limit.fem_deadline(plan)
-    problem = prepare(scene, plan, architecture, start=start, deadline=deadline, progress=progress)
+    problem = prepare(
+        scene,
+        plan,
+        architecture,
+        start=start,
+        campaign=campaign,
+        deadline=deadline,
+        progress=progress,
+    )
     writer = Writer(path, scene.fingerprint, problem.architecture, source)
     spent = saved.seconds if saved is not None else 0.0
     clock = lambda: spent + time.perf_counter() - began  # noqa: E731
@@ -66,6 +82,13 @@ def train(
     emulator, record = _finish(problem, state, progress=progress)
     record |= {"start": source} if source else {}
     return replace(emulator, record={**record, "seconds": round(clock(), 1)})
+
+
+def _check_campaign(saved: Plan, given: Plan) -> None:
+    """Refuse to resume with other FEM runs."""
+    if saved.campaign != given.campaign:
+        what = "FEM runs of a campaign" if saved.campaign else "FEM runs of its own"
+        raise InputError(f"the checkpoint was trained on {what}; resume it with the same")
 
 
 def _as_learned(scene: Scene, plan: Plan, start: Emulator | None, began: float) -> Emulator:

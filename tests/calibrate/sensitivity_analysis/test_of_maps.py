@@ -40,6 +40,18 @@ def test_emulator_and_fem_agree_on_one_design(forward: ForwardMap) -> None:
     assert one.attrs["unit"] == "mm"
 
 
+@pytest.mark.slow
+def test_fem_s_slopes_are_those_of_its_factors(forward: ForwardMap) -> None:
+    both = (forward, fem_forward(em.Simulator(forward.scene)))
+    one, other = (
+        cal.sensitivity(map_, tip(forward), method="derivatives", samples=8, field=True)
+        for map_ in both
+    )
+    for name in ("displacement", FIELD):
+        bounds = [found[name]["bound_on_total_together"] for found in (one, other)]
+        assert np.allclose(*bounds, rtol=1e-6)
+
+
 def test_the_field_node_by_node(forward: ForwardMap) -> None:
     found = cal.sensitivity(forward, field=True, samples=16)[FIELD]
     scene = forward.scene

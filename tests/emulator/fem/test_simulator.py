@@ -164,7 +164,7 @@ def test_arguments_of_the_wrong_shape_are_refused(beam, simulator):
     with pytest.raises(InputError, match=r"start has shape \(3,\)"):
         simulator.solve(beam.centre, jnp.zeros(3))
     with pytest.raises(InputError, match="2 theta, but 1 starts"):
-        simulator.campaign(jnp.ones((2, 2)), jnp.zeros((1, *beam.held.shape)))
+        em.fem.solve_together(simulator, jnp.ones((2, 2)), jnp.zeros((1, *beam.held.shape)))
 
 
 @pytest.mark.parametrize("kind", [np.float32, int])

@@ -75,7 +75,7 @@ def test_errors_are_those_that_the_paper_s_network_leaves(published, twisting):
 def test_errors_of_the_ventricle_against_our_fem(published):
     emulator = released_network("LeftVentricle", published)
     thetas, tests = published_tests("LeftVentricle", published)
-    solved = em.Simulator(emulator.scene).campaign(thetas)
+    solved = em.fem.solve_together(em.Simulator(emulator.scene), thetas)
     assert solved.converged.all()
     found = jax.jit(jax.vmap(emulator.cache()))(thetas)
     err_u = np.median(np.linalg.norm(found - solved.displacement, axis=-1))

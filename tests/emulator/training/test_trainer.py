@@ -9,6 +9,7 @@ import emulator as em
 from emulator.error.comparison import evaluate
 from emulator.errors import InputError
 from emulator.fem import run_campaign, sobol, uniform
+from emulator.fem.campaign import StoredRuns
 from emulator.geometry.quadratic import to_quadratic
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import Plan, recipe, train
@@ -312,3 +313,22 @@ def test_an_aim_follows_the_clock(monkeypatch):
     assert late(State({}, (), 200, 0.0), 300) == 200
     now[0] = 20.0  # well before it: no more than the plan's
     assert late(State({}, (), 200, 0.0), 300) == 300
+
+
+@pytest.mark.slow
+def test_a_campaign_s_runs_are_asked_for_again(beam, tests, tmp_path):
+    """Resumed on other FEM runs, a training would not be the one that was begun."""
+    stored = StoredRuns(tests, "0123456789abcdef")
+    plan = Plan(steps=30, simulations=6, batch=2, checkpoint_every=10)
+    whole = train(beam, plan, tmp_path, architecture=SMALL, campaign=stored)
+    assert whole.record["plan"]["campaign"] == stored.digest
+    with pytest.raises(InputError, match="trained on FEM runs of a campaign; resume it with"):
+        train(beam, Plan(), tmp_path, architecture=SMALL, resume=True)
+    resumed = train(beam, Plan(), tmp_path, architecture=SMALL, resume=True, campaign=stored)
+    leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
+    for a, b in zip(*leaves, strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(InputError, match="7 simulations of a campaign with 6"):
+        train(beam, replace(plan, simulations=7), tmp_path, campaign=stored)
+    with pytest.raises(InputError, match="recipe 'family' takes no FEM runs, so no campaign"):
+        train(beam, recipe("family"), tmp_path, campaign=stored)

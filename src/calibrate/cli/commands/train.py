@@ -49,6 +49,12 @@ def register(commands: Any) -> None:
     )
     length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
     parser.add_argument("--simulations", type=int, help="FEM runs to train on")
+    parser.add_argument(
+        "--campaign",
+        metavar="STORE.zarr",
+        help="take the FEM runs from this store of calibrate campaign, all that converged or the "
+        "first --simulations of them; give it again with --resume",
+    )
     parser.add_argument("--batch", type=int, help="theta a step")
     parser.add_argument("--seed", type=int)
     parser.add_argument(
@@ -73,12 +79,19 @@ def run(arguments: argparse.Namespace) -> int:
     given = _given(arguments)
     start = load(arguments.start) if arguments.start else None
     plan = recipe(arguments.recipe or _default_recipe(start))
+    campaign = None
+    if arguments.campaign:
+        from emulator.fem.campaign.stored_runs import read_runs
+
+        campaign = read_runs(arguments.campaign, scene)
+        given.setdefault("simulations", len(campaign.runs.theta))
     fixed = arguments.resume or "steps" in given
     result = train_emulator(
         scene,
         replace(plan, **given),
         arguments.out,
         start=start,
+        campaign=campaign,
         budget=None if fixed else seconds("10m" if arguments.budget is None else arguments.budget),
         resume=arguments.resume,
         progress=show_progress(arguments),
@@ -124,4 +137,5 @@ def command_line(scene: str, record: Mapping[str, Any]) -> str:
     options = " ".join(f"--{name} {record['plan'][name]}" for name in names)
     # The record names the emulator training started from by its fingerprint, not by its folder.
     start = " --start EMULATOR" if "start" in record else ""
-    return f"calibrate train {scene} {options}{start} --out DIR"
+    campaign = " --campaign STORE.zarr" if record["plan"]["campaign"] else ""
+    return f"calibrate train {scene} {options}{start}{campaign} --out DIR"

@@ -1,0 +1,150 @@
+"""FEM over a design of theta, as a dataset with named dimensions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+import zarr
+from tqdm import tqdm
+
+from calibrate.provenance import versions
+from emulator.errors import InputError
+from emulator.fem import NewtonOptions, Simulator
+from emulator.fem.campaign import Executor, Neighbours, Solver, in_process, solve_rows
+from emulator.fem.campaign.zarr_rows import Question, ZarrRows, make_store, writing
+from emulator.fem.designs import DESIGNS
+from emulator.scenes.scene import Scene
+
+
+def campaign(
+    scene: Scene,
+    samples: int | None = None,
+    *,
+    thetas: jax.Array | None = None,
+    design: str = "sobol",
+    seed: int = 0,
+    slopes: bool = False,
+    out: str | Path | None = None,
+    scheduler: str | None = None,
+    options: NewtonOptions | None = None,
+    progress: bool = False,
+) -> xr.Dataset:
+    """FEM's displacement at every theta of a design.
+
+    Solves that fail are rows with that status and NaN. A campaign that was interrupted goes on
+    where it was when it is called again in the same way.
+
+    Parameters
+    ----------
+    samples, design, seed : of the theta: ``sobol``, ``latin_hypercube``, or ``sobol_corners``,
+        which has the box's corners too, as emulators are trained on.
+    thetas : (c, p), instead of a design.
+    slopes : du/dtheta, too.
+    out : Zarr store to write to; otherwise the dataset is in memory.
+    scheduler : address of a Dask scheduler, whose workers solve; otherwise this process does.
+
+    Returns
+    -------
+    Dataset over ``theta_id``, ``parameter``, ``node`` and ``xyz``, as described in
+    :mod:`emulator.fem.campaign.zarr_rows`.
+
+    Raises
+    ------
+    InputError
+        No or unknown samples; a store of another campaign; a scheduler that does not answer.
+    SolverError
+        The cluster was lost; what was solved is in the store.
+    """
+    asked = question(
+        scene, samples, thetas=thetas, design=design, seed=seed, slopes=slopes, options=options
+    )
+    if out is not None:
+        fill(asked, out, scheduler=scheduler, progress=progress)
+        return xr.open_zarr(out, chunks=None)
+    store = zarr.storage.MemoryStore()
+    with _executor(scheduler) as execute:
+        _solve_missing(ZarrRows(make_store(store, asked)), asked.solver, execute, progress)
+    return xr.open_zarr(store, chunks=None)
+
+
+def question(
+    scene: Scene,
+    samples: int | None = None,
+    *,
+    thetas: jax.Array | None = None,
+    design: str = "sobol",
+    seed: int = 0,
+    slopes: bool = False,
+    options: NewtonOptions | None = None,
+) -> Question:
+    """What :func:`campaign` asks of FEM."""
+    if (samples is None) == (thetas is None):
+        raise InputError("campaign: give a number of samples or thetas, one of them")
+    about: dict[str, Any] = {"design": "given"}
+    if thetas is None:
+        assert samples is not None
+        if design not in DESIGNS:
+            raise InputError(f"campaign: design '{design}' is unknown; known: {', '.join(DESIGNS)}")
+        thetas = DESIGNS[design](scene, samples, seed)
+        about = {"design": design, "seed": seed}
+    chosen = np.asarray(thetas, dtype=float)
+    if chosen.ndim != 2 or chosen.shape[1] != len(scene.parameters) or not len(chosen):
+        raise InputError(
+            f"campaign: thetas have shape {chosen.shape}; expected (count, "
+            f"{len(scene.parameters)}) for {', '.join(scene.parameter_names)}"
+        )
+    has_energy = all(load.has_potential for load in scene.loads)
+    simulator = Simulator(scene, NewtonOptions() if options is None else options)
+    solver = Solver(simulator, sensitivities=slopes, energy=has_energy)
+    about = {**about, "samples": len(chosen)}
+    return Question(solver, chosen, {"design": about, "versions": versions()})
+
+
+def fill(
+    asked: Question,
+    out: str | Path,
+    *,
+    scheduler: str | None = None,
+    progress: bool = False,
+) -> int:
+    """Solve what the store at ``out`` lacks; the number of rows that were solved."""
+    with _executor(scheduler) as execute, writing(out, asked) as rows:
+        return _solve_missing(rows, asked.solver, execute, progress)
+
+
+def _solve_missing(rows: ZarrRows, solver: Solver, execute: Executor, progress: bool) -> int:
+    missing = rows.missing()
+    solved = solve_rows(
+        solver,
+        jnp.asarray(rows.thetas),
+        numbers=missing,
+        starts=Neighbours(solver.simulator.scene, rows),
+        execute=execute,
+    )
+    total = len(rows.thetas)
+    with tqdm(
+        total=total, initial=total - len(missing), desc="FEM", disable=not progress, unit="run"
+    ) as bar:
+        for row in solved:
+            rows.write(row)
+            bar.update()
+    return len(missing)
+
+
+@contextmanager
+def _executor(scheduler: str | None) -> Iterator[Executor]:
+    """Where to solve: in this process, or on the cluster at ``scheduler``."""
+    if scheduler is None:
+        yield in_process
+        return
+    from emulator.fem.campaign.cluster import connected
+
+    with connected(scheduler) as cluster:
+        yield cluster

@@ -1,0 +1,27 @@
+"""FEM at many theta: the one loop over solves, in this process or on a Dask cluster.
+
+A design of theta becomes tasks (:mod:`.row`), each with displacements to start from
+(:mod:`.starts`). An executor solves them (:mod:`.engine`, :mod:`.cluster`) and hands back rows in
+the order they are finished, which are kept in memory (:mod:`.memory`) or in a Zarr store
+(:mod:`.zarr_rows`). Zarr and Dask are imported only by who asks for them.
+"""
+
+from emulator.fem.campaign.engine import Executor, Solver, in_process, solve_rows, solve_together
+from emulator.fem.campaign.row import Row, Task
+from emulator.fem.campaign.runs import Runs, StoredRuns, run_campaign
+from emulator.fem.campaign.starts import Neighbours, Predictor
+
+__all__ = [
+    "Executor",
+    "Neighbours",
+    "Predictor",
+    "Row",
+    "Runs",
+    "Solver",
+    "StoredRuns",
+    "Task",
+    "in_process",
+    "run_campaign",
+    "solve_rows",
+    "solve_together",
+]
