@@ -21,7 +21,7 @@ def misfits(tree: xr.DataTree) -> list[str]:
     """A sentence for each observation that does not fit; none without replicated data."""
     if "posterior_predictive" not in tree.children:
         return []
-    replicates, observed = tree["posterior_predictive"], tree["observed_data"]
+    replicates, observed = (tree[k].to_dataset() for k in ("posterior_predictive", "observed_data"))
     return [
         sentence
         for name in observed.data_vars
