@@ -16,8 +16,8 @@ def register(commands: Any) -> None:
     parser = commands.add_parser(
         "completion",
         help="script that completes calibrate's words in your shell",
-        description="Prints a script for bash, zsh or fish that completes commands, options, scenes, "
-        "emulators, samplers, recipes and files, without starting calibrate.",
+        description="Prints a script for bash, zsh or fish that completes commands, options, "
+        "scenes, emulators, samplers, recipes and files, without starting calibrate.",
         epilog='bash: eval "$(calibrate completion bash)" in ~/.bashrc; zsh: calibrate completion '
         "zsh > a folder of $fpath/_calibrate; fish: calibrate completion fish > "
         "~/.config/fish/completions/calibrate.fish",
