@@ -28,7 +28,7 @@ def ask(tmp_path_factory):
     (folder / "ventricle.toml").touch()
 
     def words(*typed):
-        command = [bash, "-c", ASK, "bash", "script", "calibrate", *typed]
+        command = [bash, "-c", ASK, "bash", "./script", "calibrate", *typed]
         found = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
         return set(found.stdout.split())
 
