@@ -8,7 +8,13 @@ OUT ?= demo-output
 # Of studies: what is called and imported exists, and takes these arguments.
 LENIENT := $(addprefix --disable-error-code ,import-untyped import-not-found index misc operator union-attr arg-type type-var)
 
-.PHONY: demo test test-slow notebooks docs lint format study clean
+# With the oldest libraries: what each of them is used for.
+OLDEST := .venv-oldest
+OLDEST_TESTS := tests/test_package.py $(addprefix tests/emulator/,mechanics scenes fem/test_simulator.py surrogates \
+	training test_schema.py test_store.py) $(addprefix tests/calibrate/,samplers certificate cli/test_cli.py \
+	sensitivity_analysis report test_tree.py test_data.py test_demo.py)
+
+.PHONY: demo test test-slow test-oldest package notebooks docs lint format study clean
 
 demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
@@ -18,6 +24,15 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
+
+# Warnings are shown, not errors: old libraries announce what new ones did.
+test-oldest: $(OLDEST)/.installed
+	JAX_COMPILATION_CACHE_DIR=$(OLDEST)/jax $(OLDEST)/bin/python -m pytest -m "not slow" -W default $(OLDEST_TESTS)
+
+package: $(STAMP)
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/python tests/package_check.py dist
 
 notebooks: $(STAMP)
 	$(BIN)/python -m pytest tests/test_notebooks.py
@@ -50,5 +65,11 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
+$(OLDEST)/.installed: pyproject.toml constraints-oldest.txt
+	$(PYTHON) -m venv $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --quiet --constraint constraints-oldest.txt \
+		--editable '.[plot]' pytest pytest-xdist jsonschema
+	@touch $@
+
 clean:
-	rm -rf $(VENV) $(OUT)
+	rm -rf $(VENV) $(OLDEST) dist $(OUT)

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -68,6 +69,13 @@ def test_constraints_hold_names_and_versions_only():
     assert all(re.fullmatch(r"[A-Za-z0-9_.-]+==[A-Za-z0-9_.!+-]+", line) for line in pins)
     for name in ("jax", "numpyro", "sparsax", "h5py", "pytest"):
         assert any(line.startswith(f"{name}==") for line in pins)
+
+
+def test_the_oldest_versions_are_those_that_pyproject_allows():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    every = [*project["dependencies"], *project["optional-dependencies"]["plot"]]
+    lines = (ROOT / "constraints-oldest.txt").read_text().splitlines()
+    assert {word.replace(">=", "==") for word in every} <= set(lines)
 
 
 def test_versions_agree():

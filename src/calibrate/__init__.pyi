@@ -16,7 +16,7 @@ from .observations import (
 from .population import Population, population_of_fits
 from .posterior import Posterior, sample
 from .priors import box_prior, log_normal, truncated, truncated_normal
-from .samplers import NUTSOptions
+from .samplers import Density, NUTSOptions, density_of
 from .sensitivity_analysis import sensitivity
 from .statistical_model import Model, model
 
@@ -26,6 +26,7 @@ __all__ = [
     "CavityVolume",
     "Certificate",
     "CorrelatedNoise",
+    "Density",
     "Dependence",
     "DiscrepancyNoise",
     "GaussianNoise",
@@ -40,6 +41,7 @@ __all__ = [
     "campaign",
     "certify",
     "compare",
+    "density_of",
     "landmarks",
     "length_between",
     "log_normal",

@@ -38,6 +38,8 @@ from emulator.surrogates.protocol import ForwardMap, Prediction
 Data = Mapping[str, jax.Array]
 """Data by the observation's name; each of the observation's shape and unit."""
 
+_GROUP = "observed_data"  # of a posterior's DataTree
+
 NoiseValues = Mapping[str, Mapping[str, jax.Array]]
 """Inferred numbers of each observation's noise: observation to number's name to value."""
 
@@ -262,11 +264,18 @@ class Model:
         return {name: jnp.asarray(values) for name, values in named.items()}
 
     def _fitting(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """``data`` in float64 by name, of the right shapes; NaN where missing."""
+        """``data`` in float64 by name, of the right shapes; NaN where missing.
+
+        A number may be an array of one, and ``data`` a DataTree with what was observed in a group.
+        """
+        if isinstance(data, Mapping) and _GROUP in data and _GROUP not in self.observe.parts:
+            data = data[_GROUP]
         named = {
             name: np.asarray(values, dtype=float)
             for name, values in self.observe.name(data, "data").items()
         }
+        for name in [n for n, shape in self.observe.shapes.items() if shape == ()]:
+            named[name] = named[name].reshape(()) if named[name].shape == (1,) else named[name]
         for name, values in named.items():
             self.observe.parts[name].check(name, values)
         return named

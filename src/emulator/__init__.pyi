@@ -3,6 +3,8 @@ from .catalogue import find_scene
 from .errors import InputError, SolverError
 from .fem import NewtonOptions, Simulator, Solution, Status
 from .fem.functional import potential_energy
+from .geometry.io import Body, read_body, read_mesh
+from .geometry.mesh import Mesh
 from .scenes import Parameter, Scene, Support
 from .surrogates import Emulator, load, save_emulator, shipped
 from .surrogates.fem import FEMForward, fem_forward
@@ -12,10 +14,12 @@ from .surrogates.released_network import released_network
 __version__: str
 
 __all__ = [
+    "Body",
     "Emulator",
     "FEMForward",
     "ForwardMap",
     "InputError",
+    "Mesh",
     "NewtonOptions",
     "Parameter",
     "Prediction",
@@ -30,6 +34,8 @@ __all__ = [
     "find_scene",
     "load",
     "potential_energy",
+    "read_body",
+    "read_mesh",
     "released_network",
     "save_emulator",
     "scenes",

@@ -7,10 +7,11 @@ and what would be right. Numbers are finite, and neither strings nor booleans.
 from __future__ import annotations
 
 import json
+import re
 import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from difflib import get_close_matches
 from pathlib import Path as FilePath
 from typing import (
@@ -30,6 +31,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
     Tag,
     ValidationError,
     ValidationInfo,
@@ -38,6 +40,8 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic import Field as Entry
+from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
 
 from emulator.errors import InputError
@@ -45,6 +49,9 @@ from emulator.line_index import Path, json_lines, line_of
 from emulator.store import read_json
 
 _SCALARS = {float: "number", int: "whole number", str: "string"}
+# Of a docstring: the section of parameters, and the entries in it.
+_SECTION = re.compile(r"Parameters\n\s*-+\n(.*?)(?:\n\s*\n|\Z)", re.DOTALL)
+_ENTRY = re.compile(r"^ {4}(\w[\w, ]*?) : (.*?)(?=^ {4}\w|\Z)", re.MULTILINE | re.DOTALL)
 # What pydantic calls a value of the wrong type, where no field of a table says what is right.
 _EXPECTED = {
     "float_type": "a number",
@@ -58,7 +65,13 @@ _EXPECTED = {
 class Table(BaseModel):
     """A table of a file: no other keys than its fields, no value of another type."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        frozen=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,  # a text below a field describes it in the schema
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -124,6 +137,18 @@ class OneOf:
             custom_error_context={"key": self.key, "choices": json.dumps(list(self.choices))},
         )
         return handler.generate_schema(Annotated[Union[members], tag])  # noqa: UP007
+
+    def __get_pydantic_json_schema__(
+        self, core: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """One of the tables; each but the default's needs its ``key``."""
+        found = handler(core)
+        for name, member in zip(self.choices, found["oneOf"], strict=True):
+            table = handler.resolve_ref_schema(member)
+            table["properties"][self.key] = {"const": name, "description": table["description"]}
+            if name != self.default:
+                table["required"] = [self.key, *table.get("required", ())]
+        return found
 
     def _tag(self, data: Any) -> str | None:
         found = data.get(self.key, self.default) if isinstance(data, dict) else None
@@ -214,8 +239,65 @@ def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:
         required = entry.default is MISSING and entry.default_factory is MISSING
         # np.ndarray stands for a vector in a file. Defaults are left to the dataclass.
         hint = tuple[float, float, float] if hints[entry.name] is np.ndarray else hints[entry.name]
-        entries[entry.name] = (hint, ... if required else None)
-    return create_model(kind.__name__, __base__=Table, **entries)
+        about = _shown_default(entry)
+        text = documented(kind).get(entry.name)
+        entries[entry.name] = (
+            hint,
+            Entry(... if required else None, description=text, json_schema_extra=about),
+        )
+    return create_model(kind.__name__, __base__=Table, __doc__=summary(kind), **entries)
+
+
+def json_schema(model: type[Table]) -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of a file, for editors: keys, types, defaults, descriptions.
+
+    It admits all that :func:`parse` admits. ``parse`` is stricter where a schema cannot say it.
+    """
+    schema = model.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_for_files(schema)}
+
+
+def summary(kind: type) -> str:
+    """First sentence of a docstring, on one line and without markup."""
+    return _plain((kind.__doc__ or "").split("\n\n")[0])
+
+
+def documented(kind: type) -> dict[str, str]:
+    """What the docstrings of a class and its bases say of each parameter, by name."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        for section in _SECTION.findall(base.__doc__ or ""):
+            for names, text in _ENTRY.findall(section):
+                found |= dict.fromkeys(names.split(", "), _plain(text))
+    return found
+
+
+def _plain(text: str) -> str:
+    text = re.sub(r":\w+:`~?([^`]*)`", r"\1", " ".join(text.split()))
+    return text.replace("``", "").strip()
+
+
+def _shown_default(entry: Field[Any]) -> dict[str, Any] | None:
+    """The dataclass's default, for a schema."""
+    if entry.default is MISSING or entry.default is None:
+        return None
+    return {"default": json.loads(json.dumps(entry.default))}
+
+
+def _for_files(node: Any) -> Any:
+    """A schema without null, which no file of ours has, and without titles made of keys."""
+    if isinstance(node, list):
+        return [_for_files(each) for each in node if each != {"type": "null"}]
+    if not isinstance(node, dict):
+        return node
+    empty = {"default": None, "title": node.get("title")}
+    kept = {
+        key: _for_files(value)
+        for key, value in node.items()
+        if not (key in empty and value == empty[key] and not isinstance(value, dict))
+    }
+    (only,) = kept["anyOf"] if len(kept.get("anyOf", ())) == 1 else (None,)
+    return {**only, **{k: v for k, v in kept.items() if k != "anyOf"}} if only else kept
 
 
 def expectation(annotation: Any) -> str | None:

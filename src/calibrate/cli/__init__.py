@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from calibrate.cli import commands
 from calibrate.cli.common import BAD_INPUT, FAILED, Parser
 from calibrate.cli.compiled import VARIABLE, keep_programs
+from emulator import __version__
 from emulator.errors import InputError, SolverError
 
 _NO_CACHE = "--no-cache"
@@ -21,6 +22,7 @@ _NO_CACHE = "--no-cache"
 def build_parser(only: str | None = None) -> Parser:
     """The parser with every command, or with ``only`` one: the others' modules cost imports."""
     parser = Parser(prog="calibrate", description="Bayesian calibration of soft-tissue models.")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument(
         _NO_CACHE,
         action="store_true",

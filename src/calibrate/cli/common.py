@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shutil
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -80,16 +81,40 @@ def emit(result: Any, *, as_json: bool, text: str) -> None:
     print(to_json(result) if as_json else text)
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table in text: the first column aligned to the left, the others to the right."""
+def table(header: Sequence[str], rows: Iterable[Sequence[object]], width: int | None = None) -> str:
+    """A table in text: the first column aligned to the left, the others to the right.
+
+    Columns that do not fit ``width`` (by default the terminal's, if there is one) go below, with
+    the first column again.
+    """
     lines = [list(header), *([_cell(value) for value in row] for row in rows)]
     widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
-    out = []
-    for line in lines:
-        cells = [line[0].ljust(widths[0])]
-        cells += [cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)]
-        out.append("  ".join(cells).rstrip())
-    return "\n".join(out)
+    if width is None:
+        width = shutil.get_terminal_size((_ENDLESS, 24)).columns
+    blocks = [
+        "\n".join(_aligned(line, widths, columns) for line in lines)
+        for columns in _blocks(widths, width)
+    ]
+    return "\n\n".join(blocks)
+
+
+_ENDLESS = 1_000_000  # columns of a file or a pipe
+
+
+def _blocks(widths: Sequence[int], width: int) -> list[list[int]]:
+    """Columns after the first that stand side by side; at least one a block."""
+    blocks: list[list[int]] = [[]]
+    for k in range(1, len(widths)):
+        together = [0, *blocks[-1], k]
+        if blocks[-1] and sum(widths[j] + 2 for j in together) - 2 > width:
+            blocks.append([])
+        blocks[-1].append(k)
+    return blocks
+
+
+def _aligned(line: Sequence[str], widths: Sequence[int], columns: Sequence[int]) -> str:
+    cells = [line[0].ljust(widths[0]), *(line[k].rjust(widths[k]) for k in columns)]
+    return "  ".join(cells).rstrip()
 
 
 def _cell(value: object) -> str:

@@ -2,7 +2,7 @@
 
 from calibrate.samplers.blackjax_nuts import BlackJAXNUTSOptions
 from calibrate.samplers.delayed_acceptance import DelayedAcceptanceOptions
-from calibrate.samplers.density import density_of, named_draws
+from calibrate.samplers.density import Density, density_of, named_draws
 from calibrate.samplers.laplace import LaplaceOptions
 from calibrate.samplers.mclmc import MCLMCOptions
 from calibrate.samplers.nuts import NUTSOptions
@@ -18,6 +18,7 @@ __all__ = [
     "ChainSampler",
     "Context",
     "DelayedAcceptanceOptions",
+    "Density",
     "Draws",
     "Kernel",
     "LaplaceOptions",

@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.geometry.foreign import as_meshio
 from emulator.geometry.groups import MARK, own_node_sets, read_sets
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import orient
@@ -33,8 +35,10 @@ class Body:
     sheets: np.ndarray | None = None
 
 
-def read_mesh(path: str | Path) -> Mesh:
+def read_mesh(source: str | Path | Any) -> Mesh:
     """Tetrahedra and named sets from any file meshio reads, lengths taken as mm.
+
+    Or from a mesh of scikit-fem, PyVista or meshio (:mod:`emulator.geometry.foreign`).
 
     Groups of triangles become facet sets and node sets, groups of lines and points node sets.
     Nodes of no tetrahedron are dropped and inverted tetrahedra are turned.
@@ -45,10 +49,10 @@ def read_mesh(path: str | Path) -> Mesh:
         Missing or unreadable file, cells other than tetrahedra, a group without a name, a group
         off the surface, or a mesh :class:`Mesh` refuses.
     """
-    return _convert(path, directions=False).mesh
+    return _convert(source, directions=False).mesh
 
 
-def read_body(path: str | Path) -> Body:
+def read_body(source: str | Path | Any) -> Body:
     """The mesh as :func:`read_mesh` returns it, with its ``fibres`` and ``sheets``.
 
     Both are cell data, or point data averaged over each element's corners; a direction and its
@@ -59,7 +63,7 @@ def read_body(path: str | Path) -> Body:
     InputError
         As :func:`read_mesh`, or a direction that is not a unit vector.
     """
-    return _convert(path, directions=True)
+    return _convert(source, directions=True)
 
 
 def read_fibres(path: str | Path) -> np.ndarray:
@@ -171,8 +175,9 @@ def _load(path: Path) -> meshio.Mesh:
         raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
 
 
-def _convert(path: str | Path, *, directions: bool) -> Body:
-    found = _load(Path(path))
+def _convert(source: str | Path | Any, *, directions: bool) -> Body:
+    is_file = isinstance(source, str | Path)
+    found = _load(Path(source)) if is_file else as_meshio(source)
     try:
         mesh, used = _mesh(found)
         if not directions:
@@ -180,7 +185,8 @@ def _convert(path: str | Path, *, directions: bool) -> Body:
         fibres, sheets = (_directions(found, mesh, used, name) for name in ("fibres", "sheets"))
         return Body(mesh, fibres, sheets)
     except InputError as error:
-        raise InputError(f"mesh file {path}: {str(error).removeprefix('mesh: ')}") from error
+        name = f"mesh file {source}" if is_file else f"mesh ({type(source).__name__})"
+        raise InputError(f"{name}: {str(error).removeprefix('mesh: ')}") from error
 
 
 def _mesh(found: meshio.Mesh) -> tuple[Mesh, np.ndarray]:

@@ -60,7 +60,13 @@ class Helix:
 
 @dataclass(frozen=True)
 class Biventricle:
-    """Helix angle in both ventricles; angles in degrees, ``axis`` from apex to base."""
+    """Helix angle in both ventricles.
+
+    Parameters
+    ----------
+    angles : degrees at endocardium and epicardium.
+    axis : from apex to base.
+    """
 
     rule: ClassVar[str] = "biventricle"
 
@@ -74,7 +80,13 @@ class Biventricle:
 
 @dataclass(frozen=True)
 class Uniform:
-    """One direction everywhere, of any length above 0; likewise the sheets."""
+    """One direction everywhere.
+
+    Parameters
+    ----------
+    direction : of the fibres, of any length above 0.
+    sheets : sheet direction, likewise; for a law that takes any.
+    """
 
     rule: ClassVar[str] = "uniform"
 

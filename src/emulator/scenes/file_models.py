@@ -19,29 +19,46 @@ class Plane(Table):
     """Nodes or facets on the plane ``axis = at`` mm."""
 
     axis: Literal["x", "y", "z"]
+    """the plane's normal."""
     at: float
+    """its place on that axis, mm."""
 
 
 class ParameterTable(Table):
     """A quantity that varies."""
 
     unit: str = ""
+    """as law or load expect it, e.g. kPa; left out when dimensionless."""
     range: tuple[float, float]
+    """lowest and highest value."""
     scale: Literal["log", "uniform"] = "uniform"
+    """log to sample equal ratios equally."""
 
 
 class SceneFile(Table):
     """A whole scene file."""
 
     law: str
+    """a hyperelastic law."""
     mesh: str
+    """mesh file of tetrahedra in mm, any format meshio reads; its path is relative to this file."""
     parameters: dict[str, ParameterTable]
+    """what varies: parameters of the law, of loads and of regions."""
     supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...]
+    """what holds the body; a table without a kind holds a node set."""
     loads: tuple[Annotated[Load, OneOf("kind", LOADS)], ...] = ()
+    """what moves the body."""
     constants: dict[str, float] = Field(default_factory=dict)
+    """parameters that do not vary, in the unit that law or load expect."""
     dilatation: Literal["pointwise", "mean"] = "pointwise"
+    """mean: one volume ratio an element, so that quadratic tetrahedra do not lock."""
     order: Literal[1, 2] | None = None
+    """2 for quadratic tetrahedra, made from linear ones if need be; as the mesh file without it."""
     regions: str | None = None
+    """cell data of the mesh file with a whole number for each tetrahedron, e.g. gmsh:physical."""
     fibres: Annotated[FibreRule, OneOf("rule", FIBRE_RULES)] | None = None
+    """a rule for fibres and sheets; without it they come from the mesh file."""
     node_sets: dict[str, Plane] = Field(default_factory=dict)
+    """node sets beside those of the mesh file."""
     facet_sets: dict[str, Plane] = Field(default_factory=dict)
+    """facet sets beside those of the mesh file."""

@@ -49,6 +49,7 @@ def _text(rows: list[dict[str, Any]]) -> str:
     head, *lines = table(
         ("scene", "nodes", "tetrahedra", "law"),
         [(r["name"], r["nodes"], r["elements"], r["law"]) for r in rows],
+        _WIDTH,
     ).splitlines()
     found = [head]
     for line, row in zip(lines, rows, strict=True):

@@ -1,0 +1,81 @@
+"""``calibrate completion``: what the Tab key completes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import Any
+
+from calibrate.cli.common import DONE, add_json, emit
+
+_SHELLS = ("bash", "zsh", "fish")
+
+
+def register(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "completion",
+        help="script that completes calibrate's words in your shell",
+        description="Prints a script for bash, zsh or fish that completes commands, options, "
+        "scenes, emulators, samplers, recipes and files, without starting calibrate.",
+        epilog='bash: eval "$(calibrate completion bash)" in ~/.bashrc; zsh: calibrate completion '
+        "zsh > a folder of $fpath/_calibrate; fish: calibrate completion fish > "
+        "~/.config/fish/completions/calibrate.fish",
+    )
+    parser.add_argument("shell", choices=_SHELLS)
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the script."""
+    script = completion(arguments.shell)
+    emit({"script": script}, as_json=arguments.json, text=script)
+    return DONE
+
+
+def completion(shell: str) -> str:
+    """The script for a shell, from the parsers of all commands."""
+    import shtab
+
+    from calibrate.cli import build_parser
+    from emulator.mechanics.laws import LAWS
+    from emulator.scenes import BUILT_IN
+    from emulator.surrogates.files import shipped
+
+    of_words = {
+        "SCENE": _words([*BUILT_IN], "toml"),
+        "EMULATOR": _words(shipped()),
+        "NAME|DIR": _words(shipped()),
+        "DIR|fem": _words(["fem"]),
+        "synthetic": _words(["synthetic"], "csv"),
+    }
+    files = {"MESH": shtab.FILE, "NAME|FILE": shtab.FILE, "FILE|synthetic": shtab.FILE}
+    by_metavar = {**{key: shtab.cmd(words) for key, words in of_words.items()}, **files}
+    parser = build_parser()
+    for action in _actions(parser):
+        metavar = str(action.metavar)
+        if metavar in by_metavar:
+            action.complete = by_metavar[metavar]  # type: ignore[attr-defined]
+        elif metavar.startswith("DIR"):
+            action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
+        elif metavar.startswith("FILE"):
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+        elif action.dest == "law":
+            action.complete = shtab.cmd(_words([*LAWS]))  # type: ignore[attr-defined]
+    return shtab.complete(parser, shell)
+
+
+def _words(names: list[str], suffix: str = "") -> str:
+    """A command of any shell that prints names, and files here that end in ``suffix``."""
+    printed = f"printf '%s\\n' {' '.join(sorted(names))}"
+    return f"{printed}; ls | grep '\\.{suffix}$'" if suffix else f"{printed}; ls -d */ 2>/dev/null"
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Every argument of a parser and of its commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _actions(command)

@@ -1,0 +1,103 @@
+"""Wheel and sdist away from the repository: ``python tests/package_check.py DIST``, by ``make package``.
+
+The wheel is installed into a new environment, with the versions of ``constraints.txt`` and none of
+the extras, and used from another folder. The tests of the package itself then run from the
+unpacked sdist. Nothing may come from the checkout.
+"""
+
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+import venv
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+IMPORTS = """
+import importlib, pkgutil, sys
+import calibrate, emulator
+for package in (emulator, calibrate):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:  # of the extra "plot"
+            assert error.name in ("plotly", "matplotlib"), error
+from emulator.surrogates.files import shipped
+for name in shipped():
+    emulator.load(name)
+files = [getattr(module, "__file__", None) or "" for module in sys.modules.values()]
+assert not [file for file in files if file.startswith(sys.argv[1])]
+print(f"{len(files)} modules, {len(shipped())} emulators, none of the checkout")
+"""
+
+
+def main(dist: Path) -> None:
+    """Check the one wheel and the one sdist in ``dist``."""
+    (wheel,), (sdist,) = dist.glob("*.whl"), dist.glob("*.tar.gz")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with tarfile.open(sdist) as archive:
+            archive.extractall(folder, filter="data")
+        source = folder / sdist.name.removesuffix(".tar.gz")
+        check_contents(wheel, source)
+        python = environment(folder / "bare", wheel)
+        use_wheel(python, folder / "away")
+        test_sdist(python, source)
+    print("wheel and sdist work away from the repository")
+
+
+def check_contents(wheel: Path, source: Path) -> None:
+    """All that is tracked is in the sdist, and all of ``src`` in the wheel."""
+    tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True).splitlines()
+    private = (".ci/", ".pre-commit", ".python-version")
+    absent = [f for f in tracked if not (source / f).is_file() and not f.startswith(private)]
+    assert not absent, f"not in the sdist: {absent}"
+    packed = set(zipfile.ZipFile(wheel).namelist())
+    absent = [f for f in tracked if f.startswith("src/") and f.removeprefix("src/") not in packed]
+    assert not absent, f"not in the wheel: {absent}"
+    print(f"sdist and wheel hold what they should, the wheel {len(packed)} files")
+
+
+def environment(folder: Path, wheel: Path) -> Path:
+    """The interpreter of a new environment with the wheel in it."""
+    venv.create(folder, with_pip=True)
+    python = folder / "bin" / "python"
+    install(python, str(wheel))
+    return python
+
+
+def install(python: Path, package: str) -> None:
+    """Install into the environment of ``python``, at the versions that are known to work."""
+    words = ["-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt")]
+    subprocess.run([python, *words, package], check=True)
+
+
+def use_wheel(python: Path, away: Path) -> None:
+    """What a newcomer does first, in the empty folder ``away``."""
+    away.mkdir()
+    calibrate = python.with_name("calibrate")
+    run([calibrate, "--version"], away)
+    run([calibrate, "scenes"], away)
+    run([calibrate, "demo", "--out", "posterior"], away)
+    assert {path.name for path in (away / "posterior").iterdir()} >= {"posterior.nc", "run.json"}
+    run([python, "-c", IMPORTS, str(ROOT)], away)
+
+
+def test_sdist(python: Path, source: Path) -> None:
+    """Tests of the package as a whole, from the unpacked sdist, on the installed wheel."""
+    install(python, "pytest")
+    tests = ["tests/test_package.py", "tests/test_architecture.py"]
+    run([python, "-m", "pytest", "-m", "not slow", *tests], source)
+
+
+def run(command: list[str | Path], folder: Path) -> None:
+    """Run a command in ``folder`` that knows nothing of this process's environment."""
+    print("$", *(word if "\n" not in str(word) else "..." for word in command[:4]), flush=True)
+    kept = {name: os.environ[name] for name in ("PATH", "HOME", "LANG") if name in os.environ}
+    subprocess.run(command, cwd=folder, env=kept, check=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
