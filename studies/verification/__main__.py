@@ -78,7 +78,7 @@ STUDIES = {
     "ventricle, noise x 3": replace(VENTRICLE, noise=0.9, volume=3.0),
     "ventricle, 6 landmarks": replace(VENTRICLE, landmarks=6),
     "ventricle, volume alone": replace(VENTRICLE, landmarks=0),
-    "ventricle, 1 known pressure": replace(VENTRICLE, states=1),
+    "ventricle, 1 known pressure": replace(VENTRICLE, states=1, certify="worst"),
     "ventricle, 2 known pressures": replace(VENTRICLE, states=2),
     "ventricle, 3 known pressures": replace(VENTRICLE, states=3),
     "ventricle, another mesh": replace(VENTRICLE, truth="mesh", right=False, certify="first"),
