@@ -85,9 +85,9 @@ def check(cases: list[Case], *, quick: bool) -> None:
         emulator, mesh = found["emulator, full field"], found["FEM from rest"]["truth_mm"]["median"]
         assert emulator["own_mm"]["median"] < 0.1 * mesh, body
         assert emulator["gradient_s"] < 0.1 * found["FEM from rest"]["gradient_s"], body
-    if not quick:
-        ways = {case["posterior"]: case for case in cases if "posterior" in case}
-        assert ways["series + discrepancy, 60 FEM runs, NUTS"]["largest_shift"] < 0.15
+    ways = {case["posterior"]: case for case in cases if "posterior" in case}
+    best = ways.get("series + discrepancy, 60 FEM runs, NUTS")
+    assert best is None or best["largest_shift"] < 0.15
 
 
 def summary(cases: list[Case]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator._precision import require_float64
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
@@ -93,8 +94,9 @@ class Simulator(Shown):
         Raises
         ------
         InputError
-            ``theta`` or ``start`` has the wrong shape.
+            ``theta`` or ``start`` has the wrong shape, or float64 is off.
         """
+        require_float64("FEM")
         theta, start = self._checked(theta, self.rest if start is None else start)
         try:
             solution = self._equilibrium(theta, jax.lax.stop_gradient(start))
