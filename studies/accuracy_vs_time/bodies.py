@@ -106,8 +106,13 @@ BODIES = {
     "liver": Body(
         lambda: liver(6),
         ("liver", "liver_pignn"),
-        {},  # with other shells it is another body, held at more or less of it
-        lambda: liver(6, 2),
+        # With other shells it is another body, held at more or less of it (README).
+        {
+            "linear, coarser": lambda: liver(4),
+            "linear, finer": lambda: liver(12),
+            "quadratic": lambda: liver(6, 2),
+        },
+        lambda: liver(9, 2),
     ),
     "ventricle": Body(
         em.scenes.left_ventricle,

@@ -52,7 +52,6 @@ class Rung:
     fem_runs: int = 0
     compiled: bool = True
     full: bool = False
-    narrow: bool = False
 
     @property
     def calls(self) -> int:
@@ -111,10 +110,7 @@ def rungs(name: str, body: Body, *, quick: bool) -> Iterator[Rung]:
         best, offline = _shipped(body.shipped[0])
         yield of_map("emulator as shipped", "emulator", best, at, **offline)
         alone, before = _shipped(body.shipped[1])
-        rung = of_map("network alone", "network", alone, at, **before)
-        yield rung
-        # Maps with a discrepancy model refuse float32 (docs/experiments.md).
-        yield replace(rung, name="network alone, float32", narrow=True)
+        yield of_map("network alone", "network", alone, at, **before)
     whole = Rung("emulator, full field", "emulator", scene, best, full=True, **offline)
     yield whole
     yield of_fem("FEM started by the emulator", simulator, at, best, **offline)
@@ -160,10 +156,8 @@ def measure(
     value, gradient = rung.solve, _gradient(rung.solve)
     if rung.compiled:
         value, gradient = jax.jit(value), jax.jit(gradient)
-    with jax.enable_x64(not rung.narrow):
-        tests = jnp.asarray(np.asarray(tests), dtype=jnp.float32 if rung.narrow else jnp.float64)
-        found = [np.asarray(value(theta), float)[rows] for theta in tests]
-        value_s, gradient_s = _median(value, rung), _median(gradient, rung)
+    found = [np.asarray(value(theta))[rows] for theta in tests]
+    value_s, gradient_s = _median(value, rung), _median(gradient, rung)
     seen = np.stack([np.asarray(observe(jnp.asarray(u), None)) for u in found])
     return {
         "nodes": len(rung.scene.mesh.nodes),
@@ -185,10 +179,8 @@ def _gradient(solve: Solve) -> Callable[[jax.Array], jax.Array]:
 
 def _median(function: Solve, rung: Rung) -> float:
     """Median seconds of a call, none of which has met its theta before."""
-    kind = jnp.float32 if rung.narrow else jnp.float64
-    each = [jnp.asarray(np.asarray(t), dtype=kind) for t in unseen(rung.scene, rung.calls + 1)]
     spent = []
-    for theta in each:
+    for theta in jax.block_until_ready(list(unseen(rung.scene, rung.calls + 1))):
         began = time.perf_counter()
         jax.block_until_ready(function(theta))
         spent.append(time.perf_counter() - began)

@@ -1,4 +1,4 @@
-"""Entries of our own and of two outside samplers: a forward map, and what draws with it.
+"""Entries of our own and of an outside sampler: a forward map, and what draws with it.
 
 ``entries/<entry>/<problem>.csv`` holds draws, ``entries/<entry>/entry.json`` what they took.
 """
@@ -68,7 +68,7 @@ def sampler(name: str, **options: Any) -> Method:
             statistical, data, sampler=name, options=chosen.options(**options), seed=3,
             predictions=False, simulator=simulator() if chosen.solves_fem else None,
         )  # fmt: skip
-        return posterior.draws(), int(posterior.tree["sample_stats"].attrs.get("fem_solves", 0))
+        return posterior.draws(), int(posterior.tree.attrs.get("fem_solves", 0))
 
     return draw
 
@@ -92,27 +92,6 @@ def by_emcee(statistical: Model, data: Draws) -> tuple[Draws, int]:
     return {n: np.asarray(v) for n, v in density.constrain(jnp.asarray(z)).items()}, 0
 
 
-def by_pymc(statistical: Model, data: Draws) -> tuple[Draws, int]:
-    """PyMC, our log density wrapped by PyTensor; compiled by JAX, so that NumPyro's NUTS draws.
-
-    PyMC's own NUTS calls Python for every gradient and was not through one problem in 200 s.
-    """
-    import pymc as pm
-    from pytensor import wrap_jax
-
-    density = density_of(statistical)
-    log_density = wrap_jax(lambda z: density.log_density(z, data))
-    with pm.Model():
-        z = pm.Flat("z", shape=density.dimension)
-        pm.Potential("posterior", log_density(z))
-        trace = pm.sample(
-            500, tune=300, chains=4, random_seed=3, progressbar=False, nuts_sampler="numpyro",
-            compute_convergence_checks=False, nuts_sampler_kwargs={"chain_method": "vectorized"},
-        )  # fmt: skip
-    z = np.asarray(trace["posterior"]["z"]).reshape(-1, density.dimension)
-    return {n: np.asarray(v) for n, v in density.constrain(jnp.asarray(z)).items()}, 0
-
-
 @dataclass(frozen=True)
 class Entry:
     """A line of the leaderboard.
@@ -132,7 +111,6 @@ OURS = {
     "emulator_nuts": Entry("emulator, NUTS", shipped, sampler("nuts", **_NUTS)),
     "emulator_laplace": Entry("emulator, Laplace", shipped, sampler("laplace")),
     "emcee": Entry("emulator, emcee", shipped, by_emcee, _MID),
-    "pymc": Entry("emulator, PyMC", shipped, by_pymc, _MID),
     "network_nuts": Entry("network alone, NUTS", network, sampler("nuts", **_NUTS), _MID),
     "pod_gp_nuts": Entry(
         f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_NUTS), _MID
