@@ -16,6 +16,7 @@ STUDIES = Path(__file__).parents[1] / "studies"
 QUICK = {
     "accuracy_vs_time": "--quick",
     "beam_coverage": "PUBLISHED --cases 2",
+    "campaign": "--quick",
     "certificate": "--quick",
     "decoder_speed": "--quick",
     "effects": "--quick",

@@ -25,7 +25,7 @@ from emulator.errors import InputError
 from emulator.store import write_json
 
 HERE = Path(__file__).parent
-NEEDS = {"emcee": "emcee"}  # packages of entries that are not ours
+NEEDS = {"emcee": "emcee", "pymc": "pymc"}  # packages of entries that are not ours
 QUICK = ("volume_mid",)
 
 

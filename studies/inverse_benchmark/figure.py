@@ -29,9 +29,15 @@ def draw(cases: list[Case], path: Path) -> None:
     if floors:
         each.plot([names.index(n) for n in floors], list(floors.values()), "_", color="0.3", ms=18,
                   label="floor: as many draws of the reference")  # fmt: skip
-    each.set_xticks(range(len(names)), [name.replace("_", "\n") for name in names], fontsize=8)
+    each.set_xticks(
+        range(len(names)),
+        [name.replace("displacements", "displ.").replace("_", "\n") for name in names],
+        fontsize=8,
+    )
     each.set(yscale="log", ylabel="sliced Wasserstein distance (posterior sd)")
     time.set(xscale="log", xlabel="processor time a problem (s), median")
+    time.set_xticks([3, 10, 30, 100], ["3", "10", "30", "100"], minor=False)
+    time.minorticks_off()
     for axes in (each, time):
         axes.grid(color="0.92")
         axes.spines[["top", "right"]].set_visible(False)
