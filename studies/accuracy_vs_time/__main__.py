@@ -86,8 +86,8 @@ def check(cases: list[Case], *, quick: bool) -> None:
         assert emulator["own_mm"]["median"] < 0.1 * mesh, body
         assert emulator["gradient_s"] < 0.1 * found["FEM from rest"]["gradient_s"], body
     ways = {case["posterior"]: case for case in cases if "posterior" in case}
-    best = ways.get("series + discrepancy, 60 FEM runs, NUTS")
-    assert best is None or best["largest_shift"] < 0.15
+    sure = ways.get("series + discrepancy, 60 FEM runs, NUTS")
+    assert sure is None or sure["largest_shift"] < 0.15
 
 
 def summary(cases: list[Case]) -> dict[str, Any]:
@@ -98,10 +98,10 @@ def summary(cases: list[Case]) -> dict[str, Any]:
 
 def main() -> None:
     """Run the study."""
-    arguments = parser(__doc__, HERE)
-    arguments.add_argument("--only", nargs="+", choices=PARTS, help="parts to run")
-    arguments.add_argument("--part", help="print one part's cases as JSON; for the study itself")
-    arguments = arguments.parse_args()
+    words = parser(__doc__, HERE)
+    words.add_argument("--only", nargs="+", choices=PARTS, help="parts to run")
+    words.add_argument("--part", help="print one part's cases as JSON; for the study itself")
+    arguments = words.parse_args()
     if arguments.part in BODIES:
         print(json.dumps(list(examine(arguments.part, quick=arguments.quick))))
         return

@@ -102,10 +102,10 @@ def rungs(name: str, body: Body, *, quick: bool) -> Iterator[Rung]:
         yield of_map(label, "emulator", forward, at, **offline)
     for runs in body.reduced[:1] if quick else body.reduced:
         campaign = lambda runs=runs: run_campaign(simulator, sobol(scene, runs, SEED))  # noqa: E731
-        seconds, reduced = _clocked(lambda campaign=campaign: fit_reduced(scene, campaign()))
+        seconds, fitted = _clocked(lambda campaign=campaign: fit_reduced(scene, campaign()))
         label = f"POD + GP, {runs} FEM runs"
-        yield of_map(label, "POD + GP", reduced, at, offline_s=seconds, fem_runs=runs)
-    best = forward
+        yield of_map(label, "POD + GP", fitted, at, offline_s=seconds, fem_runs=runs)
+    best: ForwardMap = forward
     if body.shipped:
         best, offline = _shipped(body.shipped[0])
         yield of_map("emulator as shipped", "emulator", best, at, **offline)
@@ -196,7 +196,7 @@ def _errors(gap: np.ndarray) -> dict[str, float]:
 def solved(scene: Scene, at: np.ndarray, tests: jax.Array, *, steps: int = 0) -> np.ndarray:
     """FEM's displacements (c, d, 3) mm of the points, ``steps`` Newton steps beyond tolerance."""
     simulator, observe = Simulator(scene), landmarks(scene, at)
-    fields = run_campaign(simulator, tests).displacement
+    fields = list(run_campaign(simulator, tests).displacement)
     if steps:
         beyond = jax.jit(lambda u, theta: _beyond(simulator, u, theta, steps))
         fields = [beyond(u, theta) for u, theta in zip(fields, tests, strict=True)]

@@ -151,9 +151,9 @@ def check_quick(folder: Path) -> None:
 
 def main() -> None:
     """Run the study."""
-    arguments = parser(__doc__, HERE)
-    arguments.add_argument("--score", type=Path, help="folder of draws to score")
-    arguments = arguments.parse_args()
+    words = parser(__doc__, HERE)
+    words.add_argument("--score", type=Path, help="folder of draws to score")
+    arguments = words.parse_args()
     if arguments.score is not None:
         try:
             found = scored(arguments.score)
@@ -175,10 +175,10 @@ def main() -> None:
     results.cases = [case for case in results.cases if "entry" not in case]
     for folder in sorted(path.parent for path in ENTRIES.glob("*/entry.json")):
         results.case(f"entry: {folder.name}", lambda folder=folder: scored(folder))
-    found = [case for case in results.cases if "entry" in case]
+    entered = [case for case in results.cases if "entry" in case]
     results.write()
-    print(leaderboard(found))
-    draw(found, arguments.out / "inverse_benchmark.png")
+    print(leaderboard(entered))
+    draw(entered, arguments.out / "inverse_benchmark.png")
     check(results.cases)
     if arguments.quick:
         check_quick(arguments.out)

@@ -38,6 +38,7 @@ def draw(cases: list[Case], path: Path) -> None:
     time.set(xscale="log", xlabel="processor time a problem (s), median")
     time.set_xticks([3, 10, 30, 100], ["3", "10", "30", "100"], minor=False)
     time.minorticks_off()
+    each.set_yticks([0.05, 0.1, 0.2, 0.5], ["0.05", "0.1", "0.2", "0.5"])
     for axes in (each, time):
         axes.grid(color="0.92")
         axes.spines[["top", "right"]].set_visible(False)

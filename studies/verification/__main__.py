@@ -174,8 +174,11 @@ class Setting:
             jnp.asarray(self.fields[r][:, self.true.nodes]), jnp.asarray(self.thetas[r])
         )
         rng = np.random.default_rng([SEED, r, *self.name.encode()])
-        noise = self.model.noise
-        return {n: np.asarray(v) + noise[n].sd * rng.normal(size=v.shape) for n, v in exact.items()}
+        sd = {"displacement": self.study.noise, "volume": self.study.volume}
+        return {
+            n: np.asarray(v) + sd[n.split("@")[0]] * rng.normal(size=v.shape)
+            for n, v in exact.items()
+        }
 
     def posterior(self, r: int, options: NUTSOptions) -> cal.Posterior:
         """Draws given data set ``r``, by NUTS."""
@@ -195,7 +198,7 @@ def setting_of(name: str, study: Study) -> Setting:
     return Setting(name, study, model, scene, observed(study, scene, at), thetas, fields)
 
 
-def compare(setting: Setting, r: int) -> tuple[dict[str, tuple[bool, float, float]], float]:
+def compare(setting: Setting, r: int) -> tuple[dict[str, tuple], float]:
     """Of each shared parameter: covered, (mean - truth) / sd, sd / prior's; and R-hat."""
     posterior, width, row = setting.posterior(r, OPTIONS), prior_sd(setting.model), {}
     draws = posterior.draws()
@@ -297,9 +300,9 @@ def check(cases: list[Case], *, quick: bool) -> None:
 
 def main() -> None:
     """Run the study."""
-    arguments = parser(__doc__, HERE)
-    arguments.add_argument("--only", nargs="+", default=[], help="cases to run; all by default")
-    arguments = arguments.parse_args()
+    words = parser(__doc__, HERE)
+    words.add_argument("--only", nargs="+", default=[], help="cases to run; all by default")
+    arguments = words.parse_args()
     results = Results(
         arguments.out, SEED, again=arguments.again, settings={"quick": arguments.quick}
     )

@@ -42,11 +42,11 @@ def ventricle(exponent: float) -> Scene:
 def _without_barriers() -> Iterator[None]:
     """The exact energy in training, as if Eq. 21 to 23 were not there."""
     kept = objectives.Barriers
-    objectives.Barriers = lambda: None  # type: ignore[assignment, misc]
+    objectives.Barriers = lambda: None  # type: ignore[assignment]
     try:
         yield
     finally:
-        objectives.Barriers = kept  # type: ignore[misc]
+        objectives.Barriers = kept
 
 
 def _trained(rate: float, batch: int, exponent: float, barriers: bool, recipe: str) -> Ended:
