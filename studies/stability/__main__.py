@@ -24,7 +24,6 @@ from emulator.store import write_json
 HERE = Path(__file__).parent
 LIMIT = 120.0  # seconds for one case, compilation and judgement included
 
-
 COLOURS = {
     "CONVERGED": "tab:green",
     "ITERATION_LIMIT": "tab:orange",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -70,6 +71,10 @@ class Plan:
                 raise InputError(
                     f"training: {name} is {getattr(self, name)}; it must be {value} or more"
                 )
+        if not 0.0 < self.learning_rate < math.inf:
+            raise InputError(
+                f"training: learning_rate is {self.learning_rate}; it must be positive and finite"
+            )
         check_seed(self.seed, "training")
         if self.simulations < (1 if self.discrepancy else 0):
             raise InputError(

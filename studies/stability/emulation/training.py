@@ -63,7 +63,7 @@ def _trained(rate: float, batch: int, exponent: float, barriers: bool, recipe: s
 def judge(found: Emulator) -> Ended:
     """Predictions are finite, and the error bar knows how poor they are."""
     scene, forward = found.scene, found.cache()
-    simulator, bar = Simulator(scene), None
+    simulator = Simulator(scene)
     thetas = sobol(scene, TESTS, 11)
     predicted = np.stack([np.asarray(forward(theta)) for theta in thetas])
     if not np.isfinite(predicted).all():

@@ -122,6 +122,8 @@ def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
             "4 simulations are fewer than a batch of 16",
         ),
         ({"steps": 0}, "steps is 0; it must be 1 or more"),
+        ({"learning_rate": float("nan")}, "learning_rate is nan; it must be positive and finite"),
+        ({"learning_rate": -1e-3}, "learning_rate is -0.001; it must be positive and finite"),
         ({"simulations": 4}, "4 simulations are fewer than a batch of 16"),
     ],
 )
