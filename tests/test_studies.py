@@ -40,7 +40,7 @@ QUICK = {
     "sbc": "--replicates 20 --only map",
     "sensitivity": "--quick",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
-    "squeezed_to_half laplace_two_modes float32_once_clamped_beam "
+    "squeezed_to_half elements_10000_to_1 springs_1e12 twist_360_from_rest laplace_two_modes float32_once_clamped_beam "
     "outside_by_half_once_clamped_beam",
     "ventricle_family": "--quick",
     "verification": "--quick",
@@ -118,6 +118,7 @@ def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
     assert right.independent
     assert right.residual < 1e-8
     assert "residual" in module.judge(beam, 1.001 * u, theta).wrong
+    assert not module.is_round_off(beam, 1.001 * u, theta)
     assert "residual" in module.judge(beam, u, 1.001 * theta).wrong
     assert "support" in module.judge(beam, u + 1e-15, theta).wrong
     assert "J = " in module.judge(beam, -2.0 * beam.mesh.nodes, theta).wrong

@@ -258,7 +258,7 @@ def relative_residual(
     system: System, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
 ) -> jax.Array:
     """Norm of the residual relative to the internal and external forces, shape ()."""
-    return balance(system, u, theta, load, 0.0)[1]
+    return balance(system, u, theta, load)[1]
 
 
 class Forces(NamedTuple):
@@ -279,7 +279,6 @@ def forces_at(
     u: jax.Array,
     theta: jax.Array,
     load: jax.Array | float,
-    negligible: jax.Array | float,
 ) -> Forces:
     """Forces at ``u`` (n, 3) mm and ``load`` times the loads, see :func:`balance`."""
     internal = system.internal_force(u, theta)
@@ -287,8 +286,7 @@ def forces_at(
     residual = system.restrict(internal - external)
     size, norm = _norm(internal), _norm(residual)
     scale = size + _norm(external)
-    relative = norm / jnp.where(scale > 0.0, scale, 1.0)
-    return Forces(residual, size, jnp.where(norm <= negligible, 0.0, relative))
+    return Forces(residual, size, norm / jnp.where(scale > 0.0, scale, 1.0))
 
 
 def balance(
@@ -296,14 +294,13 @@ def balance(
     u: jax.Array,
     theta: jax.Array,
     load: jax.Array | float = 1.0,
-    negligible: jax.Array | float = 0.0,
 ) -> tuple[jax.Array, jax.Array]:
     """Residual (f,) in mN, and its norm relative to internal and external forces, shape ().
 
-    The forces include reactions. A norm up to ``negligible`` (mN) counts as 0, and so does the
-    relative residual of a body without any forces. NaN stays NaN.
+    The forces include reactions. The relative residual of a body without any forces is 0. NaN stays
+    NaN.
     """
-    forces = forces_at(system, u, theta, load, negligible)
+    forces = forces_at(system, u, theta, load)
     return forces.residual, forces.relative
 
 

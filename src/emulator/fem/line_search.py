@@ -152,7 +152,7 @@ def _progress(
     def lowers(fraction: jax.Array) -> jax.Array:
         lower = potential(fraction)[0] <= ceiling + fraction * descent
         if system.forces:
-            left = balance(system, u + fraction * direction.move, theta, level, 0.0)[0]
+            left = balance(system, u + fraction * direction.move, theta, level)[0]
             before = jnp.sum(direction.residual**2)
             lower |= jnp.sum(left**2) < (1.0 - _ARMIJO * fraction) * before
         return lower

@@ -30,36 +30,59 @@ _SLOW = 0.3  # of the residual left by a step with its own tangent: round-off, o
 
 
 class Verdict(NamedTuple):
-    """Whether a level is solved or given up; neither where the iteration goes on."""
+    """Whether a level is solved or given up; neither where the iteration goes on.
+
+    drowned : whether it is solved because what is left may be round-off.
+    """
 
     solved: jax.Array
     failed: jax.Array
+    drowned: jax.Array
 
 
-def judge_level(state: NewtonState, outcome: Outcome, options: NewtonOptions) -> Verdict:
-    """Whether the level of ``state`` is solved or given up after ``outcome``."""
+def judge_level(
+    state: NewtonState, outcome: Outcome, move: jax.Array, options: NewtonOptions
+) -> Verdict:
+    """Whether the level of ``state`` is solved or given up after ``outcome``.
+
+    move : (n, 3) mm, Newton's full step from ``state``.
+    """
     error, at_level = outcome.error, state.at_level + 1
     slow = state.refresh & (error > _SLOW * state.error) & (at_level > 1)
-    solved = (error <= options.tolerance) | (slow & (error <= options.round_off))
+    met = jnp.isfinite(state.error) & jnp.isfinite(error)
+    drowned = met & _drowned(state, move)
+    solved = (error <= options.tolerance) | (slow & (error <= options.round_off)) | drowned
+    solved |= met & (jnp.linalg.norm(outcome.residual) <= options.absolute)
     stuck = state.refresh & ~(outcome.fraction > 0.0)
     spent = at_level >= options.level_iterations
     if state.volumes is not None:
         spent |= at_level >= _MIXED_ITERATIONS
     spent |= (_squeezed(state, outcome) >= _SQUEEZES) & (_halved(state) >= options.min_increment)
     spent |= ~_convex(state, outcome) & (_halved(state) >= state.careful)
-    return Verdict(solved, ~solved & (stuck | spent))
+    return Verdict(solved, ~solved & (stuck | spent), drowned)
+
+
+def _drowned(state: NewtonState, move: jax.Array) -> jax.Array:
+    """Whether both the residual and what Newton's step makes of it may be round-off."""
+    quiet = jnp.linalg.norm(state.residual) <= state.negligible.residual
+    return quiet & (jnp.max(jnp.abs(move)) <= state.negligible.correction)
 
 
 @partial(jax.jit, static_argnames="options")
 def next_state(
-    state: NewtonState, outcome: Outcome, descends: jax.Array, options: NewtonOptions
+    state: NewtonState,
+    outcome: Outcome,
+    descends: jax.Array,
+    move: jax.Array,
+    options: NewtonOptions,
 ) -> NewtonState:
     """Stay, move on to a higher load level, or fall back to a lower one.
 
     descends : whether the tangent's own direction lowers the potential, as far as that is known.
+    move : (n, 3) mm, the full step.
     """
     state = state._replace(convex=state.convex & descends)
-    solved, failed = judge_level(state, outcome, options)
+    solved, failed, drowned = judge_level(state, outcome, move, options)
     complete, moved = solved & (state.level >= 1.0), solved | failed
     iterations = state.iterations + 1
     reached = jnp.where(solved, state.level, state.reached)
@@ -80,7 +103,7 @@ def next_state(
         iterations=iterations,
         factorisations=state.factorisations + state.refresh,
         residual=outcome.residual,
-        error=outcome.error,
+        error=jnp.where(drowned, 0.0, outcome.error),
         refresh=moved | ~_keeps_tangent(state, outcome, options),
         convex=(moved & ~complete) | _convex(state, outcome),
         crushed=crushed,

@@ -30,10 +30,11 @@ from emulator.fem.mixed import Condensed, Volumes, advance, consistent
 from emulator.fem.options import NewtonOptions
 from emulator.fem.programs import compiled, cond
 from emulator.fem.solution import Status
-from emulator.fem.state import NewtonState
+from emulator.fem.state import Negligible, NewtonState
 from emulator.fem.step_length import Outcome, level_balance, take_step
 
 _ROUND_OFF = 1e-15  # strain that floating point cannot tell from none
+_STILL = 1e-12  # of the body's size: a correction that may be round-off
 _STRETCH = 1e-6  # small enough for the forces to be linear in it
 
 
@@ -45,14 +46,14 @@ class Newton:
     options: NewtonOptions
     theta: jax.Array
 
-    def begin(self, start: jax.Array, negligible: jax.Array | None = None) -> NewtonState:
+    def begin(self, start: jax.Array, negligible: Negligible | None = None) -> NewtonState:
         """The state to iterate from: ``start``, or rest where that is no start.
 
-        negligible : residual in mN that is round-off, if known.
+        negligible : what may be round-off, if known.
         """
         system, theta = self.system, self.theta
         negligible = self.negligible() if negligible is None else negligible
-        residual, error = level_balance(system, start, theta, jnp.ones(()), negligible)
+        residual, error = level_balance(system, start, theta, jnp.ones(()))
         least_J = system.least_volume_ratio(start)
         state = _first(
             theta,
@@ -66,31 +67,33 @@ class Newton:
         )
         return state._replace(volumes=_consistent(system, state.u, theta) if system.mixed else None)
 
-    def negligible(self) -> jax.Array:
-        r"""Residual in mN that is round-off: :math:`10^{-15} |K_0 X|`, at least ``absolute``.
+    def negligible(self) -> Negligible:
+        r"""Residual in mN that may be round-off: :math:`10^{-15} |K_0 X|`; and correction in mm.
 
         A uniform stretch by 1e-15 of the body at rest changes the internal forces by so much; it is
         taken from a stretch by 1e-6. Without loads there is no other force to compare a residual
-        with.
+        with. On a slender body, or beside stiff springs, such a residual may still matter, so the
+        step that Newton's method takes for it must be short as well.
         """
         X = jnp.asarray(self.system.scene.mesh.nodes)
-        stretched = forces_at(self.system, _STRETCH * X, self.theta, 0.0, 0.0)
+        stretched = forces_at(self.system, _STRETCH * X, self.theta, 0.0)
         size = _ROUND_OFF / _STRETCH * stretched.internal
-        return jnp.maximum(jnp.where(jnp.isfinite(size), size, 0.0), self.options.absolute)
+        extent = jnp.max(jnp.max(X, axis=0) - jnp.min(X, axis=0))
+        return Negligible(jnp.where(jnp.isfinite(size), size, 0.0), _STILL * extent)
 
     def step(self, state: NewtonState) -> NewtonState:
         """One iteration."""
         system, theta = self.system, self.theta
         residual, error = cond(
             state.at_level == 0,
-            lambda: level_balance(system, state.u, theta, state.level, state.negligible),
+            lambda: level_balance(system, state.u, theta, state.level),
             lambda: (state.residual, state.error),
         )
         state = state._replace(residual=residual, error=error)
         direction = newton_direction(system, theta, state)
         outcome = take_step(system, theta, state, direction, self.options)
         state = state._replace(tangent=direction.tangent, singular=direction.singular)
-        after = next_state(state, outcome, direction.descends, self.options)
+        after = next_state(state, outcome, direction.descends, direction.move, self.options)
         if state.volumes is None:
             return after
         return after._replace(volumes=self._volumes(state, outcome, direction, after))
@@ -116,7 +119,7 @@ def _first(
     start: jax.Array,
     residual: jax.Array,
     error: jax.Array,
-    negligible: jax.Array,
+    negligible: Negligible,
     least_J: jax.Array,
     *,
     entries: int,
@@ -125,7 +128,8 @@ def _first(
     """The state at ``start`` or at rest, for tangents of ``entries``; volumes left out."""
     fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(theta))
     inverted = ~(least_J > 0.0)
-    solved = ~inverted & (error <= options.tolerance)
+    balanced = (error <= options.tolerance) | (jnp.linalg.norm(residual) <= options.absolute)
+    solved = ~inverted & balanced & jnp.isfinite(error)
     status = jnp.where(solved, Status.CONVERGED, Status.RUNNING)
     u = jnp.where(fine & ~inverted, start, 0.0)
     count, increment = jnp.zeros((), dtype=int), jnp.full((), options.increment, float)

@@ -19,6 +19,16 @@ NEAR = 0.05
 UNBALANCED = 0.5
 
 
+class Negligible(NamedTuple):
+    """What floating point cannot tell from nothing, together: shape () in mN, and in mm.
+
+    A residual alone may be so small and yet bend a slender body by metres.
+    """
+
+    residual: jax.Array
+    correction: jax.Array
+
+
 class NewtonState(NamedTuple):
     """What the next iteration needs.
 
@@ -28,7 +38,7 @@ class NewtonState(NamedTuple):
     at_level : iterations spent at this level. iterations, factorisations : all of them.
     residual : (f,) mN at ``u`` and ``level``, not yet evaluated while at_level is 0.
     error : the residual relative to the forces at work; inf until the supports are met.
-    negligible : residual in mN that is round-off.
+    negligible : residual in mN, and correction of a node in mm, that may be round-off.
     tangent : (nnz,) mN/mm, the last one assembled. refresh : whether the next iteration needs a
     new one.
     convex : whether every step at this level was a full one, down the potential.
@@ -51,7 +61,7 @@ class NewtonState(NamedTuple):
     factorisations: jax.Array
     residual: jax.Array
     error: jax.Array
-    negligible: jax.Array
+    negligible: Negligible
     tangent: jax.Array
     refresh: jax.Array
     convex: jax.Array

@@ -33,10 +33,10 @@ class Outcome(NamedTuple):
 
 
 def level_balance(
-    system: System, u: jax.Array, theta: jax.Array, level: jax.Array, negligible: jax.Array
+    system: System, u: jax.Array, theta: jax.Array, level: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Residual (f,) and its relative size, infinite unless finite and the supports are met."""
-    residual, error = balance(system, u, theta, level, negligible)
+    residual, error = balance(system, u, theta, level)
     return residual, _where_met(system, u, level, error)
 
 
@@ -77,7 +77,7 @@ def _full_step(
 
     def tried() -> Outcome:
         trial = state.u + direction.move
-        residual, error = level_balance(system, trial, theta, state.level, state.negligible)
+        residual, error = level_balance(system, trial, theta, state.level)
         J, now = system.least_volume_ratio(trial), system.least_volume_ratio(state.u)
         good = _good(error, state.error, J, options.shrink, now)
         whole = Outcome(trial, residual, error, jnp.ones(()), jnp.array(False))
@@ -119,7 +119,7 @@ def _searched_step(
         system, state.u, state.level, theta, direction, options.shrink, nearer
     )
     u = _moved(system, state.u, direction.move, fraction, state.level)
-    residual, error = level_balance(system, u, theta, state.level, state.negligible)
+    residual, error = level_balance(system, u, theta, state.level)
     return Outcome(u, residual, error, fraction, crushed)
 
 
