@@ -5,8 +5,8 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
+from emulator.fem.factorisations import REFUSALS
 from emulator.fem.newton import Newton
-from emulator.fem.sparse import REFUSALS
 
 
 def test_the_driver_equals_the_closed_loop(beam):
