@@ -64,9 +64,16 @@ class Factor:
         )
         self._ksp = PETSc.KSP().create(alone)
         self._ksp.setType("preonly")
-        self._ksp.getPC().setType("cholesky" if structure.upper else "lu")
+        kind = "cholesky" if structure.upper else "lu"
+        self._ksp.getPC().setType(kind)
         self._ksp.getPC().setFactorSolverType("mumps")
         self._ksp.setFromOptions()
+        asked = self._ksp.getPC().getType(), self._ksp.getPC().getFactorSolverType()
+        if asked != (kind, "mumps"):
+            raise InputError(
+                f"factorisation 'petsc': PETSC_OPTIONS ask for {' of '.join(map(str, asked))}; "
+                f"leave it at {kind} of mumps"
+            )
         self._ksp.setOperators(self._matrix)
         self.factorisations = 0
 
@@ -111,7 +118,7 @@ class Factor:
         return found
 
     def _check_factor(self) -> None:
-        """Raise ``ValueError`` with the reason where there is no factor."""
+        """Raise the reason where there is no factor; :class:`InputError` if options would help."""
         pc = self._ksp.getPC()
         failed, kinds = pc.getFailedReason(), petsc().PC.FailedReason
         if failed == kinds.NOERROR:
@@ -121,7 +128,7 @@ class Factor:
         if failed in (kinds.FACTOR_NUMERIC_ZEROPIVOT, kinds.FACTOR_STRUCT_ZEROPIVOT):
             raise ValueError(f"petsc: matrix is singular (MUMPS: {said})")
         if code in _WORKSPACE_TOO_SMALL:
-            raise ValueError(
+            raise InputError(
                 f"petsc: MUMPS needs more working space than it estimated ({said}); "
                 "add -mat_mumps_icntl_14 100 to PETSC_OPTIONS"
             )
@@ -130,7 +137,7 @@ class Factor:
     def _check_solution(self, residual: float, size: float) -> None:
         reason = self._ksp.getConvergedReason()
         if reason < 0 or not residual <= _BACKWARD_ERROR * size:
-            raise ValueError(
+            raise InputError(
                 f"petsc: the solution leaves a residual of {residual / size:.0e} of |A||x| + |b| "
                 f"(KSP: {reason}); with an approximate factor, iterate: add "
                 "-ksp_type fgmres -ksp_rtol 1e-10 to PETSC_OPTIONS"

@@ -30,7 +30,11 @@ class _Last:
         if self.factor is None or not self.factor.serves(structure):
             self.factor = None  # freed before another is made
             self.factor = Factor(structure)
-        self.factor.factorise(values)
+        try:
+            self.factor.factorise(values)
+        except Exception:
+            self.factor = None  # MUMPS cannot go on from a failure
+            raise
         return self.factor
 
 
