@@ -135,7 +135,8 @@ def inverse_benchmark(results):  # the study feeds its scorer wrong draws
 
 
 def large_meshes(results):
-    linear, quadratic = results["cases"]
+    linear, quadratic, tangent = results["cases"]
+    assert tangent["solvers"]["CHOLMOD"]["residual"] < 1e-9
     assert linear["from_rest"]["status"] == quadratic["from_rest"]["status"] == "converged"
     assert 0.0 < linear["share_of_factorisation"] < 1.0
 

@@ -14,6 +14,7 @@ from calibrate.verify.consistency import block as nearly_incompressible
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.factorisations import CHOICES, FACTORISATIONS, REFUSALS, mumps
+from emulator.fem.factorisations.petsc import _LAST
 from emulator.fem.kept import KeptFactor
 from emulator.fem.sparse import Pattern
 from emulator.scenes.loads import FollowerPressure
@@ -97,6 +98,9 @@ def test_inertia_tells_a_definite_matrix_from_an_indefinite_one():
     assert factor.negative_eigenvalues() == (np.linalg.eigvalsh(A) < 0.0).sum()
     with pytest.raises(REFUSALS, match="not positive definite"):
         pattern.solve(values, b, "petsc_definite")
+    # The factor of the refused matrix serves the one that takes any.
+    np.testing.assert_allclose(pattern.solve(values, b, "petsc"), np.linalg.solve(A, b), rtol=1e-8)
+    assert _LAST.factor.factorisations == 1
     with pytest.raises(REFUSALS, match="not positive definite"):
         jax.block_until_ready(jax.jit(partial(pattern.solve, method="petsc_definite"))(values, b))
     A, pattern, values, b = matrix(shift=8.0)
