@@ -241,8 +241,7 @@ def main() -> None:
     for mesh in QUICK if given.quick else MESHES:
         results.case(f"P{mesh[0]} {mesh[1:]}", lambda mesh=mesh: measured(mesh))
     for mesh in QUICK[:1] if given.quick else DIRECT:
-        name = f"solvers of P{mesh[0]} {mesh[1:]}"
-        results.case(name, lambda mesh=mesh: solvers.measured(partial(ventricle, *mesh)))
+        solvers.measure(results, f"P{mesh[0]} {mesh[1:]}", partial(ventricle, *mesh))
     if not given.quick:
         results.case("posterior", lambda: from_mesh_to_certificate("human", POSTERIOR))
     meshes = [case for case in results.cases if "from_rest" in case]

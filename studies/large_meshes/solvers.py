@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from studies.common.output import Case
+from studies.common.output import Case, Results
 from studies.common.processes import peak_gb, run
 
 from emulator.errors import InputError
@@ -132,26 +133,30 @@ def one(path: Path, solver: str) -> Case:
     return row | found | {"peak_GB": peak_gb()}
 
 
-def there() -> bool:
-    """Whether PETSc is."""
+def there() -> tuple[str, ...]:
+    """The solvers that are installed."""
     try:
         mumps.petsc()
     except InputError:
-        return False
-    return True
+        return SOLVERS[:1]
+    return SOLVERS
 
 
-def measured(make: Callable[[], Scene]) -> Case:
-    """Every solver that is installed on a tangent of one scene, each in a process of its own."""
+def measure(results: Results, name: str, make: Callable[[], Scene]) -> None:
+    """A case for each solver, in a process of its own, of the tangent of one scene."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "matrix.npz"
-        case = {**store(make(), path), "solvers": {}}
-        for solver in SOLVERS if there() else SOLVERS[:1]:
-            done = run("large_meshes.solvers", path, solver)
-            failed = {"status": f"exit code {done.returncode}", "said": done.stderr[-300:]}
-            found = failed if done.returncode else json.loads(done.stdout.splitlines()[-1])
-            case["solvers"][solver] = found
-    return case
+        size = cache(lambda: store(make(), path))
+        for solver in there():
+            results.case(f"{solver}, {name}", lambda solver=solver: measured(size(), path, solver))
+
+
+def measured(size: Case, path: Path, solver: str) -> Case:
+    """:func:`one` in a process of its own, or how it ended."""
+    done = run("large_meshes.solvers", path, solver)
+    if done.returncode:
+        return {"status": f"exit code {done.returncode}", "solver": solver, **size}
+    return {"solver": solver, **size, **json.loads(done.stdout.splitlines()[-1])}
 
 
 if __name__ == "__main__":
