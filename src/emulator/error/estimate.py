@@ -56,8 +56,8 @@ from emulator.error.step import (
 )
 from emulator.errors import InputError
 from emulator.fem.assembly import System
+from emulator.fem.factorisations import REFUSALS
 from emulator.fem.simulator import Simulator
-from emulator.fem.sparse import REFUSALS
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 

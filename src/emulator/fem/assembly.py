@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.fem.factorisations import Factorisation, find_factorisation
 from emulator.fem.functional import (
     DeadForce,
     at_points,
@@ -38,17 +39,25 @@ from emulator.fem.functional import (
 from emulator.fem.kept import KeptFactor
 from emulator.fem.mixed import Condensed, consistent, linearise
 from emulator.fem.programs import compiled
-from emulator.fem.sparse import Factorisation, Pattern, block_pattern
+from emulator.fem.sparse import Pattern, block_pattern
 from emulator.scenes.local_terms import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """The discrete equations of a scene; vectors of free displacements have shape (f,)."""
+    """The discrete equations of a scene; vectors of free displacements have shape (f,).
+
+    factorisation : by its name in :data:`emulator.fem.factorisations.FACTORISATIONS`.
+    """
 
     scene: Scene
-    factorisation: Factorisation = "umfpack"
+    factorisation: str = "umfpack"
+
+    @property
+    def direct(self) -> Factorisation:
+        """What solves with the tangent."""
+        return find_factorisation(self.factorisation)
 
     @cached_property
     def programs(self) -> dict[Callable, Callable]:
@@ -86,7 +95,9 @@ class System:
         local: list[LocalTerm | LocalForce] = [*self.springs, *self.terms, *self.forces]
         groups = [self.scene.discretisation.connectivity, *(part.nodes for part in local)]
         dofs = [(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1) for nodes in groups]
-        return block_pattern(dofs, free_index, symmetric=self.factorisation == "cholmod")
+        # A definite factorisation reads the upper triangle whatever the loads are.
+        symmetric = self.direct.triangle and (self.direct.definite or not self.forces)
+        return block_pattern(dofs, free_index, symmetric=symmetric)
 
     @cached_property
     def dead(self) -> DeadForce:
@@ -231,10 +242,15 @@ class System:
         """The smallest ``J``, shape (): NaN if any is."""
         return jnp.min(volume_ratio(self.scene, u))
 
-    @compiled
     def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
         """Solve ``K x = rhs`` over the free degrees of freedom, shape (f,)."""
-        return self.pattern.solve(tangent, rhs, self.factorisation)
+        if self.direct.on_host:
+            return self.direct.solve(self.pattern, tangent, rhs)
+        return self._solve(tangent, rhs)
+
+    @compiled
+    def _solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
+        return self.direct.solve(self.pattern, tangent, rhs)
 
     def step(self, tangent: jax.Array, rhs: jax.Array, *, near: bool = True) -> jax.Array:
         """:meth:`solve` for a step of Newton's method, with the factor of another one if it serves.
@@ -250,8 +266,9 @@ class System:
     @cached_property
     def kept(self) -> KeptFactor | None:
         """The factor that steps keep while it serves; None where the matrices are small."""
-        wanted = self.factorisation == "cholmod" and not self.mixed
-        return KeptFactor(self.pattern) if wanted and KeptFactor.pays(self.pattern) else None
+        wanted = self.direct.definite and not self.mixed
+        pays = wanted and KeptFactor.pays(self.pattern)
+        return KeptFactor(self.pattern, self.direct) if pays else None
 
 
 def relative_residual(

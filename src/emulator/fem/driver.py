@@ -1,5 +1,7 @@
 """The search for equilibrium driven from Python, each step with the cheapest factorisation.
 
+A *definite* factorisation, CHOLMOD, is asked first and a *general* one, UMFPACK, where it refuses.
+
 CHOLMOD takes about half of UMFPACK's time on a ventricle and a fifth on a large cube, but raises on
 an indefinite tangent, and inside ``jax.jit`` nothing can be done about that. Out here a refusal is
 information: the route of :mod:`emulator.fem.loading_path` is not convex and is given up, and on the
@@ -16,11 +18,10 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System
+from emulator.fem.factorisations import REFUSALS
 from emulator.fem.loading_path import LoadingPath, PathState, Route
 from emulator.fem.options import NewtonOptions
-from emulator.fem.programs import compiled
 from emulator.fem.solution import Solution
-from emulator.fem.sparse import REFUSALS
 
 _MOST_PATIENCE = 8  # iterations with UMFPACK before CHOLMOD is asked again
 
@@ -29,7 +30,8 @@ _MOST_PATIENCE = 8  # iterations with UMFPACK before CHOLMOD is asked again
 class Driver:
     """The steps of one scene, put together from compiled programs.
 
-    definite, general : the same equations with CHOLMOD and with UMFPACK.
+    definite, general : the same equations with a factorisation that refuses indefinite tangents,
+    e.g. CHOLMOD, and with one that takes any, e.g. UMFPACK.
     """
 
     definite: System
@@ -90,25 +92,24 @@ class Driver:
         return self._path(theta).ramp_step(state)
 
     def definite_step(self, theta: jax.Array, state: PathState) -> PathState:
-        """An iteration of Newton's method with CHOLMOD."""
+        """An iteration of Newton's method with the definite factorisation."""
         return self._path(theta).newton_step(state)
 
     def general_step(self, theta: jax.Array, state: PathState) -> PathState:
-        """An iteration of Newton's method with UMFPACK."""
+        """An iteration of Newton's method with the general factorisation."""
         return LoadingPath(self.general, self.options, theta).newton_step(state)
 
     def _path(self, theta: jax.Array) -> LoadingPath:
         return LoadingPath(self.definite, self.options, theta)
 
 
-@compiled
 def _trial(system: System, tangent: jax.Array) -> jax.Array:
     """The factorisation alone."""
     return system.solve(tangent, jnp.zeros(system.pattern.size))
 
 
 def _unless_refused(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Result of ``function``; ``None`` where CHOLMOD finds its tangent not positive definite."""
+    """Result of ``function``; ``None`` where its tangent is found not positive definite."""
     try:
         return jax.block_until_ready(function(*arguments))
     except REFUSALS as error:

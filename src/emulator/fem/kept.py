@@ -14,7 +14,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.sparse import Pattern, remember_factors
+from emulator.fem.factorisations import Factorisation
+from emulator.fem.factorisations.suitesparse import CHOLMOD, remember_factors
+from emulator.fem.programs import while_loop
+from emulator.fem.sparse import Pattern
 
 TOLERANCE = 1e-10  # of the residual, in the norm of the reference's inverse
 _PATIENCE = 6  # steps after which half the pace that the last allowed step needs is asked for
@@ -45,17 +48,19 @@ class KeptFactor:
     For numbers, on meshes where a factorisation takes as long as many back-substitutions. Two
     factors of such a mesh may not fit into memory, so the solver is told to remember one.
 
-    pattern : upper triangle, for CHOLMOD.
+    pattern : upper triangle. definite : what factorises, and refuses any other matrix.
     """
 
-    def __init__(self, pattern: Pattern) -> None:
+    def __init__(self, pattern: Pattern, definite: Factorisation = CHOLMOD) -> None:
         remember_factors(1)
         self._pattern = pattern
         self._kept: jax.Array | None = None
         as_long = int(_STEPS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
         self._steps = max(_PATIENCE, as_long)
-        self._beside = jax.jit(self._conjugate_gradients)
-        self._factorised = jax.jit(lambda values, b: pattern.solve(values, b, "cholmod"))
+        jit = (lambda function: function) if definite.on_host else jax.jit
+        self._product = jax.jit(pattern.product)
+        self._factorised = jit(partial(definite.solve, pattern))
+        self._beside = jit(self._conjugate_gradients)
         self.factorisations = 0
 
     @staticmethod
@@ -80,12 +85,7 @@ class KeptFactor:
     def _conjugate_gradients(
         self, tangent: jax.Array, kept: jax.Array, b: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        pattern = self._pattern
-
-        def precondition(residual: jax.Array) -> jax.Array:
-            return pattern.solve(kept, residual, "cholmod")
-
-        product = partial(pattern.product, tangent)
+        product, precondition = partial(self._product, tangent), partial(self._factorised, kept)
         return conjugate_gradients(product, precondition, b, self._steps, TOLERANCE)
 
 
@@ -126,5 +126,5 @@ def conjugate_gradients(
         return going & on_pace(state.k, state.size)
 
     start = _State(jnp.array(0), jnp.zeros_like(b), b, first, begin, jnp.array(True))
-    state = jax.lax.while_loop(running, step, start)
+    state = while_loop(running, step, start)
     return state.x, state.convex & (state.size <= enough) & jnp.isfinite(state.size)

@@ -164,8 +164,8 @@ def _taken(
 
 def _definite(system: System, values: jax.Array, residual: jax.Array, move: jax.Array) -> jax.Array:
     """Whether the tangent ``values`` (nnz,) is positive definite, as far as can be told."""
-    if system.factorisation == "cholmod":
-        return jnp.array(True)  # CHOLMOD refuses any other
+    if system.direct.definite:
+        return jnp.array(True)  # it refuses any other
     if system.forces:  # not symmetric: at least the step goes down
         return jnp.vdot(residual, move) <= 0.0
     return inverse_is_positive(partial(system.solve, values), system.pattern.size)

@@ -27,10 +27,10 @@ _STEPS = 25  # about as long as one factorisation by UMFPACK
 
 @dataclass(frozen=True, eq=False)
 class NearSolver:
-    """Solves with tangents of ``general``, whose pattern is full and whose factors are UMFPACK's.
+    """Solves with tangents of ``general``.
 
-    definite : the same equations with CHOLMOD.
-    reference : (nnz,) a positive definite tangent of ``definite``; None for UMFPACK alone.
+    definite : the same equations with a factorisation that refuses indefinite tangents.
+    reference : (nnz,) a positive definite tangent of ``definite``; None for ``general`` alone.
     """
 
     general: System

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +22,13 @@ from emulator._precision import require_float64
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
+from emulator.fem.factorisations import REFUSALS, Choice, find_choice
+from emulator.fem.factorisations.suitesparse import CHOLMOD, quiet_blas
 from emulator.fem.functional import volume_ratio
 from emulator.fem.loading_path import find_equilibrium
 from emulator.fem.near import NearSolver
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
-from emulator.fem.sparse import REFUSALS, Factorisation, quiet_blas
 from emulator.scenes.scene import Scene
 from emulator.shown import Row, Shown
 
@@ -44,14 +44,26 @@ class Simulator(Shown):
     factorisation : ``umfpack`` (any tangent), ``cholmod`` (faster; raises where the tangent is
         indefinite, as it often is on the way from rest), or ``auto``: CHOLMOD where it works and
         UMFPACK where it does not, which under ``jit``, ``vmap`` and ``grad`` means UMFPACK.
+        ``petsc`` (an extra) is MUMPS in both places, for meshes whose factors do not fit
+        (docs/large_meshes.md).
+
+    Raises
+    ------
+    InputError
+        A factorisation that is unknown or not installed.
     """
 
     scene: Scene
     options: NewtonOptions = field(default_factory=NewtonOptions)
-    factorisation: Factorisation | Literal["auto"] = "auto"
+    factorisation: str = "auto"
 
     def __post_init__(self) -> None:
+        find_choice(self.factorisation)
         quiet_blas()
+
+    @property
+    def _choice(self) -> Choice:
+        return find_choice(self.factorisation)
 
     def shown(self) -> tuple[str, list[Row]]:
         """What it simulates and how."""
@@ -63,11 +75,12 @@ class Simulator(Shown):
     @cached_property
     def system(self) -> System:
         """Residual and tangent of the scene."""
-        return System(self.scene, "umfpack" if self.factorisation == "auto" else self.factorisation)
+        return System(self.scene, self._choice.general.name)
 
     @cached_property
     def _driver(self) -> Driver:
-        return Driver(System(self.scene, "cholmod"), self.system, self.options)
+        definite = self._choice.definite or CHOLMOD
+        return Driver(System(self.scene, definite.name), self.system, self.options)
 
     @property
     def rest(self) -> jax.Array:
@@ -143,12 +156,12 @@ class Simulator(Shown):
                 "not a question of its tangent's sign"
             )
         sound = jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
-        return bool(sound) and self._driver.linearise(u, theta)[0].factorisation == "cholmod"
+        return bool(sound) and self._driver.linearise(u, theta)[0].direct.definite
 
     def _drives(self, *arguments: jax.Array) -> bool:
-        """Whether Python sees the numbers and CHOLMOD could work."""
+        """Whether Python sees the numbers and a definite factorisation could work."""
         traced = any(isinstance(argument, jax.core.Tracer) for argument in arguments)
-        return not (self.factorisation != "auto" or traced or self.system.forces)
+        return not (self._choice.definite is None or traced or self.system.forces)
 
     def linearised(self, u: jax.Array, theta: jax.Array) -> tuple[System, jax.Array]:
         """The system that can factorise the tangent at ``u``, and that tangent (nnz,)."""
@@ -160,15 +173,15 @@ class Simulator(Shown):
         """For solves inside ``jit`` with tangents like that at ``u`` (n, 3) mm and ``theta`` (p,).
 
         Both are numbers. Where that tangent is not positive definite, or no load has a potential,
-        the solver is UMFPACK.
+        each is factorised.
         """
         theta, u = self._checked(theta, u, "displacement")
         reference = None
         if self._drives(u, theta):
             system, tangent = self._driver.linearise(u, theta)
-            if system.factorisation == "cholmod":
+            if system.direct.definite:
                 reference = np.asarray(tangent)
-        return NearSolver(self.system, System(self.scene, "cholmod"), reference)
+        return NearSolver(self.system, self._driver.definite, reference)
 
     def _checked(
         self, theta: jax.Array, start: jax.Array, what: str = "start"
@@ -229,7 +242,7 @@ class Simulator(Shown):
 
     @cached_property
     def _systems(self) -> tuple[System, ...]:
-        return (self.system,) if self.factorisation != "auto" else self._driver.systems
+        return (self.system,) if self._choice.definite is None else self._driver.systems
 
     @cached_property
     def _moved(self):  # noqa: ANN202

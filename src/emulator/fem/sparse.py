@@ -1,53 +1,18 @@
-"""Sparse direct solves inside ``jax.jit``, and the pattern that assembled tangents share.
-
-The factorisations are SuiteSparse's, through sparsax: CHOLMOD for positive definite tangents,
-UMFPACK for any. CHOLMOD raises on an indefinite matrix, even inside ``jit``, so callers who choose
-it must know that theirs is definite, or catch :data:`REFUSALS`.
-"""
+"""The pattern that assembled tangents share, and its products and direct solves."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import sparsax
-from threadpoolctl import ThreadpoolController
+
+from emulator.fem.factorisations import find_factorisation
 
 # Relative increase of the diagonal, four units of round-off: an exactly zero pivot becomes tiny.
 _RAISE = 2.0**-50
 _LEAST_ROW = 1e-290  # a row whose absolute sum is below this is empty
-
-Factorisation = Literal["umfpack", "cholmod"]
-
-REFUSALS = (jax.errors.JaxRuntimeError, ValueError)
-"""Exceptions of a factorisation that refuses its matrix. Timing decides: the first if JAX meets the
-failure while waiting for the result, the second if the call itself fails. Both messages name
-``sparsax`` and the reason."""
-
-
-# By default sparsax caches up to 32 UMFPACK and 8 CHOLMOD factors of each pattern, for matrices
-# that recur. Ours recur only in consecutive solves, and a factor of a large mesh takes a gigabyte.
-def remember_factors(count: int) -> None:
-    """Let the solver keep so many factors of each pattern, of CHOLMOD and of UMFPACK each."""
-    sparsax.set_umf_cache_size(count)
-    sparsax.set_num_cache_size(count)
-
-
-remember_factors(2)
-
-
-def quiet_blas() -> None:
-    """Hold the BLAS inside the sparse solver to one thread.
-
-    A second thread pool beside XLA's oversubscribes the cores: a factorisation of 2.5 ms then took
-    up to 250 ms. Only the library bundled with sparsax is changed, not NumPy's.
-    """
-    for library in ThreadpoolController().lib_controllers:
-        if "sparsax" in library.filepath:
-            library.set_num_threads(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +37,12 @@ class Pattern:
         """Values (nnz,) from the entries of all blocks, flattened one after the other."""
         return jax.ops.segment_sum(entries[self.source], self.target, num_segments=len(self.rows))
 
-    def solve(self, values: jax.Array, rhs: jax.Array, method: Factorisation) -> jax.Array:
-        """``x`` with ``A x = rhs``, shape (size,); differentiable, usable under ``vmap``."""
-        solver = sparsax.solve if method == "cholmod" else sparsax.umf_solve
-        return solver(self.rows, self.columns, values, rhs)
+    def solve(self, values: jax.Array, rhs: jax.Array, method: str) -> jax.Array:
+        """``x`` with ``A x = rhs``, shape (size,), by the factorisation of that name.
+
+        Differentiable, usable under ``vmap``.
+        """
+        return find_factorisation(method).solve(self, values, rhs)
 
     def product(self, values: jax.Array, x: jax.Array) -> jax.Array:
         """``A x``, shape (size,)."""
@@ -115,7 +82,7 @@ def block_pattern(groups: list[np.ndarray], free_index: np.ndarray, *, symmetric
     ----------
     groups : each (k, d): global degrees of freedom of the rows, and columns, of k blocks.
     free_index : (n_dofs,) position among the free ones, -1 where held.
-    symmetric : keep only the upper triangle, as CHOLMOD wants.
+    symmetric : keep only the upper triangle.
     """
     size = int(free_index.max()) + 1
     pairs = [_block_entries(free_index[dofs]) for dofs in groups]

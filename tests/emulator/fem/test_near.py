@@ -13,9 +13,9 @@ from scipy.sparse.linalg import spsolve
 
 import emulator as em
 from emulator.fem.assembly import System
+from emulator.fem.factorisations import REFUSALS
 from emulator.fem.kept import KeptFactor, conjugate_gradients
 from emulator.fem.near import NearSolver
-from emulator.fem.sparse import REFUSALS
 from emulator.scenes.loads import FollowerPressure
 
 

@@ -15,10 +15,10 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.fem.assembly import relative_residual
 from emulator.fem.campaign.row import Row, Task
+from emulator.fem.factorisations import REFUSALS
 from emulator.fem.functional import potential_energy, volume_ratio
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
-from emulator.fem.sparse import REFUSALS
 
 Starts = Callable[[int], Sequence[Any]]
 """Displacements (n, 3) mm that the solve of that number may start from; none for rest."""
