@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +13,13 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.training.checkpoint import State
 from emulator.training.plan import Plan
-from emulator.training.problem import Problem
 from emulator.training.step import WARMUP
 
+if TYPE_CHECKING:
+    from emulator.training.problem import Problem
+
+LEAST_S = 5.0
+"""Seconds below which a budget is refused at once."""
 # Fractions of a budget: until when FEM runs may start, and until when the network trains, with a
 # discrepancy model to fit afterwards and without.
 _FEM_SHARE = 0.3
@@ -26,10 +31,32 @@ _CLOCKED = 8  # steps that are timed beforehand
 
 @dataclass(frozen=True)
 class Budget:
-    """Seconds for a training that began at ``started`` of the performance counter."""
+    """Seconds for a training that began at ``started`` of the performance counter.
+
+    Raises
+    ------
+    InputError
+        Fewer than 5 seconds, in which nothing can be compiled and solved.
+    """
 
     seconds: float
     started: float
+
+    def __post_init__(self) -> None:
+        if self.seconds < LEAST_S:
+            raise InputError(
+                f"a budget of {self.seconds:g} s: one FEM solution and its compilation alone take "
+                f"more than {LEAST_S:g} s; give a minute or more"
+            )
+
+    def require(self, done: str) -> None:
+        """:class:`InputError` where the time is over when only ``done`` is done."""
+        spent = time.perf_counter() - self.started
+        if spent > self.seconds:
+            raise InputError(
+                f"the budget of {self.seconds:g} s is over after {done}, {spent:.0f} s; give "
+                f"{4.0 * spent:.0f} s or more"
+            )
 
     def fem_deadline(self, plan: Plan) -> float:
         """When FEM runs stop to begin; a network alone is trained on all of its plan's."""

@@ -7,8 +7,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from emulator.errors import InputError
 from emulator.fem.campaign import StoredRuns
 from emulator.scenes.scene import Scene
@@ -65,14 +63,13 @@ def train(
         plan, architecture, source = saved.plan, saved.architecture or architecture, saved.start
         start = budget = None  # both are in the checkpoint
     limit = None if budget is None else Budget(budget, began)
-    deadline = np.inf if limit is None else limit.fem_deadline(plan)
     problem = prepare(
         scene,
         plan,
         architecture,
         start=start,
         campaign=campaign,
-        deadline=deadline,
+        budget=limit,
         progress=progress,
     )
     writer = Writer(path, scene.fingerprint, problem.architecture, source)

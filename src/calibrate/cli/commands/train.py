@@ -12,11 +12,12 @@ from calibrate.cli.common import (
     add_json,
     add_scene,
     emit,
+    scene_words,
     seconds,
     show_progress,
 )
 from emulator.errors import InputError
-from emulator.training.plan import OBJECTIVES, RECIPES
+from emulator.training.plan import OBJECTIVES, RECIPES, Plan
 
 
 def register(commands: Any) -> None:
@@ -74,21 +75,24 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.training import recipe, remove_checkpoint
     from emulator.training import train as train_emulator
 
-    scene = find_scene(arguments.scene, arguments.root)
+    scene = find_scene(*scene_words(arguments))
     check_folder(arguments.out)
     given = _given(arguments)
     start = load(arguments.start) if arguments.start else None
-    plan = recipe(arguments.recipe or _default_recipe(start))
+    plan = replace(recipe(arguments.recipe or _default_recipe(start)), **given)
+    if not arguments.resume:
+        _refuse_idle(plan, given, arguments.budget)
     campaign = None
     if arguments.campaign:
         from emulator.fem.campaign.stored_runs import read_runs
 
         campaign = read_runs(arguments.campaign, scene)
-        given.setdefault("simulations", len(campaign.runs.theta))
+        if "simulations" not in given:
+            plan = replace(plan, simulations=len(campaign.runs.theta))
     fixed = arguments.resume or "steps" in given
     result = train_emulator(
         scene,
-        replace(plan, **given),
+        plan,
         arguments.out,
         start=start,
         campaign=campaign,
@@ -131,10 +135,21 @@ def _given(arguments: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
+def _refuse_idle(plan: Plan, given: Mapping[str, Any], budget: str | None) -> None:
+    """:class:`InputError` for an option that changes nothing under ``plan``."""
+    idle = plan.idle | ({"budget": "trains nothing"} if plan.as_learned else {})
+    asked = [*given, *([] if budget is None else ["budget"])]
+    for name in (name for name in asked if name in idle):
+        raise InputError(
+            f"--{name} has no effect with recipe '{plan.recipe}', which {idle[name]}; leave it out"
+        )
+
+
 def command_line(scene: str, record: Mapping[str, Any]) -> str:
     """The command that repeats a training exactly, with the steps and runs it really took."""
     names = ("recipe", "objective", "steps", "simulations", "batch", "seed")
-    options = " ".join(f"--{name} {record['plan'][name]}" for name in names)
+    plan = Plan(**record["plan"])
+    options = " ".join(f"--{name} {getattr(plan, name)}" for name in names if name not in plan.idle)
     # The record names the emulator training started from by its fingerprint, not by its folder.
     start = " --start EMULATOR" if "start" in record else ""
     campaign = " --campaign STORE.zarr" if record["plan"]["campaign"] else ""
