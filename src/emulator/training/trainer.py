@@ -12,7 +12,8 @@ from emulator.fem.campaign import StoredRuns
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.budget import Aim, Budget
+from emulator.training.aim import Aim
+from emulator.training.budget import Budget
 from emulator.training.checkpoint import CHECKPOINT, Checkpoint, State, Writer, read_checkpoint
 from emulator.training.discrepancy_stage import add_discrepancy
 from emulator.training.loop import Bar, Hook, Keep, Steps, optimise, require_finite
