@@ -9,11 +9,11 @@ the order they are finished, which are kept in memory (:mod:`.memory`) or in a Z
 from emulator.fem.campaign.engine import (
     Executor,
     Solver,
-    executor,
     in_process,
     solve_rows,
     solve_together,
 )
+from emulator.fem.campaign.place import executor
 from emulator.fem.campaign.row import Row, Task
 from emulator.fem.campaign.runs import Runs, StoredRuns, run_campaign
 from emulator.fem.campaign.starts import Neighbours, Predictor

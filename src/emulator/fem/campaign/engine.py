@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -107,24 +106,6 @@ Executor = Callable[[Solver, Iterator[Task]], Iterator[Row]]
 def in_process(solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
     """The executor of this process: one task after the other, none taken before it is solved."""
     return map(solver, tasks)
-
-
-@contextmanager
-def executor(scheduler: str | None) -> Iterator[Executor]:
-    """Where to solve: in this process, or on the workers of the Dask scheduler at that address.
-
-    Raises
-    ------
-    InputError
-        The address is malformed, or nobody answers there.
-    """
-    if scheduler is None:
-        yield in_process
-        return
-    from emulator.fem.campaign.cluster import connected
-
-    with connected(scheduler) as cluster:
-        yield cluster
 
 
 def solve_rows(
