@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from study_checks import CHECKS
+
 STUDIES = Path(__file__).parents[1] / "studies"
 QUICK = {
     "accuracy_vs_time": "--quick",
@@ -68,203 +70,6 @@ def test_every_study_is_complete(folder):
         assert figure.name in readme
 
 
-def accuracy_vs_time(results):  # the study asserts its fronts
-    cases = {case["rung"]: case for case in results["cases"]}
-    names = ("network alone", "emulator, full field", "emulator + 1 Newton step")
-    network, emulator, polished = (cases[name]["own_mm"]["median"] for name in names)
-    assert polished < 0.01 * emulator < 1e-4 * network
-
-
-def certificate(results):
-    verdicts = {case["name"]: case["status"] for case in results["cases"]}
-    assert verdicts["five, constant 0, seed 0"] == "accepted"
-    assert verdicts["five, constant 1, seed 0"] == "reweight"
-    assert verdicts["modes, stuck 1, seed 0"] != "accepted"
-
-
-def decoder_speed(results):  # the study asserts equal gradients
-    cases = {case["name"]: case for case in results["cases"]}
-    assert 20 < cases["emulator"]["observed_nodes"] < cases["emulator"]["nodes"]
-    assert cases["twisting cube, 27 nodes"]["landmark_nodes"] <= 27
-    assert results["summary"]["times_faster_than_fem"] > 1.0
-
-
-def effects(results):
-    cases = {case["effect"]: case for case in results["cases"]}
-    assert set(cases) == {"", "gravity", "quadratic elements"}
-    assert cases[""]["changes"]["displacement"] == 0.0
-    assert 0.0 < cases["gravity"]["changes"]["displacement"] < 1.0
-
-
-def error_bar(results):
-    cases = {case["name"]: case for case in results["cases"]}
-    inside = cases["once_clamped_beam, shipped 'once_clamped_beam', inside"]
-    assert inside["effectivity"]["error bar"]["within_factor_2"] == 1.0
-    assert cases["once_clamped_beam, reduced, 5 FEM runs, 50 % outside"]["theta"] == 4
-
-
-def fem_posterior(results):
-    (case,) = results["cases"]
-    runs = {run["method"]: run for run in case["runs"]}
-    assert case["largest_shift"][0] < 1e-5
-    assert runs["emulator + certificate"]["fem_solves"] == 30
-    # Two chains: their starts, discarded draws, and at most four rounds.
-    assert runs["delayed acceptance"]["fem_solves"] <= 2 * (1 + 20 + 4 * 20)
-    # Gradients are counted in warm-up, too.
-    tuned = runs["FEM-NUTS, tuned by the emulator"]
-    assert tuned["fem_solves"] > tuned["kept_fem_solves"] > 20
-
-
-def fem_speed(results):
-    cases = {case["name"]: case for case in results["cases"]}
-    assert cases["scikit-fem + SciPy, cold"]["difference"] <= 1e-6
-    assert cases["FEniCS, cold"]["status"].startswith("skipped")
-    assert cases["cube, 4 cells an edge"]["nodes"] == 125
-
-
-def few_runs(results):
-    errors = {(c["method"], c["runs"]): c["err_u_mm"]["median"] for c in results["cases"]}
-    ratio = results["summary"]["left_ventricle"]["residual over the series / POD + GP"]["5"]
-    assert ratio == errors["residual over the series", 5] / errors["POD + GP", 5] < 1.0 / 3.0
-    assert 0.0 < errors["Taylor series", 1] < 0.2
-
-
-def inverse_benchmark(results):  # the study feeds its scorer wrong draws
-    entries = {case["entry"]: case for case in results["cases"] if "entry" in case}
-    assert {"emulator, NUTS", "emulator, emcee", "emulator, Laplace"} <= set(entries)
-
-
-def large_meshes(results):
-    linear, quadratic = results["cases"]
-    assert linear["from_rest"]["status"] == quadratic["from_rest"]["status"] == "converged"
-    assert 0.0 < linear["share_of_factorisation"] < 1.0
-
-
-def many_solves(results):
-    assert [case["status"] for case in results["cases"]] == ["converged"] * 3
-    assert results["summary"]["solves"] == 3
-
-
-def new_ventricle(results):
-    (case,) = results["cases"]
-    assert case["fem_runs"] == 9
-    assert case["err_V"]["median"] < 0.1
-
-
-def objectives(results):
-    cases = {case["name"]: case for case in results["cases"]}
-    trained = [cases[name] for name in ("simulations", "gradients", "energy", "both")]
-    assert {case["steps"] for case in trained} == {60}
-    assert [case["fem_runs"] for case in trained] == [17, 17, 1, 17]
-    start = cases["the centre's solution"]
-    assert cases["gradients"]["err_F"]["median"] < start["err_F"]["median"]
-
-
-def poor_emulators(results):
-    cases = {case["name"]: case for case in results["cases"]}
-    taken = cases["coarse, 1 run, 1st order, taken as exact"]
-    learned = cases["coarse, 1 run, 1st order, error learned"]
-    assert learned["error_runs"] == 24
-    assert learned["width_median"] > taken["width_median"]
-    assert learned["shift_in_own_sd_rms"] < taken["shift_in_own_sd_rms"]
-
-
-def published_pressure(results):
-    cases = {(case["load"], case["observed"]): case for case in results["cases"]}
-    assert len(cases) == 2
-    displaced = "24 landmarks and volume at 8 mmHg"
-    a = {load: cases[load, displaced]["parameters"]["a"]["mean"] for load in ("exact", "published")}
-    assert a["published"] > a["exact"]
-
-
-def released_networks(results):
-    models = {row["model"]: row for row in results["models"]}
-    assert len(models) == 3
-    assert max(row["off_the_released_code"] for row in models.values()) < 1e-6
-    assert models["TwistingBeam"]["err_u_stored_mm"] == pytest.approx(9.4e-5, abs=0.05e-5)
-    network, ours = results["cases"]
-    shifts = [max(abs(v) for v in row["shift_sd"].values()) for row in (network, ours)]
-    assert shifts[0] > shifts[1]
-
-
-def sbc(results):
-    (case,) = results["cases"]
-    assert case["status"] == "not calibrated"
-    assert case["replicates"] == 20
-
-
-def sensitivity(results):  # the study asserts known indices and FEM's
-    cases = {case["name"]: case for case in results["cases"]}
-    assert cases["ventricle, FEM"]["volume"]["evaluations"] == 56
-
-
-def stability(results):
-    status = {case["name"]: case["status"] for case in results["cases"]}
-    assert status == {
-        "theta_zero_inside_jit": "SINGULAR_TANGENT",
-        "theta_too_short": "InputError",
-        "pushed_through_itself": "INVERTED_ELEMENT",
-        "squeezed_to_half": "CONVERGED",
-        "laplace_two_modes": "WARNED",
-        "float32_once_clamped_beam": "InputError",
-        "float32_once_clamped_beam_pignn": "PREDICTED",
-        "outside_by_half_once_clamped_beam": "OUTSIDE",
-        "outside_by_half_once_clamped_beam_pignn": "OUTSIDE",
-    }
-    assert results["summary"]["silent_wrong"] == 0
-
-
-def transfer(results):
-    cases = {case["name"]: case for case in results["cases"]}
-    assert len(cases) == 8
-    # Before any step, from scratch is the centre's solution and a transfer is not.
-    scratch, family = (cases[f"from {name}, 0 steps"] for name in ("scratch", "the family"))
-    assert scratch["err_u"]["median"] != family["err_u"]["median"]
-
-
-def verification(results):
-    (case,) = results["cases"]
-    assert case["sets"] == 10
-    assert case["r_hat"]["largest"] < 1.1
-    assert 0.0 < case["sd_over_prior"]["mu"] < 0.5
-
-
-def ventricle_family(results):
-    (case,) = results["cases"]
-    before, nothing = case["before"]["err_u"], case["one_solution_everywhere"]["err_u"]
-    assert before["median"] < nothing["median"]
-    assert before["median"] < 0.2 * case["mean_u_mm"]
-
-
-CHECKS = {
-    check.__name__: check
-    for check in (
-        accuracy_vs_time,
-        certificate,
-        decoder_speed,
-        effects,
-        error_bar,
-        fem_posterior,
-        fem_speed,
-        few_runs,
-        inverse_benchmark,
-        large_meshes,
-        many_solves,
-        new_ventricle,
-        objectives,
-        poor_emulators,
-        published_pressure,
-        released_networks,
-        sbc,
-        sensitivity,
-        stability,
-        transfer,
-        ventricle_family,
-        verification,
-    )
-}
-
-
 def test_every_study_has_a_line():
     assert {path.parent.name for path in STUDIES.glob("*/__main__.py")} == set(QUICK)
     assert set(CHECKS) <= set(QUICK)
@@ -318,6 +123,20 @@ def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
     assert "J = " in module.judge(beam, -2.0 * beam.mesh.nodes, theta).wrong
     assert "finite" in module.judge(beam, np.nan * u, theta).wrong
     assert module.judge(beam, u, theta, "a claim that fails").wrong == "a claim that fails"
+
+
+def test_the_benchmarks_distance_of_a_shift():
+    """Along e a shift d moves all draws by e . d, whose mean size over the circle is 2 |d| / pi."""
+    from studies.inverse_benchmark.score import sliced
+    from studies.inverse_benchmark.tables import Table
+
+    draws, weights = np.random.default_rng(0).normal(size=(300, 2)), np.arange(1.0, 301.0)
+    table = Table(draws, weights / weights.sum())
+    assert sliced(table, table) == 0.0
+    moved = table._replace(draws=draws + [3.0, 4.0])
+    assert sliced(table, moved) == pytest.approx(10.0 / np.pi, rel=0.1)
+    twice = Table(np.repeat(draws, np.arange(1, 301), axis=0), np.full(45150, 1 / 45150))
+    assert sliced(table, twice) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_cases_that_are_there_are_not_repeated(tmp_path, monkeypatch):

@@ -29,20 +29,31 @@ def misfits(tree: xr.DataTree) -> list[str]:
     ]
 
 
+def tail_probabilities(replicates: np.ndarray, data: np.ndarray) -> tuple[float, float]:
+    """Of :math:`T_1` and :math:`T_2`: replicates (chains, draws, *shape), data (*shape)."""
+    ours, theirs = _distances(replicates, data)
+    p = np.mean((theirs**2).sum(axis=1) >= (ours**2).sum())
+    return float(p), float(np.mean(theirs.max(axis=1) >= ours.max()))
+
+
+def _distances(replicates: np.ndarray, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of data present (n,) and replicates (draws, n) from the replicates' mean, in their sd."""
+    present = np.isfinite(data.ravel())
+    y = replicates.reshape(-1, data.size)[:, present]
+    mean, sd = y.mean(axis=0), y.std(axis=0)
+    return np.abs(data.ravel()[present] - mean) / sd, np.abs(y - mean) / sd
+
+
 def _misfit(name: str, replicates: np.ndarray, data: np.ndarray) -> str:
     """About data (*shape) and replicates (chains, draws, *shape); empty where they agree."""
     y = replicates.reshape(-1, data.size)
-    present = np.isfinite(data.ravel())
-    mean, sd = y.mean(axis=0), y.std(axis=0)
-    if len(y) < _FEWEST or not np.isfinite(y).all() or not (sd > 0.0).all():
+    if len(y) < _FEWEST or not np.isfinite(y).all() or not (y.std(axis=0) > 0.0).all():
         return ""
-    ours = np.abs(data.ravel() - mean)[present] / sd[present]
-    theirs = np.abs(y - mean)[:, present] / sd[present]
-    p = float(np.mean((theirs**2).sum(axis=1) >= (ours**2).sum()))
-    p_worst = float(np.mean(theirs.max(axis=1) >= ours.max()))
+    p, p_worst = tail_probabilities(replicates, data)
     if p >= SMALLEST_P and p_worst > 0.0:
         return ""
-    place = np.unravel_index(np.flatnonzero(present)[ours.argmax()], data.shape)
+    ours, _ = _distances(replicates, data)
+    place = np.unravel_index(np.flatnonzero(np.isfinite(data))[ours.argmax()], data.shape)
     where = f"{name}[{', '.join(map(str, place))}]" if data.size > 1 else name
     return (
         f"{name} does not fit the model, posterior predictive p {min(p, p_worst):.3f} ({where} is "

@@ -7,7 +7,6 @@ and what would be right. Numbers are finite, and neither strings nor booleans.
 from __future__ import annotations
 
 import json
-import re
 import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -44,14 +43,12 @@ from pydantic import Field as Entry
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
 
+from emulator.docstrings import documented, summary
 from emulator.errors import InputError
 from emulator.line_index import Path, json_lines, line_of
 from emulator.store import read_json
 
 _SCALARS = {float: "number", int: "whole number", str: "string"}
-# Of a docstring: the section of parameters, and the entries in it.
-_SECTION = re.compile(r"Parameters\n\s*-+\n(.*?)(?:\n\s*\n|\Z)", re.DOTALL)
-_ENTRY = re.compile(r"^ {4}(\w[\w, ]*?) : (.*?)(?=^ {4}\w|\Z)", re.MULTILINE | re.DOTALL)
 # What pydantic calls a value of the wrong type, where no field of a table says what is right.
 _EXPECTED = {
     "float_type": "a number",
@@ -255,26 +252,6 @@ def json_schema(model: type[Table]) -> dict[str, Any]:
     """
     schema = model.model_json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_for_files(schema)}
-
-
-def summary(kind: type) -> str:
-    """First sentence of a docstring, on one line and without markup."""
-    return _plain((kind.__doc__ or "").split("\n\n")[0])
-
-
-def documented(kind: type) -> dict[str, str]:
-    """What the docstrings of a class and its bases say of each parameter, by name."""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        for section in _SECTION.findall(base.__doc__ or ""):
-            for names, text in _ENTRY.findall(section):
-                found |= dict.fromkeys(names.split(", "), _plain(text))
-    return found
-
-
-def _plain(text: str) -> str:
-    text = re.sub(r":\w+:`~?([^`]*)`", r"\1", " ".join(text.split()))
-    return text.replace("``", "").strip()
 
 
 def _shown_default(entry: Field[Any]) -> dict[str, Any] | None:

@@ -43,7 +43,7 @@ def _reduced(runs: int) -> Callable[[Scene], ForwardMap]:
 
 
 def _network(scene: Scene) -> ForwardMap:  # noqa: ARG001 - it is shipped
-    return entries.network()[0]
+    return entries.NETWORK()[0]
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ WAYS = {
         for n in (5, 20, 60)
     },
     **{f"POD + GP, {n} FEM runs, NUTS": Way("POD + GP", _reduced(n)) for n in (10, 30, 60)},
-    "network alone, NUTS": Way("network", _network, before_s=lambda: entries.network()[1]),
+    "network alone, NUTS": Way("network", _network, before_s=lambda: entries.NETWORK()[1]),
     "series + discrepancy, 20 FEM runs, MCLMC": Way(
         "emulator", _mechanics(20), entries.sampler("mclmc")
     ),

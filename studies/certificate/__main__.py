@@ -23,6 +23,7 @@ from studies.common.output import save
 import calibrate as cal
 from calibrate.certificate import certify
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE, GREEN, ORANGE, VERMILION
 from calibrate.provenance import study_header
 from emulator import Simulator
 from emulator.store import write_json
@@ -33,10 +34,10 @@ SEED = 0
 LARGEST_SHIFT, LARGEST_SD = 0.5, 0.25  # what no accepted posterior may exceed
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
 MARKS = {
-    "accepted": ("#009E73", "o"),
-    "reweight": ("#0072B2", "s"),
-    "undecided": ("#E69F00", "^"),
-    "not certified": ("#D55E00", "X"),
+    "accepted": (GREEN, "o"),
+    "reweight": (BLUE, "s"),
+    "undecided": (ORANGE, "^"),
+    "not certified": (VERMILION, "X"),
 }
 
 

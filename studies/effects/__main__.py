@@ -21,6 +21,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.effects import Comparison, Measured, recommend
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE, GREEN, VERMILION
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import run_campaign
@@ -185,7 +186,7 @@ def draw(cases: list[Case], path: Path) -> None:
     figure, panels = plt.subplots(
         1, 3, figsize=(12.5, 1.4 + 0.42 * len(effects)), sharey=True, layout="constrained"
     )
-    marks = dict(zip(scenes, (("o", "#0072B2"), ("s", "#D55E00"), ("^", "#009E73")), strict=False))
+    marks = dict(zip(scenes, (("o", BLUE), ("s", VERMILION), ("^", GREEN)), strict=False))
     for axes, (title, value) in zip(panels, values.items(), strict=True):
         for scene, (mark, colour) in marks.items():
             there = [c for c in rows if c["scene"] == scene and value(c) is not None]

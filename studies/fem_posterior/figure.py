@@ -8,13 +8,14 @@ from studies.fem_posterior.comparison import cost
 from studies.fem_posterior.methods import CHEAP, LATE, PLAIN, TUNED
 
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE, GREEN, ORANGE, VERMILION
 
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
 MARKS = {
-    PLAIN: ("#D55E00", "X"),
-    TUNED: ("#E69F00", "^"),
-    LATE: ("#0072B2", "o"),
-    CHEAP: ("#009E73", "s"),
+    PLAIN: (VERMILION, "X"),
+    TUNED: (ORANGE, "^"),
+    LATE: (BLUE, "o"),
+    CHEAP: (GREEN, "s"),
 }
 
 

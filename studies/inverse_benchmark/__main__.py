@@ -35,7 +35,7 @@ def references(results: Results, problems: list[Problem]) -> None:
         data_of(problem)
 
         def make(problem: Problem = problem) -> Case:
-            return reference.make(problem, entries.shipped()[0], entries.simulator())
+            return reference.make(problem, entries.EMULATOR()[0], entries.simulator())
 
         results.case(f"reference: {problem.name}", make)
 

@@ -6,7 +6,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +32,9 @@ Method = Callable[[Model, Draws], tuple[Draws, int]]
 
 
 @lru_cache
-def shipped() -> tuple[ForwardMap, float, int]:
-    """The shipped emulator, the seconds of its training, and its FEM runs."""
-    trained = em.load(SCENE)
-    return trained.cache(), trained.record["seconds"], trained.record["plan"]["simulations"] + 1
-
-
-@lru_cache
-def network() -> tuple[ForwardMap, float, int]:
-    """The shipped network alone."""
-    trained = em.load(f"{SCENE}_pignn")
+def shipped(name: str) -> tuple[ForwardMap, float, int]:
+    """A shipped emulator, the seconds of its training, and its FEM runs."""
+    trained = em.load(name)
     return trained.cache(), trained.record["seconds"], trained.record["plan"]["simulations"] + 1
 
 
@@ -126,21 +119,24 @@ class Entry:
     problems: tuple[str, ...] = tuple(PROBLEMS)
 
 
-_MID = tuple(name for name, problem in PROBLEMS.items() if problem.level == "mid")
 _NUTS = {"warmup": 300, "draws": 500, "chains": 4, "rounds": 2}
+EMULATOR = partial(shipped, SCENE)
+NETWORK = partial(shipped, f"{SCENE}_pignn")
 OURS = {
-    "emulator_nuts": Entry("emulator, NUTS", shipped, sampler("nuts", **_NUTS)),
-    "emulator_laplace": Entry("emulator, Laplace", shipped, sampler("laplace")),
-    "emcee": Entry("emulator, emcee", shipped, by_emcee, _MID),
-    "network_nuts": Entry("network alone, NUTS", network, sampler("nuts", **_NUTS), _MID),
+    "emulator_nuts": Entry("emulator, NUTS", EMULATOR, sampler("nuts", **_NUTS)),
+    "emulator_laplace": Entry("emulator, Laplace", EMULATOR, sampler("laplace")),
+    "emcee": Entry("emulator, emcee", EMULATOR, by_emcee),
+    "network_nuts": Entry("network alone, NUTS", NETWORK, sampler("nuts", **_NUTS)),
     "pod_gp_nuts": Entry(
-        f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_NUTS), _MID
+        f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_NUTS)
     ),
     "delayed_acceptance": Entry(
-        "emulator and FEM, delayed acceptance", shipped,
-        sampler("delayed_acceptance", draws=125, rounds=1), _MID,
+        "emulator and FEM, delayed acceptance", EMULATOR,
+        sampler("delayed_acceptance", draws=125, rounds=1),
     ),
-    "pymc": Entry("emulator, PyMC", shipped, by_pymc, ("displacements_mid",)),
+    "emulator_mclmc": Entry("emulator, MCLMC", EMULATOR, sampler("mclmc", **_NUTS)),
+    "emulator_smc": Entry("emulator, SMC", EMULATOR, sampler("smc")),
+    "pymc": Entry("emulator, PyMC", EMULATOR, by_pymc),
 }  # fmt: skip
 
 

@@ -6,8 +6,8 @@ from studies.common.output import Case, save
 from studies.inverse_benchmark.problems import PROBLEMS
 
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import COLOURS
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKS = "osv^DXP*<>"
 
 

@@ -25,6 +25,7 @@ from studies.common.output import save
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE
 from calibrate.provenance import study_header
 from emulator.error.comparison import case_errors, quantiles
 from emulator.fem import run_campaign, sobol
@@ -208,7 +209,7 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
             mine = [row for row in rows if row["seed"] == seed]
             x = [row["errors"][key]["median"] for row in mine]
             y = [names.index(row["idea"]) for row in mine]
-            axes.plot(x, y, mark, color="#0072B2", mfc="none", label=f"seed {seed}")
+            axes.plot(x, y, mark, color=BLUE, mfc="none", label=f"seed {seed}")
         axes.set(xscale="log", xlabel=f"median {label}")
         axes.grid(axis="x", color="0.9")
         axes.spines[["top", "right"]].set_visible(False)

@@ -20,6 +20,7 @@ from studies.common.output import Case, Results, parser, save
 import calibrate as cal
 import emulator as em
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE, GREEN, ORANGE
 from calibrate.figures.sensitivity import body_figure
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.priors import truncated_normal
@@ -152,9 +153,9 @@ def draw_indices(cases: dict[str, Case], path: Path) -> None:
     plt = pyplot()
     figure, panels = plt.subplots(1, 2, figsize=(9.5, 3.8), sharey=True, layout="constrained")
     shown = {
-        "ventricle, FEM": ("FEM, total", "#009E73"),
-        "ventricle, emulator": ("emulator, total", "#0072B2"),
-        "ventricle, prior of 10 %": ("emulator, total, prior of 10 %", "#E69F00"),
+        "ventricle, FEM": ("FEM, total", GREEN),
+        "ventricle, emulator": ("emulator, total", BLUE),
+        "ventricle, prior of 10 %": ("emulator, total, prior of 10 %", ORANGE),
     }
     for axes, name in zip(panels, ("displacement", "volume"), strict=True):
         factors = cases["ventricle, FEM"][name]["factors"]
@@ -182,7 +183,7 @@ def draw_segments(case: Case, path: Path) -> None:
     figure, panels = plt.subplots(1, 2, figsize=(9.5, 4.6), sharey=True, layout="constrained")
     for axes, name in zip(panels, ("displacement", "volume"), strict=True):
         y = np.arange(len(case[name]["factors"]))
-        axes.barh(y, case[name]["mu_star"], color="#0072B2")
+        axes.barh(y, case[name]["mu_star"], color=BLUE)
         axes.set(yticks=y, yticklabels=case[name]["factors"], title=name)
         axes.set_xlabel(f"mean absolute effect over the range, {case[name]['unit']}")
         axes.spines[["top", "right"]].set_visible(False)

@@ -1,10 +1,12 @@
 """Hard cases: each must end well or name its failure, never answer wrongly.
 
-Run from anywhere: ``python -m studies.stability``. Writes results.json and stability.png beside
-itself and asserts what the README of the study says.
+Run from anywhere: ``python -m studies.stability``. Writes results.json, after each case, and
+stability.png beside itself and asserts what the README of the study says. Cases that results.json
+holds are kept.
 """
 
 import argparse
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -103,21 +105,49 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def table(rows: list[dict[str, Any]]) -> str:
+    """How each family ended, as the README has it."""
+    names = list(dict.fromkeys(sorted((row["status"] for row in rows), key=list(COLOURS).index)))
+    words = [name.replace("_", " ").lower() if name.isupper() else name for name in names]
+    lines = [f"| family | cases | {' | '.join(words)} |", "|---" * (len(names) + 2) + "|"]
+    families = dict.fromkeys(row["family"] for row in rows)
+    for family in [*families, "all"]:
+        ended = Counter(row["status"] for row in rows if family in (row["family"], "all"))
+        counts = " | ".join(str(ended[name] or "") for name in names)
+        lines.append(f"| {family} | {ended.total()} | {counts} |")
+    return "\n".join(lines)
+
+
+def _kept(row: dict[str, Any], chosen: tuple[str, ...], again: bool) -> bool:
+    """Whether a row of results.json is not to be made again."""
+    good = row["status"] in NAMED and not row["silent_wrong"]
+    return not row["name"].startswith(chosen) or (good and not again)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", nargs="*", help="names, or beginnings of names; all by default")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--limit", type=float, default=LIMIT, help="seconds a case")
+    parser.add_argument("--again", action="store_true", help="repeat cases that results.json has")
     parser.add_argument("--out", type=Path, default=HERE)
     arguments = parser.parse_args()
     chosen = tuple(arguments.cases or [""])
-    names = [name for name in CASES if name.startswith(chosen)]
-    rows = study(names, arguments.workers, arguments.limit)
+    path = arguments.out / "results.json"
+    there = json.loads(path.read_text())["cases"] if path.is_file() else []
+    known = [row for row in there if _kept(row, chosen, arguments.again)]
+    had = {row["name"] for row in there}
+    names = [name for name in CASES if name in had or name.startswith(chosen)]
     header = study_header(HERE, SEED)
+
+    def keep(rows: list[dict[str, Any]]) -> None:
+        write_json(path, {**header, "summary": summary(rows), "cases": rows})
+
+    rows = study(names, arguments.workers, arguments.limit, known, keep)
     found = summary(rows)
-    write_json(arguments.out / "results.json", {**header, "summary": found, "cases": rows})
+    keep(rows)
     draw(rows, arguments.out / "stability.png")
-    print(found)
+    print(table(rows), found, sep="\n")
     check(rows)
 
 

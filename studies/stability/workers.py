@@ -4,11 +4,15 @@ import multiprocessing
 import queue
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from multiprocessing.connection import Connection
 from typing import Any
 
 from studies.stability.cases import CASES, outcome
+
+# Compiled programs stay mapped, and a process may have 65 530 maps: after some 200 cases LLVM can
+# allocate no more.
+MOST_CASES = 60
 
 
 def work(pipe: Connection) -> None:
@@ -18,16 +22,18 @@ def work(pipe: Connection) -> None:
 
 
 class Worker:
-    """A process that is killed when a case hangs; the next case gets a new one."""
+    """A process, killed when a case hangs or it has had many; the next case gets a new one."""
 
     def __init__(self) -> None:
         self.process: Any = None
+        self.had = 0
 
     def start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
         self.process = context.Process(target=work, args=(other,), daemon=True)
         self.process.start()
+        self.had = 0
         other.close()
 
     def stop(self) -> None:
@@ -38,8 +44,11 @@ class Worker:
 
     def run(self, name: str, limit: float) -> dict[str, Any]:
         """The outcome of ``name``; its status is ``hang`` or ``crash`` where there is none."""
+        if self.had >= MOST_CASES:
+            self.stop()
         if self.process is None:
             self.start()
+        self.had += 1
         begin = time.perf_counter()
         self.pipe.send(name)
         try:
@@ -60,13 +69,28 @@ class Worker:
         }
 
 
-def study(names: Iterable[str], workers: int, limit: float) -> list[dict[str, Any]]:
-    """Every case, in the order of ``names``."""
+def study(
+    names: Iterable[str],
+    workers: int,
+    limit: float,
+    known: Iterable[dict[str, Any]] = (),
+    keep: Callable[[list[dict[str, Any]]], None] = lambda _: None,
+) -> list[dict[str, Any]]:
+    """Every case, in the order of ``names``; those in ``known`` are taken as they are.
+
+    keep : is given all rows so far after each case.
+    """
     names = list(names)
+    rows = {row["name"]: row for row in known if row["name"] in set(names)}
     waiting: queue.SimpleQueue[str] = queue.SimpleQueue()
     for name in names:
-        waiting.put(name)
-    rows: dict[str, dict[str, Any]] = {}
+        if name not in rows:
+            waiting.put(name)
+
+    def so_far() -> list[dict[str, Any]]:
+        return [rows[name] for name in names if name in rows]
+
+    writing = threading.Lock()
 
     def drain() -> None:
         worker = Worker()
@@ -81,10 +105,12 @@ def study(names: Iterable[str], workers: int, limit: float) -> list[dict[str, An
                 f"{row['time_s']:6.1f} s  {row['iterations'] or '':>4} {row['note'][:70]}",
                 flush=True,
             )
+            with writing:
+                keep(so_far())
 
     threads = [threading.Thread(target=drain) for _ in range(workers)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    return [rows[name] for name in names]
+    return so_far()

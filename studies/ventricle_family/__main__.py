@@ -28,6 +28,7 @@ from studies.common.output import save
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE, GREEN, VERMILION
 from calibrate.provenance import hardware, study_header, versions
 from emulator.error.comparison import case_errors, quantiles
 from emulator.fem.campaign import Runs, run_campaign
@@ -237,7 +238,7 @@ def summary(cases: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-METHODS = {"network": ("o", "#0072B2"), "mechanics": ("s", "#D55E00"), "POD + GP": ("^", "#009E73")}
+METHODS = {"network": ("o", BLUE), "mechanics": ("s", VERMILION), "POD + GP": ("^", GREEN)}
 
 
 def draw(cases: list[dict[str, Any]], path: Path) -> None:

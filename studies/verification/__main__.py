@@ -24,6 +24,7 @@ from studies.common.output import Case, Results, parser, save
 import calibrate as cal
 import emulator as em
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import COLOURS
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import Simulator, run_campaign
@@ -268,10 +269,9 @@ def draw(cases: list[Case], path: Path) -> None:
     )
     y = np.arange(len(cases))
     marks = "osv^DXP"
-    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
     names = list(dict.fromkeys(name for case in cases for name in case["covered"]))
     for k, name in enumerate(names):
-        style = {"color": colours[k % 7], "marker": marks[k % 7], "ls": "none", "mfc": "none"}
+        style = {"color": COLOURS[k % 7], "marker": marks[k % 7], "ls": "none", "mfc": "none"}
         style["label"] = name
         shift = 0.12 * (k % 5 - 2)
         for axes, key in zip(panels, ("covered", "sd_over_prior"), strict=True):

@@ -5,8 +5,9 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.stats import chi2
 
-from calibrate.fit import misfits
+from calibrate.fit import SMALLEST_P, misfits, tail_probabilities
 
 
 def tree(data, sd=1.0, correlated=False):
@@ -63,3 +64,23 @@ def test_without_replicates_nothing_is_said():
     whole = tree(np.full((20, 3), 99.0))
     del whole["posterior_predictive"]
     assert misfits(whole) == []
+
+
+def test_p_of_the_sum_is_chi_squareds():
+    """Of independent Gaussian data, T_1 has the chi-squared distribution."""
+    rng = np.random.default_rng(3)
+    replicates, y = rng.normal(size=(4, 5000, 30)), rng.normal(size=30)
+    for scale in (0.7, 1.0, 1.25):
+        p, _ = tail_probabilities(replicates, scale * y)
+        assert p == pytest.approx(chi2.sf(scale**2 * (y @ y), 30), abs=0.015)
+
+
+def test_one_outlier_among_many_is_told_by_the_largest():
+    """6 sd in one of 2000 data move the sum by 0.6 of its sd."""
+    y = np.random.default_rng(4).normal(size=(2000, 1))
+    y[1234] = 6.0
+    replicates = tree(y)["posterior_predictive"]["u"].values
+    p, p_worst = tail_probabilities(replicates, y)
+    assert p > SMALLEST_P
+    assert p_worst == 0.0
+    assert "u[1234, 0] is 6" in misfits(tree(y))[0]

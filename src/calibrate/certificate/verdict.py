@@ -14,6 +14,7 @@ import numpy as np
 
 from calibrate.certificate.evidence import Evidence, Figure, Physics, Sampling
 from calibrate.certificate.misfit import Misfit
+from calibrate.fit import SMALLEST_P
 from emulator.shown import Row, Shown
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
@@ -23,7 +24,7 @@ LARGEST_R_HAT = 1.05
 SMALLEST_ESS = 100.0
 LARGEST_DIVERGENT = 0.002
 LARGEST_FAILED = 0.02
-SMALLEST_P, SMALLEST_P_WORST = 0.005, 0.001
+SMALLEST_P_WORST = 0.001
 # Spread of the log ratio of FEM's likelihood over the corrected map's, above which the two are too
 # different whatever the tail; at 1.5 a tenth of the FEM runs would count.
 LARGEST_SPREAD = 1.5

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE, VERMILION
 from calibrate.sbc import LEVELS, Calibration
 from emulator.store import replacing
 
-_INSIDE, _OUTSIDE, _BAND = "#0072B2", "#D55E00", "0.85"  # blue and vermilion differ for all readers
+_INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ for all readers
 
 
 def draw(found: Calibration, title: str, path: str | Path) -> None:

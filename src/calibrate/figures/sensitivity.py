@@ -10,6 +10,7 @@ import xarray as xr
 
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.evaluation import surface_triangles
+from calibrate.figures.palette import BLUE, VERMILION
 from calibrate.sensitivity_analysis import FIELD
 from emulator.scenes.scene import Scene
 from emulator.store import replacing
@@ -17,7 +18,7 @@ from emulator.store import replacing
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_FIRST, _TOTAL = "#0072B2", "#D55E00"
+_FIRST, _TOTAL = BLUE, VERMILION
 # By method: what a bar shows, and its label.
 _BARS = {
     "sobol": (

@@ -12,21 +12,14 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from scipy.stats import rankdata
 
+from calibrate.figures.palette import BLUE, COLOURS, VERMILION
 from calibrate.identifiability.stress import stress_band
 from calibrate.observations import CavityVolume, Observation
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
 from emulator.scenes.cavities import inflated_cavity
 
-BLUE, ORANGE, GREEN, PINK, YELLOW, SKY = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-)
-_CHAINS = (BLUE, ORANGE, GREEN, PINK, YELLOW, SKY)  # told apart by the colour-blind
+_CHAINS = COLOURS[:6]
 _BAND = "rgba(0, 114, 178, 0.22)"
 _MOST_TRACED = 500  # draws of a chain in a trace
 _MOST_PAIRED = 800  # draws in a pair plot
@@ -66,7 +59,7 @@ def _one_number(name: str, part: Observation, values: np.ndarray, measured: floa
             name="predicted, with noise",
         )
     )  # fmt: skip
-    figure.add_vline(x=measured, line={"color": ORANGE, "width": 3}, annotation_text="measured")
+    figure.add_vline(x=measured, line={"color": VERMILION, "width": 3}, annotation_text="measured")
     figure.update_layout(xaxis_title=f"{name} ({part.unit})", yaxis={"showticklabels": False})
     return figure
 
@@ -163,7 +156,7 @@ def stress(posterior: Posterior) -> go.Figure:
     """The stress that a stretch takes, 90 % band."""
     figure = go.Figure()
     fibres = posterior.model.forward.scene.law.fibres
-    for direction, colour in (("fibre", BLUE), ("cross-fibre", ORANGE))[: 2 if fibres else 1]:
+    for direction, colour in (("fibre", BLUE), ("cross-fibre", VERMILION))[: 2 if fibres else 1]:
         band = stress_band(posterior, direction)
         label = f"along the {direction}" if fibres else "in any direction"
         fill = f"rgba({int(colour[1:3], 16)}, {int(colour[3:5], 16)}, {int(colour[5:], 16)}, 0.2)"
@@ -219,7 +212,7 @@ def _add_measured(figure: go.Figure, posterior: Posterior, seen: str, pressure: 
     values = np.asarray(posterior.thetas(state)[:, column])
     figure.add_scatter(
         x=[float(posterior.data[seen])], y=[float(values.mean())], mode="markers",
-        marker={"color": ORANGE, "size": 11, "symbol": "x"},
+        marker={"color": VERMILION, "size": 11, "symbol": "x"},
         error_y={"type": "data", "array": [float(values.std())]},
         name=f"{seen} measured; pressure {'known' if values.std() == 0.0 else 'inferred'}",
     )  # fmt: skip
