@@ -2,7 +2,8 @@
 
 The demo draws beam.png. report.png and explore.png are photographs of the pages, which need
 playwright and a Chromium: the one that CALIBRATE_BROWSER names, or ``chromium``. Studies draw their
-own pictures, ``python -m studies.<name>``, and notebooks theirs, ``make notebooks``.
+own pictures, ``python -m studies.<name>``, and notebooks theirs, ``make notebooks``. Names make some:
+``python docs/pictures.py report.png``.
 """
 
 import io
@@ -28,6 +29,7 @@ from emulator.surrogates import load
 
 HERE = Path(__file__).parent
 COLOURS = 128
+_PATIENCE_MS = 300_000
 # Of a page without a graphics card.
 SOFTWARE = (
     "--no-sandbox",
@@ -48,7 +50,7 @@ def report(path: Path, browser: Any) -> None:
     """The body on a report of the ventricle's demo, at one of its draws."""
     with tempfile.TemporaryDirectory() as folder:
         infer(replace(DEMOS["left_ventricle"].run, sampler="laplace"), folder)
-        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page = opened(browser, 1280, 900)
         page.goto(write_report(folder, fem=False).resolve().as_uri())
         page.wait_for_selector(".slider-rail-touch-rect")
         rail = page.query_selector(".slider-rail-touch-rect")
@@ -68,19 +70,26 @@ def explore(path: Path, browser: Any) -> None:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
-            page = browser.new_page(viewport={"width": 1024, "height": 720})
+            page = opened(browser, 1024, 720)
             page.goto(f"http://127.0.0.1:{server.server_address[1]}")
             page.wait_for_function("window.updates > 0")
             box = page.query_selector("#p-pressure").bounding_box()
             page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.5 * box["height"])
             said = "document.getElementById('{}').innerText.includes('{}')"
-            page.wait_for_function(said.format("error", "median"), timeout=120_000)
+            page.wait_for_function(said.format("error", "median"))
             page.click("#fem")
-            page.wait_for_function(said.format("against", "off by"), timeout=120_000)
+            page.wait_for_function(said.format("against", "off by"))
             keep(page.screenshot(), path)
         finally:
             server.shutdown()
             thread.join()
+
+
+def opened(browser: Any, width: int, height: int) -> Any:
+    """An empty page that is waited for patiently: without a graphics card it draws slowly."""
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(_PATIENCE_MS)
+    return page
 
 
 def keep(photograph: bytes, path: Path) -> None:
@@ -116,13 +125,14 @@ PHOTOGRAPHS: dict[str, Callable[[Path, Any], None]] = {"report.png": report, "ex
 
 
 def main() -> None:
-    """Make every picture."""
-    beam(HERE / "beam.png")
-    print(HERE / "beam.png")
+    """Make the pictures that are named, or every one."""
+    names = sys.argv[1:] or ["beam.png", *PHOTOGRAPHS]
+    if "beam.png" in names:
+        beam(HERE / "beam.png")
+    chosen = [name for name in names if name in PHOTOGRAPHS]
     with chromium() as browser:
-        for name, make in PHOTOGRAPHS.items() if browser is not None else ():
-            make(HERE / name, browser)
-            print(HERE / name)
+        for name in chosen if browser is not None else ():
+            PHOTOGRAPHS[name](HERE / name, browser)
 
 
 if __name__ == "__main__":

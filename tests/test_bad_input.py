@@ -15,9 +15,10 @@ import emulator as em
 from bad_words import COMMANDS, INFERENCES
 from calibrate.cli import main
 from calibrate.cli.common import seconds
-from calibrate.data import read_data
+from calibrate.data import read_data, write_data
 from calibrate.run import Run
 from calibrate.sbc import sbc
+from calibrate.workflow import make_data
 from cli_support import write_block
 from emulator.errors import InputError
 from emulator.surrogates.files import SHIPPED
@@ -217,3 +218,18 @@ def test_unusual_input_is_taken(folder, monkeypatch, tmp_path):
     out = tmp_path / "made" / "by the way" / "u.vtu"
     assert main(["simulate", "scene.toml", "--out", str(out), "--json"]) == 0
     assert out.is_file()
+
+
+@pytest.mark.slow
+def test_landmarks_a_millimetre_off(tmp_path, capsys):
+    """Data that no theta explains with the noise given: exit code 1, and the hint says so."""
+    run = Run("once_clamped_beam", truth={"mu": 73.0, "lam": 61.0}, observe="landmarks:12")
+    observe, data = make_data(run, em.scenes.once_clamped_beam())
+    data["displacement"] += np.random.default_rng(1).normal(0.0, 1.0, (12, 3))
+    write_data(tmp_path / "off.csv", observe, data)
+    words = ["infer", "once_clamped_beam", "--data", str(tmp_path / "off.csv"), "--noise", "0.2"]
+    words += ["--warmup", "200", "--draws", "300", "--chains", "2"]
+    assert main([*words, "--json", "--out", str(tmp_path / "r")]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] not in ("accepted", "not certified")
+    assert any("does not fit" in hint for hint in found["warnings"])

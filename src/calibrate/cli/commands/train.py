@@ -46,7 +46,9 @@ def register(commands: Any) -> None:
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
-        "--budget", metavar="TIME", help="time for everything, e.g. 10m (default 10m)"
+        "--budget",
+        metavar="TIME",
+        help="time for everything, e.g. 10m (default 10m; without a network, all FEM runs)",
     )
     length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
     parser.add_argument("--simulations", type=int, help="FEM runs to train on")
@@ -89,7 +91,10 @@ def run(arguments: argparse.Namespace) -> int:
         campaign = read_runs(arguments.campaign, scene)
         if "simulations" not in given:
             plan = replace(plan, simulations=len(campaign.runs.theta))
-    fixed = arguments.resume or "steps" in given
+    # Without a network its FEM runs are all that a plan has: only a budget that was asked for
+    # makes them fewer.
+    whole = not plan.steps and arguments.budget is None
+    fixed = arguments.resume or "steps" in given or whole
     result = train_emulator(
         scene,
         plan,
@@ -112,6 +117,9 @@ def run(arguments: argparse.Namespace) -> int:
     remove_checkpoint(arguments.out)
     steps = record["plan"]["steps"]
     text = f"trained {scene.name}: {steps} steps, {record['seconds']:.0f} s, in {arguments.out}"
+    runs = record["plan"]["simulations"]
+    if not fixed and plan.runs > runs:
+        text += f"\n{runs} of {plan.runs} FEM runs fit into the budget: more time, smaller errors"
     emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
     return DONE
 
