@@ -2,8 +2,8 @@
 
 The demo draws beam.png. report.png and explore.png are photographs of the pages, which need
 playwright and a Chromium: the one that CALIBRATE_BROWSER names, or ``chromium``. Studies draw their
-own pictures, ``python -m studies.<name>``, and notebooks theirs, ``make notebooks``. Names make some:
-``python docs/pictures.py report.png``.
+own pictures, ``python -m studies.<name>``, and notebooks theirs, ``make notebooks``.
+``python docs/pictures.py report.png`` makes one.
 """
 
 import io
