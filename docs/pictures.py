@@ -50,17 +50,21 @@ def report(path: Path, browser: Any) -> None:
     """The body on a report of the ventricle's demo, at one of its draws."""
     with tempfile.TemporaryDirectory() as folder:
         infer(replace(DEMOS["left_ventricle"].run, sampler="laplace"), folder)
-        page = opened(browser, 1280, 900)
+        page = opened(browser, 1152, 900)
         page.goto(write_report(folder, fem=False).resolve().as_uri())
         page.wait_for_selector(".slider-rail-touch-rect")
         rail = page.query_selector(".slider-rail-touch-rect")
         rail.scroll_into_view_if_needed()
         box = rail.bounding_box()
         page.mouse.click(box["x"] + 0.7 * box["width"], box["y"] + 0.5 * box["height"])
-        page.wait_for_timeout(2000)
+        page.mouse.move(0, 0)  # away from the plot, which shows its tools under it
         plot = page.evaluate_handle(
             "[...document.querySelectorAll('.js-plotly-plot')].find(d => d.layout.sliders)"
         )
+        page.evaluate(
+            "plot => Plotly.relayout(plot, {'scene.camera.eye': {x: 1.5, y: 1.5, z: 1.2}})", plot
+        )
+        page.wait_for_timeout(2000)
         keep(plot.as_element().screenshot(), path)
 
 
