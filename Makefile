@@ -14,7 +14,7 @@ OLDEST_TESTS := tests/test_package.py $(addprefix tests/emulator/,mechanics scen
 	training test_schema.py test_store.py) $(addprefix tests/calibrate/,samplers certificate cli/test_cli.py \
 	sensitivity_analysis report test_tree.py test_data.py test_demo.py)
 
-.PHONY: demo test test-slow test-oldest package notebooks docs lint format study clean
+.PHONY: demo test test-slow test-oldest package notebooks pictures docs lint format study clean
 
 demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
@@ -36,6 +36,10 @@ package: $(STAMP)
 
 notebooks: $(STAMP)
 	$(BIN)/python -m pytest tests/test_notebooks.py
+
+# README's and the docs'; photographs of pages need a Chromium, see docs/pictures.py.
+pictures: $(STAMP)
+	$(BIN)/python docs/pictures.py
 
 docs: $(STAMP)
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build

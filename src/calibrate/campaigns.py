@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from tqdm import tqdm
 from calibrate.provenance import versions
 from emulator.errors import InputError
 from emulator.fem import NewtonOptions, Simulator
-from emulator.fem.campaign import Executor, Neighbours, Solver, in_process, solve_rows
+from emulator.fem.campaign import Executor, Neighbours, Solver, executor, solve_rows
 from emulator.fem.campaign.zarr_rows import Question, ZarrRows, make_store, writing
 from emulator.fem.designs import DESIGNS
 from emulator.scenes.scene import Scene
@@ -69,7 +67,7 @@ def campaign(
         fill(asked, out, scheduler=scheduler, progress=progress)
         return xr.open_zarr(out, chunks=None)
     store = zarr.storage.MemoryStore()
-    with _executor(scheduler) as execute:
+    with executor(scheduler) as execute:
         _solve_missing(ZarrRows(make_store(store, asked)), asked.solver, execute, progress)
     return xr.open_zarr(store, chunks=None)
 
@@ -115,7 +113,7 @@ def fill(
     progress: bool = False,
 ) -> int:
     """Solve what the store at ``out`` lacks; the number of rows that were solved."""
-    with _executor(scheduler) as execute, writing(out, asked) as rows:
+    with executor(scheduler) as execute, writing(out, asked) as rows:
         return _solve_missing(rows, asked.solver, execute, progress)
 
 
@@ -136,15 +134,3 @@ def _solve_missing(rows: ZarrRows, solver: Solver, execute: Executor, progress: 
             rows.write(row)
             bar.update()
     return len(missing)
-
-
-@contextmanager
-def _executor(scheduler: str | None) -> Iterator[Executor]:
-    """Where to solve: in this process, or on the cluster at ``scheduler``."""
-    if scheduler is None:
-        yield in_process
-        return
-    from emulator.fem.campaign.cluster import connected
-
-    with connected(scheduler) as cluster:
-        yield cluster

@@ -18,6 +18,7 @@ from emulator.surrogates.registry import build_forward, full_options
 
 OUR_FEM = "fem"
 """What to evaluate against, unless it is the folder of a released model."""
+_CASES = 50
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Evaluation:
 
     emulator : shipped name or folder; its scene is the one evaluated.
     against : ``fem``, or the folder of a published model's data.
-    cases : FEM runs against ``fem``, inside the box and again outside.
+    cases : FEM runs against ``fem``, inside the box and again outside; 50 by default.
     outside : fraction of each side by which the box is widened for the cases outside; ``None``
         for no such cases.
     forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
@@ -35,13 +36,15 @@ class Evaluation:
 
     emulator: str
     against: str = OUR_FEM
-    cases: int = 50
+    cases: int | None = None
     outside: float | None = None
     forward: str = "emulator"
     forward_options: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         full_options(self.forward, self.forward_options)
+        if self.cases is not None and self.against != OUR_FEM:
+            raise InputError("cases: every released one is compared; use --against fem for others")
         if self.outside is not None and self.against != OUR_FEM:
             raise InputError("outside: nothing was released outside the box; use --against fem")
         if self.outside is not None and not 0.0 < self.outside < float("inf"):
@@ -70,9 +73,10 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
     """
     emulator = load(plan.emulator)
     scene = emulator.scene
+    cases = _CASES if plan.cases is None else plan.cases
     simulator = Simulator(scene)  # shared by references and forward map: it compiles once
     if plan.against == OUR_FEM:
-        reference = fem_reference(simulator, plan.cases, progress=progress)
+        reference = fem_reference(simulator, cases, progress=progress)
     else:
         reference = published_reference(scene, plan.against, progress=progress)
     made_of = Ingredients(
@@ -92,9 +96,7 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
     }
     outside = None
     if plan.outside is not None:
-        beyond = outside_reference(
-            simulator, plan.cases, plan.outside, reference, progress=progress
-        )
+        beyond = outside_reference(simulator, cases, plan.outside, reference, progress=progress)
         outside, report["outside"] = _outside(forward, beyond, plan.outside)
     return Evaluated(forward, inside, outside, report)
 

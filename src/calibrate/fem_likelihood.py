@@ -6,7 +6,7 @@ stage. It is the only place that solves FEM for a draw.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -19,7 +19,7 @@ import numpy as np
 from calibrate.statistical_model import Data, Model
 from emulator.errors import InputError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Solver, solve_rows
+from emulator.fem.campaign import Executor, Solver, in_process, solve_rows
 from emulator.fem.functional import volume_ratio
 
 
@@ -48,6 +48,8 @@ class Likelihoods(NamedTuple):
 class FEMLikelihood:
     """FEM's log likelihood under ``model``; solves start from the cheap map's prediction.
 
+    execute : solves, in this process by default.
+
     Raises
     ------
     InputError
@@ -56,6 +58,7 @@ class FEMLikelihood:
 
     model: Model
     simulator: Simulator
+    execute: Executor = in_process
 
     def __post_init__(self) -> None:
         if self.simulator.scene.fingerprint != self.model.forward.scene.fingerprint:
@@ -68,17 +71,59 @@ class FEMLikelihood:
 
         ``stability`` asks for ``stable`` as well, at the cost of one more factorisation a state.
         """
-        thetas = self.model.states.thetas(draw)
+        return next(self.many([draw], data, stability=(0,) if stability else ()))[1]
+
+    def many(
+        self, draws: Sequence[Mapping[str, Any]], data: Data, *, stability: Collection[int] = ()
+    ) -> Iterator[tuple[int, Likelihoods]]:
+        """Numbers of ``draws`` and their log likelihoods, as they are finished.
+
+        ``stability`` : numbers of the draws of which ``stable`` is asked, too.
+        """
+        thetas = [self.model.states.thetas(draw) for draw in draws]
+        states = len(self.model.states.states)
+        each = jnp.concatenate(thetas)
+        solved: dict[int, dict[int, jax.Array]] = {number: {} for number in range(len(draws))}
+        # A draw that fails in one load state is done: its other states are not begun.
+        numbers = (k for k in range(len(each)) if k // states in solved)
+        # Not under jit: there the solver cannot use CHOLMOD, which is faster.
+        for row in solve_rows(
+            self._solver,
+            each,
+            numbers=numbers,
+            starts=lambda k: (self._start(each[k]),),
+            execute=self.execute,
+        ):
+            number, state = divmod(row.number, states)
+            if number not in solved:
+                continue
+            if not row.converged:
+                del solved[number]
+                cheap = float(self._cheap(dict(draws[number]), data))
+                yield number, Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
+                continue
+            solved[number][state] = row.solution.displacement
+            if len(solved[number]) == states:
+                fields = [jnp.asarray(solved[number][k]) for k in range(states)]
+                del solved[number]
+                yield (
+                    number,
+                    self._told(draws[number], thetas[number], fields, data, number in stability),
+                )
+
+    def _told(
+        self,
+        draw: Mapping[str, Any],
+        thetas: jax.Array,
+        fields: list[jax.Array],
+        data: Data,
+        stability: bool,
+    ) -> Likelihoods:
+        """Log likelihoods from FEM's displacements (n, 3) mm, one a load state."""
         noise = self.model.noise_values(draw)
         cheap = float(self._cheap(dict(draw), data))
-        solved = []
-        # Not under jit: there the solver cannot use CHOLMOD, which is faster.
-        for row in solve_rows(self._solver, thetas, starts=lambda k: (self._start(thetas[k]),)):
-            if not row.converged:
-                return Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
-            solved.append(row.solution.displacement)
-        fem, means, smallest = self._fem(jnp.stack(solved), thetas, noise, data)
-        stable = self._stable(solved, thetas) if stability else None
+        fem, means, smallest = self._fem(jnp.stack(fields), thetas, noise, data)
+        stable = self._stable(fields, thetas) if stability else None
         return Likelihoods(float(fem), cheap, True, float(smallest), means, stable)
 
     def _stable(self, solved: list[jax.Array], thetas: jax.Array) -> bool | None:

@@ -28,14 +28,19 @@ def check_run(path: Path, tree: xr.DataTree, run: Mapping[str, Any]) -> None:
     Parameters
     ----------
     path, tree : the posterior's file and its content.
-    run : entries of the run, by name.
+    run : entries of run.json, by name, as they are there.
     """
     try:
         sampled: dict[str, Any] = json.loads(tree.attrs["run"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} does not name the run it was sampled for; infer again") from error
-    now = json.loads(json.dumps(run))  # tuples become lists, as in the file
+    now = json.loads(json.dumps(run))
     for name in sorted({*sampled, *now} - set(_PLACES)):
+        if name not in now:
+            raise InputError(
+                f"{path} was sampled with {name} = {json.dumps(sampled[name])}, which run.json "
+                "lacks; restore it, or infer again"
+            )
         if sampled.get(name) != now.get(name):
             raise InputError(
                 f"{path} was sampled with {name} = {json.dumps(sampled.get(name))}, but run.json "

@@ -74,6 +74,8 @@ class Run:
         for name in ("warmup", "draws", "chains"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be 1 or more")
+        if self.truth and self.data != "synthetic":
+            raise InputError(f"truth has no effect beside data file {self.data}; leave one out")
         if self.error_runs < 0:
             raise InputError(f"error_runs is {self.error_runs}; it must be 0 or more")
         if self.seed < 0:

@@ -19,7 +19,7 @@ probability c covers the truth where :math:`|u - 1/2| < c / 2`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -33,6 +33,8 @@ from calibrate.arviz import ecdf_utils
 from calibrate.posterior import sample
 from calibrate.statistical_model import Model
 from emulator.errors import InputError, check_seed
+from emulator.fem.campaign import executor, in_process
+from emulator.surrogates.protocol import solved_by
 
 LOG_LIKELIHOOD = "log likelihood"
 """Name of the quantity that depends on the data."""
@@ -196,6 +198,7 @@ def sbc(
     seed: int = 0,
     progress: bool = False,
     draw: Sample | None = None,
+    scheduler: str | None = None,
 ) -> Calibration:
     """Simulation-based calibration of ``model``, its forward map and a sampler.
 
@@ -206,10 +209,13 @@ def sbc(
     draws : of each posterior that are ranked, evenly spaced along the chains; draws that depend on
         each other would make the ranks too even or too extreme.
     draw : draws of a posterior, instead of a sampler's.
+    scheduler : address of a Dask scheduler whose workers make the data, where ``truth`` has FEM as
+        its forward map.
 
     Raises
     ------
     InputError
+        A scheduler that does not answer, or a truth that solves no FEM.
         ``truth`` does not have the unknowns and observations of ``model``.
     """
     _check_count(replicates)
@@ -229,15 +235,25 @@ def sbc(
         rows = np.linspace(0, len(every[model.names[0]]) - 1, draws).astype(int)
         return {name: values[rows] for name, values in every.items()}
 
-    each = _replicates(model, truth, draw or sampled, replicates, seed, progress=progress)
-    return calibration_of(each, seed)
+    made = _data_sets(truth, replicates, seed, scheduler)
+    return calibration_of(_replicates(model, made, draw or sampled, seed, progress=progress), seed)
+
+
+def _data_sets(truth: Model, count: int, seed: int, scheduler: str | None) -> predictions.Prior:
+    """Draws of the prior of ``truth``, and data made there."""
+    rng_key = jax.random.key(seed)
+    if scheduler is None:
+        return predictions.prior_replicates(truth, rng_key, count)
+    solved_by(truth.forward, in_process)  # a map that solves nothing is refused before connecting
+    with executor(scheduler) as execute:
+        there = replace(truth, forward=solved_by(truth.forward, execute))
+        return predictions.prior_replicates(there, rng_key, count)
 
 
 def _replicates(
-    model: Model, truth: Model, draw: Sample, count: int, seed: int, *, progress: bool
+    model: Model, made: predictions.Prior, draw: Sample, seed: int, *, progress: bool
 ) -> Iterator[Replicate]:
-    made = predictions.prior_replicates(truth, jax.random.key(seed), count)
-    rows = range(min(count, len(next(iter(made.draws.values())))))
+    rows = range(len(next(iter(made.draws.values()))))
     for r in tqdm(rows, "calibration", disable=not progress, unit="data set"):
         data = {name: values[r] for name, values in made.data.items()}
         true = {name: values[r] for name, values in made.draws.items()}

@@ -36,7 +36,7 @@ from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
-from emulator.store import save_arrays, write_json
+from emulator.store import read_json, save_arrays, write_json
 from emulator.surrogates import registry
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.kind import Ingredients
@@ -180,7 +180,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     tree = read_tree(path)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{path} was made for another scene than '{run.scene}'")
-    check_run(path, tree, asdict(run))
+    check_run(path, tree, read_json(folder / RUN))
     forward = restore_forward(run, scene, folder)
     check_forward(path, tree, forward)
     observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
@@ -204,12 +204,14 @@ def certify_and_keep(
     *,
     draws: int | None = None,
     reweight_to: str | Path | None = None,
+    scheduler: str | None = None,
     progress: bool = False,
 ) -> Certificate:
     """Check a posterior against FEM and write certificate.json.
 
-    With ``reweight_to``, the reweighted posterior is kept in that folder, ready to be certified in
-    its turn, where the verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
+    ``scheduler`` is the address of a Dask scheduler whose workers solve. With ``reweight_to``, the
+    reweighted posterior is kept in that folder, ready to be certified in its turn, where the
+    verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
 
     Raises
     ------
@@ -217,7 +219,7 @@ def certify_and_keep(
         FEM has decided on the draws already.
     """
     simulator = simulator_of(posterior.model.forward.scene)
-    check = examine(posterior, simulator, draws=draws, progress=progress)
+    check = examine(posterior, simulator, draws=draws, scheduler=scheduler, progress=progress)
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     if reweight_to is not None and keeps(check.certificate):
         _keep_reweighted(reweighted(check), Path(folder), Path(reweight_to))

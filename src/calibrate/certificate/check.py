@@ -59,6 +59,7 @@ from calibrate.posterior import Posterior
 from calibrate.samplers.registry import SAMPLERS
 from emulator.errors import InputError
 from emulator.fem import Simulator
+from emulator.fem.campaign import executor
 
 _FEM_RUNS = 200
 _FEWEST = 25
@@ -92,29 +93,33 @@ def examine(
     *,
     draws: int | None = None,
     seed: int = 0,
+    scheduler: str | None = None,
     progress: bool = False,
 ) -> Check:
     """Check ``posterior`` with ``draws`` FEM runs, 200 by default.
 
+    scheduler : address of a Dask scheduler whose workers solve; otherwise this process does.
+
     Raises
     ------
     InputError
-        The simulator is for another scene, too few runs are asked for, or FEM has decided on the
-        draws already.
+        The simulator is for another scene, too few runs are asked for, FEM has decided on the
+        draws already, or a scheduler does not answer.
     """
     _refuse_fem_draws(posterior)
     count = _FEM_RUNS if draws is None else draws
     if count < _FEWEST:
         raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
     predictive = Predictive(posterior.model, posterior.data)
-    likelihood = FEMLikelihood(posterior.model, simulator)
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
     # More threads than one for small matrices oversubscribe the cores: twice the time.
     with (
         threadpool_limits(1, user_api="blas"),
+        executor(scheduler) as execute,
         tqdm(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
     ):
+        likelihood = FEMLikelihood(posterior.model, simulator, execute)
         solver = Solver(predictive, likelihood, bar)
         at_draws, training, correction, pool = _train(solver, z, count, rng)
         tests = _test(solver, pool, count - len(training.z), rng)
@@ -139,10 +144,17 @@ def certify(
     *,
     draws: int | None = None,
     seed: int = 0,
+    scheduler: str | None = None,
     progress: bool = False,
 ) -> Certificate:
-    """The certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200)."""
-    check = examine(posterior, simulator, draws=draws, seed=seed, progress=progress)
+    """The certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200).
+
+    ``scheduler`` is the address of a Dask scheduler whose workers solve, as of
+    :func:`calibrate.campaign`.
+    """
+    check = examine(
+        posterior, simulator, draws=draws, seed=seed, scheduler=scheduler, progress=progress
+    )
     return check.certificate
 
 

@@ -58,11 +58,16 @@ class Solver:
 
     def __call__(self, z: np.ndarray, *, stability: int = 0) -> Runs:
         """FEM at points (s, p); at the first ``stability`` of them, also whether it is stable."""
-        draws = self.predictive.constrain(z)
-        found = []
-        for s in range(len(z)):
-            draw = {name: values[s] for name, values in draws.items()}
-            found.append(self._solve(z[s].tobytes(), draw, stability=s < stability))
+        keys = [point.tobytes() for point in z]
+        new = list(dict.fromkeys(key for key in keys if key not in self._known))
+        draws, rows = self.predictive.constrain(z), [keys.index(key) for key in new]
+        each = [{name: values[s] for name, values in draws.items()} for s in rows]
+        asked = {k for k, s in enumerate(rows) if s < stability}
+        self.bar.update(len(keys) - len(new))
+        for k, told in self.likelihood.many(each, self.predictive.data, stability=asked):
+            self._known[new[k]] = told
+            self.bar.update()
+        found = [self._known[key] for key in keys]
         missing = np.full(len(self.predictive.scales), np.nan)
         return Runs(
             z,
@@ -71,12 +76,6 @@ class Solver:
             np.array([f.smallest_J for f in found]),
             tuple(f.stable for f in found),
         )
-
-    def _solve(self, key: bytes, draw: dict[str, np.ndarray], *, stability: bool) -> Likelihoods:
-        if key not in self._known:
-            self._known[key] = self.likelihood(draw, self.predictive.data, stability=stability)
-        self.bar.update()
-        return self._known[key]
 
 
 def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from emulator.errors import InputError
-from emulator.store import to_json
+from emulator.store import check_folder, to_json
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -35,6 +35,34 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         "scene", metavar="SCENE", help="built-in name, .toml file, or published:<Model>"
     )
     parser.add_argument("--root", metavar="DIR", help="folder of the published data")
+
+
+def scene_words(arguments: argparse.Namespace) -> tuple[str, str | None]:
+    """Name and folder that :func:`add_scene` read; a folder belongs to published scenes alone."""
+    if arguments.root is not None and not arguments.scene.startswith("published:"):
+        raise InputError(
+            f"--root has no effect with scene '{arguments.scene}': it is the folder of the "
+            "published data, for published:<Model>"
+        )
+    return arguments.scene, arguments.root
+
+
+def add_scheduler(parser: argparse.ArgumentParser, which: str) -> None:
+    """Add ``--scheduler``; ``which`` names the solves that go there."""
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help=f"{which} on the workers of this Dask scheduler, e.g. tcp://127.0.0.1:8786",
+    )
+
+
+def scheduler_word(arguments: argparse.Namespace) -> str | None:
+    """The address that :func:`add_scheduler` read; :class:`InputError` for what is none."""
+    if arguments.scheduler is not None:
+        from emulator.fem.campaign.cluster import check_address
+
+        check_address(arguments.scheduler)
+    return arguments.scheduler
 
 
 def assignments(words: Sequence[str], example: str = "mu=73") -> dict[str, float]:
@@ -69,11 +97,10 @@ def seconds(text: str) -> float:
 
 
 def check_vtu(path: str) -> None:
-    """Refuse a file to write that is not a ``.vtu`` in a folder that exists, before the work."""
+    """Refuse a file to write that is not a ``.vtu``, or cannot be written, before the work."""
     if not path.endswith(".vtu"):
         raise InputError(f"--out {path}: the file name must end in .vtu")
-    if not Path(path).resolve().parent.is_dir():
-        raise InputError(f"--out {path}: its folder does not exist")
+    check_folder(Path(path).parent)
 
 
 def emit(result: Any, *, as_json: bool, text: str) -> None:

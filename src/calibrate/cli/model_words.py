@@ -7,9 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from calibrate.cli.common import add_scene, assignments
+from calibrate.cli.common import add_scene, assignments, scene_words
 from calibrate.cli.forward import add_forward, forward_options
 from calibrate.cli.noise_words import discrepancy_words, noise_scale_words, noise_words
+from emulator.errors import InputError
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
@@ -42,11 +43,11 @@ def add_model(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--observe",
-        default="nodes:20",
         metavar="WHAT",
-        help="of synthetic data, e.g. nodes:N, landmarks:N, all, a node set, 3,14,15, volume, "
-        "volume:FACETSET, surface:FACETSET:N, strain:fibre:N, segment_strain:circumferential, "
-        "length:A:B, parameter:NAME; several joined by +, as in landmarks:24+volume",
+        help="of synthetic data (default nodes:20), e.g. nodes:N, landmarks:N, all, a node set, "
+        "3,14,15, volume, volume:FACETSET, surface:FACETSET:N, strain:fibre:N, "
+        "segment_strain:circumferential, length:A:B, parameter:NAME; several joined by +, as in "
+        "landmarks:24+volume",
     )
     _add_noise(parser)
     add_forward(parser)
@@ -65,13 +66,20 @@ def add_model(parser: argparse.ArgumentParser) -> None:
 
 def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """What :func:`add_model` read, as fields of :class:`~calibrate.run.Run`."""
+    scene, root = scene_words(arguments)
+    measured = arguments.data != "synthetic"
+    for option in ("truth", "observe") if measured else ():
+        if getattr(arguments, option):
+            raise InputError(
+                f"--{option} has no effect beside --data {arguments.data}: it is for synthetic data"
+            )
     return {
-        "scene": _absolute(arguments.scene, is_path=arguments.scene.endswith(".toml")),
-        "root": arguments.root and _absolute(arguments.root),
-        "data": _absolute(arguments.data, is_path=arguments.data != "synthetic"),
+        "scene": _absolute(scene, is_path=scene.endswith(".toml")),
+        "root": root and _absolute(root),
+        "data": _absolute(arguments.data, is_path=measured),
         "truth": assignments(arguments.truth),
         "known": assignments(arguments.known),
-        "observe": arguments.observe,
+        "observe": arguments.observe or "nodes:20",
         "prior": prior_word(arguments.prior),
         "noise": noise_words(arguments.noise),
         "noise_scale": noise_scale_words(arguments.noise_scale),

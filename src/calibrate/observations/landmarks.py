@@ -15,6 +15,7 @@ from calibrate.observations.points import (
     DISPLACEMENT,
     DISPLACEMENT_FIELD,
     DisplacementPoints,
+    check_distinct,
     check_table,
     count_of,
 )
@@ -86,6 +87,7 @@ class Landmarks(DisplacementPoints):
         points = np.atleast_2d(np.asarray(points, dtype=float))
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise InputError(f"landmarks have shape {points.shape}; expected (d, 3), finite, in mm")
+        check_distinct(points, "landmarks")
         elements, weights = locate(scene.mesh, points)
         members = scene.mesh.elements[elements]
         nodes, position = np.unique(members, return_inverse=True)
@@ -98,7 +100,7 @@ def landmarks(scene: Scene, points: np.ndarray) -> Landmarks:
     Raises
     ------
     InputError
-        A point that lies neither in an element nor just beside one.
+        A point that lies neither in an element nor just beside one, or is given twice.
     """
     return Landmarks.of(scene, points)
 

@@ -88,7 +88,10 @@ class NodalDisplacements(DisplacementPoints):
             index = check_nodes(scene, np.asarray(nodes))
         if len(np.unique(index)) < len(index):
             values, counts = np.unique(index, return_counts=True)
-            raise InputError(f"node {values[counts > 1][0]} is observed twice")
+            raise InputError(
+                f"node {values[counts > 1][0]} is observed twice; give each node once, repeated "
+                "measurements as their mean, with less noise"
+            )
         return cls(index, scene.mesh.nodes[index])
 
 

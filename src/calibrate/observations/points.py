@@ -88,6 +88,18 @@ def check_table(where: np.ndarray, values: np.ndarray, what: str = "displacement
             raise InputError(f"row {row + 1} has a {word} that is not finite; repair it")
 
 
+def check_distinct(points: np.ndarray, what: str) -> None:
+    """Raise :class:`InputError` where two of ``points`` (d, 3) mm are one: data counted twice."""
+    _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    again = np.flatnonzero(first[inverse.ravel()] != np.arange(len(points)))
+    if again.size:
+        k = int(again[0])
+        raise InputError(
+            f"{what} {first[inverse.ravel()[k]]} and {k} are both at {points[k].tolist()} mm; give "
+            "each place once, repeated measurements as their mean, with less noise"
+        )
+
+
 def count_of(word: str, kind: str) -> int | None:
     """N of ``<kind>:N``; ``None`` for other words; :class:`InputError` when N is no number."""
     found, colon, text = word.partition(":")

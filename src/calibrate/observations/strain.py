@@ -13,7 +13,7 @@ from calibrate.noise.protocol import Sites
 from calibrate.observations.landmarks import spread_landmarks
 from calibrate.observations.local_basis import COMPONENTS, local_directions
 from calibrate.observations.location import locate_gradients
-from calibrate.observations.points import check_table, count_of
+from calibrate.observations.points import check_distinct, check_table, count_of
 from calibrate.observations.protocol import Field, Labels
 from calibrate.observations.strain_components import Samples, Strains, columns_of, components_in
 from emulator.errors import InputError
@@ -123,6 +123,7 @@ class Strain(Strains):
         points = np.atleast_2d(np.asarray(points, dtype=float))
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise InputError(f"strain: points of shape {points.shape}; expected (d, 3), finite, mm")
+        check_distinct(points, "strains")
         components = tuple(components)
         directions = local_directions(scene, components)
         elements, gradients = locate_gradients(scene.mesh, points)
@@ -141,6 +142,7 @@ def strains(scene: Scene, components: Any, points: np.ndarray) -> Strain:
     Raises
     ------
     InputError
-        A component that the scene has no direction for, or a point outside the body.
+        A component that the scene has no direction for, or a point outside the body or
+        given twice.
     """
     return Strain.of(scene, (components,) if isinstance(components, str) else components, points)

@@ -29,8 +29,9 @@ from calibrate.samplers.density import Density
 from calibrate.samplers.options import check_counts
 from calibrate.samplers.protocol import Context, Draws
 from calibrate.statistical_model import Data
-from emulator.errors import SolverError
+from emulator.errors import InputError, SolverError
 
+_FEWEST = 25  # draws whose largest fifth has a tail to fit
 _STEP = 1e-4  # of central differences of the gradient; coordinates are about 1 wide
 _EQUAL = 1e-3  # log ratios closer together than this have no tail to fit
 _AWAY = 0.05  # sd that the optimiser may stop from the mode
@@ -60,6 +61,11 @@ class LaplaceOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "draws", "chains", "starts")
+        if self.draws * self.chains < _FEWEST:
+            raise InputError(
+                f"{self.label}: {self.draws} draws of {self.chains} chains; give {_FEWEST} or more "
+                "together, or its error cannot be estimated"
+            )
 
 
 class _Gaussian(NamedTuple):

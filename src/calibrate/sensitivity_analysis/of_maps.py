@@ -16,7 +16,14 @@ from calibrate.priors import Prior, box_prior
 from calibrate.sensitivity_analysis.analysis import Function, analyse
 from calibrate.sensitivity_analysis.factors import Factors, check_independent, densities, quantiles
 from emulator.errors import InputError
-from emulator.surrogates.protocol import ForwardMap, Prediction, evaluate_all, slopes_of
+from emulator.fem.campaign import executor, in_process
+from emulator.surrogates.protocol import (
+    ForwardMap,
+    Prediction,
+    evaluate_all,
+    slopes_of,
+    solved_by,
+)
 
 FIELD = "field"
 """The name under which the whole body's displacement is analysed, node by node."""
@@ -32,6 +39,7 @@ def sensitivity(
     groups: Mapping[str, Sequence[str]] | None = None,
     field: bool = False,
     seed: int = 0,
+    scheduler: str | None = None,
 ) -> xr.DataTree:
     """Which parameter moves which observation, and by how much.
 
@@ -42,6 +50,7 @@ def sensitivity(
     method, samples : as in :func:`~calibrate.sensitivity_analysis.analyse`.
     groups : parameters varied together, by the group's name.
     field : analyse the size of every node's displacement, too.
+    scheduler : address of a Dask scheduler whose workers solve, for a map that is FEM.
 
     Returns
     -------
@@ -53,7 +62,8 @@ def sensitivity(
     ------
     InputError
         Nothing to analyse; several load states; correlated parameters; a prior that leaves the
-        range in which the map answers.
+        range in which the map answers; a scheduler that does not answer, or beside a map that
+        solves no FEM.
     """
     scene = forward.scene
     if observe is None and not field:
@@ -61,11 +71,36 @@ def sensitivity(
     parts = {} if observe is None else dict(observations(observe).parts)
     if observe is not None and observations(observe).states != ("",):
         raise InputError("sensitivity: observations of several load states; take one at a time")
+    if scheduler is not None:
+        solved_by(forward, in_process)  # a map that solves nothing is refused before connecting
     prior = box_prior(scene) if prior is None else prior
     check_independent(prior)
     prior, _ = fit_to(forward, prior)
     factors = Factors(scene.parameter_names, dict(groups or {}))
-    outputs = _Outputs(forward, parts, field=field)
+    found = {}
+    with executor(scheduler) as execute:
+        solving = forward if scheduler is None else solved_by(forward, execute)
+        outputs = _Outputs(solving, parts, field=field)
+        function, derivative = _over_unit_cube(outputs, prior, factors)
+        for name, entries in outputs.places.items():
+            data = analyse(
+                factors,
+                _some(function, entries),
+                method=method,
+                samples=samples,
+                derivative=_some(derivative, entries),
+                seed=seed,
+            )
+            unit = "mm" if name == FIELD else parts[name].unit
+            found[name] = data.assign_attrs(unit=unit)
+            if name == FIELD:  # its output is the node of that number
+                found[name] = found[name].assign_coords(output=outputs.nodes)
+    about = {"forward": forward.label, "scene": scene.name, "method": method, "seed": seed}
+    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=about), **found})
+
+
+def _over_unit_cube(outputs: _Outputs, prior: Prior, factors: Factors) -> tuple[Function, Function]:
+    """All numbers (n, m) and their derivatives (n, m, p) at points (n, p) of the unit cube."""
 
     def at(points: np.ndarray) -> jax.Array:
         return quantiles(prior, factors.names, jnp.asarray(points))
@@ -78,23 +113,7 @@ def sensitivity(
         density = np.asarray(densities(prior, factors.names, thetas))
         return outputs.slopes(thetas) / density[:, None, :]
 
-    function, derivative = _remembered(values), _remembered(slopes)
-    found = {}
-    for name, entries in outputs.places.items():
-        data = analyse(
-            factors,
-            _some(function, entries),
-            method=method,
-            samples=samples,
-            derivative=_some(derivative, entries),
-            seed=seed,
-        )
-        unit = "mm" if name == FIELD else parts[name].unit
-        found[name] = data.assign_attrs(unit=unit)
-        if name == FIELD:  # its output is the node of that number
-            found[name] = found[name].assign_coords(output=outputs.nodes)
-    about = {"forward": forward.label, "scene": scene.name, "method": method, "seed": seed}
-    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=about), **found})
+    return _remembered(values), _remembered(slopes)
 
 
 class _Outputs:

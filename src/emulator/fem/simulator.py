@@ -28,6 +28,7 @@ from emulator.fem.functional import volume_ratio
 from emulator.fem.loading_path import find_equilibrium
 from emulator.fem.near import NearSolver
 from emulator.fem.options import NewtonOptions
+from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution, Status
 from emulator.scenes.scene import Scene
 from emulator.shown import Row, Shown
@@ -81,6 +82,10 @@ class Simulator(Shown):
     def _driver(self) -> Driver:
         definite = self._choice.definite or CHOLMOD
         return Driver(System(self.scene, definite.name), self.system, self.options)
+
+    @cached_property
+    def _balanced(self) -> System:
+        return System(balanced(self.scene))
 
     @property
     def rest(self) -> jax.Array:
@@ -157,6 +162,27 @@ class Simulator(Shown):
             )
         sound = jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
         return bool(sound) and self._driver.linearise(u, theta)[0].direct.definite
+
+    def reactions(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Force (n, 3) in mN of the supports on the body at the equilibrium ``u`` (n, 3) mm.
+
+        Springs count as supports; where the body is free the force is zero. Their sum is minus the
+        resultant of the loads (:mod:`emulator.fem.reactions`).
+        """
+        theta, u = self._checked(theta, u, "displacement")
+        return reactions(self._balanced, u, theta)
+
+    def reaction(self, name: str, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Resultant (3,) in mN of :meth:`reactions` over the node set or facet set ``name``.
+
+        A node that two supports share counts in both.
+
+        Raises
+        ------
+        InputError
+            No such set.
+        """
+        return self.reactions(u, theta)[nodes_of(self.scene.mesh, name)].sum(axis=0)
 
     def _drives(self, *arguments: jax.Array) -> bool:
         """Whether Python sees the numbers and a definite factorisation could work."""

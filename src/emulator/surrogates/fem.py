@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.campaign import Row, Solver, solve_rows
+from emulator.fem.campaign import Executor, Row, Solver, in_process, solve_rows
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 from emulator.store import to_json
@@ -26,11 +25,15 @@ from emulator.surrogates.protocol import (
 
 @dataclass(frozen=True, eq=False)
 class FEMForward:
-    """The simulator as a forward map; Newton begins at ``start(theta)``, or at rest if ``None``."""
+    """The simulator as a forward map; Newton begins at ``start(theta)``, or at rest if ``None``.
+
+    execute : solves many theta, in this process by default.
+    """
 
     simulator: Simulator
     nodes: np.ndarray
     start: ForwardMap | None = None
+    execute: Executor = in_process
 
     kind = "fem"
     label = "FEM"
@@ -53,12 +56,12 @@ class FEMForward:
         return Prediction(solution.displacement[self.nodes], solution.converged)
 
     def evaluate_all(self, thetas: jax.Array) -> Prediction:
-        """Predictions at many theta (c, p), one after the other."""
-        return self._predicted(list(self._rows(thetas)))
+        """Predictions at many theta (c, p), one after the other or as ``execute`` does."""
+        return self._predicted(self._rows(thetas))
 
     def slopes_all(self, thetas: jax.Array) -> tuple[Prediction, jax.Array]:
         """Predictions at many theta (c, p), and du/dtheta (c, p, k, 3) from the solves' factors."""
-        rows = list(self._rows(thetas, sensitivities=True))
+        rows = self._rows(thetas, sensitivities=True)
         slopes = jnp.stack([row.sensitivities[:, self.nodes] for row in rows])
         return self._predicted(rows), slopes
 
@@ -68,11 +71,12 @@ class FEMForward:
             jnp.stack([row.solution.converged for row in rows]),
         )
 
-    def _rows(self, thetas: jax.Array, *, sensitivities: bool = False) -> Iterator[Row]:
+    def _rows(self, thetas: jax.Array, *, sensitivities: bool = False) -> list[Row]:
         solver = Solver(self.simulator, sensitivities=sensitivities, from_rest_again=False)
         start = self.start
         starts = (lambda _: ()) if start is None else (lambda number: (start(thetas[number]),))
-        return solve_rows(solver, thetas, starts=starts)
+        rows = solve_rows(solver, thetas, starts=starts, execute=self.execute)
+        return sorted(rows, key=lambda row: row.number)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (k, 3) in mm."""
@@ -80,7 +84,11 @@ class FEMForward:
 
     def at(self, nodes: np.ndarray) -> FEMForward:
         """The same simulator, returning only ``nodes``."""
-        return FEMForward(self.simulator, check_nodes(self.scene, nodes), self.start)
+        return replace(self, nodes=check_nodes(self.scene, nodes))
+
+    def solved_by(self, execute: Executor) -> FEMForward:
+        """The same map, whose many solves are another executor's."""
+        return replace(self, execute=execute)
 
 
 def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMForward:
@@ -89,5 +97,8 @@ def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMFor
 
 
 FEM = ForwardKind(
-    "fem", "finite elements, from rest each time", lambda made_of, _: fem_forward(made_of.simulator)
+    "fem",
+    "finite elements, from rest each time",
+    lambda made_of, _: fem_forward(made_of.simulator),
+    solves_fem=True,
 )

@@ -80,6 +80,7 @@ class ForwardKind:
         ``from_arrays`` raises ``KeyError`` where one is missing. ``None`` for a kind that reads
         what it needs from elsewhere.
     from_emulator : whether an emulator is one of its ingredients.
+    solves_fem : whether a prediction is a FEM solve, which workers of a cluster can do.
     """
 
     name: str
@@ -89,3 +90,4 @@ class ForwardKind:
     to_arrays: Callable[[ForwardMap], Arrays] | None = None
     from_arrays: Callable[[Scene, Arrays], ForwardMap] | None = None
     from_emulator: bool = False
+    solves_fem: bool = False

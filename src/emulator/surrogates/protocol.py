@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.fem.campaign import Executor
 from emulator.scenes.scene import Scene
 
 
@@ -88,6 +89,23 @@ def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
     if own is not None:
         return own(thetas)
     return jax.jit(lambda t: jax.lax.map(forward.evaluate, t, batch_size=_AT_ONCE))(thetas)
+
+
+def solved_by(forward: ForwardMap, execute: Executor) -> ForwardMap:
+    """``forward`` with its solves at many theta done by ``execute``.
+
+    Raises
+    ------
+    InputError
+        A map that solves nothing.
+    """
+    own = getattr(forward, "solved_by", None)
+    if own is None:
+        raise InputError(
+            f"a {forward.kind} map solves no FEM, so a scheduler has no effect; take fem_forward, "
+            "or leave the scheduler out"
+        )
+    return own(execute)
 
 
 def fingerprint_of(*parts: str | np.ndarray | jax.Array) -> str:

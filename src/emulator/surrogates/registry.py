@@ -69,6 +69,13 @@ def check_emulator(name: str, emulator: str | None) -> None:
         raise InputError(f"--emulator has no effect without --forward {owners}")
 
 
+def check_scheduler(name: str, scheduler: str | None) -> None:
+    """:class:`InputError` if a scheduler is given to a kind whose predictions solve no FEM."""
+    if scheduler is not None and not forward_kind(name).solves_fem:
+        owners = " or ".join(kind.name for kind in FORWARD_MAPS.values() if kind.solves_fem)
+        raise InputError(f"--scheduler has no effect without --forward {owners}")
+
+
 def build_forward(name: str, ingredients: Ingredients, given: Mapping[str, Any] = {}) -> ForwardMap:
     """The forward map called ``name`` over all nodes, with the options ``given``."""
     return forward_kind(name).build(ingredients, full_options(name, given))

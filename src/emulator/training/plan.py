@@ -80,7 +80,9 @@ class Plan:
             raise InputError(
                 f"training: {self.simulations} simulations; a discrepancy model needs 1 or more"
             )
-        if self.objective != "energy" and self.simulations < self.batch:
+        if self.objective == "modes" and self.simulations < 1:
+            raise InputError(f"training: {self.simulations} simulations; modes need 1 or more")
+        if self.objective not in ("energy", "modes") and self.simulations < self.batch:
             raise InputError(
                 f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"
             )
@@ -101,6 +103,20 @@ class Plan:
     def as_learned(self) -> bool:
         """Whether a network is taken as another emulator has it: nothing is trained or fitted."""
         return not self.steps and self.recipe == "family"
+
+    @property
+    def idle(self) -> dict[str, str]:
+        """Settings that change nothing, and why."""
+        found = {}
+        if not self.steps:
+            found = dict.fromkeys(("objective", "batch"), "trains no network")
+        elif self.objective == "modes":
+            found = {"batch": "takes all FEM runs at every step"}
+        if not self.runs:
+            found["simulations"] = "takes no FEM runs"
+        if self.as_learned:
+            found["seed"] = "draws nothing at random"
+        return found
 
     @property
     def slopes(self) -> bool:

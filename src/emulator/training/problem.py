@@ -22,6 +22,7 @@ from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.protocol import all_nodes
 from emulator.surrogates.taylor import Expansion, constant, expand
 from emulator.training.basis import mechanical_modes
+from emulator.training.budget import Budget
 from emulator.training.discrepancy_stage import FEWEST
 from emulator.training.modal import ARCHITECTURE, Modal
 from emulator.training.objectives import Scales, make_loss, mean_square_gradient
@@ -88,7 +89,7 @@ def prepare(
     *,
     start: Emulator | None = None,
     campaign: StoredRuns | None = None,
-    deadline: float = np.inf,
+    budget: Budget | None = None,
     progress: bool = False,
 ) -> Problem:
     """Run the FEM solutions a plan needs and set up its emulator; equal for equal inputs.
@@ -98,9 +99,14 @@ def prepare(
     start : the emulator whose network to begin from, on any mesh; its architecture then is the
         default.
     campaign : FEM runs that are there already; the centre's alone is then solved.
-    deadline : of the performance counter, after which no FEM run is begun, except the fewest that
-        a discrepancy model can be judged by.
+    budget : ends FEM runs in time, except the fewest that a discrepancy model can be judged by.
+
+    Raises
+    ------
+    InputError
+        The budget is over before training begins.
     """
+    deadline = np.inf if budget is None else budget.fem_deadline(plan)
     family = None
     if start is not None and start.family is not None:
         family = family_on(start, scene, plan)
@@ -109,10 +115,14 @@ def prepare(
     simulator = Simulator(scene)
     # Rounded as a file stores it, so that the discrepancy is fitted to the series that is loaded.
     series = expand(simulator, order=plan.order).rounded() if plan.order else None
+    if budget is not None and series is not None:
+        budget.require("the series about the centre of the box")
     if campaign is None:
         runs = _run(simulator, plan, series, deadline, progress)
     else:
         runs = _taken(simulator, plan, series, campaign)
+    if budget is not None:
+        budget.require(f"{len(runs.theta)} FEM runs")
     if plan.runs:
         plan = replace(plan, simulations=len(runs.theta) - 1)
     if series is None and plan.centred:

@@ -7,14 +7,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from emulator.errors import InputError
 from emulator.fem.campaign import StoredRuns
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.budget import Aim, Budget
+from emulator.training.aim import Aim
+from emulator.training.budget import Budget
 from emulator.training.checkpoint import CHECKPOINT, Checkpoint, State, Writer, read_checkpoint
 from emulator.training.discrepancy_stage import add_discrepancy
 from emulator.training.loop import Bar, Hook, Keep, Steps, optimise, require_finite
@@ -65,14 +64,13 @@ def train(
         plan, architecture, source = saved.plan, saved.architecture or architecture, saved.start
         start = budget = None  # both are in the checkpoint
     limit = None if budget is None else Budget(budget, began)
-    deadline = np.inf if limit is None else limit.fem_deadline(plan)
     problem = prepare(
         scene,
         plan,
         architecture,
         start=start,
         campaign=campaign,
-        deadline=deadline,
+        budget=limit,
         progress=progress,
     )
     writer = Writer(path, scene.fingerprint, problem.architecture, source)

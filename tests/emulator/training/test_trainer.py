@@ -106,8 +106,11 @@ def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
 
 @pytest.mark.slow
 def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
-    with pytest.raises(InputError, match=r"the budget leaves \d+ training steps .* give at least"):
+    with pytest.raises(InputError, match="a budget of 1 s: one FEM solution and its compilation"):
         train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=1.0)
+    over = r"the budget leaves \d+ training steps .* give at least|the budget of 5 s is over after"
+    with pytest.raises(InputError, match=over):
+        train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=5.0)
 
 
 @pytest.mark.parametrize(
@@ -298,19 +301,19 @@ def test_a_network_on_a_quadratic_mesh(tmp_path):
 
 def test_an_aim_follows_the_clock(monkeypatch):
     """Steps of 1 s against a deadline in 1000 s, then of 2 s; no more than the plan's."""
-    from emulator.training import budget
+    from emulator.training import aim as module
     from emulator.training.checkpoint import State
 
     now = [0.0]
-    monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
-    aim = budget.Aim(1000.0, Plan())
+    monkeypatch.setattr(module.time, "perf_counter", lambda: now[0])
+    aim = module.Aim(1000.0, Plan())
     now[0] = 200.0
     assert aim(State({}, (), 200, 0.0), 5000) == 1000
     now[0] = 600.0
     assert aim(State({}, (), 400, 0.0), 1000) == 400 + int(400.0 / 1.5)
     assert aim(State({}, (), 401, 0.0), 666) == 666
     now[0] = 0.0
-    late = budget.Aim(100.0, Plan(recipe="hybrid", discrepancy=True, steps=300))
+    late = module.Aim(100.0, Plan(recipe="hybrid", discrepancy=True, steps=300))
     now[0] = 200.0  # past the deadline: no step more
     assert late(State({}, (), 200, 0.0), 300) == 200
     now[0] = 20.0  # well before it: no more than the plan's

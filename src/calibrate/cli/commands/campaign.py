@@ -7,7 +7,16 @@ import time
 from collections import Counter
 from typing import Any
 
-from calibrate.cli.common import DONE, FAILED, add_json, add_scene, emit, show_progress
+from calibrate.cli.common import (
+    DONE,
+    FAILED,
+    add_json,
+    add_scene,
+    add_scheduler,
+    emit,
+    scene_words,
+    show_progress,
+)
 
 
 def register(commands: Any) -> None:
@@ -38,11 +47,7 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--load-steps", type=int, default=1, metavar="N", help="as for simulate (default 1)"
     )
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="solve on the workers of this Dask scheduler, e.g. tcp://127.0.0.1:8786",
-    )
+    add_scheduler(parser, "solve")
     parser.add_argument("--out", required=True, metavar="STORE.zarr")
     add_json(parser)
     parser.set_defaults(run=run)
@@ -60,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.out.endswith(".zarr"):
         raise InputError(f"--out {arguments.out}: the store's name must end in .zarr")
     asked = question(
-        find_scene(arguments.scene, arguments.root),
+        find_scene(*scene_words(arguments)),
         arguments.samples,
         design=arguments.design,
         seed=arguments.seed,

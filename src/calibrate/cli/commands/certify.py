@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress
+from calibrate.cli.common import (
+    DONE,
+    FAILED,
+    add_json,
+    add_scheduler,
+    emit,
+    scheduler_word,
+    show_progress,
+)
 from calibrate.cli.posterior_table import summary
 from emulator.errors import InputError
 
@@ -19,6 +27,7 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--reweight", metavar="DIR2", help="write FEM's posterior, reweighted from the check, there"
     )
+    add_scheduler(parser, "the FEM runs")
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -32,13 +41,14 @@ def run(arguments: argparse.Namespace) -> int:
         target = check_folder(arguments.reweight)
         if target.resolve() == Path(arguments.folder).resolve():
             raise InputError(f"--reweight {target}: that is DIR itself; name another folder")
-    progress = show_progress(arguments)
+    scheduler, progress = scheduler_word(arguments), show_progress(arguments)
     plan, posterior = read_posterior(arguments.folder)
     certificate = certify_and_keep(
         posterior,
         arguments.folder,
         draws=arguments.draws,
         reweight_to=arguments.reweight,
+        scheduler=scheduler,
         progress=progress,
     )
     result = report(plan, posterior, certificate)

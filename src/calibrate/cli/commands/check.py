@@ -7,9 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress, table
+from calibrate.cli.common import (
+    DONE,
+    FAILED,
+    add_json,
+    add_scheduler,
+    emit,
+    scheduler_word,
+    show_progress,
+    table,
+)
 from calibrate.cli.model_words import add_model, model_of
 from calibrate.cli.noise_words import noise_words
+from emulator.errors import InputError
 
 
 def register(commands: Any) -> None:
@@ -39,6 +49,7 @@ def register(commands: Any) -> None:
         metavar="[NAME=]SD",
         help="noise of the data, as for --noise, where it is not the model's: the check must fail",
     )
+    add_scheduler(sbc, "with --fem-data, the FEM runs")
     sbc.add_argument("--warmup", type=int, default=200)
     sbc.add_argument("--draws", type=int, default=250)
     sbc.add_argument("--chains", type=int, default=2)
@@ -54,6 +65,9 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     from emulator.store import check_folder, write_json
 
     folder, progress = check_folder(arguments.out), show_progress(arguments)
+    if arguments.scheduler is not None and not arguments.fem_data:
+        raise InputError("--scheduler has no effect without --fem-data")
+    scheduler = scheduler_word(arguments)
     run = Run(**model_of(arguments), seed=arguments.seed)
     model = model_before_data(run, progress=progress)
     truth = model
@@ -69,6 +83,7 @@ def run_sbc(arguments: argparse.Namespace) -> int:
         options=options,
         seed=arguments.seed,
         progress=progress,
+        scheduler=scheduler,
     )
     result = found.to_json()
     write_json(folder / "calibration.json", result)

@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import DONE, add_json, add_scene, emit, table
+from calibrate.cli.common import DONE, add_json, add_scene, emit, scene_words, table
 
 if TYPE_CHECKING:
     from calibrate.effects import Measured, Recommendation
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.errors import check_seed
 
     check_seed(arguments.seed, "effects")
-    scene = find_scene(arguments.scene, arguments.root)
+    scene = find_scene(*scene_words(arguments))
     observe = observations(parse_observation(scene, arguments.observe, arguments.seed))
     quiet = arguments.json or not sys.stderr.isatty()
     found = recommend(

@@ -21,7 +21,7 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--against", required=True, metavar="DIR|fem", help="a published model's folder, or our FEM"
     )
-    parser.add_argument("--cases", type=int, default=50, help="FEM runs when against fem")
+    parser.add_argument("--cases", type=int, help="FEM runs when against fem (default 50)")
     parser.add_argument(
         "--outside",
         type=float,

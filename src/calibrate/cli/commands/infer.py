@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import suppress
+from dataclasses import fields
 from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress
@@ -26,7 +27,7 @@ def register(commands: Any) -> None:
         help="e.g. target_accept=0.95, start=pathfinder; an unknown name lists those there are",
     )
     parser.add_argument("--draws", type=int, default=1000)
-    parser.add_argument("--warmup", type=int, default=500)
+    parser.add_argument("--warmup", type=int, help="iterations that adapt (default 500)")
     parser.add_argument("--chains", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
@@ -53,6 +54,15 @@ def sampler_options(words: list[str]) -> dict[str, Any]:
     return found
 
 
+def warmup(sampler: str, given: int | None) -> int:
+    """Iterations that adapt; :class:`InputError` where they are given to a sampler without any."""
+    if given is not None and "warmup" not in {
+        f.name for f in fields(find_sampler(sampler).options)
+    }:
+        raise InputError(f"--warmup has no effect with sampler '{sampler}', which does not adapt")
+    return 500 if given is None else given
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Sample and keep a posterior."""
     from calibrate.run import Run
@@ -65,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         **model_of(arguments),
         sampler=arguments.sampler,
         sampler_options=sampler_options(arguments.sampler_options),
-        warmup=arguments.warmup,
+        warmup=warmup(arguments.sampler, arguments.warmup),
         draws=arguments.draws,
         chains=arguments.chains,
         seed=arguments.seed,

@@ -6,7 +6,16 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import DONE, add_json, add_scene, emit, table
+from calibrate.cli.common import (
+    DONE,
+    add_json,
+    add_scene,
+    add_scheduler,
+    emit,
+    scene_words,
+    scheduler_word,
+    table,
+)
 from calibrate.cli.forward import add_forward, forward_options
 from emulator.errors import InputError, check_seed
 
@@ -76,6 +85,7 @@ def register(commands: Any) -> None:
     )
     add_forward(parser)
     parser.add_argument("--emulator", metavar="NAME|DIR", help="default: the one shipped")
+    add_scheduler(parser, "with --forward fem, the FEM runs")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--out", metavar="DIR", help="write sensitivity.nc, figures, and the map as VTU"
@@ -94,10 +104,12 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.catalogue import find_scene
     from emulator.store import check_folder
     from emulator.surrogates.kind import Ingredients
-    from emulator.surrogates.registry import build_forward
+    from emulator.surrogates.registry import build_forward, check_scheduler
 
     check_seed(arguments.seed, "sensitivity")
-    scene = find_scene(arguments.scene, arguments.root)
+    check_scheduler(arguments.forward, arguments.scheduler)
+    scheduler = scheduler_word(arguments)
+    scene = find_scene(*scene_words(arguments))
     if arguments.out:
         check_folder(arguments.out)
     observe = arguments.observe and parse_observation(scene, arguments.observe, arguments.seed)
@@ -116,6 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
         groups=groups,
         field=arguments.field,
         seed=arguments.seed,
+        scheduler=scheduler,
     )
     if arguments.out:
         write(found, scene, Path(arguments.out))

@@ -6,7 +6,16 @@ import argparse
 from functools import partial
 from typing import Any
 
-from calibrate.cli.common import DONE, FAILED, add_json, add_scene, assignments, check_vtu, emit
+from calibrate.cli.common import (
+    DONE,
+    FAILED,
+    add_json,
+    add_scene,
+    assignments,
+    check_vtu,
+    emit,
+    scene_words,
+)
 
 
 def register(commands: Any) -> None:
@@ -39,9 +48,10 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.fem import NewtonOptions, Simulator, Status
     from emulator.fem.fields import element_fields
     from emulator.fem.functional import potential_energy, volume_ratio
+    from emulator.fem.reactions import supported_sets
     from emulator.geometry.io import write_solution
 
-    scene = find_scene(arguments.scene, arguments.root)
+    scene = find_scene(*scene_words(arguments))
     theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
     if arguments.out:
         check_vtu(arguments.out)
@@ -69,6 +79,11 @@ def run(arguments: argparse.Namespace) -> int:
         "max_displacement": float(np.linalg.norm(solution.displacement, axis=1).max()),
         "J_range": [float(J.min()), float(J.max())],
     }
+    reactions: dict[str, list[float]] = {}
+    if status is Status.CONVERGED:
+        for name in supported_sets(scene):
+            reactions[name] = simulator.reaction(name, solution.displacement, theta).tolist()
+        result["reactions"] = reactions
     if arguments.out and status is Status.CONVERGED:
         u = np.asarray(solution.displacement)
         fields = element_fields(scene, solution.displacement, theta)
@@ -80,6 +95,9 @@ def run(arguments: argparse.Namespace) -> int:
     lines.append(
         f"J from {J.min():.4f} to {J.max():.4f}, relative residual {result['residual']:.1e}"
     )
+    for name, force in reactions.items():
+        components = ", ".join(f"{component:.5g}" for component in force)
+        lines.append(f"force of the support '{name}' on the body: {components} mN")
     if stable is False:
         lines.append(
             "an unstable equilibrium: it has buckled, and any imperfection leads elsewhere"

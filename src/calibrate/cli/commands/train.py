@@ -12,11 +12,12 @@ from calibrate.cli.common import (
     add_json,
     add_scene,
     emit,
+    scene_words,
     seconds,
     show_progress,
 )
 from emulator.errors import InputError
-from emulator.training.plan import OBJECTIVES, RECIPES
+from emulator.training.plan import OBJECTIVES, RECIPES, Plan
 
 
 def register(commands: Any) -> None:
@@ -45,7 +46,9 @@ def register(commands: Any) -> None:
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
-        "--budget", metavar="TIME", help="time for everything, e.g. 10m (default 10m)"
+        "--budget",
+        metavar="TIME",
+        help="time for everything, e.g. 10m (default 10m; without a network, all FEM runs)",
     )
     length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
     parser.add_argument("--simulations", type=int, help="FEM runs to train on")
@@ -74,21 +77,27 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.training import recipe, remove_checkpoint
     from emulator.training import train as train_emulator
 
-    scene = find_scene(arguments.scene, arguments.root)
+    scene = find_scene(*scene_words(arguments))
     check_folder(arguments.out)
     given = _given(arguments)
     start = load(arguments.start) if arguments.start else None
-    plan = recipe(arguments.recipe or _default_recipe(start))
+    plan = replace(recipe(arguments.recipe or _default_recipe(start)), **given)
+    if not arguments.resume:
+        _refuse_idle(plan, given, arguments.budget)
     campaign = None
     if arguments.campaign:
         from emulator.fem.campaign.stored_runs import read_runs
 
         campaign = read_runs(arguments.campaign, scene)
-        given.setdefault("simulations", len(campaign.runs.theta))
-    fixed = arguments.resume or "steps" in given
+        if "simulations" not in given:
+            plan = replace(plan, simulations=len(campaign.runs.theta))
+    # Without a network its FEM runs are all that a plan has: only a budget that was asked for
+    # makes them fewer.
+    whole = not plan.steps and arguments.budget is None
+    fixed = arguments.resume or "steps" in given or whole
     result = train_emulator(
         scene,
-        replace(plan, **given),
+        plan,
         arguments.out,
         start=start,
         campaign=campaign,
@@ -108,6 +117,9 @@ def run(arguments: argparse.Namespace) -> int:
     remove_checkpoint(arguments.out)
     steps = record["plan"]["steps"]
     text = f"trained {scene.name}: {steps} steps, {record['seconds']:.0f} s, in {arguments.out}"
+    runs = record["plan"]["simulations"]
+    if not fixed and plan.runs > runs:
+        text += f"\n{runs} of {plan.runs} FEM runs fit into the budget: more time, smaller errors"
     emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
     return DONE
 
@@ -131,10 +143,21 @@ def _given(arguments: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
+def _refuse_idle(plan: Plan, given: Mapping[str, Any], budget: str | None) -> None:
+    """:class:`InputError` for an option that changes nothing under ``plan``."""
+    idle = plan.idle | ({"budget": "trains nothing"} if plan.as_learned else {})
+    asked = [*given, *([] if budget is None else ["budget"])]
+    for name in (name for name in asked if name in idle):
+        raise InputError(
+            f"--{name} has no effect with recipe '{plan.recipe}', which {idle[name]}; leave it out"
+        )
+
+
 def command_line(scene: str, record: Mapping[str, Any]) -> str:
     """The command that repeats a training exactly, with the steps and runs it really took."""
     names = ("recipe", "objective", "steps", "simulations", "batch", "seed")
-    options = " ".join(f"--{name} {record['plan'][name]}" for name in names)
+    plan = Plan(**record["plan"])
+    options = " ".join(f"--{name} {getattr(plan, name)}" for name in names if name not in plan.idle)
     # The record names the emulator training started from by its fingerprint, not by its folder.
     start = " --start EMULATOR" if "start" in record else ""
     campaign = " --campaign STORE.zarr" if record["plan"]["campaign"] else ""

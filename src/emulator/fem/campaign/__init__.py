@@ -6,7 +6,14 @@ the order they are finished, which are kept in memory (:mod:`.memory`) or in a Z
 (:mod:`.zarr_rows`). Zarr and Dask are imported only by who asks for them.
 """
 
-from emulator.fem.campaign.engine import Executor, Solver, in_process, solve_rows, solve_together
+from emulator.fem.campaign.engine import (
+    Executor,
+    Solver,
+    in_process,
+    solve_rows,
+    solve_together,
+)
+from emulator.fem.campaign.place import executor
 from emulator.fem.campaign.row import Row, Task
 from emulator.fem.campaign.runs import Runs, StoredRuns, run_campaign
 from emulator.fem.campaign.starts import Neighbours, Predictor
@@ -20,6 +27,7 @@ __all__ = [
     "Solver",
     "StoredRuns",
     "Task",
+    "executor",
     "in_process",
     "run_campaign",
     "solve_rows",

@@ -17,8 +17,8 @@ import time
 import uuid
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, cast
 
@@ -53,6 +53,7 @@ class Cluster:
 
     client: Client
     address: str
+    _sent: dict[Solver, str] = field(default_factory=dict)
 
     def __call__(self, solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
         """Rows as they come back.
@@ -63,14 +64,18 @@ class Cluster:
             No workers for a minute, the scheduler has gone, or a theta that killed each worker it
             was given to; all other rows come first.
         """
-        name = f"campaign-{uuid.uuid4().hex}"
         try:
-            self.client.register_plugin(Bench(solver), name=name)
-            yield from self._rows(name, tasks)
+            yield from self._rows(self._name(solver), tasks)
         except (OSError, CancelledError) as error:  # an error of the solve itself is neither
             raise self._gone(error) from error
-        finally:
-            self._forget(name)
+
+    def _name(self, solver: Solver) -> str:
+        """The name that workers know ``solver`` by; they are sent it once."""
+        if solver not in self._sent:
+            name = f"campaign-{uuid.uuid4().hex}"
+            self.client.register_plugin(Bench(solver), name=name)
+            self._sent[solver] = name
+        return self._sent[solver]
 
     def _rows(self, name: str, tasks: Iterator[Task]) -> Iterator[Row]:
         under_way: dict[Future, int] = {}
@@ -132,12 +137,12 @@ class Cluster:
         said = " ".join(str(error).split())
         return SolverError(f"campaign: the scheduler {self.address} does not answer ({said})")
 
-    def _forget(self, name: str) -> None:
-        """Let the workers forget the scene, where there still are any."""
-        try:
-            self.client.unregister_worker_plugin(name)
-        except (OSError, CancelledError, RuntimeError, ValueError, KeyError):
-            return
+    def forget(self) -> None:
+        """Let the workers forget the scenes, where there still are any."""
+        for name in self._sent.values():
+            with suppress(OSError, CancelledError, RuntimeError, ValueError, KeyError):
+                self.client.unregister_worker_plugin(name)
+        self._sent.clear()
 
 
 @contextmanager
@@ -150,18 +155,25 @@ def connected(address: str, *, within: float | None = None) -> Iterator[Cluster]
         The address is malformed, or nobody answers there in ``within`` seconds (10).
     """
     within = CONNECT_S if within is None else within
-    if not _ADDRESS.fullmatch(address):
-        raise InputError(f"scheduler '{address}' is no address; give e.g. tcp://127.0.0.1:8786")
+    check_address(address)
     try:
         client = Client(address, timeout=within, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
             f"scheduler {address} does not answer within {within:g} s; is it running?"
         ) from error
+    cluster = Cluster(client, address)
     try:
-        yield Cluster(client, address)
+        yield cluster
     finally:
+        cluster.forget()
         client.close()
+
+
+def check_address(address: str) -> None:
+    """:class:`InputError` unless ``address`` looks like a scheduler's."""
+    if not _ADDRESS.fullmatch(address):
+        raise InputError(f"scheduler '{address}' is no address; give e.g. tcp://127.0.0.1:8786")
 
 
 class Bench(WorkerPlugin):

@@ -49,6 +49,14 @@ class Load(ABC):
         """Whether the load's work is a potential of the displacement."""
         return True
 
+    @property
+    def at_held_nodes(self) -> Load:
+        """The load whose force is that of this one where nodes are held, too.
+
+        A potential is only meant for nodes that move.
+        """
+        return self
+
     def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
         """Raise :class:`~emulator.errors.InputError` if the load cannot act on this body.
 

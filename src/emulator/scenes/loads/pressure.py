@@ -24,6 +24,7 @@ from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.facets import cone_volume, rim
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.loads.dead_pressure import DeadPressure, at_rest
+from emulator.scenes.loads.follower import FollowerPressure
 from emulator.scenes.loads.surface_pressure import SurfacePressure
 from emulator.scenes.local_terms import LocalTerm, Values
 
@@ -38,6 +39,11 @@ class CavityPressure(SurfacePressure):
     def simpler(self) -> tuple[str, DeadPressure]:
         """The pressure on the wall as it is at rest."""
         return at_rest(self)
+
+    @property
+    def at_held_nodes(self) -> FollowerPressure:
+        """The pressure on the wall alone: the lid's part in ``V`` acts on the held rim."""
+        return FollowerPressure(self.facet_set, self.pressure, self.parameter)
 
     def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
         """Refuse a cavity whose rim is neither held nor slides in a plane through the origin."""

@@ -1,0 +1,91 @@
+"""Bad scene files and meshes, and emulators of another scene; tests/test_bad_input.py has the rest."""
+
+import meshio
+import numpy as np
+import pytest
+
+from cli_support import SCENE, answer, complaint, write_block
+from emulator.geometry.bodies.box import box
+
+
+@pytest.fixture
+def block(tmp_path):
+    return write_block(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('unit = "kPa"', 'unit = "mmHg"', "parameter 'mu' is in mmHg; law 'neo_hookean' takes kPa"),
+        ("lam = 30.0", "lam = -30.0", "parameter 'lam' is -30 kPa; it must be above 0"),
+        ("lam = 30.0", "nu = 0.3", "parameter 'nu' is not one of law 'neo_hookean'"),
+        ('law = "neo_hookean"', 'law = "guccione"', "law 'guccione' needs fibres"),
+        ('kind = "gravity"', 'kind = "weight"', 'kind = "weight"; expected'),
+        (
+            'node_set = "left"',
+            'node_set = "left"\nglue = 1',
+            "unknown key 'glue'; known: components",
+        ),
+        (
+            "[[loads]]",
+            '[[supports]]\nnode_set = "left"\ndisplacement = [1, 0, 0]\n[[loads]]',
+            "support on 'left' contradicts another one at node",
+        ),
+    ],
+)
+def test_bad_scene_files(capsys, block, old, new, message):
+    assert old in SCENE
+    block.write_text(SCENE.replace(old, new))
+    said = complaint(capsys, "simulate", block)
+    assert "scene.toml" in said
+    assert message in said
+
+
+def test_bad_meshes_in_scene_files(capsys, block):
+    mesh = box((20.0, 10.0, 10.0), (2, 1, 1))
+    solid = ("tetra", mesh.elements)
+    brick = ("hexahedron", [[0, 1, 4, 3, 6, 7, 10, 9]])
+    meshio.write(block.parent / "block.vtu", meshio.Mesh(mesh.nodes, [solid, brick]))
+    assert "it has hexahedron cells" in complaint(capsys, "simulate", block)
+    tags = [np.zeros(len(mesh.elements), int), np.array([7])]
+    data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
+    file = meshio.Mesh(mesh.nodes, [solid, ("triangle", mesh.surface[:1])], cell_data=data)
+    meshio.write(block.parent / "block.msh", file, file_format="gmsh22", binary=False)
+    block.write_text(SCENE.replace("block.vtu", "block.msh"))
+    assert "physical group 7 (triangles) has no name" in complaint(capsys, "simulate", block)
+
+
+def test_a_scene_without_a_shipped_emulator_says_so(capsys, block, tmp_path):
+    line = complaint(
+        capsys, "infer", block, "--truth", "mu=7", "--observe", "all", "--out", tmp_path / "r"
+    )
+    assert "is neither shipped nor a folder with emulator.json" in line
+
+
+@pytest.mark.slow
+def test_a_posterior_of_another_emulator_is_not_certified(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    from emulator.surrogates import load, save_emulator
+
+    emulator = load("once_clamped_beam")
+    save_emulator(emulator, "mine")
+    words = ["--truth", "mu=73", "lam=61", "--emulator", "mine", "--warmup", 10, "--draws", 10]
+    code, _ = answer(capsys, "infer", "once_clamped_beam", *words, "--no-certify", "--out", "r")
+    assert code == 0
+    from dataclasses import replace
+
+    series = replace(emulator.taylor, displacement=1.01 * emulator.taylor.displacement)
+    save_emulator(replace(emulator, taylor=series), "mine")
+    assert "was made with another emulator map" in complaint(
+        capsys, "certify", "r", "--draws", "30"
+    )
+
+
+def test_a_mesh_with_a_flat_element(capsys, block):
+    mesh = box((20.0, 10.0, 10.0), (2, 1, 1))
+    elements = mesh.elements.copy()
+    elements[5, 3] = elements[5, 2]
+    meshio.write(block.parent / "block.vtu", meshio.Mesh(mesh.nodes, [("tetra", elements)]))
+    assert "block.vtu: element 5 has no volume, 1 such of 12" in complaint(
+        capsys, "simulate", block
+    )
