@@ -83,11 +83,13 @@ def table(cases: list[Case]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for c in cases:
-        own = f"{c['own_mm']['median']:.1e} mm" if c["own_mm"] else ""
+        own, truth = (
+            f"{c[key]['median']:.1e} mm" if c[key] else "" for key in ("own_mm", "truth_mm")
+        )
         nodes = "" if c["own_mm"] else f" ({c['nodes']} nodes)"
         rows.append(
             f"| {c['rung']}{nodes} | {c['fem_runs']} | {c['offline_s']:.0f} s | {own} | "
-            f"{c['truth_mm']['median']:.1e} mm | {1e3 * c['value_s']:.3g} ms | "
+            f"{truth} | {1e3 * c['value_s']:.3g} ms | "
             f"{1e3 * c['gradient_s']:.3g} ms |"
         )
     return "\n".join(rows)
@@ -126,7 +128,10 @@ def check(cases: list[Case], *, quick: bool) -> None:
 def check_body(found: dict[str, Case], *, quick: bool) -> None:
     """Fronts, Newton steps, emulators better than their mesh, and agreement with FEniCSx."""
     own = {name: case["own_mm"]["median"] for name, case in found.items() if case["own_mm"]}
-    best = front(np.array([(c["gradient_s"], c["truth_mm"]["median"]) for c in found.values()]))
+    known = [case for case in found.values() if case["truth_mm"]]
+    best = front(
+        np.array([(c["gradient_s"], c["truth_mm"]["median"]) for c in known]).reshape(-1, 2)
+    )
     assert (np.diff(best[:, 0]) >= 0.0).all()
     assert (np.diff(best[:, 1]) <= 0.0).all()
     assert own.get("FEM from rest", 0.0) < 1e-6
@@ -137,7 +142,8 @@ def check_body(found: dict[str, Case], *, quick: bool) -> None:
     if "emulator + 2 Newton steps" in own:
         assert own["emulator + 2 Newton steps"] < max(1e-9, own["emulator, full field"])
     if emulator and rest and not quick:  # an emulator better than its mesh buys nothing
-        assert own["emulator, full field"] < 0.1 * rest["truth_mm"]["median"]
+        if rest["truth_mm"]:
+            assert own["emulator, full field"] < 0.1 * rest["truth_mm"]["median"]
         assert emulator["gradient_s"] < 0.1 * rest["gradient_s"]
 
 

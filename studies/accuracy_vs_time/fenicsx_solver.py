@@ -291,8 +291,9 @@ def main():
         size = size_of_forces(body, problem["spare"][0])
         tried = candidates(body, problem["spare"], tolerance, size)
         _, name, steps, solver = tried[0]
-        cold = from_rest(body, solver, steps, problem, tolerance, size)
-        warm = from_neighbours(body, solver, steps, problem, tolerance, size)
+        settings = (tolerance, size, steps)
+        cold = solve_all(body, solver, problem, settings, [None] * len(problem["theta"]))
+        warm = solve_all(body, solver, problem, settings, problem["starts"])
     np.savez(
         sys.argv[2],
         **{f"cold_{key}": value for key, value in cold.items()},
@@ -318,31 +319,20 @@ def surely(body, solver, theta, tolerance, size, steps, start=None):
     return iterations
 
 
-def from_rest(body, solver, steps, problem, tolerance, size):
-    """Every theta from rest; then once more with its gradient."""
-    columns = {"seconds": [], "iterations": [], "displacement": [], "both_s": [], "gradient": []}
-    for theta in problem["theta"]:
-        seconds, iterations = timed(surely, body, solver, theta, tolerance, size, steps)
-        columns["seconds"].append(seconds)
-        columns["iterations"].append(iterations)
-        columns["displacement"].append(body.displacement())
+def solve_all(body, solver, problem, settings, starts):
+    """Every theta, from rest where its start is ``None``: columns by name, with gradients."""
+    columns: dict[str, list] = {}
+    for theta, near in zip(problem["theta"], starts):  # noqa: B905
+        start = None if near is None else body.dofs(near)
+        seconds, iterations = timed(surely, body, solver, theta, *settings, start)
+        u = body.displacement()
         adjoint, gradient = timed(body.gradient, solver)
-        columns["both_s"].append(seconds + adjoint)
-        columns["gradient"].append(gradient)
-    return {name: np.array(values) for name, values in columns.items()}
-
-
-def from_neighbours(body, solver, steps, problem, tolerance, size):
-    """Every theta from the solution at a neighbour, which is given."""
-    columns = {"seconds": [], "iterations": [], "displacement": [], "both_s": []}
-    for theta, near in zip(problem["theta"], problem["starts"]):  # noqa: B905
-        start = body.dofs(near)
-        seconds, iterations = timed(surely, body, solver, theta, tolerance, size, steps, start)
-        columns["seconds"].append(seconds)
-        columns["iterations"].append(iterations)
-        columns["displacement"].append(body.displacement())
-        adjoint, _ = timed(body.gradient, solver)
-        columns["both_s"].append(seconds + adjoint)
+        found = {
+            "seconds": seconds, "iterations": iterations, "displacement": u,
+            "both_s": seconds + adjoint, "gradient": gradient,
+        }  # fmt: skip
+        for name, value in found.items():
+            columns.setdefault(name, []).append(value)
     return {name: np.array(values) for name, values in columns.items()}
 
 

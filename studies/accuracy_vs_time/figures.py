@@ -37,7 +37,8 @@ def draw(cases: list[Case], path: Path) -> None:
     for row, body in zip(panels, bodies, strict=True):
         found = [case for case in cases if case["body"] == body]
         for axes, key in zip(row, LABELS, strict=True):
-            _panel(axes, [case for case in found if case[key]], key)
+            known = [case for case in found if case[key]]
+            _panel(axes, known, key) if known else axes.set_axis_off()
         nodes = next(case["nodes"] for case in found if case["own_mm"])
         row[0].set_ylabel(f"{body}, {nodes} nodes\nerror (mm)")
     for axes, label in zip(panels[0], LABELS.values(), strict=True):

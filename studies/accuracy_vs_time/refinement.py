@@ -43,10 +43,10 @@ def _on(scene: Scene, change: Callable[[Mesh], Mesh], children: int) -> Scene:
     parents = corner_parents(to_quadratic(scene.mesh))
     held = scene.held_displacement[parents].mean(axis=1)
     mesh = change(scene.mesh)
-    assert all(isinstance(support, Support) for support in scene.supports)
-    supports = tuple(
-        replace(support, displacement=held[mesh.node_set(support.node_set)])
-        for support in scene.supports
-    )
+    supports = []
+    for support in scene.supports:
+        assert isinstance(support, Support), support.kind
+        there = held[mesh.node_set(support.node_set)]
+        supports.append(replace(support, displacement=there))
     fibres = None if scene.fibres is None else np.repeat(scene.fibres, children, axis=0)
-    return replace(scene, mesh=mesh, supports=supports, fibres=fibres, origin={})
+    return replace(scene, mesh=mesh, supports=tuple(supports), fibres=fibres, origin={})

@@ -29,7 +29,6 @@ from emulator.surrogates.taylor import expand
 from emulator.training import RECIPES, train
 
 POINTS, SEED = 24, 4
-TOLERANCES = (1e-3, 1e-6)
 FAST_CALLS = 60
 COMPILED = 5000  # nodes below which Newton steps are compiled into one program with the map
 Solve = Callable[[jax.Array], jax.Array]
@@ -104,7 +103,7 @@ def of_fem(
 def from_rest(place: Place) -> Iterator[Rung]:
     """FEM from rest, by tolerance."""
     yield of_fem("FEM from rest", place.simulator, place)
-    for tolerance in place.some(TOLERANCES):
+    for tolerance in place.some(place.body.tolerances):
         loose = Simulator(place.scene, NewtonOptions(tolerance=tolerance, round_off=tolerance))
         yield of_fem(f"FEM from rest, tolerance {tolerance:g}", loose, place)
 
