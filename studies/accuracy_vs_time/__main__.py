@@ -72,7 +72,7 @@ def examine(name: str, arguments: argparse.Namespace) -> Iterator[Case]:
         else:
             found = (measure(rung, place, known) for rung in STAGES[stage](place))
         for case in found:
-            about = {"name": f"{name}: {case['rung']}", "status": "done"}
+            about = {"name": f"{name}: {case['rung']}", "status": "done", "clock": "processor"}
             yield {**about, "body": name, "stage": stage, **case}
 
 
