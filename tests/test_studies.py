@@ -77,7 +77,7 @@ def test_every_study_has_a_line():
 
 # Figures that need more than the few cases.
 FULL_ONLY = {
-    "accuracy_vs_time": {"posteriors.png"},
+    "accuracy_vs_time": {"posteriors.png", "released.png"},
     "few_runs": {"meshes.png"},
     "sensitivity": {"segments.png"},
     "sbc": {"beam.png", "ventricle.png", "noise.png", "prior.png"},

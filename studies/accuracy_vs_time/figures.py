@@ -1,4 +1,4 @@
-"""The study's figures: errors against time on five bodies, and the posterior's error."""
+"""The study's figures: errors against time, a row a body, and the posterior's error."""
 
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from calibrate.figures.drawing import pyplot
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
 STYLES = {
     "FEM": ("#009E73", "s"),
+    "FEniCSx": ("#000000", "x"),
     "polished": ("#56B4E9", "D"),
     "emulator": ("#0072B2", "o"),
     "series": ("#E69F00", "^"),
@@ -28,23 +29,31 @@ def front(points: np.ndarray) -> np.ndarray:
 
 
 def draw(cases: list[Case], path: Path) -> None:
-    """Error against the time of a value with gradient; a column a body, a row an error."""
+    """Error against the time of a value with gradient; a row a body, a column an error."""
     bodies = list(dict.fromkeys(case["body"] for case in cases))
     figure, panels = pyplot().subplots(
-        2, len(bodies), figsize=(3.4 * len(bodies), 7.4), layout="constrained", squeeze=False
+        len(bodies), 2, figsize=(7.2, 2.4 * len(bodies) + 1.0), layout="constrained", squeeze=False
     )
-    for column, body in zip(panels.T, bodies, strict=True):
+    for row, body in zip(panels, bodies, strict=True):
         found = [case for case in cases if case["body"] == body]
-        for axes, key in zip(column, LABELS, strict=True):
-            _panel(axes, [case for case in found if case[key]], key)
+        for axes, key in zip(row, LABELS, strict=True):
+            known = [case for case in found if case[key]]
+            _panel(axes, known, key) if known else axes.set_axis_off()
         nodes = next(case["nodes"] for case in found if case["own_mm"])
-        column[0].set_title(f"{body}, {nodes} nodes")
-        column[1].set_xlabel("value and gradient (ms)")
-    for axes, label in zip(panels[:, 0], LABELS.values(), strict=True):
-        axes.set_ylabel(f"error, median over theta (mm)\n{label}")
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False)
-    save(figure, path)
+        row[0].set_ylabel(f"{body}, {nodes} nodes\nerror (mm)")
+    for axes, label in zip(panels[0], LABELS.values(), strict=True):
+        axes.set_title(label, fontsize=10)
+    for axes in panels[-1]:
+        axes.set_xlabel("value and gradient (ms)")
+    shown = {
+        label: handle
+        for axes in panels.flat
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        shown.values(), shown, loc="outside lower center", ncols=4, frameon=False, fontsize=9
+    )
+    save(figure, path, dpi=160)
 
 
 def _panel(axes: Any, cases: list[Case], key: str) -> None:
@@ -52,8 +61,16 @@ def _panel(axes: Any, cases: list[Case], key: str) -> None:
     best = front(points)
     axes.step(best[:, 0], best[:, 1], where="post", color="0.6", lw=1, label="Pareto front")
     for kind, (colour, mark) in STYLES.items():
-        rows = [k for k, case in enumerate(cases) if case["kind"] == kind]
-        axes.plot(*points[rows].T, mark, color=colour, mfc="none", ms=7, ls="", label=kind)
+        for narrow in (False, True):
+            rows = [
+                k
+                for k, case in enumerate(cases)
+                if case["kind"] == kind and case["rung"].endswith("float32") == narrow
+            ]
+            if rows:
+                fill = {"mfc": colour, "ms": 4} if narrow else {"mfc": "none", "ms": 6}
+                label = f"{kind}, float32" if narrow else kind
+                axes.plot(*points[rows].T, mark, color=colour, ls="", label=label, **fill)
     axes.set(xscale="log", yscale="log")
     axes.grid(color="0.92")
     axes.spines[["top", "right"]].set_visible(False)
