@@ -119,24 +119,25 @@ class Entry:
     problems: tuple[str, ...] = tuple(PROBLEMS)
 
 
+_MID = tuple(name for name, problem in PROBLEMS.items() if problem.level == "mid")
 _NUTS = {"warmup": 300, "draws": 500, "chains": 4, "rounds": 2}
 EMULATOR = partial(shipped, SCENE)
 NETWORK = partial(shipped, f"{SCENE}_pignn")
 OURS = {
     "emulator_nuts": Entry("emulator, NUTS", EMULATOR, sampler("nuts", **_NUTS)),
     "emulator_laplace": Entry("emulator, Laplace", EMULATOR, sampler("laplace")),
-    "emcee": Entry("emulator, emcee", EMULATOR, by_emcee),
-    "network_nuts": Entry("network alone, NUTS", NETWORK, sampler("nuts", **_NUTS)),
+    "emcee": Entry("emulator, emcee", EMULATOR, by_emcee, _MID),
+    "network_nuts": Entry("network alone, NUTS", NETWORK, sampler("nuts", **_NUTS), _MID),
     "pod_gp_nuts": Entry(
-        f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_NUTS)
+        f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_NUTS), _MID
     ),
     "delayed_acceptance": Entry(
         "emulator and FEM, delayed acceptance", EMULATOR,
-        sampler("delayed_acceptance", draws=125, rounds=1),
+        sampler("delayed_acceptance", draws=125, rounds=1), _MID,
     ),
     "emulator_mclmc": Entry("emulator, MCLMC", EMULATOR, sampler("mclmc", **_NUTS)),
-    "emulator_smc": Entry("emulator, SMC", EMULATOR, sampler("smc")),
-    "pymc": Entry("emulator, PyMC", EMULATOR, by_pymc),
+    "emulator_smc": Entry("emulator, SMC", EMULATOR, sampler("smc"), _MID),
+    "pymc": Entry("emulator, PyMC", EMULATOR, by_pymc, _MID),
 }  # fmt: skip
 
 
