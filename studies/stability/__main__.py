@@ -107,7 +107,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """How each family ended, as the README has it."""
-    names = list(dict.fromkeys(sorted((row["status"] for row in rows), key=list(COLOURS).index)))
+    found = {row["status"] for row in rows}
+    names = [name for name in COLOURS if name in found] + sorted(found - set(COLOURS))
     words = [name.replace("_", " ").lower() if name.isupper() else name for name in names]
     lines = [f"| family | cases | {' | '.join(words)} |", "|---" * (len(names) + 2) + "|"]
     families = dict.fromkeys(row["family"] for row in rows)
