@@ -41,14 +41,8 @@ def test_outputs_are_small_and_of_no_machine():
         assert "site-packages" not in str(outputs), path.name
 
 
-FAST = "first_posterior"
-
-
-@pytest.mark.parametrize(
-    "path",
-    [p if p.stem == FAST else pytest.param(p, marks=pytest.mark.slow) for p in NOTEBOOKS],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 @pytest.mark.filterwarnings("default")  # Jupyter's own, in the process that runs it
 def test_notebook(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)

@@ -42,6 +42,7 @@ def test_a_cache_that_was_chosen_is_left_alone(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_programs_are_kept_and_damaged_ones_compiled_again(tmp_path):
     first = calibrate(*WORDS, CALIBRATE_CACHE=str(tmp_path / "kept"))
     assert first.returncode == 0, first.stderr

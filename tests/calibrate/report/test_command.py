@@ -2,12 +2,15 @@
 
 import json
 
+import pytest
+
 from calibrate.cli import main
 from calibrate.report import charts
 from calibrate.run import Run
 from calibrate.workflow import infer
 
 
+@pytest.mark.slow
 def test_a_law_without_fibres_and_a_body_without_cavity(tmp_path, capsys):
     truth = {"mu": 70.0, "lam": 70.0}
     run = Run(

@@ -104,6 +104,7 @@ def test_a_power_below_one_widens_proposals(beam, biased):
         DelayedAcceptanceOptions(power=0.0)
 
 
+@pytest.mark.slow
 def test_where_fem_fails_there_are_no_draws(beam, biased):
     exact, model, data = biased
     fem = LinearFEM(beam, exact, limit=72.0)

@@ -117,6 +117,7 @@ def test_coefficients_are_of_values_and_slopes(modal, problem):
         assert np.sqrt(np.mean((found - slope)[free] ** 2)) < 0.1 * np.sqrt(np.mean(slope**2))
 
 
+@pytest.mark.slow
 def test_a_network_alone_learns_a_beam(beam, tmp_path):
     plan = replace(PLAN, simulations=30, steps=450, freeze=150, polish=200)
     emulator = train(beam, plan, tmp_path, architecture=replace(SMALL, hidden=(32, 32)))
