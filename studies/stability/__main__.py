@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from studies.common.output import save
+from studies.stability import emulation
 from studies.stability.cases import CASES
 from studies.stability.judge import TOLERANCE
 from studies.stability.solver.case import SEED
@@ -43,6 +44,14 @@ COLOURS = {
 }
 
 
+WRONG = "silent wrong"
+
+
+def ended(row: dict[str, Any]) -> str:
+    """How a case ended, as figure and table have it."""
+    return WRONG if row["silent_wrong"] else str(row["status"])
+
+
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """How the cases of each family ended, and the residual of those that converged."""
     plt = pyplot()
@@ -51,12 +60,12 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         1, 2, figsize=(12, 0.5 * len(families) + 2.2), sharey=True, layout="constrained"
     )
     lengths = np.zeros(len(families))
-    for status in [*COLOURS, *sorted({row["status"] for row in rows} - set(COLOURS))]:
+    for status in [*COLOURS, *sorted({ended(row) for row in rows} - set(COLOURS))]:
         counts = np.array(
-            [sum((r["family"], r["status"]) == (f, status) for r in rows) for f in families]
+            [sum((r["family"], ended(r)) == (f, status) for r in rows) for f in families]
         )
         if counts.any():
-            colour = COLOURS.get(status, "tab:red")
+            colour = COLOURS.get(status, "tab:red" if status == WRONG else "tab:pink")
             left.barh(families, counts, left=lengths, color=colour, label=status)
             lengths += counts
     left.set(xlabel="cases")
@@ -115,15 +124,15 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """How each family ended, as the README has it."""
-    found = {row["status"] for row in rows}
+    found = {ended(row) for row in rows}
     names = [name for name in COLOURS if name in found] + sorted(found - set(COLOURS))
     words = [name.replace("_", " ").lower() if name.isupper() else name for name in names]
     lines = [f"| family | cases | {' | '.join(words)} |", "|---" * (len(names) + 2) + "|"]
     families = dict.fromkeys(row["family"] for row in rows)
     for family in [*families, "all"]:
-        ended = Counter(row["status"] for row in rows if family in (row["family"], "all"))
-        counts = " | ".join(str(ended[name] or "") for name in names)
-        lines.append(f"| {family} | {ended.total()} | {counts} |")
+        count = Counter(ended(row) for row in rows if family in (row["family"], "all"))
+        cells = " | ".join(str(count[name] or "") for name in names)
+        lines.append(f"| {family} | {count.total()} | {cells} |")
     return "\n".join(lines)
 
 
@@ -156,7 +165,9 @@ def main() -> None:
     found = summary(rows)
     keep(rows)
     draw(rows, arguments.out / "stability.png")
-    print(table(rows), found, sep="\n")
+    above = [row for row in rows if row["name"] in emulation.CASES]
+    below = [row for row in rows if row["name"] not in emulation.CASES]
+    print(*(table(part) for part in (below, above) if part), found, sep="\n\n")
     check(rows)
 
 
