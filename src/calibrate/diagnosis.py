@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from calibrate.samplers.modes import MISSED_AT, MISSED_BY
+
 _LARGEST_R_HAT = 1.01  # Vehtari et al. (2021)
 _SMALLEST_ESS = 400.0
 _LARGEST_K = 0.7  # Vehtari et al. (2024)
 _LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
+_MANY = 100.0
 _MARKED = 0.5  # of a standard deviation
 
 
@@ -35,7 +38,7 @@ def diagnose(
         _too_few(summary),
         _rejections(statistics.get("accepted")),
         _approximation(attributes.get("pareto_k"), attributes.get("importance_efficiency")),
-        _rival(attributes.get("rival_mode")),
+        _missed(attributes.get(MISSED_AT), attributes.get(MISSED_BY)),
     ]
     return [sentence for sentence in found if sentence]
 
@@ -114,10 +117,13 @@ def _approximation(pareto_k: float | None, efficiency: float | None) -> str:
     )
 
 
-def _rival(lower: float | None) -> str:
-    if lower is None:
+def _missed(place: str | None, lighter: float | None) -> str:
+    if place is None or lighter is None:
         return ""
+    times = float(np.exp(min(-lighter, np.log(_MANY))))
+    mass = "many times" if times >= _MANY else f"{times:.2g} times"
     return (
-        f"the posterior has another mode, {float(lower):.2g} nats lower than the one the Gaussian "
-        "is at: use a sampler for several modes, such as smc"
+        f"no draw is at another mode of the posterior, {place}, which has {mass} the mass of all "
+        "draws: use a sampler for several modes, such as smc, or a prior that leaves one of them "
+        "out"
     )

@@ -22,6 +22,7 @@ from calibrate.observations.present import missing_values
 from calibrate.provenance import versions
 from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws, r_hat
 from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.samplers.modes import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
 from calibrate.tree import make_tree
@@ -210,17 +211,24 @@ def sample(
     made = provenance(model, seed, sampler, options)
     kept = Checkpoint(checkpoint, _identity(made, checked))
     context = Context(progress, kept, fem)
-    found = chosen.sample(density_of(model), checked, options, seed, context)
+    density = density_of(model)
+    found = chosen.sample(density, checked, options, seed, context)
+    attributes = dict(found.attributes)
+    if MISSED_BY not in attributes:
+        modes = find_modes(density, checked, jax.random.fold_in(jax.random.key(seed), _MODES))
+        z = found.z.reshape(-1, density.dimension)
+        attributes |= missed_mode(density, checked, z, modes)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
     draws = named_draws(model, found.z)
     tree = make_tree(model, checked, draws, found.statistics, rng_key)
-    for name, value in {**made, **found.attributes}.items():
+    for name, value in {**made, **attributes}.items():
         tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
     kept.remove()
     return Posterior(tree, model, checked)
 
 
-_PREDICTIONS = 0x9E3779B9  # keeps the keys of replicated data apart from the sampler's
+# Keep the keys of replicated data and of the search for modes apart from the sampler's.
+_PREDICTIONS, _MODES = 0x9E3779B9, 0x85EBCA6B
 
 
 def _fem_likelihood(

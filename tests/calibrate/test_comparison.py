@@ -93,6 +93,7 @@ def test_a_model_and_itself_are_not_told_apart(problems, trees):
     assert verdict.startswith("not decided: ")
 
 
+@pytest.mark.slow
 def test_evidence_where_the_sampler_knows_it(problems, trees):
     models, data = problems
     tree = cal.sample(

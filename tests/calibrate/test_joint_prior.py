@@ -88,6 +88,7 @@ def test_draws_have_marginals_and_correlation(beam):
         assert rank == pytest.approx(6.0 / np.pi * np.arcsin(-0.4), abs=0.03)
 
 
+@pytest.mark.slow
 def test_nuts_meets_the_closed_form_posterior(beam):
     """A linear map, a Gaussian joint prior: the posterior is normal."""
     sd = np.array([5.0, 8.0])

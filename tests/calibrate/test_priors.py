@@ -104,6 +104,7 @@ def test_a_map_without_a_box_takes_any_prior_and_chains_start(beam):
         assert table[name]["sd"] < 10.0
 
 
+@pytest.mark.slow
 def test_the_posterior_beyond_the_box_is_the_known_one(beam):
     """Truth 100.3 in a box that ends at 100: the posterior must reach beyond it."""
     forward = linear_forward(beam)

@@ -145,7 +145,7 @@ def test_correlated_noise_and_missing_values_have_their_groups(beam):
     model = cal.model(forward, observe, noise)
     data = np.array(forward.at(observe.nodes)(jnp.array([72.0, 68.0])))
     data[1, 2] = np.nan
-    options = cal.NUTSOptions(50, 60, chains=1, rounds=1)
+    options = cal.NUTSOptions(100, 500, chains=1, rounds=1)
     tree = cal.sample(model, data, options=options).tree
     assert tree["log_likelihood"]["displacement"].sizes["entry_displacement"] == 8
     assert az.loo(tree).n_data_points == 8

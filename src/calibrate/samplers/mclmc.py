@@ -6,11 +6,13 @@ Metropolis step. Its cost per transition is fixed, where NUTS's is that of the t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from blackjax.adaptation.adjusted_mclmc_adaptation import adjusted_mclmc_find_L_and_step_size
 from blackjax.mcmc import adjusted_mclmc_dynamic as mclmc
 
@@ -21,6 +23,9 @@ from emulator.errors import InputError
 
 # Parts of the warm-up: step size, then the metric, then the step size again.
 _STEP_SIZE, _METRIC = 0.25, 0.5
+# Longest trajectory over the mean one. The tuning first keeps the length of a trajectory and adapts
+# its steps; where the density ends they shrink, and one transition would take 1e5 of them.
+_LONGEST = 8.0
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,13 @@ class State(NamedTuple):
 
 def kernel(log_density: Callable[..., jax.Array], options: MCLMCOptions) -> Kernel:
     """BlackJAX's kernel; ``init`` runs the whole tuning."""
-    transition = mclmc.build_kernel(mclmc.make_random_trajectory_length_fn(True))
+    random_length = mclmc.make_random_trajectory_length_fn(True)
+    longest = math.ceil(_LONGEST * options.leapfrogs)
+
+    def length(rng_key: jax.Array, mean: jax.Array) -> jax.Array:
+        return jnp.minimum(random_length(rng_key, mean), longest)
+
+    transition = mclmc.build_kernel(length)
 
     def init(rng_key: jax.Array, position: jax.Array, *arguments: Any) -> State:
         if position.size == 1:

@@ -99,6 +99,7 @@ def test_prior_and_likelihood_make_the_density(beam):
     )
 
 
+@pytest.mark.slow
 def test_particles_die_out_where_the_map_has_no_answer(beam):
     forward = replace(linear_forward(beam), limit=75.0)
     prior = {name: dist.Uniform(60.0, 80.0) for name in beam.parameter_names}

@@ -48,6 +48,7 @@ def test_a_carried_force_is_the_force_where_it_was_linearised(beam_scene):
     np.testing.assert_allclose(force, at.force, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_carried_force_falls_with_the_square_of_the_step(beam_scene):
     """Where a Newton step leads, the eliminated force is what the tangent left out."""
     rng = np.random.default_rng(1)

@@ -93,6 +93,7 @@ def all_of(ventricle):
     return everything(ventricle)
 
 
+@pytest.mark.slow
 def test_factors_of_one_are_the_plain_ventricle(ventricle, state, all_of):
     plain = em.scenes.left_ventricle(**COARSE)
     u, _ = state

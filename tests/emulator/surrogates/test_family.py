@@ -89,6 +89,7 @@ def test_it_learns_and_takes_it_to_a_body_unseen(family: Emulator) -> None:
     assert left < 0.35 * np.linalg.norm(unseen.displacement)
 
 
+@pytest.mark.slow
 def test_padding_changes_nothing(family: Emulator) -> None:
     """What training sees of a padded body is what is predicted on it."""
     from emulator.training import ventricles

@@ -158,6 +158,7 @@ def _killed_after(scene, folder, stop, monkeypatch):
             train(scene, replace(PLAN, checkpoint_every=5), folder, architecture=SMALL)
 
 
+@pytest.mark.slow
 def test_more_modes_than_snapshots_leave_zeros(beam):
     plan = replace(PLAN, simulations=4, batch=2)
     runs = run_campaign(em.Simulator(beam), design(beam, 2, 0), sensitivities=True)

@@ -51,6 +51,7 @@ def test_it_meets_its_runs_and_their_sensitivities(simulator, runs, series, fitt
             np.testing.assert_allclose(np.moveaxis(found, -1, 0), slopes, atol=1e-4 * largest)
 
 
+@pytest.mark.slow
 def test_better_than_values_alone(beam):
     """From six runs, ten times closer than POD with Gaussian processes (measured: a hundred)."""
     simulator = em.Simulator(beam)
