@@ -258,7 +258,7 @@ class Model:
                     "missing (NaN); Model.given leaves them out"
                 )
         if self.check_scale:
-            draws = self.prior_draws(jax.random.key(0), PRIOR_DRAWS)
+            draws = jax.jit(lambda key: self.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))
             stacked = np.stack([np.asarray(draws[n]) for n in self.states.unknowns], axis=1)
             check_magnitudes(self._predict_stacked, self.observe, self.noise, stacked, named)
         return {name: jnp.asarray(values) for name, values in named.items()}

@@ -14,6 +14,7 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -78,7 +79,7 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
     thetas = known_thetas(scene, observe.states, {**run.known, **run.truth})
     noises = run.synthetic_noise(observe)
     fields = [simulator_of(scene)(theta)[observe.nodes] for theta in thetas]
-    exact = observe(jnp.stack(fields), thetas)
+    exact = jax.jit(observe)(jnp.stack(fields), thetas)
     rng = np.random.default_rng([run.seed, 1])
     return observe, {
         name: np.asarray(exact[name]) + noises[name].simulate(rng, part.shape)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calibrate.arviz import array_stats
 from calibrate.certificate.correction import Correction
@@ -128,7 +128,7 @@ def missed_by(predictive: Predictive, correction: Correction, runs: Runs) -> int
     """
     at = predictive.evaluate(runs.z, correction)
     fem = np.where(runs.converged, at.prior + runs.fem, -np.inf)
-    likely = fem > fem.max() - 0.5 * chi2.ppf(_LIKELY, runs.z.shape[1])
+    likely = fem > fem.max() - 0.5 * chdtri(runs.z.shape[1], 1.0 - _LIKELY)
     return int(np.sum(likely & ~(at.prior + at.corrected > fem - _MISSED)))
 
 

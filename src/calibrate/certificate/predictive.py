@@ -87,12 +87,12 @@ class Predictive:
     def corrected_means(self, z: np.ndarray, correction: Correction) -> np.ndarray:
         """The corrected map's data without noise, flat (s, m)."""
         features, means = self.features(z), self.means(z)[0]
-        return means + np.asarray(jax.vmap(lambda x: correct(correction, x)[0])(features))
+        return means + np.asarray(_corrections(correction, features))
 
     def features(self, z: np.ndarray) -> np.ndarray:
         """Unknowns of theta (s, q) on their parameters' scales, standardised by the prior."""
         draws = self.constrain(z)
-        return np.asarray(self._features({n: jnp.asarray(v) for n, v in draws.items()}))
+        return np.asarray(self._compiled_features(draws))
 
     @cached_property
     def scales(self) -> np.ndarray:
@@ -107,8 +107,10 @@ class Predictive:
     @cached_property
     def _scale_of_features(self) -> tuple[np.ndarray, np.ndarray]:
         with jax.ensure_compile_time_eval():
-            draws = self.model.prior_draws(jax.random.key(0), _WIDTH_DRAWS)
-            x = np.asarray(self._on_scales(draws))
+            key = jax.random.key(0)
+            x = np.asarray(
+                jax.jit(lambda key: self._on_scales(self.model.prior_draws(key, _WIDTH_DRAWS)))(key)
+            )
         return x.mean(axis=0), x.std(axis=0)
 
     def _on_scales(self, draws: Mapping[str, jax.Array]) -> jax.Array:
@@ -122,6 +124,10 @@ class Predictive:
     def _features(self, draws: Mapping[str, jax.Array]) -> jax.Array:
         centre, width = self._scale_of_features
         return (self._on_scales(draws) - centre) / width
+
+    @cached_property
+    def _compiled_features(self) -> Any:
+        return jax.jit(self._features)
 
     def _constrain(self, z: jax.Array) -> dict[str, jax.Array]:
         return jax.tree.map(lambda values: values[0], self._density.constrain(z[None]))
@@ -172,6 +178,12 @@ class Predictive:
             for k in range(0, len(padded), _BLOCK)
         ]
         return jax.tree.map(lambda *arrays: np.concatenate(arrays)[: len(z)], *parts)
+
+
+@jax.jit
+def _corrections(correction: Correction, features: jax.Array) -> jax.Array:
+    """Corrections (s, m) at ``features`` (s, q)."""
+    return jax.vmap(lambda x: correct(correction, x)[0])(features)
 
 
 def _inside(z: jax.Array) -> np.ndarray:

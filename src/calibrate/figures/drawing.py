@@ -42,7 +42,8 @@ def displacement_draws(posterior: Posterior, count: int = 200) -> np.ndarray:
     """Full displacement fields (count, n, 3) mm at evenly spaced draws, from the forward map."""
     thetas = posterior.thetas()
     rows = np.linspace(0, len(thetas) - 1, count).astype(int)
-    return np.asarray(jax.jit(lambda t: jax.lax.map(posterior.model.full, t))(thetas[rows]))
+    chosen = np.asarray(thetas)[rows]
+    return np.asarray(jax.jit(lambda t: jax.lax.map(posterior.model.full, t))(chosen))
 
 
 def displacement_part(posterior: Posterior) -> DisplacementPoints:

@@ -19,7 +19,6 @@ from typing import Any, ClassVar, Self
 import jax
 import numpy as np
 import numpyro.distributions as dist
-from scipy import stats
 
 from calibrate.noise.description import describe, restore
 from calibrate.noise.protocol import Sites
@@ -73,6 +72,8 @@ class StudentTNoise:
     @property
     def upper_sd(self) -> float:
         """Sd of the Gaussian that has as much mass beyond five of its own sds."""
+        from scipy import stats  # half a second, for this noise alone
+
         beyond = float(stats.t.isf(stats.norm.sf(_FAR), self.dof))
         return self._scale.upper * beyond / _FAR
 

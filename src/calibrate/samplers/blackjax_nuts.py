@@ -6,9 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-import blackjax
 import jax
-from blackjax.adaptation.base import get_filter_adapt_info_fn
 
 from calibrate.samplers.options import ChainOptions, check_target_accept
 from calibrate.samplers.protocol import Kernel
@@ -39,6 +37,9 @@ class State(NamedTuple):
 
 def kernel(log_density: Callable[..., jax.Array], options: BlackJAXNUTSOptions) -> Kernel:
     """BlackJAX's kernel; ``init`` runs the whole window adaptation."""
+    import blackjax  # here: other samplers need not wait for it
+    from blackjax.adaptation.base import get_filter_adapt_info_fn
+
     transition = blackjax.nuts.build_kernel()
 
     def init(rng_key: jax.Array, position: jax.Array, *arguments: Any) -> State:

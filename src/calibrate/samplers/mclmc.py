@@ -13,8 +13,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from blackjax.adaptation.adjusted_mclmc_adaptation import adjusted_mclmc_find_L_and_step_size
-from blackjax.mcmc import adjusted_mclmc_dynamic as mclmc
 
 from calibrate.samplers.options import ChainOptions, check_target_accept
 from calibrate.samplers.protocol import Kernel
@@ -59,6 +57,9 @@ class State(NamedTuple):
 
 def kernel(log_density: Callable[..., jax.Array], options: MCLMCOptions) -> Kernel:
     """BlackJAX's kernel; ``init`` runs the whole tuning."""
+    from blackjax.adaptation.adjusted_mclmc_adaptation import adjusted_mclmc_find_L_and_step_size
+    from blackjax.mcmc import adjusted_mclmc_dynamic as mclmc
+
     random_length = mclmc.make_random_trajectory_length_fn(True)
     longest = math.ceil(_LONGEST * options.leapfrogs)
 

@@ -112,7 +112,7 @@ def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> di
         value = float(program(jnp.asarray(point), data)[0])
         return value if np.isfinite(value) else -np.inf
 
-    found = {MISSED_BY: np.inf}
+    found: dict[str, Any] = {MISSED_BY: np.inf}
     covariance = np.atleast_2d(np.cov(z, rowvar=False))
     sign, log_det = np.linalg.slogdet(covariance)
     if len(modes.z) == 0 or not (sign > 0.0 and np.isfinite(log_det)):

@@ -12,7 +12,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from blackjax.vi.multipathfinder import multi_approximate
 
 _PATHS = 4  # of a chain
 _SAMPLES = 20  # of a Gaussian
@@ -33,6 +32,8 @@ def pathfinder_start(
     candidates, heights : (c, p), c of 4 or more, and their log densities (c,). Paths begin at the
         first ones with a finite density.
     """
+    from blackjax.vi.multipathfinder import multi_approximate  # here: others need not wait for it
+
     path_key, choice_key = jax.random.split(rng_key)
     finite_first = jnp.argsort(~jnp.isfinite(heights), stable=True)
     found, _ = multi_approximate(

@@ -23,11 +23,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, Self
 
-import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from blackjax.smc import base, ess, resampling, solver
 from jax.scipy.special import logsumexp
 from tqdm import tqdm
 
@@ -196,6 +194,9 @@ class _Programs(NamedTuple):
 
 @lru_cache(maxsize=4)
 def _compile(density: Density, options: SMCOptions) -> _Programs:
+    import blackjax  # here: other samplers need not wait for it
+    from blackjax.smc import base, resampling
+
     count = options.draws
     hmc = blackjax.hmc.build_kernel()
 
@@ -261,6 +262,7 @@ def _compile(density: Density, options: SMCOptions) -> _Programs:
 
 def _increment(heights: jax.Array, left: jax.Array, survivors: float) -> jax.Array:
     """The largest step of the temperature that leaves the wanted effective sample size."""
+    from blackjax.smc import ess, solver
 
     def surplus(increment: jax.Array) -> jax.Array:
         return ess.log_ess(increment * heights) - jnp.log(survivors * len(heights))

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from itertools import combinations_with_replacement
 from math import comb
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,7 @@ def _degree(count: int) -> int:
     return 3 if count <= 3 else 2
 
 
-def monomials(values: jax.Array, count: int) -> jax.Array:
+def monomials(values: Any, count: int) -> Any:
     """Monomials (..., f) of the first ``count`` columns of ``values`` (..., p), centred on 1/2."""
     centred = [values[..., k] - 0.5 for k in range(count)]
     terms = []
@@ -59,7 +59,9 @@ def monomials(values: jax.Array, count: int) -> jax.Array:
             for k in chosen[1:]:
                 product = product * centred[k]
             terms.append(product)
-    return jnp.stack(terms, axis=-1)
+    # NumPy's arrays stay NumPy's: one operation at a time, JAX would compile each.
+    stack = np.stack if isinstance(values, np.ndarray) else jnp.stack
+    return stack(terms, axis=-1)
 
 
 def coefficient_count(dimension: int) -> int:
@@ -96,7 +98,7 @@ def straighten(map_: TransportMap, z: np.ndarray) -> np.ndarray:
     squashed = expit(z[:, order])
     zeta = np.array(z)
     for k in range(1, z.shape[1]):
-        terms = np.asarray(monomials(squashed, k))
+        terms = monomials(squashed, k)
         zeta[:, order[k]] -= terms @ coefficients[k, : terms.shape[1]]
     return zeta
 
@@ -107,7 +109,7 @@ def bend(map_: TransportMap, zeta: np.ndarray) -> np.ndarray:
     z = np.array(zeta)
     squashed = expit(z[:, order])
     for k in range(1, z.shape[1]):
-        terms = np.asarray(monomials(squashed, k))
+        terms = monomials(squashed, k)
         z[:, order[k]] += terms @ coefficients[k, : terms.shape[1]]
         squashed[:, k] = expit(z[:, order[k]])
     return z
@@ -121,7 +123,7 @@ def fit(draws: np.ndarray) -> TransportMap:
     start = identity(dimension)
     coefficients = np.array(start.coefficients)
     for k in range(1, dimension):
-        terms = np.asarray(monomials(jnp.asarray(squashed[:, order]), k))
+        terms = monomials(squashed[:, order], k)
         target = draws[:, order[k]]
         # Ridge penalty: features that a short pilot hardly varied get small coefficients.
         sd = np.maximum(terms.std(axis=0), 1e-12)

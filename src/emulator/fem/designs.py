@@ -8,7 +8,6 @@ from itertools import product
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import qmc
 
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -20,6 +19,8 @@ _MOST_CORNERED = 6  # parameters; the box of more has too many corners, and none
 def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
     """``count`` theta (count, p) of a scrambled Sobol sequence over the box, on its scales."""
     _check(count, seed)
+    from scipy.stats import qmc  # half a second, which a solve needs not wait for
+
     bits = max(count - 1, 1).bit_length()
     points = qmc.Sobol(len(scene.parameters), rng=seed).random_base2(bits)[:count]
     return scene.from_unit(jnp.asarray(points))
@@ -31,6 +32,8 @@ def latin_hypercube(scene: Scene, count: int, seed: int) -> jax.Array:
     Each parameter is spread evenly by itself; a shorter design is not part of a longer one.
     """
     _check(count, seed)
+    from scipy.stats import qmc
+
     points = qmc.LatinHypercube(len(scene.parameters), rng=seed).random(count)
     return scene.from_unit(jnp.asarray(points))
 

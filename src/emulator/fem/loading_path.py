@@ -178,7 +178,7 @@ class LoadingPath:
         """
         newton, level, mip = self._newton.begin(u, before.negligible), jnp.ones(()), None
         if self.ramps:
-            level = jnp.asarray(_FIRST_LEVELS)[route]
+            level = _first_level(route)
             mip = self._mip(level).begin(u)
         newton = newton._replace(iterations=before.iterations, factorisations=before.factorisations)
         return _entered(newton, mip, route, ramping, level)
@@ -189,6 +189,11 @@ def _warm(newton: NewtonState, *, ramps: bool) -> jax.Array:
     """Whether Newton's method is worth trying from where it begins."""
     moved = jnp.any(newton.u != 0.0)
     return moved & (newton.error <= UNBALANCED) if ramps else moved
+
+
+@jax.jit
+def _first_level(route: jax.Array) -> jax.Array:
+    return jnp.asarray(_FIRST_LEVELS)[route]
 
 
 @jax.jit

@@ -35,7 +35,7 @@ import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
 from emulator.fem.definiteness import inverse_is_positive
-from emulator.fem.functional import displacement_gradient, strain_law
+from emulator.fem.functional import at_points, displacement_gradient, strain_law
 from emulator.fem.line_search import largest_sound
 from emulator.fem.programs import compiled
 from emulator.mechanics.measures import Measures, measures_read
@@ -110,7 +110,7 @@ class MipNewton:
 def _measures_of(system: System, u: jax.Array) -> jax.Array:
     """Strain measures (m, q, k) of the displacement ``u`` (n, 3) mm."""
     measures, H = _measures(system.scene), displacement_gradient(system.scene, u)
-    return _everywhere(system.scene, lambda H, at: measures.of(H, at.directions), H)
+    return at_points(system.scene, lambda H, at: measures.of(H, at.directions), H)
 
 
 @compiled
@@ -125,7 +125,7 @@ def _promised(
     """Tangent (nnz,), whether it is solvable, and residual (f,)."""
     point, grid = MaterialPoint(system.scene, theta), system.scene.discretisation
     H = displacement_gradient(system.scene, u)
-    stress, tangent = _everywhere(system.scene, point.linearise, H, measures)
+    stress, tangent = at_points(system.scene, point.linearise, H, measures)
     force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
     residual = system.restrict(system.scatter(force) + system.others(u, theta, level))
     K = system.assemble(system.element_blocks(tangent), u, theta, stiffening)
@@ -157,7 +157,7 @@ def _taken(
     """Displacement (n, 3) mm and measures (m, q, k) after ``fraction`` of the step."""
     point = MaterialPoint(system.scene, theta)
     H, change = (displacement_gradient(system.scene, field) for field in (u, move))
-    after = _everywhere(system.scene, point.at_stress, H, change, measures)
+    after = at_points(system.scene, point.at_stress, H, change, measures)
     taken = fraction > 0.0
     return jnp.where(taken, u + fraction * move, u), jnp.where(taken, after, measures)
 
@@ -175,12 +175,6 @@ def _measures(scene: Scene) -> Measures:
     names = measures_read(scene.law)
     assert names is not None
     return Measures(names)
-
-
-def _everywhere(scene: Scene, function, *fields):  # noqa: ANN001, ANN002, ANN202
-    """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...)."""
-    axes = (0,) * len(fields)
-    return jax.vmap(jax.vmap(function, (*axes, None)), (*axes, 0))(*fields, scene.tissue)
 
 
 @dataclass(frozen=True)
@@ -203,15 +197,24 @@ class MaterialPoint:
     def linearise(self, H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
         """First Piola stress (3, 3) and tangent (3, 3, 3, 3) in kPa at a point."""
         phi = self.energy(at)
-        s, C = jax.grad(phi)(own), jax.hessian(phi)(own)
+
+        def stresses(own: jax.Array) -> tuple[jax.Array, jax.Array]:
+            s = jax.grad(phi)(own)
+            return s, s
 
         def measures(H: jax.Array) -> jax.Array:
             return self.measures.of(H, at.directions)
 
+        def pulled_back(H: jax.Array) -> tuple[jax.Array, jax.Array]:
+            now, pull_back = jax.vjp(measures, H)
+            return pull_back(s)[0], now
+
+        # Derivatives with their values beside them are traced once less.
+        C, s = jax.jacfwd(stresses, has_aux=True)(own)
+        curvature, now = jax.jacfwd(pulled_back, has_aux=True)(H)
         slope = jax.jacfwd(measures)(H)
-        stress = jnp.tensordot(s + C @ (measures(H) - own), slope, 1)
-        tangent = jnp.einsum("kij,kl,lab->ijab", slope, C, slope)
-        return stress, tangent + jax.hessian(lambda H: jnp.vdot(s, measures(H)))(H)
+        stress = jnp.tensordot(s + C @ (now - own), slope, 1)
+        return stress, jnp.einsum("kij,kl,lab->ijab", slope, C, slope) + curvature
 
     def at_stress(self, H: jax.Array, change: jax.Array, own: jax.Array, at: Tissue) -> jax.Array:
         """Measures (k,) of a point where the law has the stress that its step promises."""

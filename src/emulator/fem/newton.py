@@ -22,6 +22,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from emulator.fem.assembly import System, forces_at
 from emulator.fem.direction import Direction, newton_direction
@@ -75,10 +76,10 @@ class Newton:
         with. On a slender body, or beside stiff springs, such a residual may still matter, so the
         step that Newton's method takes for it must be short as well.
         """
-        X = jnp.asarray(self.system.scene.mesh.nodes)
-        stretched = forces_at(self.system, _STRETCH * X, self.theta, 0.0)
+        X = np.asarray(self.system.scene.mesh.nodes)
+        stretched = forces_at(self.system, jnp.asarray(_STRETCH * X), self.theta, 0.0)
         size = _ROUND_OFF / _STRETCH * stretched.internal
-        extent = jnp.max(jnp.max(X, axis=0) - jnp.min(X, axis=0))
+        extent = np.ptp(X, axis=0).max()
         return Negligible(jnp.where(jnp.isfinite(size), size, 0.0), _STILL * extent)
 
     def step(self, state: NewtonState) -> NewtonState:

@@ -24,7 +24,6 @@ from emulator.fem.assembly import System
 from emulator.fem.driver import Driver
 from emulator.fem.factorisations import REFUSALS, Choice, find_choice
 from emulator.fem.factorisations.suitesparse import CHOLMOD, quiet_blas
-from emulator.fem.functional import volume_ratio
 from emulator.fem.loading_path import find_equilibrium
 from emulator.fem.near import NearSolver
 from emulator.fem.options import NewtonOptions
@@ -160,8 +159,8 @@ class Simulator(Shown):
                 f"scene '{self.scene.name}': a follower pressure has no potential, so stability is "
                 "not a question of its tangent's sign"
             )
-        sound = jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
-        return bool(sound) and self._driver.linearise(u, theta)[0].direct.definite
+        sound = bool(np.isfinite(u).all() and self.system.least_volume_ratio(u) > 0.0)
+        return sound and self._driver.linearise(u, theta)[0].direct.definite
 
     def reactions(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Force (n, 3) in mN of the supports on the body at the equilibrium ``u`` (n, 3) mm.
@@ -182,7 +181,7 @@ class Simulator(Shown):
         InputError
             No such set.
         """
-        return self.reactions(u, theta)[nodes_of(self.scene.mesh, name)].sum(axis=0)
+        return _resultant(self.reactions(u, theta), nodes_of(self.scene.mesh, name))
 
     def _drives(self, *arguments: jax.Array) -> bool:
         """Whether Python sees the numbers and a definite factorisation could work."""
@@ -323,3 +322,9 @@ def _inert(solution: Solution) -> Solution:
         ),
         solution,
     )
+
+
+@jax.jit
+def _resultant(forces: jax.Array, nodes: jax.Array) -> jax.Array:
+    """Sum (3,) of ``forces`` (n, 3) at ``nodes``."""
+    return forces[nodes].sum(axis=0)

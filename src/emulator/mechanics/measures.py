@@ -52,7 +52,9 @@ class GivenStrain(Strain):
 
     values: Mapping[str, jax.Array]
 
-    def __init__(self, values: Mapping[str, jax.Array], directions: jax.Array | None) -> None:
+    def __init__(
+        self, values: Mapping[str, jax.Array], directions: jax.Array | np.ndarray | None
+    ) -> None:
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "directions", directions)
         object.__setattr__(self, "barriers", None)
@@ -96,7 +98,7 @@ def measures_read(law: Law) -> tuple[str, ...] | None:
     Found by tracing the law once.
     """
     notes = _Notes()
-    directions = jnp.eye(3)[:2] if law.sheets else jnp.eye(3)[0] if law.fibres else None
+    directions = np.eye(3)[:2] if law.sheets else np.eye(3)[0] if law.fibres else None
 
     def energy(*parameters: jax.Array) -> jax.Array:
         return law.energy(GivenStrain(notes, directions), *parameters)

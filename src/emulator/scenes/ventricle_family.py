@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.scene import Scene
@@ -40,6 +39,8 @@ around, layers : of the mesh.
 
 def ventricles(count: int, seed: int) -> list[dict[str, Any]]:
     """Arguments of :func:`~emulator.scenes.left_ventricle` for ``count`` ventricles."""
+    from scipy.stats import qmc  # half a second, which other scenes need not wait for
+
     points = qmc.Sobol(len(SHAPES), rng=seed).random_base2(max(count - 1, 1).bit_length())[:count]
     return [_arguments(point) for point in points]
 

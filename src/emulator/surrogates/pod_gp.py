@@ -15,9 +15,6 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 import numpy as np
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from emulator.errors import InputError
 from emulator.fem.campaign import Runs, run_campaign
@@ -124,6 +121,10 @@ def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> Reduce
 
 def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Length scales (p,) and prediction weights (c,) of one coefficient (c,) of unit variance."""
+    from sklearn.exceptions import ConvergenceWarning  # slow to import, and only for a fit
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
     kernel = ConstantKernel(10.0, (1e-2, 1e8)) * RBF(np.ones(inputs.shape[1]), (5e-2, 1e2))
     process = GaussianProcessRegressor(
         kernel, alpha=_JITTER, n_restarts_optimizer=1, random_state=0

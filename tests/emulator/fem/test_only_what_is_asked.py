@@ -117,8 +117,9 @@ def test_without_regions_the_law_is_evaluated_and_no_more():
 
     def by_hand(u, theta):
         H = jnp.einsum("mai,mqaj->mqij", u[grid.connectivity], grid.gradients)
-        W = jax.vmap(jax.vmap(lambda h: 0.5 * theta[0] * Strain(h).I1_minus_3))(H)
-        return jnp.sum(grid.weights * W)
+        points = H.reshape(-1, 3, 3)  # all of them one batch
+        W = jax.vmap(lambda h: 0.5 * theta[0] * Strain(h).I1_minus_3)(points)
+        return jnp.sum(grid.weights * W.reshape(grid.weights.shape))
 
     arguments = (jnp.zeros(scene.held.shape), theta)
     expected = operations(jax.make_jaxpr(jax.value_and_grad(by_hand))(*arguments).jaxpr)

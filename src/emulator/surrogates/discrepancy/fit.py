@@ -20,7 +20,6 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from sklearn.utils.extmath import randomized_svd
 
 from emulator.errors import InputError
 from emulator.fem.campaign import Runs
@@ -128,6 +127,8 @@ def _project(fields: np.ndarray, derivatives: np.ndarray) -> tuple[np.ndarray, j
     weighted = _SENSITIVITY_WEIGHT * derivatives.reshape(count * parameters, -1)
     snapshots = np.concatenate([fields, weighted])
     wanted = min(_MOST_MODES, *snapshots.shape)
+    from sklearn.utils.extmath import randomized_svd  # slow to import, and only for a fit
+
     _, size, right = randomized_svd(snapshots, wanted, n_iter=4, random_state=0)
     kept = size > max(_TRUNCATION * size[0], np.finfo(float).tiny)
     if not kept.any():

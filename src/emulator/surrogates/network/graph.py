@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from sklearn.cluster import KMeans
-from sklearn.neighbors import NearestNeighbors
 
 from emulator.errors import InputError
 from emulator.geometry.mesh import frozen_array
@@ -99,6 +97,8 @@ def hierarchy(
     positions: np.ndarray, edges: np.ndarray, options: GraphOptions = GraphOptions()
 ) -> Hierarchy:
     """Virtual layers above the nodes at ``positions`` (n, 3), which ``edges`` (e, 2) join."""
+    from sklearn.cluster import KMeans  # slow to import; a cached emulator needs no graph
+
     joined, parents, offset = [edges], [], 0
     while len(positions) // options.cluster >= options.smallest:
         count = len(positions) // options.cluster
@@ -156,6 +156,8 @@ def _all_pairs(count: int) -> np.ndarray:
 
 
 def _nearest(positions: np.ndarray, neighbours: int) -> np.ndarray:
+    from sklearn.neighbors import NearestNeighbors
+
     count = min(neighbours, len(positions) - 1) + 1
     _, index = NearestNeighbors(n_neighbors=count).fit(positions).kneighbors(positions)
     return np.column_stack([np.repeat(index[:, 0], count - 1), index[:, 1:].ravel()])
