@@ -138,6 +138,7 @@ def test_dependent_data_have_one_log_likelihood_a_draw():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Estimated shape parameter of Pareto")
 def test_correlated_noise_and_missing_values_have_their_groups(beam):
     forward = linear_forward(beam)
     observe = cal.nodal_displacements(beam, [3, 11, 20])
