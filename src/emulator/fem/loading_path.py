@@ -3,7 +3,8 @@ r"""The way to equilibrium: which routes are tried, in which order, and when one
 A body with several equilibria has one that loading leads to from rest. These routes look for it:
 
 ======  ==================================================================================
-WARM    Newton's method from the caller's start, at the whole load
+WARM    from the caller's start, at the whole load: stress iterates while the residual is
+        above 5 %, then Newton's method
 RAMPS   stress iterates (:mod:`emulator.fem.mip`) from rest up a ramp of loads, three ramps
         of ever smaller increments, and Newton's method from where a ramp leads
 CLIMB   Newton's method from rest, load step by load step
@@ -56,7 +57,7 @@ class _Ramp(NamedTuple):
     steps: int
 
 
-# By route. The first is for a start that balances about half of the load or more. The second takes
+# By route. The first is for a start that is better balanced than rest. The second takes
 # ventricles from rest to all but their softest corners, in four to six steps: with the whole load
 # at once one in three is lost. The last is for beams that turn. (docs/experiments.md, "Stresses as
 # iterates")
@@ -64,6 +65,9 @@ _RAMPS = (_Ramp(1.0, 0.0, 8), _Ramp(0.5, 0.25, 12), _Ramp(0.25, 0.125, 20), _Ram
 # Relative residual below which a level of a ramp is carried well enough to go up
 # (docs/experiments.md, "Stresses as iterates").
 _CARRIED = 0.9
+# Relative residual up to which a start is begun from; that of rest is about 1 (docs/experiments.md,
+# "Rough starts").
+_FARTHEST = 0.9
 # First level and largest increment of the climb where all ramps are lost (docs/experiments.md,
 # "Several equilibria in the soft corner").
 _TENTH = np.float64(0.1)
@@ -136,8 +140,10 @@ class LoadingPath:
     def ramp_step(self, state: PathState) -> PathState:
         """One step of the stress iterates."""
         assert state.mip is not None
-        stiffening = _stiffening(state.level, state.route, state.on_ramp)
-        mip = self._mip(state.level).step(state.mip, stiffening)
+        stiffening, geometric = _stiffnesses(
+            state.level, state.route, state.on_ramp, state.newton.error
+        )
+        mip = self._mip(state.level).step(state.mip, stiffening, geometric)
         level, lost, leaves = _judged(
             state.level, state.route, state.on_ramp, mip.error, mip.fraction, mip.definite
         )
@@ -188,7 +194,7 @@ class LoadingPath:
 def _warm(newton: NewtonState, *, ramps: bool) -> jax.Array:
     """Whether Newton's method is worth trying from where it begins."""
     moved = jnp.any(newton.u != 0.0)
-    return moved & (newton.error <= UNBALANCED) if ramps else moved
+    return moved & (newton.error <= _FARTHEST) if ramps else moved
 
 
 @jax.jit
@@ -197,12 +203,16 @@ def _first_level(route: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def _stiffening(level: jax.Array, route: jax.Array, on_ramp: jax.Array) -> jax.Array:
-    """Load level whose stiffness a ramp's step reads.
+def _stiffnesses(
+    level: jax.Array, route: jax.Array, on_ramp: jax.Array, error: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Load level whose stiffness a ramp's step reads, and how much of the stresses'.
 
-    Loads that nothing balances yet lend none, as in Newton's method.
+    Loads that nothing balances yet lend none, as in Newton's method; nor do the stresses of a start
+    that are not in balance: rough ones would make the tangent indefinite.
     """
-    return jnp.where((route != Route.WARM) & (on_ramp == 0), 0.0, level)
+    first = (on_ramp == 0) & ((route != Route.WARM) | (error > UNBALANCED))
+    return jnp.where(first, 0.0, level), jnp.where(first, 0.0, 1.0)
 
 
 @jax.jit

@@ -85,10 +85,21 @@ class MipNewton:
         unknown = jnp.full((), jnp.inf, float)
         return MipState(u, _measures_of(self.system, u), unknown, jnp.ones(()), jnp.array(True))
 
-    def step(self, state: MipState, stiffening: jax.Array) -> MipState:
-        """One iteration, with ``stiffening`` times the stiffness of the loads in its tangent."""
+    def step(self, state: MipState, stiffening: jax.Array, geometric: jax.Array) -> MipState:
+        """One iteration.
+
+        Its tangent has ``stiffening`` times the stiffness of the loads, and that of the stresses as
+        at rest plus ``geometric`` times what they have changed since. With neither it is definite
+        for most laws, however rough the field.
+        """
         values, solvable, residual = _promised(
-            self.system, state.u, state.measures, self.theta, self.level, stiffening
+            self.system,
+            state.u,
+            state.measures,
+            self.theta,
+            self.level,
+            stiffening,
+            geometric,
         )
         # On the way from rest each tangent is unlike the one before.
         full = self.system.step(values, -residual, near=False)
@@ -121,11 +132,16 @@ def _promised(
     theta: jax.Array,
     level: jax.Array,
     stiffening: jax.Array,
+    geometric: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Tangent (nnz,), whether it is solvable, and residual (f,)."""
     point, grid = MaterialPoint(system.scene, theta), system.scene.discretisation
     H = displacement_gradient(system.scene, u)
-    stress, tangent = at_points(system.scene, point.linearise, H, measures)
+
+    def linearise(H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
+        return point.linearise(H, own, at, geometric)
+
+    stress, tangent = at_points(system.scene, linearise, H, measures)
     force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
     residual = system.restrict(system.scatter(force) + system.others(u, theta, level))
     K = system.assemble(system.element_blocks(tangent), u, theta, stiffening)
@@ -194,8 +210,13 @@ class MaterialPoint:
         law = strain_law(self.scene, self.theta)
         return self.measures.energy(lambda strain: law(strain, at), at.directions)
 
-    def linearise(self, H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
-        """First Piola stress (3, 3) and tangent (3, 3, 3, 3) in kPa at a point."""
+    def linearise(
+        self, H: jax.Array, own: jax.Array, at: Tissue, geometric: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, jax.Array]:
+        """First Piola stress (3, 3) and tangent (3, 3, 3, 3) in kPa at a point.
+
+        geometric : fraction of the stresses' change since rest that the tangent knows.
+        """
         phi = self.energy(at)
 
         def stresses(own: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -207,10 +228,12 @@ class MaterialPoint:
 
         def pulled_back(H: jax.Array) -> tuple[jax.Array, jax.Array]:
             now, pull_back = jax.vjp(measures, H)
-            return pull_back(s)[0], now
+            return pull_back(known)[0], now
 
         # Derivatives with their values beside them are traced once less.
         C, s = jax.jacfwd(stresses, has_aux=True)(own)
+        at_rest = jax.grad(phi)(jnp.zeros_like(own))
+        known = at_rest + geometric * (s - at_rest)
         curvature, now = jax.jacfwd(pulled_back, has_aux=True)(H)
         slope = jax.jacfwd(measures)(H)
         stress = jnp.tensordot(s + C @ (now - own), slope, 1)

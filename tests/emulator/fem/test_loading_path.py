@@ -103,9 +103,24 @@ def test_a_warm_start_whose_way_is_not_convex_is_left_for_rest(ventricle_simulat
     expected = ventricle_simulator(theta)
     start = -0.5 * expected  # a ventricle sucked empty
     seen, _ = routes(ventricle_simulator, theta, start)
-    assert seen[0][0] != Route.WARM
+    assert seen[-1][0] != Route.WARM
     for solve in (ventricle_simulator.solve, inside_jit):
         np.testing.assert_allclose(solve(theta, start).displacement, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("theta", [None, SOFT[0]])
+def test_a_rough_start_takes_fewer_steps_than_rest(ventricle_simulator, inside_jit, theta):
+    """A field that is right and has rough strains, as a network's: most of the load is unbalanced,
+    and the tangent there is indefinite."""
+    scene = ventricle_simulator.scene
+    theta = scene.centre if theta is None else jnp.array(theta)
+    expected = ventricle_simulator.solve(theta)
+    rough = 0.1 * np.random.default_rng(0).normal(size=scene.held.shape)
+    start = expected.displacement + jnp.where(scene.held, 0.0, rough)
+    for solve in (ventricle_simulator.solve, inside_jit):
+        solution = solve(theta, start)
+        np.testing.assert_allclose(solution.displacement, expected.displacement, atol=1e-8)
+        assert 2 * solution.factorisations <= expected.factorisations + 1
 
 
 def test_a_good_warm_start_is_kept(ventricle_simulator):
