@@ -294,7 +294,9 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     ]
     right.boxplot(counts, whis=(0, 100), medianprops={"color": "black"})
     right.set_xticks((1, 2), ["from rest", "from the network"])
-    right.set(ylabel="factorisations of a solve", ylim=(0, None))
+    right.set(ylabel="factorisations of a solve", yscale="log")
+    right.set_yticks([3, 6, 10, 30, 100], ["3", "6", "10", "30", "100"])
+    right.minorticks_off()
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
     save(figure, path)
