@@ -85,7 +85,9 @@ class MipNewton:
         unknown = jnp.full((), jnp.inf, float)
         return MipState(u, _measures_of(self.system, u), unknown, jnp.ones(()), jnp.array(True))
 
-    def step(self, state: MipState, stiffening: jax.Array, geometric: jax.Array) -> MipState:
+    def step(
+        self, state: MipState, stiffening: jax.Array, geometric: jax.Array | float = 1.0
+    ) -> MipState:
         """One iteration.
 
         Its tangent has ``stiffening`` times the stiffness of the loads, and that of the stresses as
@@ -132,7 +134,7 @@ def _promised(
     theta: jax.Array,
     level: jax.Array,
     stiffening: jax.Array,
-    geometric: jax.Array,
+    geometric: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Tangent (nnz,), whether it is solvable, and residual (f,)."""
     point, grid = MaterialPoint(system.scene, theta), system.scene.discretisation
