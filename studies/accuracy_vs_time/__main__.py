@@ -129,11 +129,10 @@ def check_body(found: dict[str, Case], *, quick: bool) -> None:
     """Fronts, Newton steps, emulators better than their mesh, and agreement with FEniCSx."""
     own = {name: case["own_mm"]["median"] for name, case in found.items() if case["own_mm"]}
     known = [case for case in found.values() if case["truth_mm"]]
-    best = front(
-        np.array([(c["gradient_s"], c["truth_mm"]["median"]) for c in known]).reshape(-1, 2)
-    )
-    assert (np.diff(best[:, 0]) >= 0.0).all()
-    assert (np.diff(best[:, 1]) <= 0.0).all()
+    if known:
+        best = front(np.array([(c["gradient_s"], c["truth_mm"]["median"]) for c in known]))
+        assert (np.diff(best[:, 0]) >= 0.0).all()
+        assert (np.diff(best[:, 1]) <= 0.0).all()
     assert own.get("FEM from rest", 0.0) < 1e-6
     for case in found.values():
         assert case.get("difference", 0.0) < AGREED, case["name"]

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import jax
@@ -106,11 +107,16 @@ def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
 
 @pytest.mark.slow
 def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
+    """What 5 s are enough for is the machine's business, and what it has compiled before."""
     with pytest.raises(InputError, match="a budget of 1 s: one FEM solution and its compilation"):
         train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=1.0)
     over = r"the budget leaves \d+ training steps .* give at least|the budget of 5 s is over after"
-    with pytest.raises(InputError, match=over):
-        train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=5.0)
+    try:
+        emulator = train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=5.0)
+    except InputError as error:
+        assert re.search(over, str(error))  # noqa: PT017 - it may also be enough
+    else:
+        assert emulator.record["plan"]["steps"] > WARMUP
 
 
 @pytest.mark.parametrize(
