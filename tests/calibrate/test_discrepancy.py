@@ -38,6 +38,7 @@ def estimate(model, data, numbers):
     return np.asarray(TRUTH) + covariance @ np.asarray(jax.grad(density)(TRUTH)), covariance
 
 
+@pytest.mark.slow
 def test_it_widens_the_posterior_until_it_covers_the_truth(beam, bent):
     forward, data = bent
     observe, noise = cal.nodal_displacements(beam), cal.GaussianNoise(sd=0.1)

@@ -83,6 +83,7 @@ def test_an_unknown_noise_is_refused(beam, forward):
         expected_precision(model)
 
 
+@pytest.mark.slow
 def test_gains_of_the_next_measurement_are_the_closed_form(case, beam, forward):
     _, posterior, _, covariance, *_ = case
     candidates = {

@@ -31,6 +31,7 @@ def problem(beam):
     return forward, observe, model, data
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_draws(problem):
     _, _, model, data = problem
     options = cal.NUTSOptions(100, 50, rounds=1)

@@ -116,6 +116,7 @@ def test_where_one_step_is_wild_the_bar_is_not(beam, one_step, bar, exact, wild,
     assert estimate.energy_gap == pytest.approx(float(gap), rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_same_inside_jit_and_vmap(beam, bar, exact, off, wild):
     fields = jnp.stack([exact + off(0.05).error, exact + wild["bent"]])
     thetas = jnp.stack([beam.centre, beam.centre])

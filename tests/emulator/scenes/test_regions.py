@@ -178,6 +178,7 @@ def test_solutions_in_theta_taylor():
     assert slope(steps, left) == pytest.approx(2.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_mean_dilatation_has_regions_too():
     scene = halves(quadratic_block("P2, mean dilatation"))
     u = jnp.asarray(0.05 * np.random.default_rng(0).normal(size=scene.held.shape))

@@ -26,6 +26,7 @@ def test_it_interpolates_its_runs(beam, runs):
         np.testing.assert_allclose(reduced(theta), u, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_error_falls_with_more_runs(beam, simulator, runs):
     tests = run_campaign(simulator, sobol(beam, 8, seed=9))
     errors = []

@@ -84,6 +84,7 @@ def test_resuming_needs_a_checkpoint_of_this_scene(beam, cube, tmp_path):
         train(beam, plan, tmp_path, architecture=SMALL, resume=True)
 
 
+@pytest.mark.slow
 def test_a_step_without_a_finite_gradient_is_not_taken(beam):
     plan = Plan(steps=10, simulations=4, batch=2)
     problem = prepare(beam, plan, SMALL)
