@@ -215,8 +215,9 @@ def sample(
     found = chosen.sample(density, checked, options, seed, context)
     attributes = dict(found.attributes)
     if MISSED_BY not in attributes:
-        modes = find_modes(density, checked, jax.random.fold_in(jax.random.key(seed), _MODES))
-        z = found.z.reshape(-1, density.dimension)
+        z = np.asarray(found.z).reshape(-1, density.dimension)
+        key = jax.random.fold_in(jax.random.key(seed), _MODES)
+        modes = find_modes(density, checked, key, draws=z)
         attributes |= missed_mode(density, checked, z, modes)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
     draws = named_draws(model, found.z)

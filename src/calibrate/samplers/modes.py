@@ -32,6 +32,8 @@ from calibrate.statistical_model import Data
 MISSED_BY, MISSED_AT = "missed_mode_nats", "missed_mode"
 
 _STARTS = 8  # draws of the prior
+_MOST = 500  # iterations of the optimiser
+_AWAY = 0.3  # sd that it may stop from a mode
 _STEP = 1e-4  # of central differences of the gradient; coordinates are about 1 wide
 _BARRIER = 1e30  # minus the log density where it is zero, for the optimiser
 _LIGHTER = 3.0  # nats: a mode of a twentieth of the draws' mass
@@ -68,23 +70,52 @@ class Modes(NamedTuple):
     heights: Any
 
 
-def find_modes(density: Density, data: Data, key: jax.Array, starts: int = _STARTS) -> Modes:
-    """Where L-BFGS ends from ``starts`` draws of the prior; none where the density is zero."""
+def find_modes(
+    density: Density,
+    data: Data,
+    key: jax.Array,
+    starts: int = _STARTS,
+    draws: np.ndarray | None = None,
+) -> Modes:
+    """Where L-BFGS ends from ``starts`` draws of the prior; none where the density is zero.
+
+    draws : (s, p) of the posterior, if there are; in coordinates where they are white it takes a
+        few steps, where a sharp posterior takes thousands.
+    """
     programs = compile_programs(density)
+    # From white coordinates w to z = factor w.
+    factor = np.eye(density.dimension)
+    if draws is not None and (found := _spread(draws)) is not None:
+        factor = np.linalg.cholesky(found)
 
-    def negative(z: np.ndarray) -> tuple[float, np.ndarray]:
-        height, slope = programs.value_and_gradient(jnp.asarray(z), data)
+    def negative(w: np.ndarray) -> tuple[float, np.ndarray]:
+        height, slope = programs.value_and_gradient(jnp.asarray(factor @ w), data)
         if not (np.isfinite(height) and np.isfinite(slope).all()):
-            return _BARRIER, np.zeros_like(z)
-        return -float(height), -np.asarray(slope)
+            return _BARRIER, np.zeros_like(w)
+        return -float(height), -(np.asarray(slope) @ factor)
 
+    begun = np.asarray(programs.starts(jax.random.split(key, starts)))
     tries = [
-        minimize(negative, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-12})
-        for start in np.asarray(programs.starts(jax.random.split(key, starts)))
+        minimize(
+            negative,
+            np.linalg.solve(factor, start),
+            jac=True,
+            method="L-BFGS-B",
+            options={"ftol": 1e-12, "maxiter": _MOST},
+        )
+        for start in begun
     ]
-    found = sorted((each for each in tries if each.fun < _BARRIER), key=lambda each: each.fun)
-    z = np.array([each.x for each in found]).reshape(len(found), density.dimension)
-    return Modes(z, np.array([-each.fun for each in found]))
+    ended = sorted((each for each in tries if each.fun < _BARRIER), key=lambda each: each.fun)
+    z = np.array([factor @ each.x for each in ended]).reshape(len(ended), density.dimension)
+    return Modes(z, np.array([-each.fun for each in ended]))
+
+
+def _spread(draws: np.ndarray) -> np.ndarray | None:
+    """Covariance (p, p) of draws (s, p); ``None`` where they do not vary in some direction."""
+    covariance = np.atleast_2d(np.cov(draws, rowvar=False))
+    if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance)[0] > 0.0:
+        return None
+    return covariance
 
 
 def precision_at(density: Density, data: Data, z: np.ndarray) -> np.ndarray:
@@ -113,10 +144,10 @@ def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> di
         return value if np.isfinite(value) else -np.inf
 
     found: dict[str, Any] = {MISSED_BY: np.inf}
-    covariance = np.atleast_2d(np.cov(z, rowvar=False))
-    sign, log_det = np.linalg.slogdet(covariance)
-    if len(modes.z) == 0 or not (sign > 0.0 and np.isfinite(log_det)):
+    covariance = _spread(z)
+    if len(modes.z) == 0 or covariance is None:
         return found
+    log_det = np.linalg.slogdet(covariance)[1]
     whitener = np.linalg.cholesky(np.linalg.inv(covariance))
     some = z[np.linspace(0, len(z) - 1, min(_SAMPLE, len(z))).astype(int)]
     drawn = np.mean([height(each) for each in some])
@@ -142,9 +173,12 @@ def _place(density: Density, z: np.ndarray) -> str:
 
 
 def _mass(density: Density, data: Data, mode: np.ndarray, top: float) -> float:
-    """Log of Laplace's mass beside a mode; nothing where it has no curvature in some direction."""
+    """Log of Laplace's mass beside a mode; none where it is flat, or the optimiser stopped away."""
     precision = precision_at(density, data, mode)
-    sign, log_det = np.linalg.slogdet(precision) if np.isfinite(precision).all() else (0.0, 0.0)
-    if not (sign > 0.0 and np.linalg.eigvalsh(precision)[0] > 0.0):
+    if not np.isfinite(precision).all() or not np.linalg.eigvalsh(precision)[0] > 0.0:
         return -np.inf
+    slope = slope_of(density, data)(mode)
+    if not slope @ np.linalg.solve(precision, slope) < _AWAY**2:
+        return -np.inf
+    log_det = np.linalg.slogdet(precision)[1]
     return float(top + 0.5 * (len(mode) * np.log(2.0 * np.pi) - log_det))

@@ -29,7 +29,7 @@ def density(log_density, size, spread=3.0):
 
 def missed(log_density, draws):
     of = density(log_density, draws.shape[1])
-    return missed_mode(of, {}, draws, find_modes(of, {}, KEY))
+    return missed_mode(of, {}, draws, find_modes(of, {}, KEY, draws=draws))
 
 
 def two(weight, apart=4.0, width=0.5):
