@@ -14,7 +14,6 @@ results.json after each ventricle and family.png; ventricles that results.json h
 
 import argparse
 import json
-import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -22,54 +21,39 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 from studies.common.output import save
+from studies.ventricle_family.workers import (
+    KEYS,
+    NETWORK,
+    RUNS,
+    THETA_SEED,
+    first_prediction,
+    one,
+    solved,
+    warm_starts,
+)
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE, GREEN, VERMILION
 from calibrate.provenance import hardware, study_header, versions
-from emulator.error.comparison import case_errors, quantiles
-from emulator.fem.campaign import Runs, run_campaign
-from emulator.fem.designs import design, sobol
+from emulator.error.comparison import quantiles
+from emulator.fem.campaign import run_campaign
+from emulator.fem.designs import sobol
 from emulator.scenes.left_ventricle import left_ventricle
-from emulator.scenes.scene import Scene
 from emulator.scenes.ventricle_family import ventricles
-from emulator.store import read_arrays, save_arrays, write_json
-from emulator.surrogates import Emulator, load, save_emulator
-from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.protocol import all_nodes
-from emulator.surrogates.taylor import constant, expand_at
-from emulator.training import recipe
-from emulator.training import train as train_emulator
-from emulator.training.discrepancy_stage import add_discrepancy
+from emulator.store import read_arrays, write_json
+from emulator.surrogates import load, save_emulator
 from emulator.training.ventricles import PLAN, BodyRuns, train_family
 
 HERE = Path(__file__).parent
-TRAINING_SEED, TEST_SEED, THETA_SEED = 0, 1, 90_210
-NETWORK = "ventricle_family"
-RUNS, TESTS = (1, 5, 20), 5
-KEYS = ("err_u", "err_V")
+TRAINING_SEED, TEST_SEED = 0, 1
+TESTS = 5  # theta a ventricle
 
 
 # How the network was trained.
-
-
-def solved(folder: Path, arguments: dict[str, Any], positions: np.ndarray, name: str) -> None:
-    """FEM runs of one ventricle, written as one file; those that fail are left out."""
-    path = folder / f"{name}.safetensors"
-    if path.is_file():
-        return
-    scene = left_ventricle(**arguments)
-    simulator = em.Simulator(scene)
-    found = [simulator.solve(scene.from_unit(jnp.asarray(x))) for x in positions]
-    converged = np.array([bool(s.converged) for s in found])
-    fields = np.stack([np.asarray(s.displacement, np.float32) for s in found])
-    save_arrays(path, {"position": positions[converged], "displacement": fields[converged]})
-    jax.clear_caches()
-    print(f"{name}: {len(scene.mesh.nodes)} nodes, {converged.sum()} of {len(found)}", flush=True)
 
 
 def solve_family(folder: Path, count: int, each: int, workers: int) -> list[BodyRuns]:
@@ -110,89 +94,6 @@ def train(arguments: argparse.Namespace) -> None:
 
 
 # What it knows of others.
-
-
-def judged(emulator: Any, known: Runs) -> dict[str, dict[str, float]]:
-    """Quantiles of the errors against FEM, over nodes and theta."""
-    fields = case_errors(emulator, known.theta, known.displacement).fields
-    return {key: quantiles(fields[key]) for key in KEYS}
-
-
-def first_prediction(scene: Scene, start: Emulator) -> tuple[Emulator, float]:
-    """The network on ``scene``, and the seconds to its first displacement."""
-    began = time.perf_counter()
-    emulator = train_emulator(scene, recipe("family"), "unused", start=start)
-    jax.block_until_ready(emulator.cache()(scene.centre))
-    return emulator, time.perf_counter() - began
-
-
-def after_runs(scene: Scene, network: Emulator, known: Runs) -> list[dict[str, Any]]:
-    """Errors of three ways to use 1, 5 and 20 FEM runs."""
-    simulator, rows = em.Simulator(scene), []
-    thetas = jnp.concatenate([scene.centre[None], design(scene, max(RUNS) - 1, 0)])
-    runs = run_campaign(simulator, thetas, sensitivities=True)
-    series = expand_at(simulator, runs.displacement[0], scene.centre, 3)
-    assert network.family is not None
-    rest = series.less(network.family.cache(all_nodes(scene)))
-    own = Emulator(scene, taylor=series)
-    started = replace(network, taylor=rest)
-    for count in RUNS:
-        some = runs.take(slice(0, count))
-        maps: dict[str, Any] = {"mechanics": own, "network": started}
-        if count > 1:
-            maps["mechanics"] = add_discrepancy(own, some)[0]
-            maps["network"], record = add_discrepancy(started, some, series)
-        errors = {name: judged(emulator.cache(), known) for name, emulator in maps.items()}
-        if count >= 3:
-            others = run_campaign(simulator, sobol(scene, count, 0))
-            errors["POD + GP"] = judged(fit_reduced(scene, others), known)
-        on = record["on"] if count > 1 else "family + taylor"
-        rows.append({"runs": count, "errors": errors, "network_on": on})
-    return rows
-
-
-def warm_starts(scene: Scene, network: Emulator, known: Runs) -> dict[str, Any]:
-    """Factorisations and iterations of FEM from rest, and from the network's prediction."""
-    simulator, predict = em.Simulator(scene), jax.jit(network.cache())
-    rest = [simulator.solve(theta) for theta in known.theta]
-    warm = [simulator.solve(theta, predict(theta)) for theta in known.theta]
-    same = [
-        float(jnp.max(jnp.abs(a.displacement - b.displacement)))
-        for a, b in zip(rest, warm, strict=True)
-    ]
-    return {
-        "factorisations_from_rest": [int(s.factorisations) for s in rest],
-        "factorisations_from_network": [int(s.factorisations) for s in warm],
-        "largest_difference_mm": max(same),
-        "converged": all(bool(s.converged) for s in [*rest, *warm]),
-    }
-
-
-def one(number: int, arguments: dict[str, Any], theta: int, few_runs: bool) -> dict[str, Any]:
-    """All about one ventricle."""
-    scene = left_ventricle(**arguments)
-    start = load(NETWORK)
-    first_prediction(left_ventricle(), start)  # imports, and programs that fit any mesh
-    network, seconds = first_prediction(scene, start)
-    known = run_campaign(em.Simulator(scene), sobol(scene, theta, THETA_SEED + number))
-    before = judged(network.cache(), known)
-    centre = Emulator(scene, taylor=constant(
-        np.full(5, 0.5), em.Simulator(scene)(scene.centre)))  # fmt: skip
-    size = jnp.linalg.norm(known.displacement, axis=-1)
-    row: dict[str, Any] = {
-        "name": f"ventricle {number}",
-        "status": "done",
-        "arguments": arguments,
-        "nodes": len(scene.mesh.nodes),
-        "mean_u_mm": float(size.mean()),
-        "before": before,
-        "one_solution_everywhere": judged(centre.cache(), known),
-        "warm_start": warm_starts(scene, network, known),
-        "after": after_runs(scene, network, known) if few_runs else [],
-        "seconds_to_first_prediction": round(seconds, 2),
-    }
-    jax.clear_caches()
-    return row
 
 
 def study(arguments: argparse.Namespace) -> list[dict[str, Any]]:
