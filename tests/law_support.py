@@ -14,6 +14,7 @@ ARGUMENTS = {
     "holzapfel_ogden_unswitched": (0.3, 2.0, 3.0, 2.5, 25.0),
     "holzapfel_ogden_isotropic": (3.0, 2.0, 25.0),
     "holzapfel_ogden_dispersed": (0.3, 2.0, 3.0, 2.5, 0.1, 25.0),
+    "holzapfel_ogden_dispersed_unswitched": (0.3, 2.0, 3.0, 2.5, 0.1, 25.0),
     "holzapfel_ogden_released": (0.15, 2.0, 1.5, 2.5, 25.0),
     "holzapfel_ogden_orthotropic": (0.3, 2.0, 3.0, 2.5, 2.0, 1.5, 0.8, 3.0, 25.0),
     "guccione": (2.0, 8.0, 2.0, 4.0, 50.0),

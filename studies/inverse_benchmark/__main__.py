@@ -45,7 +45,7 @@ def enter(key: str, entry: Entry) -> None:
     folder = ENTRIES / key
     path = folder / "entry.json"
     told: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {"problems": {}}
-    missing = [name for name in entry.problems if name not in told["problems"]]
+    missing = [name for name in PROBLEMS if name not in told["problems"]]
     if missing and key in NEEDS and importlib.util.find_spec(NEEDS[key]) is None:
         print(f"{entry.name}: {len(missing)} problems left out, package '{NEEDS[key]}' is missing")
         return

@@ -159,11 +159,22 @@ def holzapfel_ogden_dispersed(stretches: np.ndarray, values: Values) -> np.ndarr
           + (1 - 3d)\, \partial_i \bar I_4\right], \quad
         x = \max(d (\bar I_1 - 3) + (1 - 3d)(\bar I_4 - 1), 0)
     """
+    x, slope = _dispersed(stretches, values)
+    return holzapfel_ogden_isotropic(stretches, values) + _fibres(max(x, 0.0), slope, values)
+
+
+def holzapfel_ogden_dispersed_unswitched(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r""":func:`holzapfel_ogden_dispersed` where x may be negative, in kPa, (3,)."""
+    return holzapfel_ogden_isotropic(stretches, values) + _fibres(
+        *_dispersed(stretches, values), values
+    )
+
+
+def _dispersed(stretches: np.ndarray, values: Values) -> tuple[float, np.ndarray]:
+    """Mean x of dispersed fibres before any switch, and its derivatives in the stretches, (3,)."""
     d = values["dispersion"]
     I1, I4, d_I1, d_I4 = _isochoric(stretches)
-    x = max(float(d * I1 + (1.0 - 3.0 * d) * I4), 0.0)
-    slope = d * d_I1 + (1.0 - 3.0 * d) * d_I4
-    return holzapfel_ogden_isotropic(stretches, values) + _fibres(x, slope, values)
+    return float(d * I1 + (1.0 - 3.0 * d) * I4), d * d_I1 + (1.0 - 3.0 * d) * d_I4
 
 
 def _fibres(x: float, slope: np.ndarray, values: Values) -> np.ndarray:
@@ -216,6 +227,7 @@ PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
     "holzapfel_ogden_unswitched": holzapfel_ogden_unswitched,
     "holzapfel_ogden_isotropic": holzapfel_ogden_isotropic,
     "holzapfel_ogden_dispersed": holzapfel_ogden_dispersed,
+    "holzapfel_ogden_dispersed_unswitched": holzapfel_ogden_dispersed_unswitched,
     "holzapfel_ogden_released": holzapfel_ogden_released,
     "holzapfel_ogden_orthotropic": holzapfel_ogden_orthotropic,
     "guccione": guccione,
@@ -232,6 +244,14 @@ PARAMETERS: dict[str, dict[str, float]] = {
     "holzapfel_ogden_unswitched": {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "kappa": 50.0},
     "holzapfel_ogden_isotropic": {"a": 2.0, "b": 3.0, "kappa": 50.0},
     "holzapfel_ogden_dispersed": {
+        "a": 2.0,
+        "b": 3.0,
+        "a_f": 5.0,
+        "b_f": 4.0,
+        "dispersion": 0.1,
+        "kappa": 50.0,
+    },
+    "holzapfel_ogden_dispersed_unswitched": {
         "a": 2.0,
         "b": 3.0,
         "a_f": 5.0,

@@ -82,6 +82,10 @@ def test_laws_without_an_effect_are_those_with_it_where_it_is_absent():
     dispersed, strain = find_law("holzapfel_ogden_dispersed"), Strain(pulled, None, FIBRE)
     parallel = dispersed.energy(strain, 0.3, 2.0, 3.0, 2.5, 0.0, 25.0)
     assert parallel == pytest.approx(float(energy(plain, pulled)), rel=1e-14)
+    parallel = find_law("holzapfel_ogden_dispersed_unswitched").energy(
+        Strain(pressed, None, FIBRE), 0.3, 2.0, 3.0, 2.5, 0.0, 25.0
+    )
+    assert parallel == pytest.approx(float(energy(unswitched, pressed)), rel=1e-14)
     for law in LAWS.values():
         for _, simpler in law.simpler:
             assert set(simpler.parameters) <= set(law.parameters)
