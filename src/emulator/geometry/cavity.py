@@ -55,8 +55,7 @@ class Cavity:
         X = mesh.nodes[self.nodes]
         self._X = X - X.mean(axis=0)  # less cancellation: coordinates about the centroid
         self._volume = enclosed_volume(np.searchsorted(self.nodes, facets))
-        with jax.ensure_compile_time_eval():  # a number even inside jit
-            signed = float(self._volume(self._X))
+        signed = float(self._volume(self._X))
         if abs(signed) <= _FLAT * mesh.size**3:
             raise InputError(
                 f"facet set '{facet_set}' encloses no volume: it is flat, or has no inside"
@@ -77,8 +76,7 @@ class Cavity:
     @cached_property
     def rest(self) -> float:
         """Volume of the undeformed cavity, mL."""
-        with jax.ensure_compile_time_eval():
-            return float(self(jnp.zeros(self._X.shape)))
+        return self._factor * float(self._volume(self._X))
 
 
 def encloses(mesh: Mesh, facet_set: str) -> bool:

@@ -3,6 +3,8 @@ r"""Area vectors and volumes of surface facets, linear or quadratic.
 A facet with nodes :math:`x_a` has the area vector per reference area
 :math:`n = \partial x/\partial\xi \times \partial x/\partial\eta`, in mm2; it points out of the
 tissue. The cone from the origin over it has the volume :math:`\frac13 \int x \cdot n\, d\xi d\eta`.
+
+NumPy's arrays stay NumPy's, so that a mesh at rest is measured without a program being compiled.
 """
 
 from __future__ import annotations
@@ -10,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -18,35 +19,32 @@ from scipy.sparse.csgraph import connected_components
 from emulator.geometry.discretisation import FacetRule, facet_rule
 
 
-def area_vectors(x: jax.Array, rule: FacetRule) -> jax.Array:
-    """``n`` at each quadrature point of a facet ``x`` (a, 3) mm, shape (q, 3) in mm2."""
-    along = jnp.einsum("qad,ai->qdi", rule.derivatives, x)
-    return jnp.cross(along[:, 0], along[:, 1])
+def area_vectors[A: (jax.Array, np.ndarray)](x: A, rule: FacetRule) -> A:
+    """``n`` at each quadrature point of facets ``x`` (..., a, 3) mm, shape (..., q, 3) in mm2."""
+    xp = x.__array_namespace__()
+    along = xp.einsum("qad,...ai->...qdi", rule.derivatives, x)
+    return xp.cross(along[..., 0, :], along[..., 1, :])
 
 
 def nodal_areas(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
     """Integral of each shape function over the facets ``corners`` (k, a, 3), (k, a) in mm2."""
-    area = np.linalg.norm(_normals(corners, rule), axis=-1)
+    area = np.linalg.norm(area_vectors(corners, rule), axis=-1)
     return np.einsum("q,kq,qa->ka", rule.weights, area, rule.values)
 
 
 def nodal_area_vectors(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
     """Integral of each shape function times the normal over ``corners`` (k, a, 3), (k, a, 3)."""
-    return np.einsum("q,kqi,qa->kai", rule.weights, _normals(corners, rule), rule.values)
+    return np.einsum("q,kqi,qa->kai", rule.weights, area_vectors(corners, rule), rule.values)
 
 
-def _normals(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
-    """:func:`area_vectors` of all facets ``corners`` (k, a, 3) at rest, (k, q, 3) in mm2."""
-    along = np.einsum("qad,kai->kqdi", rule.derivatives, corners)
-    return np.cross(along[:, :, 0], along[:, :, 1])
-
-
-def cone_volume(x: jax.Array) -> jax.Array:
-    """Signed volume between the origin and one facet ``x`` (3 or 6, 3), mm3; exact for both."""
-    if len(x) == 3:
-        return jnp.vdot(x[0], jnp.cross(x[1], x[2])) / 6.0
+def cone_volume[A: (jax.Array, np.ndarray)](x: A) -> A:
+    """Signed volume (...) between the origin and facets ``x`` (..., 3 or 6, 3), mm3; exact."""
+    xp = x.__array_namespace__()
+    if x.shape[-2] == 3:
+        return xp.sum(x[..., 0, :] * xp.cross(x[..., 1, :], x[..., 2, :]), axis=-1) / 6.0
     rule = facet_rule(2, 4)  # x quadratic, n quadratic
-    return jnp.sum(rule.weights[:, None] * (rule.values @ x) * area_vectors(x, rule)) / 3.0
+    height = xp.sum((rule.values @ x) * area_vectors(x, rule), axis=-1)
+    return height @ rule.weights / 3.0
 
 
 def rim(facets: np.ndarray) -> np.ndarray:
@@ -71,7 +69,7 @@ def openings(facets: np.ndarray) -> list[np.ndarray]:
     return [edges[label[start] == k] for k in range(count)]
 
 
-def enclosed_volume(facets: np.ndarray) -> Callable[[jax.Array], jax.Array]:
+def enclosed_volume[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[[A], A]:
     r"""``x -> V`` in mm3: the volume that ``facets`` (k, 3 or 6) and lids on its openings enclose.
 
     .. math:: V = \frac13 \oint x \cdot n \, da
@@ -82,21 +80,21 @@ def enclosed_volume(facets: np.ndarray) -> Callable[[jax.Array], jax.Array]:
     """
     rims = [(edges, np.unique(edges[:, :2])) for edges in openings(facets)]
 
-    def volume(x: jax.Array) -> jax.Array:
-        total = jnp.sum(jax.vmap(cone_volume)(x[facets]))
+    def volume(x: A) -> A:
+        total = cone_volume(x[facets]).sum()
         for edges, ends in rims:
-            middle = jnp.mean(x[ends], axis=0)
-            fan = jax.vmap(lambda edge, middle=middle: cone_volume(_lid(edge, middle)))(x[edges])
-            total = total + jnp.sum(fan)
+            total = total + cone_volume(_lids(x[edges], x[ends].mean(axis=0))).sum()
         return total
 
     return volume
 
 
-def _lid(edge: jax.Array, middle: jax.Array) -> jax.Array:
-    """Facet between a rim edge (2 or 3, 3) and ``middle`` (3,), against the wall's orientation."""
-    start, end = edge[0], edge[1]
-    if len(edge) == 2:
-        return jnp.stack([end, start, middle])
-    spokes = [0.5 * (start + middle), 0.5 * (middle + end)]
-    return jnp.stack([end, start, middle, edge[2], *spokes])
+def _lids[A: (jax.Array, np.ndarray)](edges: A, middle: A) -> A:
+    """Facets between rim edges (e, 2 or 3, 3) and ``middle`` (3,), against the wall's facing."""
+    xp = edges.__array_namespace__()
+    start, end = edges[:, 0], edges[:, 1]
+    middle = xp.broadcast_to(middle, start.shape)
+    if edges.shape[1] == 2:
+        return xp.stack([end, start, middle], axis=1)
+    to, back = 0.5 * (start + middle), 0.5 * (middle + end)
+    return xp.stack([end, start, middle, edges[:, 2], to, back], axis=1)
