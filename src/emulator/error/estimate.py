@@ -23,9 +23,11 @@ at hand measures the departure, by the *contraction*
 about the relative error of :math:`\hat e`. If every further step shrinks by this factor,
 :math:`|\hat e - e| \le \Theta |\hat e| / (1 - \Theta)`, so :math:`\Theta \le 1/4`
 means an effectivity between 3/4 and 3/2.
-Where it is larger, or the step would invert an element, or the tangent is indefinite, one step may
-be ten times too long. Then FEM's guarded iteration starts from the prediction and runs until a step
-is less than a quarter of the way travelled so far; the error is the whole way.
+That takes a tangent like that at the equilibrium. Where half of all forces are out of balance the
+strains, and the stiffness they lend, are mostly error, and one step may be three times too short.
+Where :math:`\Theta` is larger, or the step would invert an element, or the tangent is indefinite,
+it may be ten times too long. Then FEM's guarded iteration starts from the prediction and runs until
+a step is less than a quarter of the way travelled so far; the error is the whole way.
 Where the prediction itself inverts elements, the iteration starts from the first sound state on the
 line to the solution at the centre of the box, and the way to that state is part of the error.
 

@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.assembly import System
+from emulator.fem.assembly import System, balance
 from emulator.fem.functional import volume_ratio
 from emulator.fem.newton import Newton, NewtonState
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Status
+from emulator.fem.state import UNBALANCED
 from emulator.scenes.scene import Scene
 
 ENDLESS = 1e100  # mm; larger displacements count as not finite: J, their cube, would overflow
@@ -79,7 +80,7 @@ def sound_state(
 
 def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
     """Newton's step with the opposite sign, and a check by one more back-substitution."""
-    residual, tangent = system.residual(u, theta), system.tangent(u, theta)
+    (residual, out_of_balance), tangent = balance(system, u, theta), system.tangent(u, theta)
     values = system.pattern.safe_values(tangent)
     move = system.extend(system.solve(values, residual))
     after = u - move
@@ -90,13 +91,15 @@ def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
     gap = 0.5 * jnp.vdot(residual, system.restrict(move))
     sound = system.pattern.solvable(tangent) & jnp.isfinite(length) & open_ & (gap >= 0.0)
     exact = length <= _ROUND_OFF * _norm(u)
+    # Strains that hardly balance any load are the error's own, and so is the stiffness they lend.
+    good = (again <= _CONTRACTION) & (out_of_balance <= UNBALANCED)
     return Distance(
         move=move,
         gap=gap,
         contraction=jnp.where(exact, jnp.minimum(again, 1.0), again),
         iterations=jnp.array(0),
         indefinite=gap < 0.0,
-        settled=sound & (exact | (again <= _CONTRACTION)),
+        settled=sound & (exact | good),
     )
 
 

@@ -117,6 +117,23 @@ def test_where_one_step_is_wild_the_bar_is_not(beam, one_step, bar, exact, wild,
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("corner", [(3.0, -2.0), (3.0, 3.0)])
+def test_a_short_step_far_from_balance_is_not_believed(corner):
+    """Two box lengths outside, a network's strains stiffen the beam: each step is a third of what
+    is needed, and the next one with the same tangent shorter still."""
+    forward = em.load("once_clamped_beam_pignn").cache()
+    scene, theta = forward.scene, forward.scene.from_unit(jnp.array(corner))
+    simulator = em.Simulator(scene)
+    error = forward(theta) - simulator(theta)
+    once = newton_step(simulator.system, forward(theta), theta) - forward(theta)
+    assert jnp.linalg.norm(once) < 0.5 * jnp.linalg.norm(error)
+    bar = error_bar(forward, simulator)
+    for estimate in (bar(theta), jax.jit(bar)(theta)):
+        assert estimate.valid
+        assert far(estimate.field, error) < 0.25
+
+
+@pytest.mark.slow
 def test_the_same_inside_jit_and_vmap(beam, bar, exact, off, wild):
     fields = jnp.stack([exact + off(0.05).error, exact + wild["bent"]])
     thetas = jnp.stack([beam.centre, beam.centre])
