@@ -99,6 +99,7 @@ def test_a_few_cases(name, tmp_path, request):
         assert (tmp_path / figure).stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_hang_in_stability_is_recorded_and_loses_nothing(tmp_path):
     out = ("--workers", 1, "--limit", 0.01, "--out", tmp_path)
     with pytest.raises(AssertionError, match="hangs or exceptions"):
@@ -107,6 +108,7 @@ def test_a_hang_in_stability_is_recorded_and_loses_nothing(tmp_path):
     assert [case["status"] for case in cases] == ["hang", "hang"]
 
 
+@pytest.mark.slow
 def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
     spec = importlib.util.spec_from_file_location("judge", STUDIES / "stability" / "judge.py")
     module = importlib.util.module_from_spec(spec)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from studies.common.output import save
 from studies.common.timing import clocked
+from studies.error_bar.tables import effectivities, polishes
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -241,10 +242,14 @@ def check(cases: list[dict[str, Any]]) -> None:
     for case in cases:
         if case["where"] == "inside":
             assert case["effectivity"]["error bar"]["within_factor_2"] >= 0.95, case["name"]
-        wrong = [row for row in case["rows"] if row["valid"] and _far(row)]
+        # Where it says that the tangent is indefinite, the way may lead to another equilibrium.
+        told = [row for row in case["rows"] if "indefinite" in row["guard"] or not row["valid"]]
+        wrong = [row for row in case["rows"] if row not in told and _far(row)]
         assert len(wrong) <= 0.05 * len(case["rows"]), case["name"]
         rough = case["err_u_mm"] > _ROUND_OFF  # what is exact already has no digits to gain
-        if case["where"] == "inside" and case["map"].startswith("shipped") and rough:
+        # A family's network is too rough for an unguarded step.
+        own = case["map"].startswith(f"shipped '{case['scene']}")
+        if case["where"] == "inside" and own and rough:
             assert case["cut"]["1"][1] >= 8.0
             assert case["cut"]["2"][1] >= 1000.0
 
@@ -266,6 +271,7 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     write_json(arguments.out / "results.json", {**study_header(HERE, SEED), "cases": cases})
     draw(cases, arguments.out / "effectivity.png")
+    print(effectivities(cases), polishes(cases), sep="\n\n")
     check(cases)
 
 

@@ -81,6 +81,7 @@ def answer(capsys, *words):
     return code, json.loads(captured.out)
 
 
+@pytest.mark.slow
 def test_it_is_evaluated(setting, tmp_path, capsys):
     save_emulator(untrained(setting), tmp_path)
     words = ["evaluate", tmp_path, "--against", "fem", "--cases", 3, "--outside", 0.1]

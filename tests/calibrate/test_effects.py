@@ -98,6 +98,10 @@ def test_bad_input(pulled, corners):
     bare = replace(block(loads=(Gravity(),)), law=replace(pulled.law, simpler=()))
     with pytest.raises(InputError, match="no effect that it can do without"):
         recommend(bare, corners, 1.0)
+
+
+@pytest.mark.slow
+def test_a_scene_that_fem_does_not_solve(pulled, corners):
     heavy = replace(pulled, loads=(Traction("right", (-1e6, 0.0, 0.0)), Gravity()))
     with pytest.raises(SolverError, match="effects: FEM of scene 'block'"):
         recommend(heavy, corners, 1.0, samples=2)

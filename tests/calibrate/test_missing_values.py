@@ -128,6 +128,7 @@ def test_batches_sites_and_json(beam, model, data):
     assert missing_values(fewer) == {"displacement": 5}
 
 
+@pytest.mark.slow
 def test_the_posterior_says_what_is_missing(model, data):
     from calibrate.samplers import NUTSOptions
 

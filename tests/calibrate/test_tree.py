@@ -38,7 +38,9 @@ def particles(posterior):
     return cal.sample(model, data, sampler="smc", options=SMCOptions(draws=300, chains=2))
 
 
-@pytest.fixture(scope="module", params=["posterior", "particles"])
+@pytest.fixture(
+    scope="module", params=["posterior", pytest.param("particles", marks=pytest.mark.slow)]
+)
 def saved(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("saved") / "posterior.nc"
     request.getfixturevalue(request.param).save(path)
@@ -107,6 +109,7 @@ def test_replicated_data_has_the_model_s_mean_and_noise(posterior):
     assert abs(noise.mean()) < 4 * 0.1 / np.sqrt(noise.size)
 
 
+@pytest.mark.slow
 def test_the_prior_is_the_prior_where_the_map_answers(beam):
     from dataclasses import replace
 

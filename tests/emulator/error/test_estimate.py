@@ -188,6 +188,7 @@ def test_nothing_that_is_not_finite_comes_out(beam, bar, exact, what):
     assert estimate.max > 0.0  # not known to be wrong is not known to be right
 
 
+@pytest.mark.slow
 def test_the_tangent_of_the_centre_is_factorised_once(beam, simulator, bar):
     theta = beam.from_unit(jnp.array([0.55, 0.5]))
     map_there = Off(beam, simulator(theta), 0.02)

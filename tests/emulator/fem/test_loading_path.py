@@ -108,7 +108,8 @@ def test_a_warm_start_whose_way_is_not_convex_is_left_for_rest(ventricle_simulat
         np.testing.assert_allclose(solve(theta, start).displacement, expected, atol=1e-8)
 
 
-@pytest.mark.parametrize("theta", [None, pytest.param(SOFT[0], marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("theta", [None, SOFT[0]])
 def test_a_rough_start_takes_fewer_steps_than_rest(ventricle_simulator, inside_jit, theta):
     """A field that is right and has rough strains, as a network's: most of the load is unbalanced,
     and the tangent there is indefinite."""

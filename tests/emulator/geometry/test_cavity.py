@@ -76,9 +76,9 @@ def test_the_derivative_is_that_of_a_central_difference(order):
     rng = np.random.default_rng(1)
     u, along = (jnp.asarray(rng.normal(size=(len(cavity.nodes), 3))) for _ in range(2))
     # A cubic in u: its central difference is off by h^2 times a constant only.
-    h = 1e-4
-    central = (cavity(u + h * along) - cavity(u - h * along)) / (2.0 * h)
-    assert jnp.vdot(jax.grad(cavity)(u), along) == pytest.approx(float(central), rel=1e-7)
+    h, volume = 1e-4, jax.jit(cavity)
+    central = (volume(u + h * along) - volume(u - h * along)) / (2.0 * h)
+    assert np.vdot(jax.jit(jax.grad(cavity))(u), along) == pytest.approx(float(central), rel=1e-7)
 
 
 def test_each_opening_gets_a_lid_of_its_own():

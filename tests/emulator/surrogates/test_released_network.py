@@ -95,6 +95,7 @@ def test_energies_of_the_liver(published):
     assert err_pi == pytest.approx(1.4e-2, abs=0.05e-2)
 
 
+@pytest.mark.slow
 def test_the_cached_map_never_runs_the_processor(twisting, monkeypatch):
     runs, call = [], Processor.__call__
     monkeypatch.setattr(Processor, "__call__", lambda *a: runs.append(1) or call(*a))

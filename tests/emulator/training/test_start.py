@@ -59,6 +59,7 @@ def kill_after(writes, monkeypatch):
     monkeypatch.setattr(Writer, "write", killed)
 
 
+@pytest.mark.slow
 def test_before_any_step_the_network_is_the_other_ones(other, own, start):
     problem = prepare(other, PLAN, start=start)
     emulator, own = problem.emulator, own.emulator

@@ -262,6 +262,7 @@ def test_plans_that_contradict_themselves():
         Plan(order=5)
 
 
+@pytest.mark.slow
 def test_mechanics_builds_no_network(beam, tests, tmp_path, monkeypatch):
     """No graph, no clustering, no array of a network; resumed, it is the same emulator."""
 

@@ -40,14 +40,17 @@ def fitted(simulator, runs, series):
 def test_it_meets_its_runs_and_their_sensitivities(simulator, runs, series, fitted):
     above = fit_discrepancy(simulator.scene, runs, series, series)
     scene = simulator.scene
-    slopes_of = jax.jit(jax.jacfwd(lambda x: series(x) + above(x)))
-    alone = jax.jit(jax.jacfwd(fitted))
+
+    def sampled(field):
+        """Its values and slopes, as one program."""
+        return jax.jit(lambda x: (field(x), jax.jacfwd(field)(x)))
+
+    both = sampled(fitted), sampled(lambda x: series(x) + above(x))
     largest = np.abs(runs.displacement).max()
     given = scene.space.unit_sensitivities(runs.theta, runs.sensitivities)
     for x, u, slopes in zip(scene.to_unit(runs.theta), runs.displacement, given, strict=True):
-        np.testing.assert_allclose(fitted(x), u, atol=1e-5 * largest)
-        np.testing.assert_allclose(series(x) + above(x), u, atol=1e-5 * largest)
-        for found in (alone(x), slopes_of(x)):
+        for value, found in (field(x) for field in both):
+            np.testing.assert_allclose(value, u, atol=1e-5 * largest)
             np.testing.assert_allclose(np.moveaxis(found, -1, 0), slopes, atol=1e-4 * largest)
 
 
