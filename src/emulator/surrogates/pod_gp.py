@@ -4,6 +4,10 @@ FEM displacements are projected on their leading principal modes,
 :math:`u(\theta) \approx \bar u + \sum_k c_k(\theta)\, \phi_k`, and each coefficient is a Gaussian
 process of theta's position in its box. scikit-learn fits the processes; the mean they predict,
 :math:`c_k = k_k(x, X)\, \alpha_k`, is written in JAX so that it differentiates.
+
+Where the response is smooth, length scales are long and the :math:`\alpha_k` large, of both signs:
+float64 is needed, or nothing is left of their sum (docs/experiments.md, "Nine millimetres in
+float32").
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator._precision import require_float64
 from emulator.errors import InputError
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.designs import sobol
@@ -68,7 +73,14 @@ class ReducedForward:
         return fingerprint_of(self.kind, self.scene.fingerprint, *arrays)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Displacement (k, 3) in mm at ``theta`` (p,)."""
+        """Displacement (k, 3) in mm at ``theta`` (p,).
+
+        Raises
+        ------
+        InputError
+            float64 is off.
+        """
+        require_float64("a reduced model")
         gap = (self.scene.to_unit(theta) - self.inputs)[None] / self.lengths[:, None]
         coefficients = jnp.sum(self.weights * jnp.exp(-0.5 * jnp.sum(gap**2, axis=-1)), axis=-1)
         return self.mean + jnp.tensordot(coefficients, self.modes, axes=1)
