@@ -18,6 +18,7 @@ STYLES = {
     "network": ("#CC79A7", "P"),
     "POD + GP": ("#D55E00", "v"),
 }
+DECADE = 10.0
 LEAST = 1e-12  # mm; a smaller error is drawn here
 LABELS = {"own_mm": "from FEM on the same mesh", "truth_mm": "from a much finer mesh"}
 
@@ -72,6 +73,9 @@ def _panel(axes: Any, cases: list[Case], key: str) -> None:
                 label = f"{kind}, float32" if narrow else kind
                 axes.plot(*points[rows].T, mark, color=colour, ls="", label=label, **fill)
     axes.set(xscale="log", yscale="log")
+    low, high = points[:, 1].min(), points[:, 1].max()
+    if high < DECADE * low:  # what differs by less is the same, and looks so
+        axes.set_ylim(low / DECADE**0.5, high * DECADE**0.5)
     axes.grid(color="0.92")
     axes.spines[["top", "right"]].set_visible(False)
 

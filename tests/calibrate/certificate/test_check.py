@@ -214,6 +214,7 @@ def test_certify_refuses_what_makes_no_sense(beam, cube, fem, data):
         cal.certify(posterior, LinearSimulator(fem), draws=10)
 
 
+@pytest.mark.slow
 def test_a_posterior_survives_the_disk(beam, tmp_path):
     forward = linear_forward(beam)
     model = cal.model(

@@ -58,6 +58,7 @@ def test_simulate(capsys, block, tmp_path):
     assert 1.3 < result["max_displacement"] / soft["max_displacement"] < 2.2
 
 
+@pytest.mark.slow
 def test_simulate_under_a_pressure_without_a_potential(capsys, block):
     push = 'kind = "follower_pressure"\nfacet_set = "end"\npressure = 0.1\n'
     plane = '[facet_sets.end]\naxis = "x"\nat = 20.0\n'

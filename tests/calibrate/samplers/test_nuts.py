@@ -40,6 +40,7 @@ def test_the_same_seed_gives_the_same_draws(problem):
     assert not np.array_equal(a, c)
 
 
+@pytest.mark.slow
 def test_unknown_noise_is_inferred(beam):
     forward = linear_forward(beam)
     observe = cal.nodal_displacements(beam, "all")

@@ -17,7 +17,10 @@ def problem(beam):
     return linear_problem(beam)
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n == "blackjax_nuts" else n for n in SAMPLERS],
+)
 def test_a_linear_gaussian_posterior_is_the_known_one(name, problem, beam):
     model, data = problem
     # FEM in a second stage: a draw costs a solve, and is nearly independent of the one before.

@@ -91,6 +91,7 @@ def ventricle():
     return em.Simulator(em.scenes.left_ventricle(rings=4, around=8, layers=1))
 
 
+@pytest.mark.slow
 def test_sensitivities_against_central_differences(ventricle):
     """Every entry of theta, the pressure among them."""
     scene = ventricle.scene

@@ -124,6 +124,7 @@ def test_a_rough_start_takes_fewer_steps_than_rest(ventricle_simulator, inside_j
         assert 2 * solution.factorisations <= expected.factorisations + 1
 
 
+@pytest.mark.slow
 def test_a_good_warm_start_is_kept(ventricle_simulator):
     scene = ventricle_simulator.scene
     theta = scene.centre

@@ -92,6 +92,7 @@ def test_a_pressed_face_gives_way_and_the_tangent_is_right(kind):
     np.testing.assert_allclose(K @ direction, product, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_pressure_as_a_parameter():
     scene = membrane(CavityPressure("right", 0.5))
     free = replace(
