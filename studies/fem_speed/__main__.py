@@ -176,7 +176,7 @@ def wall_volume(scene: Scene, facet_set: str) -> Callable[[jax.Array], jax.Array
     Unlike a cavity's it may be zero at rest: the slab's pressed face is flat.
     """
     facets = scene.mesh.facet_set(facet_set)
-    volume = enclosed_volume(facets)
+    volume: Callable[[jax.Array], jax.Array] = enclosed_volume(facets)
     return lambda u: volume(scene.mesh.nodes + u) / 1000.0
 
 
