@@ -233,6 +233,7 @@ PRINCIPAL_STRESS: dict[str, Callable[[np.ndarray, Values], np.ndarray]] = {
     "guccione": guccione,
 }
 
+_DISPERSED = {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "dispersion": 0.1, "kappa": 50.0}
 # Every term of each law contributes, and volume changes are resisted as in tissue.
 PARAMETERS: dict[str, dict[str, float]] = {
     "neo_hookean": {"mu": 10.0, "lam": 30.0},
@@ -243,22 +244,8 @@ PARAMETERS: dict[str, dict[str, float]] = {
     "holzapfel_ogden": {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "kappa": 50.0},
     "holzapfel_ogden_unswitched": {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0, "kappa": 50.0},
     "holzapfel_ogden_isotropic": {"a": 2.0, "b": 3.0, "kappa": 50.0},
-    "holzapfel_ogden_dispersed": {
-        "a": 2.0,
-        "b": 3.0,
-        "a_f": 5.0,
-        "b_f": 4.0,
-        "dispersion": 0.1,
-        "kappa": 50.0,
-    },
-    "holzapfel_ogden_dispersed_unswitched": {
-        "a": 2.0,
-        "b": 3.0,
-        "a_f": 5.0,
-        "b_f": 4.0,
-        "dispersion": 0.1,
-        "kappa": 50.0,
-    },
+    "holzapfel_ogden_dispersed": _DISPERSED,
+    "holzapfel_ogden_dispersed_unswitched": _DISPERSED,
     "holzapfel_ogden_released": {"a": 1.0, "b": 3.0, "a_f": 2.5, "b_f": 4.0, "kappa": 50.0},
     "holzapfel_ogden_orthotropic": {
         "a": 2.0,

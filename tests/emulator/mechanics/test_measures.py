@@ -32,7 +32,7 @@ def test_a_law_of_the_gradient_reads_no_measures():
     assert measures_read(Law("of H", (modulus("mu"),), energy)) is None
 
 
-FAST = ("neo_hookean", "holzapfel_ogden")  # with fibres and without
+FAST = ("neo_hookean", "holzapfel_ogden")  # without fibres and with
 
 
 @pytest.mark.parametrize(
