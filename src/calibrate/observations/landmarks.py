@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.observations.location import locate, shape_values
+from calibrate.observations.location import locate
 from calibrate.observations.points import (
     DISPLACEMENT,
     DISPLACEMENT_FIELD,
@@ -21,6 +21,7 @@ from calibrate.observations.points import (
 )
 from calibrate.observations.protocol import Field
 from emulator.errors import InputError
+from emulator.geometry.discretisation import shapes_at
 from emulator.scenes.scene import Scene
 
 
@@ -112,5 +113,5 @@ def spread_landmarks(scene: Scene, count: int, seed: int) -> np.ndarray:
     elements = rng.choice(len(volumes), count, p=volumes / volumes.sum())
     # Uniform in the reference element: uniform in an element with straight edges.
     barycentric = rng.dirichlet(np.ones(4), count)
-    weights = shape_values(scene.mesh.order, barycentric)
+    weights, _ = shapes_at(scene.mesh.order, barycentric)
     return np.einsum("da,dai->di", weights, scene.mesh.nodes[scene.mesh.elements[elements]])

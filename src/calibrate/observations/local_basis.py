@@ -35,7 +35,7 @@ COMPONENTS = {
 
 
 def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
-    """Unit vectors (m, c, 3) along ``components`` at every element's centroid.
+    """Unit vectors (m, q, c, 3) along ``components`` at the quadrature points.
 
     Raises
     ------
@@ -53,13 +53,13 @@ def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
     if not components:
         raise InputError(f"strain: name one component or more of {', '.join(COMPONENTS)}")
     if tuple(components) == ("fibre",):  # needs no wall
-        return np.asarray(scene.fibres)[:, None]
+        return scene.fibres_at_points[:, :, None]
     basis = _basis(scene)
-    return np.stack([basis[name] for name in components], axis=1)
+    return np.stack([basis[name] for name in components], axis=2)
 
 
 def _basis(scene: Scene) -> dict[str, np.ndarray]:
-    """Every direction that the scene has, (m, 3) each."""
+    """Every direction that the scene has, (m, q, 3) each."""
     for name in (ENDOCARDIUM, EPICARDIUM):
         if name not in scene.mesh.facet_sets:
             known = ", ".join(sorted(scene.mesh.facet_sets)) or "none"
@@ -67,13 +67,14 @@ def _basis(scene: Scene) -> dict[str, np.ndarray]:
                 f"strain in wall directions needs facet sets {ENDOCARDIUM} and {EPICARDIUM}; "
                 f"scene '{scene.name}' has {known}"
             )
-    n = depth(scene.mesh, (ENDOCARDIUM,), (EPICARDIUM,)).normal
+    normal = depth(scene.mesh, (ENDOCARDIUM,), (EPICARDIUM,)).normal
+    n = normal.reshape((*scene.discretisation.weights.shape, 3))
     c = circumferential(n, AXIS)
     basis = {"circumferential": c, "longitudinal": np.cross(n, c), "radial": n}
     if scene.fibres is not None:
-        across = np.cross(n, scene.fibres)
-        length = np.linalg.norm(across, axis=1, keepdims=True)
+        across = np.cross(n, scene.fibres_at_points)
+        length = np.linalg.norm(across, axis=-1, keepdims=True)
         if not length.min() > 1e-6:
             raise InputError("strain: a fibre runs through the wall; it has no cross-fibre")
-        basis |= {"fibre": scene.fibres, "cross_fibre": across / length}
+        basis |= {"fibre": scene.fibres_at_points, "cross_fibre": across / length}
     return basis

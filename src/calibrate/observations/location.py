@@ -8,9 +8,10 @@ map :math:`x(\xi) = \sum_a N_a(\xi)\, X_a` with Newton's method.
 from __future__ import annotations
 
 import numpy as np
-from skfem import ElementTetP1, ElementTetP2, MeshTet
+from skfem import MeshTet
 
 from emulator.errors import InputError
+from emulator.geometry.discretisation import shapes_at
 from emulator.geometry.mesh import Mesh
 
 # How far outside the body a point may lie, as a fraction of the body's size. Measured surface
@@ -30,16 +31,19 @@ def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         A point further outside than a thousandth of the body's size.
     """
     elements, inside = _find(mesh, points)
-    return elements, shape_values(mesh.order, inside)
+    return elements, shapes_at(mesh.order, inside)[0]
 
 
-def locate_gradients(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`locate`, with the shape functions' reference gradients (d, 4 or 10, 3), 1/mm."""
+def locate_gradients(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Element (d,) of each point (d, 3), its barycentric coordinates (d, 4), and gradients.
+
+    These are the shape functions' in the reference body, (d, 4 or 10, 3) in 1/mm.
+    """
     elements, inside = _find(mesh, points)
-    _, slopes = _tabulate(mesh.order, inside)
+    _, slopes = shapes_at(mesh.order, inside)
     jacobian = np.einsum("dai,daj->dij", mesh.nodes[mesh.elements[elements]], slopes)
     # NumPy, no batched LAPACK of JAX's.
-    return elements, np.einsum("daj,dji->dai", slopes, np.linalg.inv(jacobian))
+    return elements, inside, np.einsum("daj,dji->dai", slopes, np.linalg.inv(jacobian))
 
 
 def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -60,21 +64,6 @@ def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(elements), np.array(coordinates)
 
 
-def shape_values(order: int, barycentric: np.ndarray) -> np.ndarray:
-    """Shape functions (d, 4 or 10) at barycentric coordinates (d, 4)."""
-    return barycentric if order == 1 else _tabulate(order, barycentric)[0]
-
-
-def _tabulate(order: int, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shape functions (c, a) and their derivatives (c, a, 3) in the last three coordinates."""
-    element = ElementTetP1() if order == 1 else ElementTetP2()
-    xi = barycentric[:, 1:].T
-    shapes = [element.lbasis(xi, a) for a in range(len(element.doflocs))]
-    values = np.stack([np.broadcast_to(value, xi.shape[1:]) for value, _ in shapes], axis=1)
-    slopes = np.stack([np.broadcast_to(slope.T, xi.T.shape) for _, slope in shapes], axis=1)
-    return values, slopes
-
-
 def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Barycentric coordinates (c, 4) of ``point`` in elements with nodes ``X`` (c, a, 3).
 
@@ -84,7 +73,7 @@ def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = 1 if X.shape[1] == 4 else 2
     xi = np.full((len(X), 3), 0.25)
     for _ in range(1 if order == 1 else _NEWTON_STEPS):
-        values, slopes = _tabulate(order, _barycentric(xi))
+        values, slopes = shapes_at(order, _barycentric(xi))
         # d xi / d x, the inverse of the element map's Jacobian; NumPy, no batched LAPACK of JAX's.
         inverse = np.linalg.inv(np.einsum("cai,caj->cij", X, slopes))
         step = np.einsum("cji,ci->cj", inverse, point - np.einsum("ca,cai->ci", values, X))
@@ -128,5 +117,6 @@ def _onto(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     inside = coordinates - beyond[:, None] * np.einsum("cai,ci->ca", gradients, normal)
     inside = np.maximum(inside, 0.0)
     inside /= inside.sum(axis=1, keepdims=True)
-    reached = np.einsum("ca,cai->ci", shape_values(1 if X.shape[1] == 4 else 2, inside), X)
+    shapes, _ = shapes_at(1 if X.shape[1] == 4 else 2, inside)
+    reached = np.einsum("ca,cai->ci", shapes, X)
     return np.linalg.norm(reached - point, axis=1), inside

@@ -130,7 +130,7 @@ class SegmentStrain(Strains):
         samples = Samples.of(
             scene.mesh.elements[element],
             parts.gradients[rows].reshape(len(element), -1, 3),
-            directions[element],
+            directions[rows].reshape(len(element), -1, 3),
         )
         volume = parts.weights[rows].ravel() * (labels[element] == segments[:, None])
         weights = volume / volume.sum(axis=1, keepdims=True)

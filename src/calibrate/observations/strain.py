@@ -17,6 +17,8 @@ from calibrate.observations.points import check_distinct, check_table, count_of
 from calibrate.observations.protocol import Field, Labels
 from calibrate.observations.strain_components import Samples, Strains, columns_of, components_in
 from emulator.errors import InputError
+from emulator.geometry.directions import unit
+from emulator.geometry.discretisation import from_quadrature_points
 from emulator.scenes.scene import Scene
 
 
@@ -24,8 +26,8 @@ from emulator.scenes.scene import Scene
 class Strain(Strains):
     """Green-Lagrange strains (d, c) along ``components`` at ``points`` (d, 3), without unit.
 
-    The directions are those of the point's element (:mod:`calibrate.observations.local_basis`).
-    In linear elements strains are constant, and jump from one element to the next.
+    In linear elements strains and directions (:mod:`calibrate.observations.local_basis`) are
+    constant, and jump from one element to the next.
     """
 
     components: tuple[str, ...]
@@ -126,9 +128,10 @@ class Strain(Strains):
         check_distinct(points, "strains")
         components = tuple(components)
         directions = local_directions(scene, components)
-        elements, gradients = locate_gradients(scene.mesh, points)
-        samples = Samples.of(scene.mesh.elements[elements], gradients, directions[elements])
-        return cls(components, points, samples)
+        elements, inside, gradients = locate_gradients(scene.mesh, points)
+        weights = from_quadrature_points(scene.mesh.order, inside)
+        here = unit(np.einsum("dq,dqci->dci", weights, directions[elements]))
+        return cls(components, points, Samples.of(scene.mesh.elements[elements], gradients, here))
 
 
 def strains(scene: Scene, components: Any, points: np.ndarray) -> Strain:

@@ -18,6 +18,7 @@ from emulator.fem.functional import (
     point_energy,
     with_mean_dilatation,
 )
+from emulator.geometry.directions import unit
 from emulator.mechanics.kinematics import determinant
 
 if TYPE_CHECKING:
@@ -54,11 +55,9 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
     fields = {"J": mean(J), "cauchy_stress": mean(sigma), "green_lagrange": mean(E)}
     if scene.fibres is not None:
-        fibres = np.asarray(scene.fibres)
-        along = jnp.einsum("mqij,mj->mqi", F, fibres)
-        direction = mean(along)
-        fields["fibres"] = fibres
-        fields["deformed_fibres"] = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        fibres = jnp.asarray(scene.fibres_at_points)
+        along = jnp.einsum("mqij,mqj->mqi", F, fibres)
+        fields["fibres"], fields["deformed_fibres"] = unit(mean(fibres)), unit(mean(along))
         fields["fibre_stretch"] = mean(jnp.linalg.norm(along, axis=-1))
     if scene.regions is not None:
         fields["regions"] = scene.regions

@@ -80,13 +80,8 @@ def at_points(scene: Scene, function: Callable, *fields: jax.Array) -> Any:
     All points are one batch: a ``vmap`` in a ``vmap`` takes half as long again to trace.
     """
     shape = fields[0].shape[:2]
-
-    def each_point(array: jax.Array) -> jax.Array:
-        repeated = jnp.broadcast_to(array[:, None], (*shape, *array.shape[1:]))
-        return repeated.reshape(-1, *array.shape[1:])
-
-    flat = [field.reshape(-1, *field.shape[2:]) for field in fields]
-    found = jax.vmap(function)(*flat, jax.tree.map(each_point, scene.tissue))
+    flat = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), (*fields, scene.tissue))
+    found = jax.vmap(function)(*flat)
     return jax.tree.map(lambda array: array.reshape(*shape, *array.shape[1:]), found)
 
 
@@ -117,7 +112,7 @@ def at_volume(scene: Scene, theta: jax.Array) -> Callable:
     """``(change, u, gradients, weights, tissue) -> ()``: strain energy of an element, mN mm.
 
     ``change``, the volume ratio less 1, replaces the one that follows from ``u`` (a, 3) mm at every
-    point; ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3.
+    point; ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``tissue`` of its points.
     """
     at_point = point_energy(scene, theta)
 
@@ -129,7 +124,7 @@ def at_volume(scene: Scene, theta: jax.Array) -> Callable:
         at: Tissue,
     ) -> jax.Array:
         H = with_volume_change(jnp.einsum("ai,qaj->qij", u, gradients), change)
-        return jnp.vdot(weights, jax.vmap(lambda h: at_point(h, at))(H))
+        return jnp.vdot(weights, jax.vmap(at_point)(H, at))
 
     return energy
 

@@ -57,8 +57,7 @@ def discretise(mesh: Mesh) -> Discretisation:
     InputError
         A curved element that folds over itself at a quadrature point.
     """
-    element, degree = (ElementTetP1(), 1) if mesh.order == 1 else (ElementTetP2(), 2)
-    points, weights = get_quadrature(element.refdom, degree)
+    element, points, weights = _rule(mesh.order)
     values, slopes = _tabulate(element, points)
     jacobian = np.einsum("mai,qaj->mqij", mesh.nodes[mesh.elements], slopes)
     determinant = np.linalg.det(jacobian)
@@ -74,12 +73,42 @@ def discretise(mesh: Mesh) -> Discretisation:
     )
 
 
+def quadrature_points(order: int) -> np.ndarray:
+    """Barycentric coordinates (q, 4) of the quadrature points of an element of ``order`` 1 or 2."""
+    _, points, _ = _rule(order)
+    return np.column_stack([1.0 - points.sum(axis=0), *points])
+
+
+def from_quadrature_points(order: int, barycentric: np.ndarray) -> np.ndarray:
+    r"""Weights (d, q) that give a field at ``barycentric`` (d, 4) from its quadrature points.
+
+    The field is linear in an element: its corner values :math:`c` and its values at the points,
+    whose barycentric coordinates are the rows of :math:`B`, are related by :math:`v = B c`, so that
+    :math:`\lambda \cdot c = \lambda B^+ v`. With one point it is constant.
+    """
+    return np.asarray(barycentric) @ np.linalg.pinv(quadrature_points(order))
+
+
+def shapes_at(order: int, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shape functions (d, a) of an element of ``order`` at ``barycentric`` (d, 4), and derivatives.
+
+    These are (d, a, 3), in the last three coordinates.
+    """
+    return _tabulate(_rule(order)[0], np.asarray(barycentric)[:, 1:].T)
+
+
 def facet_rule(order: int, degree: int) -> FacetRule:
     """Quadrature exact for polynomials of ``degree`` on facets with 3 or 6 nodes."""
     element = ElementTriP1() if order == 1 else ElementTriP2()
     points, weights = get_quadrature(element.refdom, degree)
     values, slopes = _tabulate(element, points)
     return FacetRule(frozen_array(values), frozen_array(slopes), frozen_array(weights))
+
+
+def _rule(order: int) -> tuple[Any, np.ndarray, np.ndarray]:
+    """Reference element, quadrature points (3, q) and their weights (q,)."""
+    element, degree = (ElementTetP1(), 1) if order == 1 else (ElementTetP2(), 2)
+    return element, *get_quadrature(element.refdom, degree)
 
 
 def _tabulate(element: Any, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

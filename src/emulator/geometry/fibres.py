@@ -1,4 +1,4 @@
-r"""Fibre directions by rule, at the elements' centroids.
+r"""Fibre directions by rule, at the elements' quadrature points.
 
 The depth :math:`\tau` in the wall solves Laplace's equation, 0 on the endocardium and 1 on the
 epicardium. Its gradient is the transmural direction :math:`n`, the long axis :math:`k` then gives
@@ -9,6 +9,11 @@ the circumferential :math:`c = k \times n / |k \times n|`, and
 
 A positive angle climbs from the circumference towards the base when ``axis`` points there, going
 round anticlockwise as seen from the base: the right-handed helix of a heart's endocardium.
+
+Arrays have a direction an element, (m, 3), on linear meshes, whose elements have one point, and one
+a point, (m, q, 3), on quadratic ones. The depth is of the mesh's own order. Its gradient is taken
+at the points on a quadratic mesh; on a linear one, where an element's own is one order less
+accurate, it is averaged at the nodes first.
 """
 
 from __future__ import annotations
@@ -16,10 +21,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from skfem import Basis, ElementTetP1, MeshTet, condense, solve
-from skfem.models.poisson import laplace
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import spsolve
 
 from emulator.errors import InputError
+from emulator.geometry.directions import unit
+from emulator.geometry.discretisation import Discretisation, discretise
 from emulator.geometry.mesh import Mesh
 
 Angles = tuple[float, float]
@@ -27,14 +34,17 @@ Axis = tuple[float, float, float]
 
 
 class Directions(NamedTuple):
-    """Unit vectors (m, 3) at the elements' centroids, orthogonal to one another."""
+    """Unit vectors at the quadrature points, (m, 3) or (m, q, 3), orthogonal to one another."""
 
     fibres: np.ndarray
     sheets: np.ndarray
 
 
 class Depth(NamedTuple):
-    """Depth in a wall at the elements' centroids: ``value`` (m,), ``normal`` (m, 3) of length 1."""
+    """Depth in a wall at the quadrature points.
+
+    value : (m,) or (m, q), from 0 to 1. normal : (m, 3) or (m, q, 3) of length 1.
+    """
 
     value: np.ndarray
     normal: np.ndarray
@@ -66,7 +76,7 @@ def rule_based_fibres(
     angles: Angles = (90.0, -90.0),
     axis: Axis = (0.0, 0.0, 1.0),
 ) -> np.ndarray:
-    """The fibres (m, 3) of :func:`rule_based_directions`."""
+    """The fibres of :func:`rule_based_directions`, (m, 3) or (m, q, 3)."""
     return rule_based_directions(mesh, endocardium, epicardium, angles, axis).fibres
 
 
@@ -77,7 +87,7 @@ def biventricular_directions(
 
     Three harmonic fields, each 1 on one of lv_endocardium, rv_endocardium, epicardium and 0 on
     the other two, add up to one. Where the field of lv_endocardium is the smallest of the three,
-    the element lies in the right ventricle's free wall and depth runs from rv_endocardium to the
+    the point lies in the right ventricle's free wall and depth runs from rv_endocardium to the
     other two surfaces; elsewhere depth runs from lv_endocardium to the other two.
     The directions jump where the walls meet.
     """
@@ -91,7 +101,7 @@ def biventricular_directions(
     free = touch_left < np.minimum(touch_right, touch_outside)
     wall = Depth(
         np.where(free, right.value, left.value),
-        np.where(free[:, None], right.normal, left.normal),
+        np.where(free[..., None], right.normal, left.normal),
     )
     return turned(wall, angles, axis)
 
@@ -102,43 +112,48 @@ def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Dept
     if np.isin(low, high).any():
         between = " and ".join(f"'{name}'" for name in (*inside, *outside))
         raise InputError(f"fibres: facet sets {between} have nodes in common; there is no wall")
-    _, elements, value, normals = nodal_depth(mesh, low, high)
-    return Depth(value[elements].mean(axis=1), _unit(normals[elements].mean(axis=1)))
+    if mesh.order == 1:
+        value, normal = nodal_depth(mesh, low, high)
+        return Depth(value[mesh.elements].mean(axis=1), unit(normal[mesh.elements].mean(axis=1)))
+    grid = discretise(mesh)
+    at_nodes = _harmonic(grid, low, high)[mesh.elements]
+    value = np.einsum("qa,ma->mq", grid.values, at_nodes)
+    return Depth(value, unit(np.einsum("mqai,ma->mqi", grid.gradients, at_nodes)))
 
 
 class NodalDepth(NamedTuple):
-    """Depth in a wall at the k corner nodes of a mesh.
+    """Depth in a wall at the nodes: ``value`` (n,) from 0 to 1, ``normal`` (n, 3) of length 1."""
 
-    corners : (k,) the nodes. elements : (m, 4) rows of ``corners``.
-    value : (k,) from 0 to 1. normal : (k, 3) of length 1.
-    """
-
-    corners: np.ndarray
-    elements: np.ndarray
     value: np.ndarray
     normal: np.ndarray
 
 
 def nodal_depth(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> NodalDepth:
-    """The harmonic function that is 0 at the corner nodes ``low`` and 1 at ``high``.
+    """The harmonic function of a linear mesh that is 0 at the nodes ``low`` and 1 at ``high``.
 
     Gradients are averaged at the nodes: an element's own is one order less accurate.
     """
-    # Corner nodes alone: a quadratic mesh gives the same directions as the linear one it came from.
-    corners, elements = np.unique(mesh.elements[:, :4], return_inverse=True)
-    elements = elements.reshape(-1, 4)
-    basis = Basis(
-        MeshTet(mesh.nodes[corners].T.copy(), elements.T.copy(), sort_t=False), ElementTetP1()
-    )
-    low, high = (np.searchsorted(corners, nodes) for nodes in (low, high))
-    value = basis.zeros()
+    mesh.require_linear("the depth at its nodes")
+    grid = discretise(mesh)
+    value = _harmonic(grid, low, high)
+    slope = np.einsum("mai,ma->mi", grid.gradients[:, 0], value[mesh.elements])
+    at_nodes = np.zeros((len(mesh.nodes), 3))
+    np.add.at(at_nodes, mesh.elements, (grid.weights * slope)[:, None])
+    return NodalDepth(value, unit(at_nodes))
+
+
+def _harmonic(grid: Discretisation, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The harmonic function (n,) that is 0 at the nodes ``low`` and 1 at ``high``."""
+    nodes, count = grid.connectivity, len(grid.mesh.nodes)
+    blocks = np.einsum("mq,mqai,mqbi->mab", grid.weights, grid.gradients, grid.gradients)
+    rows, columns = (np.broadcast_to(n, blocks.shape) for n in (nodes[:, :, None], nodes[:, None]))
+    stiffness = csc_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (count, count))
+    value = np.zeros(count)
     value[high] = 1.0
-    value = solve(*condense(laplace.assemble(basis), x=value, D=np.union1d(low, high)))
-    slope = basis.interpolate(value).grad[:, :, 0].T  # (m, 3), constant in an element
-    volumes = basis.dx.sum(axis=1)
-    at_nodes = np.zeros((len(corners), 3))
-    np.add.at(at_nodes, elements, (volumes[:, None] * slope)[:, None])
-    return NodalDepth(corners, elements, value, _unit(at_nodes))
+    free = np.setdiff1d(np.arange(count), np.union1d(low, high))
+    if len(free):  # in a wall of one linear layer every node is on a surface
+        value[free] = spsolve(stiffness[free][:, free], -(stiffness[free] @ value))
+    return value
 
 
 def turned(wall: Depth, angles: Angles, axis: Axis) -> Directions:
@@ -153,27 +168,21 @@ def turned(wall: Depth, angles: Angles, axis: Axis) -> Directions:
         raise InputError(f"fibres: angles {angles}; expected two numbers in degrees")
     n, c = wall.normal, circumferential(wall.normal, k / np.linalg.norm(k))
     first, last = np.radians(angles)
-    alpha = (first + wall.value * (last - first))[:, None]
+    alpha = (first + wall.value * (last - first))[..., None]
     return Directions(np.cos(alpha) * c + np.sin(alpha) * np.cross(n, c), n)
 
 
 def circumferential(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Unit vectors (m, 3) around ``axis`` (3,) of length 1, across the ``normals`` (m, 3).
+    """Unit vectors (..., 3) around ``axis`` (3,) of length 1, across the ``normals`` (..., 3).
 
     Where a normal is along the axis, as at the apex, an arbitrary direction across it.
     """
     across = np.cross(axis, normals)
-    on_axis = np.linalg.norm(across, axis=1) < 1e-8
+    on_axis = np.linalg.norm(across, axis=-1, keepdims=True) < 1e-8
     any_way = np.cross(normals, np.eye(3)[np.argmin(np.abs(axis))])
-    return _unit(np.where(on_axis[:, None], any_way, across))
+    return unit(np.where(on_axis, any_way, across))
 
 
 def _nodes(mesh: Mesh, names: tuple[str, ...]) -> np.ndarray:
-    """Corner nodes of facet sets."""
-    return np.unique(np.concatenate([mesh.facet_set(name)[:, :3] for name in names]))
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (k, 3) at length one; a zero vector, as where depth is constant, becomes e_x."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.where(length > 0.0, vectors / np.where(length > 0.0, length, 1.0), np.eye(3)[0])
+    """Nodes of facet sets."""
+    return np.unique(np.concatenate([mesh.facet_set(name) for name in names], axis=None))

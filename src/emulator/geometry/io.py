@@ -13,9 +13,12 @@ import meshio
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.geometry.directions import across, from_elements, from_nodes
+from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.foreign import as_meshio
 from emulator.geometry.groups import MARK, own_node_sets, read_sets
 from emulator.geometry.mesh import Mesh
+from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.tetrahedra import orient
 from emulator.store import replacing
 
@@ -24,11 +27,17 @@ _KINDS = {4: ("tetra", "triangle"), 10: ("tetra10", "triangle6")}
 _LOWER = {"triangle", "triangle6", "line", "line3", "vertex"}
 # A direction whose length differs from 1 by more is refused; single precision stays far below.
 _UNIT = 1e-3
+# Cosine up to which fibres and sheets that were interpolated are made orthogonal again.
+_SKEW = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A mesh with fibres and sheets (m, 3); ``None`` where the file has none."""
+    """A mesh with fibres and sheets at its elements' quadrature points.
+
+    Both are (m, 3) on a linear mesh and (m, q, 3) on a quadratic one; ``None`` where the file has
+    none.
+    """
 
     mesh: Mesh
     fibres: np.ndarray | None = None
@@ -52,22 +61,27 @@ def read_mesh(source: str | Path | Any) -> Mesh:
     return _convert(source, directions=False).mesh
 
 
-def read_body(source: str | Path | Any) -> Body:
+def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
     """The mesh as :func:`read_mesh` returns it, with its ``fibres`` and ``sheets``.
 
-    Both are cell data, or point data averaged over each element's corners; a direction and its
-    opposite count as equal in the average.
+    Both are data of points, or of cells: (m, 3), or (m, 3 q) for all quadrature points. Point and
+    cell data are interpolated at the quadrature points (:mod:`emulator.geometry.directions`); cell
+    data of linear elements is taken as it is.
+
+    Parameters
+    ----------
+    quadratic : make a linear mesh quadratic, its edges straight.
 
     Raises
     ------
     InputError
         As :func:`read_mesh`, or a direction that is not a unit vector.
     """
-    return _convert(source, directions=True)
+    return _convert(source, directions=True, quadratic=quadratic)
 
 
 def read_fibres(path: str | Path) -> np.ndarray:
-    """Unit fibre direction (m, 3) of each element; :class:`InputError` when the file has none."""
+    """Unit fibre directions, (m, 3) or (m, q, 3); :class:`InputError` when the file has none."""
     fibres = read_body(path).fibres
     if fibres is None:
         raise InputError(f"mesh file {path}: it has no fibres; add cell data 'fibres' (m, 3)")
@@ -94,13 +108,14 @@ def write_mesh(
     fibres: np.ndarray | None = None,
     sheets: np.ndarray | None = None,
 ) -> None:
-    """Write mesh, named sets and directions (m, 3), to be read back by :func:`read_body`.
+    """Write mesh, named sets and directions, to be read back by :func:`read_body`.
 
     Parameters
     ----------
     path : ends in .vtu, .xdmf or .msh (gmsh 2.2, sets as physical groups).
     mesh : in mm.
-    fibres, sheets : unit directions of each element; not in .msh, where meshio cannot read them.
+    fibres, sheets : unit directions (m, 3) or (m, q, 3), the latter written as 3 q components; not
+        in .msh, where meshio cannot read them.
 
     Raises
     ------
@@ -109,7 +124,7 @@ def write_mesh(
         a node set and a facet set of one name; for .xdmf, facet sets of a quadratic mesh.
     """
     directions = {
-        name: np.asarray(values)
+        name: np.asarray(values).reshape(len(mesh.elements), -1)
         for name, values in (("fibres", fibres), ("sheets", sheets))
         if values is not None
     }
@@ -175,15 +190,22 @@ def _load(path: Path) -> meshio.Mesh:
         raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
 
 
-def _convert(source: str | Path | Any, *, directions: bool) -> Body:
+def _convert(source: str | Path | Any, *, directions: bool, quadratic: bool = False) -> Body:
     is_file = isinstance(source, str | Path)
     found = _load(Path(source)) if is_file else as_meshio(source)
     try:
         mesh, used = _mesh(found)
         if not directions:
             return Body(mesh)
-        fibres, sheets = (_directions(found, mesh, used, name) for name in ("fibres", "sheets"))
-        return Body(mesh, fibres, sheets)
+        order = 2 if quadratic else mesh.order
+        fibres, sheets = (
+            _directions(found, mesh, used, name, order) for name in ("fibres", "sheets")
+        )
+        if fibres is not None and sheets is not None and fibres.ndim == 3:
+            # What was orthogonal where it was given need not be where it was interpolated.
+            skew = np.abs(np.sum(fibres * sheets, axis=-1)).max()
+            sheets = across(sheets, fibres) if skew < _SKEW else sheets
+        return Body(mesh if order == mesh.order else to_quadratic(mesh), fibres, sheets)
     except InputError as error:
         name = f"mesh file {source}" if is_file else f"mesh ({type(source).__name__})"
         raise InputError(f"{name}: {str(error).removeprefix('mesh: ')}") from error
@@ -223,24 +245,29 @@ def _tetrahedra(found: meshio.Mesh) -> str:
     return solid[0]
 
 
-def _directions(found: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str) -> np.ndarray | None:
-    """Unit vectors (m, 3) from cell or point data ``name``."""
+def _directions(
+    found: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str, order: int
+) -> np.ndarray | None:
+    """Unit vectors at the points of elements of ``order`` from cell or point data ``name``."""
     kind = _KINDS[mesh.elements.shape[1]][0]
     if name in found.cell_data:
         blocks = zip(found.cells, found.cell_data[name], strict=True)
         values = np.concatenate([data for block, data in blocks if block.type == kind])
-        return _unit(values, name, "element")
+        points = len(quadrature_points(order))
+        if points > 1 and values.ndim == 2 and values.shape[1] == 3 * points:
+            at_points = _checked(values.reshape(-1, 3), name, "quadrature point")
+            return at_points.reshape(-1, points, 3)
+        of_elements = _checked(values, name, "element")
+        return of_elements if order == 1 else from_elements(mesh, of_elements)
     if name in found.point_data:
-        at_nodes = _unit(np.asarray(found.point_data[name])[used], name, "node")
-        corners = at_nodes[mesh.elements[:, :4]]
-        # A direction and its opposite are equal: turn all to the first corner's side.
-        sides = np.where(np.einsum("mai,mi->ma", corners, corners[:, 0]) < 0.0, -1.0, 1.0)
-        mean = np.einsum("mai,ma->mi", corners, sides)
-        return mean / np.linalg.norm(mean, axis=1, keepdims=True)
+        at_nodes = _checked(np.asarray(found.point_data[name])[used], name, "node")
+        at_points = from_nodes(mesh, at_nodes, order)
+        return at_points[:, 0] if order == 1 else at_points
     return None
 
 
-def _unit(values: np.ndarray, name: str, where: str) -> np.ndarray:
+def _checked(values: np.ndarray, name: str, where: str) -> np.ndarray:
+    """Vectors (k, 3) at length one; :class:`InputError` unless they are so but for round-off."""
     values = np.asarray(values, dtype=float)
     if values.ndim != 2 or values.shape[1] != 3:
         raise InputError(f"'{name}' have shape {values.shape}; expected 3 components")
@@ -315,5 +342,5 @@ def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh
 
 
 def _padded(values: np.ndarray, blocks: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
-    """Cell data of every block: ``values`` (m, 3) on the tetrahedra, zeros elsewhere."""
-    return [values, *(np.zeros((len(rows), 3)) for _, rows in blocks[1:])]
+    """Cell data of every block: ``values`` (m, k) on the tetrahedra, zeros elsewhere."""
+    return [values, *(np.zeros((len(rows), values.shape[1])) for _, rows in blocks[1:])]

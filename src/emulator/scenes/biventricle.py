@@ -7,17 +7,25 @@ from emulator.geometry.fibres import biventricular_directions
 from emulator.mechanics.laws import find_law
 from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
+from emulator.scenes.resolution import resolved
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 
+SIZES = {
+    1: {"rings": 15, "around": 32, "layers": (3, 2)},
+    2: {"rings": 10, "around": 20, "layers": (2, 1)},
+}
+"""Rings, nodes around and layers of the mesh by default."""
+
 
 def biventricle(
-    rings: int = 15,
-    around: int = 32,
-    layers: tuple[int, int] = (3, 2),
+    rings: int | None = None,
+    around: int | None = None,
+    layers: tuple[int, int] | None = None,
     angles: tuple[float, float] = HELIX,
     kappa: float = 25.0,
     right_pressure: float = 2.0 * KPA_PER_MMHG,
+    order: int = 2,
 ) -> Scene:
     """Holzapfel-Ogden ventricles, each under its own cavity pressure, their base held.
 
@@ -29,12 +37,15 @@ def biventricle(
     Parameters
     ----------
     rings, around, layers : of the mesh, as in
-        :func:`~emulator.geometry.bodies.biventricle.biventricle`.
+        :func:`~emulator.geometry.bodies.biventricle.biventricle`; by default what the elements'
+        order needs.
     angles : helix angle in degrees on the endocardia and on the epicardium.
     kappa : resistance to volume change, kPa.
     right_pressure : in the right ventricle, kPa.
+    order : of the elements; 1, linear, as published.
     """
-    mesh = geometry.biventricle(rings=rings, around=around, layers=layers)
+    made = resolved(SIZES, order, rings=rings, around=around, layers=layers)
+    mesh = geometry.biventricle(**made)
     return Scene(
         name="biventricle",
         mesh=mesh,
@@ -49,9 +60,8 @@ def biventricle(
         fibres=biventricular_directions(mesh, angles).fibres,
         origin={
             "scene": "biventricle",
-            "rings": rings,
-            "around": around,
-            "layers": list(layers),
+            **made,
+            "layers": list(made["layers"]),
             "angles": list(angles),
             "kappa": kappa,
             "right_pressure": right_pressure,

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.geometry.directions import of_elements
 from emulator.geometry.quadratic import corner_parents, to_linear
 from emulator.scenes.scene import Scene
 
@@ -116,6 +117,9 @@ def _changes(scene: Scene) -> Iterator[_Change]:
         yield "mean dilatation", {"dilatation": "pointwise"}, 'dilatation = "pointwise"'
     if scene.mesh.order == 2:
         linear = {"mesh": to_linear(scene.mesh), "dilatation": "pointwise"}
+        for kind in ("fibres", "sheets"):
+            if getattr(scene, kind) is not None:
+                linear[kind] = of_elements(getattr(scene, kind))
         yield "quadratic elements", linear, "order = 1, and no dilatation"
 
 
@@ -126,6 +130,9 @@ def _changed(scene: Scene, **changes: Any) -> Scene | None:
     regions = changes.get("regions", scene.regions)
     if not loads and not np.any(scene.held_displacement):
         return None
+    for kind, asked in (("fibres", law.fibres), ("sheets", law.sheets)):
+        changes.setdefault(kind, getattr(scene, kind))
+        changes[kind] = changes[kind] if asked else None
     takers = set(law.parameters) | {q.name for load in loads for q in load.quantities}
     if regions is not None:
         takers |= {name for name in scene.quantities if name.startswith("stiffness_")}
@@ -135,8 +142,6 @@ def _changed(scene: Scene, **changes: Any) -> Scene | None:
             **changes,
             parameters=tuple(p for p in scene.parameters if p.name in takers),
             constants={name: v for name, v in scene.constants.items() if name in takers},
-            fibres=scene.fibres if law.fibres else None,
-            sheets=scene.sheets if law.sheets else None,
             origin={},
         )
     except InputError:

@@ -199,13 +199,10 @@ def _body(mesh_path: Path, file: SceneFile, law: Law, source: Source) -> Parts:
     """The mesh with the sets the file adds, and directions if the law or the file wants any."""
     with source.at("mesh"):
         body = _read(mesh_path, file, law)
-    mesh = body.mesh
-    if file.order is not None and file.order != mesh.order:
-        if mesh.order == 2:
-            problem = f"order = 1; mesh file {mesh_path.name} has quadratic tetrahedra, expected 2"
-            raise source.error(problem, ("order",))
-        mesh = to_quadratic(mesh)
-    mesh = _with_planes(mesh, file, source)
+    if file.order is not None and file.order < body.mesh.order:
+        problem = f"order = 1; mesh file {mesh_path.name} has quadratic tetrahedra, expected 2"
+        raise source.error(problem, ("order",))
+    mesh = _with_planes(body.mesh, file, source)
     fibres, sheets = body.fibres, body.sheets
     if file.fibres is not None:
         with source.at("fibres", table=("fibres",)):
@@ -216,8 +213,9 @@ def _body(mesh_path: Path, file: SceneFile, law: Law, source: Source) -> Parts:
 def _read(mesh_path: Path, file: SceneFile, law: Law) -> Body:
     """The mesh file, with the directions the law needs unless a rule gives them."""
     if not law.fibres or file.fibres is not None:
-        return Body(read_mesh(mesh_path))
-    body = read_body(mesh_path)
+        mesh = read_mesh(mesh_path)
+        return Body(to_quadratic(mesh) if file.order == 2 and mesh.order == 1 else mesh)
+    body = read_body(mesh_path, quadratic=file.order == 2)
     for kind, needed, found in (
         ("fibres", law.fibres, body.fibres),
         ("sheets", law.sheets, body.sheets),
@@ -225,7 +223,7 @@ def _read(mesh_path: Path, file: SceneFile, law: Law) -> Body:
         if needed and found is None:
             raise InputError(
                 f"law '{law.name}' needs {kind}, and mesh file {mesh_path.name} has none; give it "
-                f"cell data '{kind}' (m, 3), or this file a table [fibres]"
+                f"cell or point data '{kind}' of 3 components, or this file a table [fibres]"
             )
     return body
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import ParameterSpace
 
@@ -79,7 +80,7 @@ def identity_of(
     Parameters
     ----------
     prescribed : where the displacement is known (n, 3) bool, and its value (n, 3) mm.
-    directions : (m, 3) unit vectors by name, or None.
+    directions : (m, 3) or (m, q, 3) unit vectors by name, or None.
     regions : (m,) labels, or None.
     facet_sets : names of the sets under a load or a support.
     """
@@ -92,7 +93,11 @@ def identity_of(
         indices["regions"] = regions[order]
     return Identity(
         lengths={"nodes": mesh.nodes, "displacement": displacement},
-        directions={name: v[order] for name, v in directions.items() if v is not None},
+        directions={
+            name: _points_in_order(mesh, v)[order]
+            for name, v in directions.items()
+            if v is not None
+        },
         indices=indices,
         description=description,
     )
@@ -114,6 +119,16 @@ def _close(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray], tolerance: 
         a[name].shape == b[name].shape and np.allclose(a[name], b[name], rtol=0.0, atol=tolerance)
         for name in a
     )
+
+
+def _points_in_order(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
+    """Directions (m, 3) or (m, q, 3), points in an order that does not depend on the corners'."""
+    if directions.ndim == 2:
+        return directions
+    ranks = np.argsort(mesh.corners, axis=1)
+    barycentric = quadrature_points(mesh.order)[:, ranks].transpose(1, 0, 2)  # (m, q, 4)
+    order = np.argsort(barycentric @ [1.0, 1e2, 1e4, 1e6], axis=1, kind="stable")
+    return np.take_along_axis(directions, order[:, :, None], axis=1)
 
 
 def _as_set(facets: np.ndarray) -> np.ndarray:

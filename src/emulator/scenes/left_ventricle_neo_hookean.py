@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.mechanics.laws import find_law
-from emulator.scenes.left_ventricle import PRESSURE
+from emulator.scenes.left_ventricle import PRESSURE, SIZES
 from emulator.scenes.loads import CavityPressure
 from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.resolution import resolved
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 
 
-def left_ventricle_neo_hookean(rings: int = 15, around: int = 30, layers: int = 3) -> Scene:
+def left_ventricle_neo_hookean(
+    rings: int | None = None,
+    around: int | None = None,
+    layers: int | None = None,
+    order: int = 2,
+    grading: float | None = None,
+) -> Scene:
     """Neo-Hookean ventricle under cavity pressure, its base held, without fibres.
 
     theta = (mu, lam, pressure). Geometry as in
@@ -20,12 +27,12 @@ def left_ventricle_neo_hookean(rings: int = 15, around: int = 30, layers: int = 
 
     Parameters
     ----------
-    rings, around, layers : of the mesh, as in
-        :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`; the default has 1564 nodes.
+    rings, around, layers, order, grading : of the mesh, as in ``left_ventricle``.
     """
+    made = resolved(SIZES, order, rings=rings, around=around, layers=layers, grading=grading)
     return Scene(
         name="left_ventricle_neo_hookean",
-        mesh=human_ventricle(rings, around, layers),
+        mesh=human_ventricle(**made),
         law=find_law("neo_hookean"),
         parameters=(
             Parameter("mu", "kPa", 4.0, 12.0, "log"),
@@ -34,10 +41,5 @@ def left_ventricle_neo_hookean(rings: int = 15, around: int = 30, layers: int = 
         ),
         loads=(CavityPressure("endocardium"),),
         supports=(Support("base"),),
-        origin={
-            "scene": "left_ventricle_neo_hookean",
-            "rings": rings,
-            "around": around,
-            "layers": layers,
-        },
+        origin={"scene": "left_ventricle_neo_hookean", **made},
     )

@@ -16,11 +16,13 @@ STIFFNESSES = tuple(
 
 
 def left_ventricle_segments(
-    rings: int = 15,
-    around: int = 30,
-    layers: int = 3,
+    rings: int | None = None,
+    around: int | None = None,
+    layers: int | None = None,
     angles: tuple[float, float] = HELIX,
     kappa: float = 25.0,
+    order: int = 2,
+    grading: float | None = None,
 ) -> Scene:
     """:func:`~emulator.scenes.left_ventricle.left_ventricle` with a stiffness for each segment.
 
@@ -31,9 +33,9 @@ def left_ventricle_segments(
 
     Parameters
     ----------
-    rings, around, layers, angles, kappa : as in ``left_ventricle``.
+    rings, around, layers, angles, kappa, order, grading : as in ``left_ventricle``.
     """
-    plain = left_ventricle(rings, around, layers, angles, kappa)
+    plain = left_ventricle(rings, around, layers, angles, kappa, order=order, grading=grading)
     centre = {p.name: float((p.low * p.high) ** 0.5) for p in MYOCARDIUM}
     return replace(
         plain,

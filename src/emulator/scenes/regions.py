@@ -1,4 +1,4 @@
-r"""Data that differ between elements: tissue directions, and regions of different stiffness.
+r"""Data that differ from place to place: tissue directions, regions of different stiffness.
 
 In region k of a scene that has regions, the law's energy is multiplied by the factor :math:`s_k`,
 
@@ -25,10 +25,10 @@ from emulator.mechanics.quantity import Quantity, number
 
 
 class Tissue(NamedTuple):
-    """Material data of one element, or stacked over elements with a leading axis m.
+    """Material data of one point, or stacked over elements and their points, axes (m, q).
 
     directions : fibre (3,), or fibre and sheet (2, 3); None without fibres.
-    region : index of the element's region among the factors, (); None without regions.
+    region : index of its region among the factors, (); None without regions.
     """
 
     directions: jax.Array | None = None

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.discretisation import Discretisation, discretise
+from emulator.geometry.discretisation import Discretisation, discretise, quadrature_points
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
@@ -42,11 +42,13 @@ class Scene(Shown):
     loads : external loads; may be empty, when the supports alone deform the body.
     supports : prescribed displacements and springs.
     constants : parameters of the law and the loads that do not vary.
-    fibres : (m, 3) unit fibre direction of each element, for laws that read it.
+    fibres : unit fibre directions, for laws that read them: at every quadrature point (m, q, 3),
+        or of each element (m, 3). Constant in an element, they cost a quadratic one most of its
+        accuracy.
     origin : how a built-in scene was made: its name and arguments, written to scene files.
     dilatation : ``pointwise``, or ``mean`` to use the mean volume change of each element, which
         keeps quadratic elements from locking when the material is nearly incompressible.
-    sheets : (m, 3) unit sheet direction of each element, across its fibre, for laws that read it.
+    sheets : unit sheet directions across the fibres, likewise.
     regions : (m,) whole number of the region each element lies in. Region 3 takes a parameter or a
         constant ``stiffness_3``, by which the law's energy there is multiplied, except its
         volumetric part; see :mod:`emulator.scenes.regions`.
@@ -122,16 +124,20 @@ class Scene(Shown):
             if not asked:
                 raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no {kind}")
             vectors = frozen_array(given)
-            object.__setattr__(self, kind, vectors)
-            if vectors.shape != (len(self.mesh.elements), 3):
+            count, points = len(self.mesh.elements), len(quadrature_points(self.mesh.order))
+            if vectors.shape not in ((count, 3), (count, points, 3)):
+                at_points = f" or ({count}, {points}, 3)" if points > 1 else ""
                 raise InputError(
                     f"scene '{self.name}': {kind} have shape {vectors.shape}; "
-                    f"expected ({len(self.mesh.elements)}, 3)"
+                    f"expected ({count}, 3){at_points}"
                 )
-            if not np.allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-6):
+            if not np.allclose(np.linalg.norm(vectors, axis=-1), 1.0, atol=1e-6):
                 raise InputError(f"scene '{self.name}': {kind} are not unit vectors")
+            # Linear elements have one point each: one form, so that their fingerprints agree.
+            object.__setattr__(self, kind, vectors.reshape(-1, 3) if points == 1 else vectors)
         if self.fibres is not None and self.sheets is not None:
-            along = np.abs(np.einsum("mi,mi->m", self.fibres, self.sheets)).max()
+            fibres, sheets = self.fibres_at_points, self._at_points(self.sheets)
+            along = np.abs(np.einsum("mqi,mqi->mq", fibres, sheets)).max()
             if not along < 1e-6:
                 raise InputError(
                     f"scene '{self.name}': sheets are not across the fibres (cosine {along:.2g})"
@@ -253,21 +259,33 @@ class Scene(Shown):
         """Shape functions and quadrature of the mesh."""
         return discretise(self.mesh)
 
-    @cached_property
-    def directions(self) -> np.ndarray | None:
-        """Directions of each element: fibre (m, 3), or fibre and sheet (m, 2, 3); or None."""
-        if self.fibres is None or self.sheets is None:
-            return self.fibres
-        return frozen_array(np.stack([self.fibres, self.sheets], axis=1))
+    def _at_points(self, of_elements: np.ndarray) -> np.ndarray:
+        """Directions (m, 3) or (m, q, 3) at every quadrature point, (m, q, 3)."""
+        points = len(quadrature_points(self.mesh.order))
+        wide = of_elements if of_elements.ndim == 3 else of_elements[:, None]
+        return np.broadcast_to(wide, (len(wide), points, 3))
+
+    @property
+    def fibres_at_points(self) -> np.ndarray:
+        """Unit fibre directions at the quadrature points, (m, q, 3); of a scene with fibres."""
+        if self.fibres is None:
+            raise InputError(f"scene '{self.name}' has no fibres")
+        return self._at_points(self.fibres)
 
     @cached_property
     def tissue(self) -> Tissue:
-        """Material data stacked over the elements, arrays with leading axis m."""
-        region = None
+        """Material data stacked over elements and points, arrays with leading axes (m, q)."""
+        directions = region = None
+        if self.fibres is not None:
+            directions = self.fibres_at_points
+        if self.fibres is not None and self.sheets is not None:
+            directions = np.stack([directions, self._at_points(self.sheets)], axis=2)
         if self.regions is not None:
-            region = np.unique(self.regions, return_inverse=True)[1]
+            points = len(quadrature_points(self.mesh.order))
+            index = np.unique(self.regions, return_inverse=True)[1]
+            region = np.broadcast_to(index[:, None], (len(index), points))
         # NumPy arrays: JAX arrays made inside jit would be tracers, and this is cached.
-        return Tissue(cast(Any, self.directions), cast(Any, region))
+        return Tissue(cast(Any, directions), cast(Any, region))
 
     @cached_property
     def prescribed(self) -> tuple[np.ndarray, np.ndarray]:

@@ -6,9 +6,11 @@ import numpy as np
 
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
+from emulator.scenes.beams import BEAM, SIZES, Cells
 from emulator.scenes.left_ventricle import MYOCARDIUM
 from emulator.scenes.loads import Traction
 from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.resolution import resolved
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 
@@ -17,12 +19,14 @@ def _beam(
     name: str,
     law: str,
     parameters: tuple[Parameter, ...],
-    cells: tuple[int, int, int],
+    cells: Cells | None,
     traction: float,
     fibre_angle: float,
     kappa: float,
+    order: int,
 ) -> Scene:
-    mesh = box((100.0, 10.0, 10.0), cells)
+    made = resolved(SIZES, order, cells=cells)
+    mesh = box(BEAM, **made)
     angle = np.radians(fibre_angle)
     return Scene(
         name=name,
@@ -35,7 +39,8 @@ def _beam(
         fibres=np.tile([np.cos(angle), np.sin(angle), 0.0], (len(mesh.elements), 1)),
         origin={
             "scene": name,
-            "cells": list(cells),
+            "cells": list(made["cells"]),
+            "order": order,
             "traction": traction,
             "fibre_angle": fibre_angle,
             "kappa": kappa,
@@ -44,10 +49,11 @@ def _beam(
 
 
 def traction_beam_holzapfel_ogden(
-    cells: tuple[int, int, int] = (12, 4, 5),
+    cells: Cells | None = None,
     traction: float = 0.01,
     fibre_angle: float = 0.0,
     kappa: float = 25.0,
+    order: int = 2,
 ) -> Scene:
     """A 100 x 10 x 10 mm Holzapfel-Ogden beam, one end held, the other pulled up.
 
@@ -57,20 +63,22 @@ def traction_beam_holzapfel_ogden(
 
     Parameters
     ----------
-    cells : along x, y, z.
+    cells : along x, y, z; by default what the elements' order needs.
     traction : along z on the free end, per reference area, kPa.
     fibre_angle : degrees from the beam's axis x towards y; any but 0 and 90 makes it twist.
     kappa : resistance to volume change, kPa.
+    order : of the elements.
     """
     name = "traction_beam_holzapfel_ogden"
-    return _beam(name, "holzapfel_ogden", MYOCARDIUM, cells, traction, fibre_angle, kappa)
+    return _beam(name, "holzapfel_ogden", MYOCARDIUM, cells, traction, fibre_angle, kappa, order)
 
 
 def traction_beam_guccione(
-    cells: tuple[int, int, int] = (12, 4, 5),
+    cells: Cells | None = None,
     traction: float = 0.02,
     fibre_angle: float = 0.0,
     kappa: float = 50.0,
+    order: int = 2,
 ) -> Scene:
     """A 100 x 10 x 10 mm Guccione beam, one end held, the other pulled up.
 
@@ -80,10 +88,11 @@ def traction_beam_guccione(
 
     Parameters
     ----------
-    cells : along x, y, z.
+    cells : along x, y, z; by default what the elements' order needs.
     traction : along z on the free end, per reference area, kPa.
     fibre_angle : degrees from the beam's axis x towards y; any but 0 and 90 makes it twist.
     kappa : resistance to volume change, kPa.
+    order : of the elements.
     """
     parameters = (
         Parameter("C", "kPa", 1.0, 4.0, "log"),
@@ -92,4 +101,4 @@ def traction_beam_guccione(
         Parameter("b_fs", "", 2.0, 8.0, "log"),
     )
     name = "traction_beam_guccione"
-    return _beam(name, "guccione", parameters, cells, traction, fibre_angle, kappa)
+    return _beam(name, "guccione", parameters, cells, traction, fibre_angle, kappa, order)

@@ -7,6 +7,7 @@ import numpy as np
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.resolution import resolved
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 
@@ -21,7 +22,13 @@ def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
     return displacement
 
 
-def twisting_cube(cells: int = 6, edge: float = 10.0, degrees: float = 60.0) -> Scene:
+SIZES = {1: {"cells": 6}, 2: {"cells": 4}}
+"""Cells along each edge by default."""
+
+
+def twisting_cube(
+    cells: int | None = None, edge: float = 10.0, degrees: float = 60.0, order: int = 2
+) -> Scene:
     """A cube clamped at its left face, its right face twisted about the x axis.
 
     Each point of the right face moves halfway along the chord of a rigid rotation by ``degrees``,
@@ -29,11 +36,13 @@ def twisting_cube(cells: int = 6, edge: float = 10.0, degrees: float = 60.0) -> 
 
     Parameters
     ----------
-    cells : cells along each edge.
+    cells : along each edge; by default what the elements' order needs.
     edge : length in mm.
     degrees : angle of the rotation whose half chord is prescribed.
+    order : of the elements; 1 as published.
     """
-    mesh = box((edge,) * 3, (cells,) * 3)
+    count = resolved(SIZES, order, cells=cells)["cells"]
+    mesh = box((edge,) * 3, (count,) * 3, order)
     right = mesh.nodes[mesh.node_set("right")]
     displacement = 0.5 * twist(right, np.full(3, edge / 2.0), degrees)
     return Scene(
@@ -45,5 +54,11 @@ def twisting_cube(cells: int = 6, edge: float = 10.0, degrees: float = 60.0) -> 
             Parameter("nu", "", 0.1, 0.4, "log"),
         ),
         supports=(Support("left"), Support("right", displacement)),
-        origin={"scene": "twisting_cube", "cells": cells, "edge": edge, "degrees": degrees},
+        origin={
+            "scene": "twisting_cube",
+            "cells": count,
+            "edge": edge,
+            "degrees": degrees,
+            "order": order,
+        },
     )

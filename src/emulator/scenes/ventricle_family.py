@@ -62,6 +62,7 @@ def _arguments(point: np.ndarray) -> dict[str, Any]:
         "rings": at["rings"],
         "around": at["around"],
         "layers": at["layers"],
+        "order": 1,
         "angles": (at["endocardium"], at["epicardium"]),
         "wall": (radius, length, *outside, at["truncation"] * length),
         "thicker": (at["thicker"], at["towards"]),

@@ -6,8 +6,8 @@ import numpy as np
 from skfem import MeshTet
 
 from emulator.errors import InputError
+from emulator.geometry.bodies.body import body
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import boundary_facets, orient
 
 _FACES = (
     ("left", 0, 0),
@@ -19,13 +19,14 @@ _FACES = (
 )
 
 
-def box(lengths: tuple[float, float, float], cells: tuple[int, int, int]) -> Mesh:
+def box(lengths: tuple[float, float, float], cells: tuple[int, int, int], order: int = 1) -> Mesh:
     """Structured box ``[0, lengths]`` of six tetrahedra a cell, nodes numbered x first, then y, z.
 
     Parameters
     ----------
     lengths : edge lengths in mm.
     cells : number of cells along x, y, z.
+    order : 1, or 2 for quadratic elements.
 
     Returns
     -------
@@ -38,14 +39,11 @@ def box(lengths: tuple[float, float, float], cells: tuple[int, int, int]) -> Mes
     ]
     grid = MeshTet.init_tensor(*axes)
     nodes, elements = grid.p.T, grid.t.T
-    order = np.lexsort(nodes.T)  # the last key, z, is the slowest
-    rank = np.argsort(order)
-    nodes, elements = nodes[order], rank[elements]
+    listed = np.lexsort(nodes.T)  # the last key, z, is the slowest
+    rank = np.argsort(listed)
+    nodes, elements = nodes[listed], rank[elements]
     sets = {
         name: np.flatnonzero(nodes[:, axis] == (axes[axis][0], axes[axis][-1])[end])
         for name, axis, end in _FACES
     }
-    elements = orient(nodes, elements)
-    surface = boundary_facets(elements)
-    facets = {name: surface[np.isin(surface, inside).all(axis=1)] for name, inside in sets.items()}
-    return Mesh(nodes, elements, sets, facets)
+    return body(nodes, elements, sets, sets, None, order)

@@ -94,6 +94,7 @@ def truncated_ellipsoid(
     layers: int,
     order: int = 1,
     thicker: tuple[float, float] = (0.0, 0.0),
+    grading: float = 1.0,
 ) -> Mesh:
     r"""The wall, meshed by prisms through a disc of rings; each prism is cut in three.
 
@@ -107,6 +108,8 @@ def truncated_ellipsoid(
     thicker : by which fraction the wall is thicker at the base towards an angle :math:`\phi_0`, in
         degrees; at ``t`` = 1 lies what would lie at
         :math:`t = 1 + \alpha\, r \cos(\phi - \phi_0)`.
+    grading : ring k of n lies at :math:`r = 1 - (1 - k/n)^g`. Above 1, rings are closer at the
+        base, where a held wall bends: 1.5 is worth a third of the nodes.
 
     Returns
     -------
@@ -115,7 +118,10 @@ def truncated_ellipsoid(
     """
     if layers < 1:
         raise InputError(f"ellipsoid: {layers} layers through the wall; expected at least 1")
+    if not 0.0 < grading < np.inf:
+        raise InputError(f"ellipsoid: grading {grading} of the rings; expected above 0")
     radius, angle, triangles = disc(rings, around)
+    radius = 1.0 - (1.0 - radius) ** grading
     r, phi = np.tile(radius, layers + 1), np.tile(angle, layers + 1)
     t = np.repeat(np.arange(layers + 1) / layers, len(radius))
     depth = t * _thickness(r, phi, *thicker)
@@ -170,6 +176,8 @@ def land_ventricle(rings: int = 10, around: int = 24, layers: int = 2, order: in
     return truncated_ellipsoid(LAND, rings, around, layers, order)
 
 
-def human_ventricle(rings: int = 15, around: int = 30, layers: int = 3, order: int = 1) -> Mesh:
+def human_ventricle(
+    rings: int = 15, around: int = 30, layers: int = 3, order: int = 1, grading: float = 1.0
+) -> Mesh:
     """A human-sized left ventricle for daily use: :func:`truncated_ellipsoid` of ``HUMAN``."""
-    return truncated_ellipsoid(HUMAN, rings, around, layers, order)
+    return truncated_ellipsoid(HUMAN, rings, around, layers, order, grading=grading)

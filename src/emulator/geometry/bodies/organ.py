@@ -16,6 +16,7 @@ from emulator.errors import InputError
 from emulator.geometry.bodies.ball import ball, ball_midpoints
 from emulator.geometry.bodies.body import body
 from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import boundary_facets, orient
 
 # One lobe is thick and high, the other tapers; the underside is hollow.
 _TAPER_Y, _TAPER_Z, _BEND = 0.35, 0.5, 0.3
@@ -25,7 +26,11 @@ _LIGAMENT_HALF_ANGLE = np.radians(32.0)
 
 
 def organ(
-    half_axes: tuple[float, float, float] = (75.0, 45.0, 38.0), shells: int = 6, order: int = 1
+    half_axes: tuple[float, float, float] = (75.0, 45.0, 38.0),
+    shells: int = 6,
+    order: int = 1,
+    clustering: float = 0.0,
+    ligament_shells: int = 6,
 ) -> Mesh:
     """A liver-like body; its dimensions are our choice.
 
@@ -34,10 +39,15 @@ def organ(
     half_axes : a, b, c in mm.
     shells : of the ball that is mapped; 6 give 923 nodes.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the true surface.
+    clustering : above 0, below 1: elements at the ligament are smaller, by (1 - c) / (1 + c), and
+        larger on the other side, none distorted: the ball is moved by a Moebius map.
+    ligament_shells : the ligament is made of facets of the mesh of this many shells, whatever
+        ``shells`` is. Meshes of a multiple cover it exactly; solutions of others do not converge to
+        the same limit.
 
     Returns
     -------
-    Mesh with node set ligament, a patch of the surface to hold, and facet set surface.
+    Mesh with node set and facet set ligament, a patch of the surface to hold, and facet set surface.
     """
     if not 0.0 < min(half_axes) <= max(half_axes) < np.inf:
         raise InputError(f"organ: half axes {half_axes} mm must be positive and finite")
@@ -45,14 +55,20 @@ def organ(
         raise InputError(f"organ: {shells} shells; expected at least 2")
     nodes, elements = ball(shells)
     surface = np.flatnonzero(np.linalg.norm(nodes, axis=1) > 1.0 - 0.5 / shells)
-    held = nodes[surface] @ _LIGAMENT_DIRECTION > np.cos(_LIGAMENT_HALF_ANGLE)
+    if not 0.0 <= clustering < 1.0:
+        raise InputError(f"organ: clustering {clustering}; expected from 0 to below 1")
+    held = _in_ligament(nodes[surface], ligament_shells, clustering)
     middle = ball_midpoints(nodes)
+
+    def mapped(points: np.ndarray) -> np.ndarray:
+        return _shape(_clustered(points, clustering), half_axes)
+
     return body(
-        _shape(nodes, half_axes),
+        mapped(nodes),
         elements,
-        {"surface": surface},
+        {"surface": surface, "ligament": surface[held]},
         {"ligament": surface[held]},
-        lambda edges: _shape(middle(edges), half_axes),
+        lambda edges: mapped(middle(edges)),
         order,
     )
 
@@ -61,6 +77,31 @@ def volume(half_axes: tuple[float, float, float]) -> float:
     """Volume of the true body in mm3."""
     a, b, c = half_axes
     return 4.0 / 3.0 * np.pi * a * b * c * (1.0 + _TAPER_Y * _TAPER_Z / 5.0)
+
+
+def _in_ligament(directions: np.ndarray, shells: int, clustering: float) -> np.ndarray:
+    """Which unit vectors (k, 3) of the ball before its map meet the ligament, (k,) bool."""
+    nodes, elements = ball(shells)
+    triangles = boundary_facets(orient(nodes, elements))
+    inside = _clustered(nodes, clustering) @ _LIGAMENT_DIRECTION > np.cos(_LIGAMENT_HALF_ANGLE)
+    corners = nodes[triangles[inside[triangles].all(axis=1)]]  # (t, 3, 3)
+    # A vector meets a triangle where it is a sum of its corners with no negative weight.
+    weights = np.einsum("ki,tij->tkj", directions, np.linalg.inv(corners))
+    return (weights > -1e-9).all(axis=2).any(axis=0)
+
+
+def _clustered(points: np.ndarray, clustering: float) -> np.ndarray:
+    r"""The Moebius map of the unit ball that takes its centre to :math:`a = c\, d`, (k, 3).
+
+    .. math:: T(x) = \frac{(1 + 2 a \cdot x + |x|^2)\, a + (1 - |a|^2)\, x}
+                          {1 + 2 a \cdot x + |a|^2 |x|^2}
+
+    with the ligament's direction :math:`d`. It keeps all angles (Ratcliffe 2019, Section 4.5).
+    """
+    a = clustering * _LIGAMENT_DIRECTION
+    along, square = 2.0 * (points @ a)[:, None], np.sum(points**2, axis=1)[:, None]
+    moved = (1.0 + along + square) * a + (1.0 - clustering**2) * points
+    return moved / (1.0 + along + clustering**2 * square)
 
 
 def _shape(points: np.ndarray, half_axes: tuple[float, float, float]) -> np.ndarray:

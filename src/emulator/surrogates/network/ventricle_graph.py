@@ -131,9 +131,8 @@ def _along_fibres(body: Ventricle, fibres: np.ndarray) -> np.ndarray:
 
 def _fibre_tensor(body: Ventricle, scene: Scene) -> np.ndarray:
     """Mean of f f^T over the elements at each node, weighted by volume, (n, 3, 3)."""
-    assert scene.fibres is not None, "checked before"
-    elements, weights = scene.mesh.elements, scene.discretisation.weights.sum(axis=1)
-    each = weights[:, None, None] * scene.fibres[:, :, None] * scene.fibres[:, None, :]
+    elements, fibres = scene.mesh.elements, scene.fibres_at_points
+    each = np.einsum("mq,mqi,mqj->mij", scene.discretisation.weights, fibres, fibres)
     total = np.zeros((len(body.depth), 3, 3))
     np.add.at(total, elements, each[:, None])
     return total / np.trace(total, axis1=1, axis2=2)[:, None, None]
