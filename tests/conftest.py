@@ -33,19 +33,19 @@ def published() -> Path:
 @pytest.fixture(scope="session")
 def beam() -> Scene:
     """A coarse once-clamped beam: 45 nodes, 96 tetrahedra."""
-    return em.scenes.once_clamped_beam(cells=(4, 2, 2))
+    return em.scenes.once_clamped_beam(cells=(4, 2, 2), order=1)
 
 
 @pytest.fixture(scope="session")
 def cube() -> Scene:
     """A coarse twisting cube."""
-    return em.scenes.twisting_cube(cells=3)
+    return em.scenes.twisting_cube(cells=3, order=1)
 
 
 @pytest.fixture(scope="session")
 def ventricle() -> Scene:
     """A coarse left ventricle: one layer."""
-    return em.scenes.left_ventricle(rings=4, around=8, layers=1)
+    return em.scenes.left_ventricle(rings=4, around=8, layers=1, order=1)
 
 
 @pytest.fixture(scope="session")

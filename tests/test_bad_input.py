@@ -27,7 +27,7 @@ from emulator.training.budget import Budget
 from emulator.training.plan import Plan
 from linear_support import linear_forward
 
-BEAM = em.scenes.once_clamped_beam(cells=(4, 2, 2))
+BEAM = em.scenes.once_clamped_beam(cells=(4, 2, 2), order=1)
 OBSERVE = cal.nodal_displacements(BEAM, [3, 11, 20, 30])
 FREE_END = em.scenes.once_clamped_beam().mesh.node_set("right").tolist()
 NODES = "node,ux,uy,uz\n"

@@ -67,7 +67,7 @@ KIND = ForwardKind(
 @pytest.fixture(scope="module", autouse=True)
 def setting():
     """The one line of the registry; and a coarse beam under the built-in one's name."""
-    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1))
+    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(FORWARD_MAPS, KIND.name, KIND)
         patch.setitem(registry.BUILT_IN, SCENE, lambda **_: scene)

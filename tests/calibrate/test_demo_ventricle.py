@@ -18,7 +18,7 @@ from emulator.geometry.cavity import Cavity
 from emulator.scenes import registry
 
 # One scene for the whole module, so that its simulator is compiled once.
-COARSE = cache(partial(em.scenes.left_ventricle, rings=4, around=8, layers=1))
+COARSE = cache(partial(em.scenes.left_ventricle, rings=4, around=8, layers=1, order=1))
 RUN = replace(
     demos.VENTRICLE,
     forward="reduced",

@@ -20,7 +20,7 @@ from network_support import untrained
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1))
+    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
     centre = np.asarray(em.Simulator(scene)(scene.centre))
     series = constant(np.full(2, 0.5), centre)
     path = tmp_path_factory.mktemp("emulator")

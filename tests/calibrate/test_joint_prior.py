@@ -167,7 +167,7 @@ def test_the_population_of_fits_is_found_again():
 
 
 def test_the_default_ventricles_fit_the_scene():
-    scene = left_ventricle(rings=4, around=8, layers=1)
+    scene = left_ventricle(rings=4, around=8, layers=1, order=1)
     population = POPULATIONS["ventricles"]
     prior = population.prior(scene)
     assert set(prior) == {"a", "b", "a_f", "b_f"}  # the pressure keeps the box

@@ -32,7 +32,7 @@ RUN = Run(
 @pytest.fixture(scope="module")
 def infer_once(tmp_path_factory):
     """A result with a reduced model, on a coarse beam under the built-in one's name."""
-    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1))
+    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry.BUILT_IN, SCENE, lambda **_: scene)
         folder = tmp_path_factory.mktemp("result")

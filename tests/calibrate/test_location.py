@@ -40,7 +40,7 @@ def test_linear_meshes_against_barycentric_coordinates(ventricle):
 @pytest.fixture(scope="module")
 def curved():
     """A ventricle of quadratic elements with curved walls."""
-    scene = em.scenes.left_ventricle_neo_hookean(rings=4, around=8, layers=1)
+    scene = em.scenes.left_ventricle_neo_hookean(rings=4, around=8, layers=1, order=1)
     return replace(scene, mesh=human_ventricle(4, 8, 1, order=2))
 
 

@@ -33,7 +33,7 @@ EVERY = tuple(COMPONENTS)
 @pytest.fixture(scope="module")
 def curved():
     """A ventricle of quadratic elements with curved walls, and with fibres."""
-    scene = em.scenes.left_ventricle(rings=4, around=8, layers=1)
+    scene = em.scenes.left_ventricle(rings=4, around=8, layers=1, order=1)
     return replace(scene, mesh=human_ventricle(4, 8, 1, order=2))
 
 

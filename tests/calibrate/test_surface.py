@@ -24,7 +24,7 @@ from emulator.geometry.bodies.ellipsoid import human_ventricle
 
 @pytest.fixture(scope="module")
 def curved():
-    scene = em.scenes.left_ventricle_neo_hookean(rings=4, around=8, layers=1)
+    scene = em.scenes.left_ventricle_neo_hookean(rings=4, around=8, layers=1, order=1)
     return replace(scene, mesh=human_ventricle(4, 8, 1, order=2))
 
 

@@ -33,8 +33,8 @@ SIZES = {
     1: {"rings": 15, "around": 30, "layers": 3, "grading": 1.0},
     2: {"rings": 8, "around": 28, "layers": 3, "grading": 1.5},
 }
-"""Mesh by default, as in :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`: 1564 linear
-nodes, 4627 quadratic ones."""
+"""Mesh by default, as in :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`: 1564
+linear nodes, 4627 quadratic ones."""
 
 
 def left_ventricle(

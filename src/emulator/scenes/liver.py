@@ -14,8 +14,8 @@ SIZES = {
     1: {"shells": 6, "clustering": 0.0, "ligament_shells": 6, "ligament": None},
     2: {"shells": 5, "clustering": 0.5, "ligament_shells": 5, "ligament": 2.0},
 }
-"""Mesh by default, as in :func:`~emulator.geometry.bodies.organ.organ`, and the ligament's stiffness:
-923 linear nodes, 3871 quadratic ones."""
+"""Mesh by default, as in :func:`~emulator.geometry.bodies.organ.organ`, and the ligament's
+stiffness: 923 linear nodes, 3871 quadratic ones."""
 
 
 def liver(

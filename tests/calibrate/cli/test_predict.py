@@ -72,7 +72,7 @@ def test_bad_input(capsys, words, message):
 
 
 def test_cavities():
-    scene = em.scenes.left_ventricle(rings=2, around=6, layers=1)
+    scene = em.scenes.left_ventricle(rings=2, around=6, layers=1, order=1)
     u = jnp.zeros(scene.held.shape)
     cavity = Cavity(scene.mesh, "endocardium")
     volume = float(cavity(u[cavity.nodes]))

@@ -44,7 +44,7 @@ def answer(capsys, *words):
 @pytest.mark.slow
 def test_train_evaluate_infer_certify(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    write_mesh("ventricle.vtu", em.scenes.left_ventricle(rings=4, around=8, layers=1).mesh)
+    write_mesh("ventricle.vtu", em.scenes.left_ventricle(rings=4, around=8, layers=1, order=1).mesh)
     (tmp_path / "p2.toml").write_text(SCENE)
     train = ("train", "p2.toml", "--recipe", "mechanics", "--simulations", 12, "--out", "emulator")
     assert answer(capsys, *train)[0] == 0

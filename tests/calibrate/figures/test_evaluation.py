@@ -72,7 +72,7 @@ def test_a_map_of_two_parameters_and_panels_of_more():
     np.testing.assert_allclose(
         outside.get_array(), np.median(errors(scene, 4, seed=1).fields["err_u"], axis=1)
     )
-    many = em.scenes.left_ventricle(rings=3, around=8, layers=1)
+    many = em.scenes.left_ventricle(rings=3, around=8, layers=1, order=1)
     assert sum(axes.axison for axes in parameter_figure(many, errors(many), None, "").axes) == 5
 
 

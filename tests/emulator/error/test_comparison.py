@@ -36,7 +36,7 @@ def test_fem_has_no_error(beam, simulator):
 
 
 def test_volume_error_by_hand():
-    scene = em.scenes.left_ventricle(rings=3, around=8, layers=1)
+    scene = em.scenes.left_ventricle(rings=3, around=8, layers=1, order=1)
     X = jnp.asarray(scene.mesh.nodes)
     cavity = find_cavity(scene)
     errors = field_errors(scene, scene.centre, 0.01 * X, 0.02 * X, [cavity])

@@ -88,7 +88,7 @@ def test_a_constant_theta_inside_jit_takes_the_closed_loop(cube):
 
 @pytest.fixture(scope="module")
 def ventricle():
-    return em.Simulator(em.scenes.left_ventricle(rings=4, around=8, layers=1))
+    return em.Simulator(em.scenes.left_ventricle(rings=4, around=8, layers=1, order=1))
 
 
 @pytest.mark.slow
@@ -150,7 +150,7 @@ def test_load_steps_follow_the_loading_path(beam):
 @pytest.mark.slow
 def test_a_soft_ventricle_ends_where_loading_leads():
     """Fibres go slack here, and there are several equilibria: 0.3 mL and 3.6 mm apart."""
-    scene = em.scenes.left_ventricle()
+    scene = em.scenes.left_ventricle(order=1)
     theta = scene.theta(a=0.316, b=1.0, a_f=3.0, b_f=1.0, pressure=1.333)
     from_rest = em.Simulator(scene).solve(theta)
     path = em.Simulator(scene, em.NewtonOptions.load_steps(10)).solve(theta)

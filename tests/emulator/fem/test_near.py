@@ -21,7 +21,7 @@ from emulator.scenes.loads import FollowerPressure
 
 @pytest.fixture(scope="module")
 def ventricle() -> em.Simulator:
-    return em.Simulator(em.scenes.left_ventricle(4, 8, 1))
+    return em.Simulator(em.scenes.left_ventricle(4, 8, 1, order=1))
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_without_a_potential_there_is_no_reference(ventricle: em.Simulator) -> N
 
 def test_a_kept_factor_leads_to_the_same_equilibrium(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a mesh large enough for it, and with fewer factorisations than tangents."""
-    scene = em.scenes.left_ventricle(4, 8, 1)
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
     usual = em.Simulator(scene)
     monkeypatch.setattr(KeptFactor, "pays", staticmethod(lambda pattern: True))
     monkeypatch.setattr("emulator.fem.kept._LARGE", 300)

@@ -145,7 +145,7 @@ def test_a_matrix_is_factorised_once():
 @pytest.mark.slow
 def test_iterations_make_an_approximate_factor_exact(petsc):
     """Block low-rank factors, asked for as PETSC_OPTIONS would ask."""
-    scene = em.scenes.once_clamped_beam(cells=(16, 5, 5))
+    scene = em.scenes.once_clamped_beam(cells=(16, 5, 5), order=1)
     system = System(scene, "petsc")
     K, _ = system.safe_tangent(jnp.zeros(scene.held.shape), scene.centre, 0.0)
     b = np.random.default_rng(0).normal(size=system.pattern.size)
@@ -180,11 +180,11 @@ def test_a_solution_is_checked_by_its_residual():
 
 
 def scenes():
-    ventricle = em.scenes.left_ventricle(4, 8, 1)
+    ventricle = em.scenes.left_ventricle(4, 8, 1, order=1)
     follower = replace(ventricle, loads=(FollowerPressure("endocardium"),), origin={})
     return {
         "definite": ventricle,
-        "twisted far": em.scenes.twisting_cube(cells=3, degrees=170.0),
+        "twisted far": em.scenes.twisting_cube(cells=3, degrees=170.0, order=1),
         "mean dilatation": nearly_incompressible("P2, mean dilatation"),
         "not symmetric": follower,
     }
@@ -227,7 +227,7 @@ def test_gradients_and_stability_inside_and_outside_jit():
 @pytest.mark.usefixtures("petsc")
 def test_a_kept_factor_serves_from_python(monkeypatch):
     """As on a large mesh: conjugate gradients, from Python, beside a factor of MUMPS."""
-    scene = em.scenes.left_ventricle(4, 8, 1)
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
     expected = em.Simulator(scene)(scene.centre)
     monkeypatch.setattr(KeptFactor, "pays", staticmethod(lambda pattern: True))
     monkeypatch.setattr("emulator.fem.kept._LARGE", 300)

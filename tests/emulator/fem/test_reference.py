@@ -52,7 +52,7 @@ def test_outside_the_box(hanging):
     # A uniform range widened past zero, and a Poisson ratio past a half, hold values to leave out.
     near = replace(hanging, parameters=(Parameter("mu", "kPa", 1.0, 3.0), LAM))
     assert np.asarray(sample_outside(near, 40, 1.0))[:, 0].min() > 0.0
-    nu = np.asarray(sample_outside(em.scenes.twisting_cube(cells=1), 40, 0.5))[:, 1]
+    nu = np.asarray(sample_outside(em.scenes.twisting_cube(cells=1, order=1), 40, 0.5))[:, 1]
     assert 0.45 < nu.max() < 0.5
     with pytest.raises(InputError, match="outside is -1"):
         sample_outside(hanging, 4, -1.0)
@@ -78,7 +78,7 @@ def test_solves_that_fail_outside_are_counted(hanging, simulator, out_of_balance
 
 
 def test_outside_the_box_of_a_scene_with_regions():
-    segments = em.scenes.left_ventricle_segments(rings=6, around=12, layers=1)
+    segments = em.scenes.left_ventricle_segments(rings=6, around=12, layers=1, order=1)
     thetas = sample_outside(segments, 5, 0.25)
     assert thetas.shape == (5, 18)
     assert float(jnp.min(thetas)) > 0.0

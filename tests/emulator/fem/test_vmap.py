@@ -11,17 +11,17 @@ import pytest
 from emulator.scenes.registry import BUILT_IN
 
 COARSE = {
-    "once_clamped_beam": "cells=(4, 2, 2)",
-    "twice_clamped_beam": "cells=(4, 2, 2)",
-    "turned_beam": "cells=(4, 2, 2)",
-    "traction_beam_holzapfel_ogden": "cells=(4, 2, 2)",
-    "traction_beam_guccione": "cells=(4, 2, 2)",
-    "twisting_cube": "cells=3",
-    "liver": "shells=3",
-    "left_ventricle": "rings=4, around=8, layers=1",
-    "left_ventricle_neo_hookean": "rings=4, around=8, layers=1",
-    "left_ventricle_segments": "rings=6, around=12, layers=1",
-    "biventricle": "rings=6, around=12, layers=(1, 1)",
+    "once_clamped_beam": "cells=(4, 2, 2), order=1",
+    "twice_clamped_beam": "cells=(4, 2, 2), order=1",
+    "turned_beam": "cells=(4, 2, 2), order=1",
+    "traction_beam_holzapfel_ogden": "cells=(4, 2, 2), order=1",
+    "traction_beam_guccione": "cells=(4, 2, 2), order=1",
+    "twisting_cube": "cells=3, order=1",
+    "liver": "shells=3, order=1",
+    "left_ventricle": "rings=4, around=8, layers=1, order=1",
+    "left_ventricle_neo_hookean": "rings=4, around=8, layers=1, order=1",
+    "left_ventricle_segments": "rings=6, around=12, layers=1, order=1",
+    "biventricle": "rings=6, around=12, layers=(1, 1), order=1",
 }
 
 CODE = """
@@ -60,6 +60,6 @@ def test_every_built_in_scene_by_vmap(name):
 
 
 @pytest.mark.slow
-def test_the_default_ventricle_by_vmap():
+def test_a_linear_ventricle_of_daily_size_by_vmap():
     """Where it was found: 4 theta on two cores."""
-    run("left_ventricle", "", 4, 900)
+    run("left_ventricle", "order=1", 4, 900)

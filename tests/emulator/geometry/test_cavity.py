@@ -112,8 +112,8 @@ def test_a_scene_names_its_cavities():
     assert cavity_sets(scene) == ("endocardium",)
     pressed = replace(scene, loads=(CavityPressure("endocardium", 0.1),))
     assert find_cavity(pressed).facet_set == "endocardium"
-    assert cavity_sets(em.scenes.once_clamped_beam(cells=(2, 1, 1))) == ()
-    both = em.scenes.biventricle(rings=4, around=12, layers=(1, 1))
+    assert cavity_sets(em.scenes.once_clamped_beam(cells=(2, 1, 1), order=1)) == ()
+    both = em.scenes.biventricle(rings=4, around=12, layers=(1, 1), order=1)
     assert cavity_sets(both) == ("lv_endocardium", "rv_endocardium")
     with pytest.raises(InputError, match="has 2 cavities; name a facet set: lv_endocardium, rv_"):
         find_cavity(both)

@@ -78,9 +78,9 @@ def test_walls_that_cannot_be_meshed(thicker: tuple[float, float]) -> None:
 
 
 def test_the_shape_is_part_of_the_scene() -> None:
-    scene = left_ventricle(4, 8, 1, thicker=(0.2, 40.0))
+    scene = left_ventricle(4, 8, 1, thicker=(0.2, 40.0), order=1)
     assert scene.origin["thicker"] == [0.2, 40.0]
-    assert "thicker" not in left_ventricle(4, 8, 1).origin
+    assert "thicker" not in left_ventricle(4, 8, 1, order=1).origin
 
 
 def test_bodies_that_are_no_ventricle() -> None:

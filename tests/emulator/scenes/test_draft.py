@@ -28,7 +28,7 @@ def test_a_ventricle_of_named_groups(ventricle_file):
     assert scene.law.name == "holzapfel_ogden"
     assert scene.loads == (CavityPressure("endocardium"),)
     assert scene.parameter_names == ("a", "b", "a_f", "b_f", "pressure")
-    reference = em.scenes.left_ventricle(4, 8, 1)
+    reference = em.scenes.left_ventricle(4, 8, 1, order=1)
     # Coordinates go through a file of text.
     np.testing.assert_allclose(np.abs(scene.fibres), np.abs(reference.fibres), atol=1e-6)
     assert "its walls are named" in " ".join(made.notes)

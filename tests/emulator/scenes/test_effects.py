@@ -152,7 +152,7 @@ def test_a_scene_of_small_strains_is_linear(beam):
 
 
 def test_cavities_keep_their_pressure():
-    scene = em.scenes.left_ventricle(4, 8, 1)
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
     assert effects_of(scene)["pressure that follows 'endocardium'"].without.loads == (
         DeadPressure("endocardium"),
     )
@@ -160,7 +160,7 @@ def test_cavities_keep_their_pressure():
 
 
 def test_the_inflated_cavity_is_the_one_whose_pressure_varies():
-    scene = em.scenes.biventricle(4, 8, (1, 1))
+    scene = em.scenes.biventricle(4, 8, (1, 1), order=1)
     assert inflated_cavity(scene) == ("lv_endocardium", "pressure")
     known = {"pressure": 1.0, "kappa": 25.0}
     *material, pressure = scene.parameters

@@ -23,7 +23,7 @@ FACTORS = (Parameter("stiffness_2", "", 0.5, 2.0, "log"), Parameter("stiffness_7
 
 @pytest.fixture(scope="module")
 def ventricle():
-    return em.scenes.left_ventricle_segments(**COARSE)
+    return em.scenes.left_ventricle_segments(**COARSE, order=1)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def all_of(ventricle):
 
 @pytest.mark.slow
 def test_factors_of_one_are_the_plain_ventricle(ventricle, state, all_of):
-    plain = em.scenes.left_ventricle(**COARSE)
+    plain = em.scenes.left_ventricle(**COARSE, order=1)
     u, _ = state
     theta = ventricle.centre.at[-1].set(0.9)
     np.testing.assert_allclose(theta[:-1], 1.0, rtol=1e-15)

@@ -21,12 +21,12 @@ def test_built_in_scenes_are_made_again_by_their_recipe(name):
 
 
 def test_any_resolution():
-    assert len(em.scenes.twisting_cube(cells=9).mesh.nodes) == 1000
-    assert len(em.scenes.once_clamped_beam(cells=(3, 1, 2)).mesh.elements) == 36
+    assert len(em.scenes.twisting_cube(cells=9, order=1).mesh.nodes) == 1000
+    assert len(em.scenes.once_clamped_beam(cells=(3, 1, 2), order=1).mesh.elements) == 36
 
 
 def test_the_centre_and_the_corners_of_a_log_box():
-    scene = em.scenes.once_clamped_beam(cells=(1, 1, 1))
+    scene = em.scenes.once_clamped_beam(cells=(1, 1, 1), order=1)
     np.testing.assert_allclose(scene.centre, np.sqrt(50.0 * 100.0))
     corners = scene.from_unit(jnp.array([[0.0, 1.0], [1.0, 0.0]]))
     np.testing.assert_allclose(corners, [[50.0, 100.0], [100.0, 50.0]])

@@ -60,7 +60,7 @@ scale = "{scale}"
 
 def runs(shape: dict) -> BodyRuns:
     """Made-up runs: a ventricle that widens with the pressure and with its softness."""
-    scene = em.scenes.left_ventricle(**shape)
+    scene = em.scenes.left_ventricle(**shape, order=1)
     position = np.random.default_rng(0).random((4, 5))
     outwards = scene.mesh.nodes * [1.0, 1.0, 0.0]
     size = 0.1 * (position[:, 4] + 1.0 - position[:, 2])
@@ -74,7 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def family(folder: Path) -> Emulator:
-    home = em.scenes.left_ventricle(4, 8, 1)
+    home = em.scenes.left_ventricle(4, 8, 1, order=1)
     plan = replace(PLAN, steps=150, learning_rate=3e-3, checkpoint_every=100)
     return train_family([runs(s) for s in SHAPES], plan, folder, home, architecture=SMALL)
 
@@ -115,7 +115,7 @@ def test_padding_changes_nothing(family: Emulator) -> None:
 
 
 def test_a_body_moved_turned_and_enlarged(family: Emulator) -> None:
-    scene = em.scenes.left_ventricle(6, 12, 2, thicker=(0.2, 40.0))
+    scene = em.scenes.left_ventricle(6, 12, 2, thicker=(0.2, 40.0), order=1)
     R, scale = Rotation.from_rotvec([0.3, -0.5, 0.7]).as_matrix(), 1.3
     mesh = scene.mesh
     nodes = scale * mesh.nodes @ R.T + [5.0, 6.0, 7.0]
@@ -156,7 +156,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(family: Emulator, folder: P
 @pytest.mark.slow
 def test_a_start_for_other_recipes(family: Emulator, tmp_path: Path) -> None:
     """Without a run it is the network; with some, the network plus what FEM's series adds."""
-    scene = em.scenes.left_ventricle(4, 8, 1)
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
     assert family.family is not None
     wide = family.family.learned
     wide = wide._replace(shapes=dict.fromkeys(wide.shapes, (-1000.0, 1000.0)))
@@ -188,11 +188,11 @@ def test_what_it_cannot_take(family: Emulator, tmp_path: Path) -> None:
         origin={},
     )
     pressures = (*scene.parameters[:4], Parameter("pressure", "kPa", 0.1, 5.0))
-    beam = em.scenes.once_clamped_beam((4, 2, 2))
+    beam = em.scenes.once_clamped_beam((4, 2, 2), order=1)
     for other, words in (
         (metres, "its size is 0.0.* are its coordinates in mm"),
         (replace(scene, parameters=pressures, origin={}), "pressure ranges from 0.1 to 5 kPa"),
-        (em.scenes.left_ventricle(4, 8, 1, kappa=50.0), "constants"),
+        (em.scenes.left_ventricle(4, 8, 1, kappa=50.0, order=1), "constants"),
         (beam, "law"),
     ):
         with pytest.raises(InputError, match=words):
@@ -204,7 +204,7 @@ def test_what_it_cannot_take(family: Emulator, tmp_path: Path) -> None:
 
 
 def test_no_fibres() -> None:
-    scene: Scene = em.scenes.left_ventricle_neo_hookean(4, 8, 1)
+    scene: Scene = em.scenes.left_ventricle_neo_hookean(4, 8, 1, order=1)
     with pytest.raises(InputError, match="has no fibres"):
         describe(scene)
 
@@ -236,7 +236,13 @@ def test_the_shipped_one_on_a_ventricle_it_has_not_seen(
 ) -> None:
     """By the command line alone, from a mesh file: no FEM run, and not far from FEM."""
     body = em.scenes.left_ventricle(
-        12, 24, 2, angles=(65.0, -55.0), wall=(21.0, 55.0, 31.0, 62.0, 17.0), thicker=(0.1, 30.0)
+        12,
+        24,
+        2,
+        angles=(65.0, -55.0),
+        wall=(21.0, 55.0, 31.0, 62.0, 17.0),
+        thicker=(0.1, 30.0),
+        order=1,
     )
     write_mesh(tmp_path / "mine.vtu", body.mesh)
     path = tmp_path / "mine.toml"

@@ -37,8 +37,8 @@ def halves():
 
 
 SCENES = {
-    "gravity": lambda: em.scenes.once_clamped_beam(cells=(4, 1, 1)),
-    "a face moved": lambda: em.scenes.twisting_cube(cells=2),
+    "gravity": lambda: em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1),
+    "a face moved": lambda: em.scenes.twisting_cube(cells=2, order=1),
     "regions": halves,
     "quadratic": lambda: heavy_block("P2"),
     "mean dilatation": lambda: heavy_block("P2, mean dilatation"),
@@ -94,7 +94,7 @@ def test_the_error_against_fem_is_of_one_order_more(kind):
 
 @pytest.fixture(scope="module")
 def ventricle():
-    return em.Simulator(em.scenes.left_ventricle(rings=3, around=6, layers=1))
+    return em.Simulator(em.scenes.left_ventricle(rings=3, around=6, layers=1, order=1))
 
 
 @pytest.fixture(scope="module")

@@ -282,7 +282,7 @@ def test_mechanics_builds_no_network(beam, tests, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_mechanics_on_a_quadratic_ventricle(tmp_path):
     """Mid-side nodes, mean dilatation, nearly incompressible: held-out FEM within micrometres."""
-    linear = em.scenes.left_ventricle(rings=2, around=6, layers=1)
+    linear = em.scenes.left_ventricle(rings=2, around=6, layers=1, order=1)
     scene = replace(linear, mesh=to_quadratic(linear.mesh), dilatation="mean", origin={})
     plan = replace(recipe("mechanics"), simulations=8, order=2)
     emulator = train(scene, plan, tmp_path)
@@ -294,7 +294,7 @@ def test_mechanics_on_a_quadratic_ventricle(tmp_path):
 @pytest.mark.slow
 def test_a_network_on_a_quadratic_mesh(tmp_path):
     """Energy lowers from the centre's solution on."""
-    linear = em.scenes.once_clamped_beam(cells=(2, 1, 1))
+    linear = em.scenes.once_clamped_beam(cells=(2, 1, 1), order=1)
     scene = replace(linear, mesh=to_quadratic(linear.mesh), origin={})
     emulator = train(
         scene, Plan(objective="energy", steps=20, batch=4), tmp_path, architecture=SMALL

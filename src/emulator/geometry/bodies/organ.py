@@ -47,7 +47,8 @@ def organ(
 
     Returns
     -------
-    Mesh with node set and facet set ligament, a patch of the surface to hold, and facet set surface.
+    Mesh with node set and facet set ligament, a patch of the surface to hold, and facet set
+    surface.
     """
     if not 0.0 < min(half_axes) <= max(half_axes) < np.inf:
         raise InputError(f"organ: half axes {half_axes} mm must be positive and finite")

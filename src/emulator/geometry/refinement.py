@@ -1,0 +1,137 @@
+r"""A finer mesh of the same body, and what carries fields to it.
+
+Linear tetrahedra become quadratic ones; quadratic ones are cut in eight, each again quadratic. The
+body stays as it is: the new nodes lie on the old elements, curved ones included, so that a
+displacement is carried over exactly,
+
+.. math:: u_\text{fine} = P\, u, \qquad P_{ia} = N_a(\xi_i),
+
+with the old shape functions at each new node. Old nodes keep their numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix, identity, vstack
+
+from emulator.geometry.directions import from_elements, unit
+from emulator.geometry.discretisation import (
+    from_quadrature_points,
+    quadrature_points,
+    shapes_at,
+)
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.quadratic import corner_parents, to_quadratic
+from emulator.geometry.tetrahedra import EDGES
+
+# Four tetrahedra at the corners, four around a diagonal of the octahedron between them: the
+# diagonal's ends, and the other four midpoints as a ring.
+_CORNERS = ((0, 4, 6, 7), (1, 4, 5, 8), (2, 5, 6, 9), (3, 7, 8, 9))
+_DIAGONALS = (((4, 9), (5, 6, 7, 8)), ((5, 7), (4, 6, 9, 8)), ((6, 8), (4, 5, 9, 7)))
+_FOUR = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # of a facet: corners, then 01, 12, 20
+# Barycentric coordinates (10, 4) of a quadratic tetrahedron's nodes.
+_NODES = np.concatenate([np.eye(4), [0.5 * (np.eye(4)[a] + np.eye(4)[b]) for a, b in EDGES]])
+
+
+def _upright(corners: tuple[int, ...]) -> tuple[int, ...]:
+    """Local nodes of a child, the last two swapped where its volume would be negative."""
+    sides = np.diff(_NODES[list(corners), 1:], axis=0)
+    a, b, c, d = corners
+    return corners if np.linalg.det(sides) > 0.0 else (a, b, d, c)
+
+
+def _children(diagonal: tuple[int, int], ring: tuple[int, ...]) -> list[tuple[int, ...]]:
+    around = [(*diagonal, ring[k], ring[(k + 1) % 4]) for k in range(4)]
+    return [_upright(corners) for corners in (*_CORNERS, *around)]
+
+
+# Local nodes (3, 8, 4) of the eight children, for each diagonal.
+_EIGHT = np.array([_children(*each) for each in _DIAGONALS])
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A finer mesh of the body of ``coarse``.
+
+    mesh : quadratic; element k came from element ``k // children`` of the coarse mesh.
+    prolongation : (fine nodes, coarse nodes), sparse; see the module docstring.
+    corners : (m, children, 4, 4) barycentric coordinates of each child's corners in its parent.
+    """
+
+    coarse: Mesh
+    mesh: Mesh
+    prolongation: csr_matrix
+    corners: np.ndarray
+
+    @property
+    def children(self) -> int:
+        """Elements that each coarse one has become."""
+        return self.corners.shape[1]
+
+    def carry(self, u: np.ndarray) -> np.ndarray:
+        """A nodal field (n, 3) on the finer mesh, the same function of place."""
+        return self.prolongation @ np.asarray(u)
+
+    def directions(self, given: np.ndarray) -> np.ndarray:
+        """Unit directions (m, 3) or (m, q, 3) at the finer mesh's quadrature points.
+
+        One direction an element is continued linearly first
+        (:func:`~emulator.geometry.directions.from_elements`).
+        """
+        at_points = from_elements(self.coarse, given) if given.ndim == 2 else given
+        inside = np.einsum("qa,mcab->mcqb", quadrature_points(2), self.corners)
+        weights = from_quadrature_points(2, inside.reshape(-1, 4))
+        weights = weights.reshape(*inside.shape[:3], -1)
+        return unit(np.einsum("mcqp,mpi->mcqi", weights, at_points)).reshape(
+            -1, inside.shape[2], 3
+        )
+
+
+def refined(mesh: Mesh) -> Refinement:
+    """The next finer mesh: quadratic elements, or each quadratic element in eight."""
+    count = len(mesh.elements)
+    if mesh.order == 1:
+        whole = to_quadratic(mesh)
+        parents = corner_parents(whole)
+        rows = np.repeat(np.arange(len(parents)), 2)
+        halves = csr_matrix((np.full(len(rows), 0.5), (rows, parents.ravel())))
+        return Refinement(mesh, whole, halves, np.broadcast_to(np.eye(4), (count, 1, 4, 4)))
+    children = _EIGHT[_shortest_diagonal(mesh)]  # (m, 8, 4)
+    elements = np.take_along_axis(mesh.elements[:, None], children, axis=2)
+    facets = {name: rows[:, _FOUR].reshape(-1, 3) for name, rows in mesh.facet_sets.items()}
+    cut = Mesh(mesh.nodes, elements.reshape(-1, 4), mesh.node_sets, facets)
+    new: list[csr_matrix] = []
+
+    def midpoints(edges: np.ndarray) -> np.ndarray:
+        new.append(_middle_of(mesh, children, elements, edges))
+        return new[0] @ mesh.nodes
+
+    whole = to_quadratic(cut, midpoints)
+    prolongation = vstack([identity(len(mesh.nodes)), new[0]], format="csr")
+    return Refinement(mesh, whole, prolongation, _NODES[children])
+
+
+def _shortest_diagonal(mesh: Mesh) -> np.ndarray:
+    """Which diagonal (m,) to cut the inner octahedron along: the shortest gives the best shapes."""
+    ends = mesh.nodes[mesh.elements[:, [diagonal for diagonal, _ in _DIAGONALS]]]
+    return np.argmin(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2), axis=1)
+
+
+def _middle_of(
+    mesh: Mesh, children: np.ndarray, elements: np.ndarray, edges: np.ndarray
+) -> csr_matrix:
+    """Old shape functions (e, n) at the middle of each of the children's ``edges`` (e, 2).
+
+    children : (m, 8, 4) local nodes. elements : (m, 8, 4) their nodes.
+    """
+    size = len(mesh.nodes)
+    pairs = np.sort(elements[:, :, EDGES], axis=-1).reshape(-1, 2)
+    keys, first = np.unique(pairs[:, 0] * size + pairs[:, 1], return_index=True)
+    found = first[np.searchsorted(keys, edges[:, 0] * size + edges[:, 1])]
+    local = children[:, :, EDGES].reshape(-1, 2)[found]
+    values, _ = shapes_at(2, _NODES[local].mean(axis=1))
+    parents = mesh.elements[found // (children.shape[1] * len(EDGES))]
+    rows = np.repeat(np.arange(len(edges)), values.shape[1])
+    return csr_matrix((values.ravel(), (rows, parents.ravel())), (len(edges), size))

@@ -1,0 +1,60 @@
+"""A scene on the next finer mesh of its body: law, loads, supports and parameters stay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from emulator.geometry.directions import across
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.refinement import Refinement, refined
+from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Support
+from emulator.scenes.supports.boundary_condition import BoundaryCondition
+
+
+@dataclass(frozen=True, eq=False)
+class Finer:
+    """``scene`` on a finer mesh than ``coarse`` has; ``refinement`` carries fields to it."""
+
+    coarse: Scene
+    scene: Scene
+    refinement: Refinement
+
+
+def finer(scene: Scene) -> Finer:
+    """``scene`` with quadratic elements for linear ones, or eight quadratic ones for each.
+
+    Fibres and sheets that are constant in an element are continued linearly. The body is the
+    mesh's own: what its elements miss of a curved surface is not put right.
+
+    Raises
+    ------
+    InputError
+        A load that is defined on linear elements only.
+    """
+    refinement = refined(scene.mesh)
+    children = refinement.children
+    fibres = None if scene.fibres is None else refinement.directions(scene.fibres)
+    sheets = None if scene.sheets is None else refinement.directions(scene.sheets)
+    if fibres is not None and sheets is not None:
+        sheets = across(sheets, fibres)
+    moved = refinement.carry(scene.held_displacement)
+    fine = replace(
+        scene,
+        mesh=refinement.mesh,
+        fibres=fibres,
+        sheets=sheets,
+        regions=None if scene.regions is None else np.repeat(scene.regions, children),
+        supports=tuple(_on(support, refinement.mesh, moved) for support in scene.supports),
+        origin={},
+    )
+    return Finer(scene, fine, refinement)
+
+
+def _on(support: BoundaryCondition, mesh: Mesh, moved: np.ndarray) -> BoundaryCondition:
+    """``support`` on the finer mesh, nodes between held ones moved between them."""
+    if isinstance(support, Support) and support.displacement.ndim == 2:
+        return replace(support, displacement=moved[mesh.node_set(support.node_set)])
+    return support
