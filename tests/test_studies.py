@@ -9,9 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import emulator as em
+from emulator.fem.functional import strain_energy
 from study_checks import CHECKS
 
 STUDIES = Path(__file__).parents[1] / "studies"
@@ -108,11 +112,17 @@ def test_a_hang_in_stability_is_recorded_and_loses_nothing(tmp_path):
     assert [case["status"] for case in cases] == ["hang", "hang"]
 
 
-@pytest.mark.slow
-def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
+def the_judge():
+    """The module ``judge`` of the study of stability."""
     spec = importlib.util.spec_from_file_location("judge", STUDIES / "stability" / "judge.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
+    module = the_judge()
     u = np.asarray(simulator(beam.centre))
     theta = np.asarray(beam.centre)
     right = module.judge(beam, u, theta)
@@ -126,6 +136,17 @@ def test_the_judge_of_stability_finds_wrong_answers(beam, simulator):
     assert "J = " in module.judge(beam, -2.0 * beam.mesh.nodes, theta).wrong
     assert "finite" in module.judge(beam, np.nan * u, theta).wrong
     assert module.judge(beam, u, theta, "a claim that fails").wrong == "a claim that fails"
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_judge_of_stability_has_fibres_where_the_scene_has_them(order):
+    """Its quadrature points are listed in another order than the scene's."""
+    judge = the_judge()
+    scene = em.scenes.left_ventricle(3, 6, 1, order=order)
+    u = 0.1 * np.random.default_rng(0).normal(size=scene.held.shape)
+    own = judge.internal_force(scene, u, scene.centre)
+    ours = jax.grad(strain_energy(scene))(jnp.asarray(u), scene.centre)
+    np.testing.assert_allclose(own, ours, atol=1e-12 * np.abs(ours).max())
 
 
 def test_the_benchmarks_distance_of_a_shift():

@@ -204,13 +204,15 @@ def certify_and_keep(
     folder: str | Path,
     *,
     draws: int | None = None,
+    mesh: int | None = None,
     reweight_to: str | Path | None = None,
     scheduler: str | None = None,
     progress: bool = False,
 ) -> Certificate:
     """Check a posterior against FEM and write certificate.json.
 
-    ``scheduler`` is the address of a Dask scheduler whose workers solve. With ``reweight_to``, the
+    ``mesh`` is the number of solves on a finer mesh, 0 for none. ``scheduler`` is the address of a
+    Dask scheduler whose workers solve. With ``reweight_to``, the
     reweighted posterior is kept in that folder, ready to be certified in its turn, where the
     verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
 
@@ -220,7 +222,9 @@ def certify_and_keep(
         FEM has decided on the draws already.
     """
     simulator = simulator_of(posterior.model.forward.scene)
-    check = examine(posterior, simulator, draws=draws, scheduler=scheduler, progress=progress)
+    check = examine(
+        posterior, simulator, draws=draws, mesh=mesh, scheduler=scheduler, progress=progress
+    )
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     if reweight_to is not None and keeps(check.certificate):
         _keep_reweighted(reweighted(check), Path(folder), Path(reweight_to))

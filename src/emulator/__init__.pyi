@@ -1,5 +1,6 @@
 from . import fem, scenes
 from .catalogue import find_scene
+from .error.mesh_error import MeshError, mesh_error
 from .errors import InputError, SolverError
 from .fem import NewtonOptions, Simulator, Solution, Status
 from .fem.functional import potential_energy
@@ -20,6 +21,7 @@ __all__ = [
     "ForwardMap",
     "InputError",
     "Mesh",
+    "MeshError",
     "NewtonOptions",
     "Parameter",
     "Prediction",
@@ -33,6 +35,7 @@ __all__ = [
     "fem_forward",
     "find_scene",
     "load",
+    "mesh_error",
     "potential_energy",
     "read_body",
     "read_mesh",

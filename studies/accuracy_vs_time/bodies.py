@@ -6,21 +6,14 @@ polyhedron, held at the same facets. Displacements are compared at the same mate
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from studies.accuracy_vs_time.refinement import quadratic, refined
 
 import emulator as em
-from emulator.geometry.bodies.ellipsoid import HUMAN, truncated_ellipsoid
-from emulator.geometry.fibres import rule_based_fibres
-from emulator.geometry.quadratic import to_quadratic
 from emulator.released.scenes import published_scene
 from emulator.scenes import Scene
-from emulator.scenes.left_ventricle import HELIX, left_ventricle
-from emulator.scenes.supports import Support
-from emulator.scenes.twisting_cube import twist
 
 
 @dataclass(frozen=True)
@@ -28,17 +21,16 @@ class Body:
     """One body.
 
     scene : makes what emulators are of. meshes : other discretisations by name. truth : the
-    finest; none where there is none. shipped : an emulator of it, and a network alone; empty for
-    none. model : whose released network is of this body; empty for none. tests : theta.
-    tolerances : looser ones of FEM. orders : of series. runs, reduced : FEM runs of series with
-    discrepancy and of POD + GP. calls : of each timing of FEM. fenics : whether FEniCSx solves it,
-    too.
+    finest; none where there is none. network : a shipped one of it; empty for none. model : whose
+    released network is of this body; empty for none. tests : theta. tolerances : looser ones of
+    FEM. orders : of series. runs, reduced : FEM runs of series with discrepancy and of POD + GP.
+    calls : of each timing of FEM. fenics : whether FEniCSx solves it, too.
     """
 
     scene: Callable[[], Scene]
     truth: Callable[[], Scene] | None
     meshes: dict[str, Callable[[], Scene]]
-    shipped: tuple[str, ...] = ()
+    network: str = ""
     model: str = ""
     tests: int = 10
     tolerances: tuple[float, ...] = (1e-3, 1e-6)
@@ -51,10 +43,10 @@ class Body:
     def has(self, stage: str) -> bool:
         """Whether the stage has rungs on this body."""
         asked = {
-            "shipped": self.shipped,
+            "shipped": self.network,
             "released": self.model,
             "meshes": self.meshes,
-            "float32": self.shipped or self.model,
+            "float32": self.network or self.model,
             "FEniCSx": self.fenics,
         }
         return bool(asked.get(stage, True))
@@ -62,29 +54,22 @@ class Body:
 
 def beam(cells: tuple[int, int, int], order: int = 1) -> Scene:
     """The once-clamped beam of other elements."""
-    scene = em.scenes.once_clamped_beam(cells)
-    return scene if order == 1 else replace(scene, mesh=to_quadratic(scene.mesh), origin={})
+    return em.scenes.once_clamped_beam(cells, order=order)
 
 
 def cube(cells: int, order: int = 1) -> Scene:
-    """The twisting cube of other elements; its supports are functions of position."""
-    scene = em.scenes.twisting_cube(cells)
-    if order == 1:
-        return scene
-    mesh = to_quadratic(scene.mesh)
-    right = mesh.nodes[mesh.node_set("right")]
-    turned = 0.5 * twist(right, np.full(3, 5.0), 60.0)
-    supports = (Support("left"), Support("right", turned))
-    return replace(scene, mesh=mesh, supports=supports, origin={})
+    """The twisting cube of other elements."""
+    return em.scenes.twisting_cube(cells, order=order)
 
 
 def ventricle(rings: int, around: int, layers: int, order: int = 1) -> Scene:
     """The left ventricle of other elements."""
-    scene = left_ventricle(rings, around, layers)
-    if order == 1:
-        return scene
-    mesh = truncated_ellipsoid(HUMAN, rings, around, layers, order)
-    return replace(scene, mesh=mesh, fibres=rule_based_fibres(mesh, angles=HELIX), origin={})
+    return em.scenes.left_ventricle(rings, around, layers, order=order, grading=1.0)
+
+
+def liver() -> Scene:
+    """The liver of linear elements, clamped at its ligament."""
+    return em.scenes.liver(order=1)
 
 
 BODIES = {
@@ -98,7 +83,7 @@ BODIES = {
             "quadratic, coarser": lambda: beam((6, 2, 3), 2),
             "quadratic": lambda: beam((12, 4, 5), 2),
         },
-        ("once_clamped_beam", "once_clamped_beam_pignn"),
+        "once_clamped_beam_pignn",
         fenics=True,
     ),
     "cube": Body(
@@ -110,19 +95,19 @@ BODIES = {
             "quadratic, coarser": lambda: cube(3, 2),
             "quadratic": lambda: cube(6, 2),
         },
-        ("twisting_cube", "twisting_cube_pignn"),
+        "twisting_cube_pignn",
         fenics=True,
     ),
     "liver": Body(
-        em.scenes.liver,
-        lambda: quadratic(em.scenes.liver()),
+        liver,
+        lambda: quadratic(liver()),
         # No coarser one: of fewer shells it is another body, held at more of its surface.
-        {"linear, finer": lambda: refined(em.scenes.liver())},
-        ("liver", "liver_pignn"),
+        {"linear, finer": lambda: refined(liver())},
+        "liver_pignn",
         tests=6,
     ),
     "ventricle": Body(
-        em.scenes.left_ventricle,
+        lambda: ventricle(15, 30, 3),
         lambda: ventricle(20, 40, 3, order=2),
         {
             "linear, coarser": lambda: ventricle(10, 20, 2),
@@ -130,7 +115,7 @@ BODIES = {
             "quadratic, coarser": lambda: ventricle(8, 16, 1, order=2),
             "quadratic": lambda: ventricle(15, 30, 3, order=2),
         },
-        ("left_ventricle", "left_ventricle_pignn"),
+        "left_ventricle_pignn",
         fenics=True,
     ),
     "fine ventricle": Body(

@@ -36,7 +36,14 @@ Arrays = dict[str, Any]
 
 
 def arrays(scene: Scene) -> Arrays:
-    """The scene as plain arrays: what FEniCSx is told."""
+    """The scene as plain arrays: what FEniCSx is told.
+
+    Raises
+    ------
+    InputError
+        Quadratic elements, which its program here has not.
+    """
+    scene.mesh.require_linear("FEniCSx")
     found: Arrays = {
         "nodes": scene.mesh.nodes,
         "elements": scene.mesh.elements,

@@ -44,7 +44,7 @@ def main() -> None:
     words = parser(__doc__, HERE)
     arguments = words.parse_args()
     quick = arguments.quick
-    scene = em.scenes.left_ventricle(*((4, 8, 1) if quick else ()))
+    scene = em.scenes.left_ventricle(*((4, 8, 1) if quick else ()), order=1)
     samples, repeats = (12, 1) if quick else (200, REPEATS)
     settings = {"samples": samples, "nodes": len(scene.mesh.nodes)}
     results = Results(arguments.out, SEED, again=arguments.again, settings=settings)

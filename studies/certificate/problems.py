@@ -177,7 +177,7 @@ def linear(scene, matrix, shift, feature=lambda theta: theta):
 
 
 def five():
-    scene = em.scenes.left_ventricle(rings=4, around=8, layers=1)
+    scene = em.scenes.left_ventricle(rings=4, around=8, layers=1, order=1)
     rng = np.random.default_rng(5)
     low, high = (np.array([getattr(p, e) for p in scene.parameters]) for e in ("low", "high"))
     # Every parameter is known to about 4 % of its range, with correlations.
@@ -189,7 +189,7 @@ def five():
 
 
 def modes():
-    scene = em.scenes.once_clamped_beam(cells=(4, 2, 2))
+    scene = em.scenes.once_clamped_beam(cells=(4, 2, 2), order=1)
     rng = np.random.default_rng(6)
     matrix = rng.normal(size=(len(scene.mesh.nodes), 3, 2)) * np.array([0.004, 0.03])
     forward = linear(scene, matrix, np.zeros((len(scene.mesh.nodes), 3)), lambda t: fold(t))

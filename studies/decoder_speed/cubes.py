@@ -44,7 +44,7 @@ def drawn(network: Network, seed: int) -> Network:
 
 def cube(cells: int, order: int, points: np.ndarray | None, seed: int) -> Cube:
     """The cube of ``cells`` cells an edge, observed at ``points`` (d, 3) mm, by default its own."""
-    scene = em.scenes.twisting_cube(cells=cells)
+    scene = em.scenes.twisting_cube(cells=cells, order=1)
     simulator = em.Simulator(scene)
     seconds = {}
     seconds["series"], series = clocked(expand, simulator, None, order)

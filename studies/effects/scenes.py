@@ -48,12 +48,12 @@ def _whole(scene: Scene, outside: str) -> Scene:
 
 def left_ventricle() -> Scene:
     """A ventricle lying on its side."""
-    return _whole(em.scenes.left_ventricle(6, 12, 1), "epicardium")
+    return _whole(em.scenes.left_ventricle(6, 12, 1, order=1), "epicardium")
 
 
 def biventricle() -> Scene:
     """Two ventricles, each with its pressure."""
-    return _whole(em.scenes.biventricle(6, 12, (1, 1)), "epicardium")
+    return _whole(em.scenes.biventricle(6, 12, (1, 1), order=1), "epicardium")
 
 
 def sheet() -> Scene:

@@ -12,7 +12,6 @@ import emulator as em
 from calibrate.run import Run
 from calibrate.statistical_model import Model, model
 from calibrate.workflow import by_fem, make_data, simulator_of
-from emulator.catalogue import scene_from_origin
 from emulator.fem import Simulator
 from emulator.scenes import Scene
 from emulator.surrogates.protocol import ForwardMap, Prediction
@@ -24,7 +23,7 @@ VENTRICLE = {
     "observe": "landmarks:24+volume",
     "noise": {"displacement": 0.3, "volume": 1.0},
 }
-COARSE = {"rings": 4, "around": 8, "layers": 1}
+COARSE = {"rings": 4, "around": 8, "layers": 1, "order": 1}
 
 
 class Counted:
@@ -99,7 +98,7 @@ def _cube() -> Problem:
 
 
 def _coarse() -> Problem:
-    scene = scene_from_origin({**em.find_scene("left_ventricle").origin, **COARSE})
+    scene = em.scenes.left_ventricle(**COARSE)
     with tempfile.TemporaryDirectory() as folder:
         forward = train(scene, recipe("mechanics"), folder).cache()
     return _problem("coarse ventricle", scene, forward, VENTRICLE)

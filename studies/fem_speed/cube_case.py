@@ -20,7 +20,7 @@ from emulator.fem import Status
 def main() -> None:
     cells = int(sys.argv[1])
     before, compiling = peak_gb(), Compiling()
-    scene = em.scenes.twisting_cube(cells=cells)
+    scene = em.scenes.twisting_cube(cells=cells, order=1)
     simulator = em.Simulator(scene)
     # A new theta: direct solvers keep factors of values they have seen.
     first, _ = clocked(simulator.solve, scene.centre)

@@ -18,10 +18,9 @@ from studies.few_runs.methods import (
 )
 
 import emulator as em
-from emulator.catalogue import scene_from_origin
 from emulator.error.comparison import quantiles
 from emulator.fem import Runs, sobol
-from emulator.scenes import Scene
+from emulator.scenes import BUILT_IN, Scene
 from emulator.scenes.cavities import find_cavity
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.taylor import Expansion
@@ -39,12 +38,11 @@ POSITIONS, VALUES = "positions only", "no slopes"
 
 
 def scene_of(name: str, shape: tuple[int, int, int] | None = None) -> Scene:
-    """A built-in ventricle on its own mesh or on one of ``shape`` (rings, around, layers)."""
-    scene = em.find_scene(name)
-    if shape is None:
-        return scene
-    sizes = dict(zip(("rings", "around", "layers"), shape, strict=True))
-    return scene_from_origin({**scene.origin, **sizes})
+    """A built-in ventricle of linear elements, on its own mesh or on one of ``shape``.
+
+    That is rings, around, layers.
+    """
+    return BUILT_IN[name](*(shape or ()), order=1)
 
 
 def design(scene: Scene, count: int) -> jax.Array:

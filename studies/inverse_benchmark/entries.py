@@ -5,9 +5,10 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
@@ -22,10 +23,12 @@ from calibrate.statistical_model import Model
 from emulator.fem import Simulator, run_campaign, sobol
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.protocol import ForwardMap
+from emulator.training import recipe, train
 
 ENTRIES = Path(__file__).parent / "entries"
 KEPT = 500  # draws of an entry that are written
 RUNS = 60  # FEM runs of the reduced model
+GOOD = 200  # of the emulator
 Draws = dict[str, np.ndarray]
 Method = Callable[[Model, Draws], tuple[Draws, int]]
 """``method(model, data)``: draws by name, and FEM solves of the sampler."""
@@ -36,6 +39,15 @@ def shipped(name: str) -> tuple[ForwardMap, float, int]:
     """A shipped emulator, the seconds of its training, and its FEM runs."""
     trained = em.load(name)
     return trained.cache(), trained.record["seconds"], trained.record["plan"]["simulations"] + 1
+
+
+@lru_cache
+def emulator() -> tuple[ForwardMap, float, int]:
+    """Series and discrepancy model of the benchmark's scene: the shipped one is of another mesh."""
+    plan = replace(recipe("mechanics"), simulations=GOOD)
+    with TemporaryDirectory() as folder:
+        trained = train(scene_of(), plan, folder)
+    return trained.cache(), trained.record["seconds"], GOOD + 1
 
 
 @lru_cache
@@ -119,7 +131,7 @@ class Entry:
 
 
 _NUTS = {"warmup": 300, "draws": 500, "chains": 4, "rounds": 2}
-EMULATOR = partial(shipped, SCENE)
+EMULATOR = emulator
 NETWORK = partial(shipped, f"{SCENE}_pignn")
 OURS = {
     "emulator_nuts": Entry("emulator, NUTS", EMULATOR, sampler("nuts", **_NUTS)),

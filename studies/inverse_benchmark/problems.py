@@ -70,8 +70,8 @@ PROBLEMS = {
 
 @lru_cache
 def scene_of(*, finer: bool = False) -> Scene:
-    """The ventricle; the one of the model, or the finer one that data are made on."""
-    return em.scenes.left_ventricle(*FINER) if finer else em.scenes.left_ventricle()
+    """The ventricle of linear elements; the model's, or the finer one that data are made on."""
+    return em.scenes.left_ventricle(*(FINER if finer else ()), order=1)
 
 
 def observed(problem: Problem, scene: Scene) -> Observations:

@@ -15,7 +15,6 @@ command by command. Writes results.json after each case and meshes.png.
 import json
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,9 +34,6 @@ from calibrate.figures.drawing import pyplot
 from emulator.fem.assembly import System
 from emulator.fem.kept import KeptFactor
 from emulator.fem.solution import Status
-from emulator.geometry.bodies.ellipsoid import HUMAN, truncated_ellipsoid
-from emulator.geometry.fibres import rule_based_fibres
-from emulator.scenes.left_ventricle import HELIX
 from emulator.scenes.scene import Scene
 
 HERE = Path(__file__).parent
@@ -61,11 +57,7 @@ LIMIT = 16.0  # GB that the largest linear mesh may take
 
 def ventricle(order: int, rings: int, around: int, layers: int) -> Scene:
     """The built-in ventricle, its elements linear or quadratic."""
-    scene = em.scenes.left_ventricle(rings, around, layers)
-    if order == 1:
-        return scene
-    mesh = truncated_ellipsoid(HUMAN, rings, around, layers, order)
-    return replace(scene, mesh=mesh, fibres=rule_based_fibres(mesh, angles=HELIX), origin={})
+    return em.scenes.left_ventricle(rings, around, layers, order=order, grading=1.0)
 
 
 def one(mesh: tuple[int, int, int, int]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ MMHG = 0.133322  # kPa
 def ventricle(published: str | None) -> Scene:
     """The built-in ventricle, or the released one under exact pressure; 4 to 10 mmHg both."""
     if published is None:
-        return em.scenes.left_ventricle()
+        return em.scenes.left_ventricle(order=1)
     released = published_scene("LeftVentricle", published)
     pressure = Parameter("pressure", "kPa", 4.0 * MMHG, 10.0 * MMHG)
     return replace(

@@ -43,7 +43,8 @@ def ventricle(name: str) -> Scene:
     wall, mesh_size, angles = VENTRICLES[name]
     mesh = truncated_ellipsoid(wall, *mesh_size)
     fibres = rule_based_fibres(mesh, angles=angles)
-    return replace(em.scenes.left_ventricle(), name=name, mesh=mesh, fibres=fibres, origin={})
+    scene = em.scenes.left_ventricle(order=1)
+    return replace(scene, name=name, mesh=mesh, fibres=fibres, origin={})
 
 
 def one(name: str, began: float, runs: int, tests: int) -> dict[str, Any]:

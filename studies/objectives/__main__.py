@@ -41,14 +41,14 @@ OBJECTIVES = {
     "energy": ("PI", "tab:blue"),
     "both": ("DD and PI", "tab:red"),
 }
-UNTRAINED, SHIPPED = "the centre's solution", "shipped emulator"
+UNTRAINED, MECHANICS = "the centre's solution", "recipe mechanics"
 COARSE = (4, 2, 2)
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 
 
 def beam(quick: bool) -> Scene:
-    """The built-in beam, or a coarse one."""
-    return em.scenes.once_clamped_beam(*([COARSE] if quick else []))
+    """The built-in beam of linear elements, or a coarse one."""
+    return em.scenes.once_clamped_beam(*([COARSE] if quick else []), order=1)
 
 
 def plan_of(objective: str, steps: int, simulations: int, quick: bool) -> Plan:
@@ -123,14 +123,12 @@ def study(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str
     before = replace(trained, network=None)  # a series of order 0: the centre's solution
     errors[UNTRAINED] = case_errors(before.cache(), known.theta, known.displacement)
     cases.append(row(UNTRAINED, errors[UNTRAINED], fem_runs=1))
-    shipped = load("once_clamped_beam")
-    if shipped.scene.fingerprint == scene.fingerprint:
-        ours = case_errors(shipped.cache(), known.theta, known.displacement)
-        facts = {
-            "fem_runs": shipped.record["plan"]["simulations"] + 1,
-            "seconds": shipped.record["seconds"],
-        }
-        cases.append(row(SHIPPED, ours, **facts))
+    if not arguments.quick:
+        with tempfile.TemporaryDirectory() as folder:
+            by_mechanics = train(scene, replace(recipe("mechanics"), simulations=200), folder)
+        ours = case_errors(by_mechanics.cache(), known.theta, known.displacement)
+        facts = {"fem_runs": 201, "seconds": by_mechanics.record["seconds"]}
+        cases.append(row(MECHANICS, ours, **facts))
     return cases, errors
 
 
@@ -170,7 +168,7 @@ def check(cases: list[dict[str, Any]]) -> None:
     assert min(OBJECTIVES, key=medians["err_Pi"].__getitem__) == "both"
     assert medians["err_u"]["energy"] > 5.0 * medians["err_u"]["simulations"]
     for key, errors in medians.items():
-        assert errors[SHIPPED] < 1e-3 * min(errors[name] for name in OBJECTIVES), key
+        assert errors[MECHANICS] < 1e-3 * min(errors[name] for name in OBJECTIVES), key
 
 
 def main() -> None:

@@ -28,8 +28,8 @@ from calibrate.learned_error import with_error
 from calibrate.observations import parse_observation
 from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
-from emulator.catalogue import find_scene, scene_from_origin
 from emulator.fem import Simulator, design, run_campaign, sobol
+from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.scene import Scene
 from emulator.store import write_json
 from emulator.surrogates.additive import Emulator
@@ -60,13 +60,11 @@ class Moments(NamedTuple):
 
 
 def scene_of(shape: tuple[int, int, int] | None) -> Scene:
-    """The left ventricle on its own mesh or on one of ``shape`` (rings, around, layers)."""
-    scene = find_scene("left_ventricle")
-    if shape is None:
-        return scene
-    return scene_from_origin(
-        {**scene.origin, **dict(zip(("rings", "around", "layers"), shape, strict=True))}
-    )
+    """The left ventricle of linear elements, on its own mesh or on one of ``shape``.
+
+    That is rings, around, layers.
+    """
+    return left_ventricle(*(shape or ()), order=1)
 
 
 def emulators(simulator: Simulator, wanted: list[tuple[int, int]]) -> dict[Any, Emulator]:

@@ -24,8 +24,8 @@ import calibrate as cal
 from calibrate.figures.drawing import pyplot
 from calibrate.observations import parse_observation
 from calibrate.provenance import study_header
-from emulator.catalogue import find_scene, scene_from_origin
 from emulator.fem import Runs, Simulator, sobol
+from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, Load, PublishedPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
@@ -60,15 +60,12 @@ MISFIT = 0.005  # p below which a certificate refuses
 
 def scene_of(load: Load, shape: tuple[int, int, int]) -> Scene:
     """The left ventricle under ``load`` over the wide box."""
-    origin = find_scene("left_ventricle").origin
-    sizes = dict(zip(("rings", "around", "layers"), shape, strict=True))
-    plain = scene_from_origin({**origin, **sizes})
-    return replace(plain, parameters=WIDE, loads=(load,))
+    return replace(left_ventricle(*shape, order=1), parameters=WIDE, loads=(load,))
 
 
 def truths(count: int) -> list[dict[str, float]]:
     """Materials in the range of the built-in scene, by name."""
-    thetas = np.asarray(sobol(find_scene("left_ventricle"), count, SEED))
+    thetas = np.asarray(sobol(left_ventricle(*QUICK_MESH, order=1), count, SEED))
     return [dict(zip(MATERIAL, map(float, theta), strict=False)) for theta in thetas]
 
 

@@ -132,7 +132,7 @@ def ventricle(results: Results, sizes: dict[str, int]) -> xr.DataTree:
 
 def segments(samples: int) -> Case:
     """Morris' screening of 17 stiffnesses and the pressure, by FEM."""
-    scene = em.scenes.left_ventricle_segments()
+    scene = em.scenes.left_ventricle_segments(order=1)
     found = cal.sensitivity(
         fem_forward(em.Simulator(scene)), observed(scene), method="morris", samples=samples,
         seed=SEED,

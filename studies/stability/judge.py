@@ -23,6 +23,7 @@ import sparsax
 
 from emulator import Scene, Simulator, potential_energy
 from emulator.fem.functional import strain_energy
+from emulator.geometry.discretisation import quadrature_points
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Traction
 from emulator.scenes.supports import ElasticSupport
 
@@ -168,7 +169,7 @@ def internal_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
         labels = np.unique(scene.regions)
         factors = jnp.array([values[f"stiffness_{label}"] for label in labels])
         factor = factors[np.searchsorted(labels, scene.regions)]
-    fibres = jnp.zeros((len(weights), 3)) if scene.fibres is None else jnp.asarray(scene.fibres)
+    fibres = fibres_of(scene, weights.shape)
 
     def energy(local: jax.Array) -> jax.Array:
         at = F(local)
@@ -184,7 +185,7 @@ def internal_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
             volume = law(jnp.cbrt(det(f)) * jnp.eye(3), fibre, *arguments)
             return s * (law(f, fibre, *arguments) - volume) + volume
 
-        return jnp.sum(weights * jax.vmap(jax.vmap(one, (0, None, None)))(at, fibres, factor))
+        return jnp.sum(weights * jax.vmap(jax.vmap(one, (0, 0, None)))(at, fibres, factor))
 
     local = jnp.asarray(u)[scene.mesh.elements]
     force = _collect(scene, scene.mesh.elements, jax.grad(energy)(local))
@@ -192,6 +193,15 @@ def internal_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
         if isinstance(support, ElasticSupport):
             force = force + _springs(scene, support, u)
     return force
+
+
+def fibres_of(scene: Scene, shape: tuple[int, ...]) -> jax.Array:
+    """Fibres at this file's points, (m, q, 3); a scene lists its own points in another order."""
+    if scene.fibres is None:
+        return jnp.zeros((*shape, 3))
+    here, there = _POINTS[scene.mesh.order][0], quadrature_points(scene.mesh.order)[:, 1:]
+    apart = np.linalg.norm(here[:, None] - there, axis=-1)
+    return jnp.asarray(scene.fibres_at_points[:, apart.argmin(axis=1)])
 
 
 def external_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:

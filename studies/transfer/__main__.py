@@ -55,7 +55,7 @@ def family(count: int, mesh: tuple[int, int, int]) -> list[Scene]:
         (short, long, short + equator, long + apex, base)
         for short, long, equator, apex, base in draws.tolist()
     ]
-    return [em.scenes.left_ventricle(*mesh, wall=wall) for wall in walls]
+    return [em.scenes.left_ventricle(*mesh, wall=wall, order=1) for wall in walls]
 
 
 def judge(problem: Problem, known: Runs) -> Callable[[Any], dict[str, Any]]:
@@ -205,7 +205,7 @@ def main() -> None:
     plan = Plan(objective="energy", steps=arguments.pretrain, batch=8, learning_rate=2e-3)
     groups = {"family": family(arguments.family, meshes["family"])}
     if arguments.one:
-        groups["one"] = [em.scenes.left_ventricle(*meshes["family"])]
+        groups["one"] = [em.scenes.left_ventricle(*meshes["family"], order=1)]
     starts: dict[str, Emulator] = {}
     pretraining: dict[str, Any] = {}
     for name, scenes in groups.items():
@@ -215,7 +215,7 @@ def main() -> None:
         pretraining[name] = {"ventricles": len(scenes), "steps": plan.steps, **record}
         print(f"pretrained on {len(scenes)} ventricles: {record['seconds']} s", flush=True)
 
-    scene = em.scenes.left_ventricle(*meshes["unseen"], wall=UNSEEN)
+    scene = em.scenes.left_ventricle(*meshes["unseen"], wall=UNSEEN, order=1)
     known = run_campaign(em.Simulator(scene), sobol(scene, arguments.tests, TEST_SEED))
     cases = [mechanics(scene, arguments.runs, known)]
     print(f"mechanics: {cases[0]['seconds']} s, {cases[0]['err_u']['median']:.2e} mm", flush=True)

@@ -81,7 +81,7 @@ def train(arguments: argparse.Namespace) -> None:
     plan = replace(PLAN, steps=arguments.steps)
     folder = arguments.out / NETWORK
     emulator = train_family(
-        runs, plan, folder, left_ventricle(), progress=True, resume=arguments.resume
+        runs, plan, folder, left_ventricle(order=1), progress=True, resume=arguments.resume
     )
     record = {
         **emulator.record,
@@ -117,7 +117,7 @@ def study(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 def warm_starts_again(row: dict[str, Any]) -> dict[str, Any]:
     """``row`` with its starts of FEM repeated."""
     number = int(row["name"].split()[1])
-    scene = left_ventricle(**row["arguments"])
+    scene = left_ventricle(**{"order": 1, **row["arguments"]})
     network, _ = first_prediction(scene, load(NETWORK))
     known = run_campaign(em.Simulator(scene), sobol(scene, TESTS, THETA_SEED + number))
     jax.clear_caches()

@@ -105,7 +105,7 @@ def one(number: int, arguments: dict[str, Any], theta: int, few_runs: bool) -> d
     """All about one ventricle."""
     scene = left_ventricle(**arguments)
     start = load(NETWORK)
-    first_prediction(left_ventricle(), start)  # imports, and programs that fit any mesh
+    first_prediction(left_ventricle(order=1), start)  # imports, and programs that fit any mesh
     network, seconds = first_prediction(scene, start)
     known = run_campaign(em.Simulator(scene), sobol(scene, theta, THETA_SEED + number))
     before = judged(network.cache(), known)

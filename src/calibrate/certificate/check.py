@@ -37,6 +37,7 @@ from calibrate.certificate.estimates import (
     tail_of,
 )
 from calibrate.certificate.evidence import Evidence
+from calibrate.certificate.mesh import MOST_RUNS, mesh_change
 from calibrate.certificate.misfit import DRAWS, misfits
 from calibrate.certificate.pool import (
     MOST_TEMPERED,
@@ -92,12 +93,15 @@ def examine(
     simulator: Simulator,
     *,
     draws: int | None = None,
+    mesh: int | None = None,
     seed: int = 0,
     scheduler: str | None = None,
     progress: bool = False,
 ) -> Check:
     """Check ``posterior`` with ``draws`` FEM runs, 200 by default.
 
+    mesh : solves on the next finer mesh (:mod:`calibrate.certificate.mesh`): 0 for none, up to 15;
+        by default four more than there are unknowns.
     scheduler : address of a Dask scheduler whose workers solve; otherwise this process does.
 
     Raises
@@ -110,6 +114,8 @@ def examine(
     count = _FEM_RUNS if draws is None else draws
     if count < _FEWEST:
         raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
+    if mesh is not None and not 0 <= mesh <= MOST_RUNS:
+        raise InputError(f"certify: {mesh} solves on the finer mesh; give 0 to {MOST_RUNS}")
     predictive = Predictive(posterior.model, posterior.data)
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
@@ -123,6 +129,8 @@ def examine(
         solver = Solver(predictive, likelihood, bar)
         at_draws, training, correction, pool = _train(solver, z, count, rng)
         tests = _test(solver, pool, count - len(training.z), rng)
+        bar.set_description("finer mesh")
+        change = mesh_change(predictive, simulator, joined([training, tests.runs]), pool, mesh, rng)
     chosen = pool.z[resampled(pool, DRAWS, rng)]
     draws_changes, corrected_changes, mean, sd = figures_of(posterior, predictive, pool, tests)
     evidence = Evidence(
@@ -134,6 +142,7 @@ def examine(
         physics_of(at_draws, training, tests, pool),
         tail_of(pool, tests, missed_by(predictive, correction, joined([training, tests.runs]))),
         misfits(predictive, correction, chosen, _key(rng)),
+        change,
     )
     return Check(judge(evidence), posterior, predictive, pool, tests)
 
@@ -143,17 +152,24 @@ def certify(
     simulator: Simulator,
     *,
     draws: int | None = None,
+    mesh: int | None = None,
     seed: int = 0,
     scheduler: str | None = None,
     progress: bool = False,
 ) -> Certificate:
     """The certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200).
 
-    ``scheduler`` is the address of a Dask scheduler whose workers solve, as of
-    :func:`calibrate.campaign`.
+    ``mesh`` is the number of solves on the next finer mesh, 0 for none. ``scheduler`` is the
+    address of a Dask scheduler whose workers solve, as of :func:`calibrate.campaign`.
     """
     check = examine(
-        posterior, simulator, draws=draws, seed=seed, scheduler=scheduler, progress=progress
+        posterior,
+        simulator,
+        draws=draws,
+        mesh=mesh,
+        seed=seed,
+        scheduler=scheduler,
+        progress=progress,
     )
     return check.certificate
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from calibrate.certificate.misfit import Misfit
 LARGEST_SHIFT = 0.25
 LARGEST_LOG_SD = float(np.log(1.2))
 LARGEST_CORRELATION_CHANGE = 0.2
+# Of the mesh: beyond, the posterior is about the mesh and not about the tissue.
+LARGEST_MESH_SHIFT = 0.5
+LARGEST_MESH_LOG_SD = float(np.log(1.25))
 # Weights of FEM runs of which none exceeds this multiple of their mean have no tail that matters:
 # proposals cover the prior, so that the ratios are bounded (docs/experiments.md, "When k-hat cries
 # wolf").
@@ -117,11 +120,44 @@ class Tail:
 
 
 @dataclass(frozen=True)
+class MeshChange:
+    """What a finer mesh changes of a posterior, by parameter.
+
+    shift : of the mean, in posterior sd. log_sd : of the sd. Both are empty where nothing is known.
+    nodes : of the finer mesh. runs, failed : solves on it, and those that did not converge.
+    linear : whether the mesh has linear elements. why : the reason that it was not asked.
+    """
+
+    shift: dict[str, Figure] = field(default_factory=dict)
+    log_sd: dict[str, Figure] = field(default_factory=dict)
+    nodes: int = 0
+    runs: int = 0
+    failed: int = 0
+    linear: bool = False
+    why: str = ""
+
+    def judged(self) -> list[tuple[str, Figure, float]]:
+        """Every figure in words, with its limit."""
+        return [
+            *((f"mean of {n} would move by {f.value:+.2f} sd", f, LARGEST_MESH_SHIFT)
+              for n, f in self.shift.items()),
+            *((f"sd of {n} would change by a factor of {np.exp(f.value):.2f}", f,
+               LARGEST_MESH_LOG_SD) for n, f in self.log_sd.items()),
+        ]  # fmt: skip
+
+    def within(self) -> bool | None:
+        """Whether all are within their limits; ``None`` where that is open."""
+        return (
+            _all(figure.within(limit) for _, figure, limit in self.judged()) if self.shift else None
+        )
+
+
+@dataclass(frozen=True)
 class Evidence:
     """All a verdict rests on.
 
     draws, corrected : what FEM changes of the draws, and of the corrected map's posterior.
-    mean, sd : of each parameter, by FEM.
+    mean, sd : of each parameter, by FEM. mesh : what a finer mesh changes.
     """
 
     draws: Changes
@@ -132,6 +168,7 @@ class Evidence:
     physics: Physics
     tail: Tail
     misfit: dict[str, Misfit]
+    mesh: MeshChange = MeshChange(why="not asked")
 
 
 def _all(answers: Iterable[bool | None]) -> bool | None:

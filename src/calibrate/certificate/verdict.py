@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calibrate.certificate.evidence import Evidence, Figure, Physics, Sampling
+from calibrate.certificate.evidence import Evidence, Figure, MeshChange, Physics, Sampling
 from calibrate.certificate.misfit import Misfit
 from calibrate.fit import SMALLEST_P
 from emulator.shown import Row, Shown
@@ -29,6 +29,9 @@ SMALLEST_P_WORST = 0.001
 # different whatever the tail; at 1.5 a tenth of the FEM runs would count.
 LARGEST_SPREAD = 1.5
 SMALLEST_POOL = 200.0  # effective points under the corrected map
+_ALLOW = "allow for the mesh's error with infer --mesh-error"
+_QUADRATIC = "make the elements quadratic (order = 2)"
+_REFINE = "refine the mesh"
 
 
 @dataclass(frozen=True, repr=False)
@@ -82,6 +85,14 @@ class Certificate(Shown):
             **_columns("correlation_change", e.draws.correlation),
             **_columns("mean_fem", e.mean),
             **_columns("sd_fem", e.sd),
+            "mesh": {
+                **_columns("shift", e.mesh.shift),
+                **_columns("log_sd_change", e.mesh.log_sd),
+                "nodes": e.mesh.nodes,
+                "runs": e.mesh.runs,
+                "failed": e.mesh.failed,
+                "not_asked": e.mesh.why,
+            },
             "misfit": {name: asdict(m) for name, m in e.misfit.items()},
             "sampling": asdict(e.sampling),
             "physics": asdict(e.physics),
@@ -96,10 +107,34 @@ def judge(evidence: Evidence) -> Certificate:
     """
     wrong = [*_sampling(evidence.sampling), *_physics(evidence.physics), *_misfit(evidence.misfit)]
     verdict, words = _agreement(evidence)
-    if wrong:
+    fine, mesh = _mesh(evidence.mesh)
+    if wrong or fine is False:
         verdict = "not certified"
-    findings = (*wrong, *words)
+    elif fine is None and verdict in ("accepted", "reweight"):
+        verdict = "undecided"
+    if evidence.mesh.why and verdict == "accepted":
+        words[0] += " on this mesh"
+    findings = (*wrong, *words, *mesh) if fine else (*wrong, *mesh, *words)
     return Certificate(verdict, findings[0].split(":")[0], findings, evidence)
+
+
+def _mesh(mesh: MeshChange) -> tuple[bool | None, list[str]]:
+    """Whether a finer mesh leaves the posterior as it is, ``None`` where that is open, in words."""
+    if mesh.why:
+        return True, [f"no finer mesh was asked: {mesh.why}"]
+    finer = f"on a finer mesh ({mesh.nodes} nodes)"
+    if not mesh.shift:
+        return None, [f"FEM failed at {mesh.failed} of {mesh.runs} points {finer}: refine the mesh"]
+    within = mesh.within()
+    if within:
+        worst = max(abs(figure.value) for figure in mesh.shift.values())
+        return True, [f"{finer} no mean would move by more than {worst:.2f} posterior sd"]
+    words = [w for w, figure, limit in mesh.judged() if figure.within(limit) is within]
+    if within is None:
+        more = "give more runs on the finer mesh (--mesh-runs)"
+        return None, [f"{finer} the {words[0]}, too close to the limit for its error: {more}"]
+    remedy = f"{_QUADRATIC if mesh.linear else _REFINE}, or {_ALLOW}"
+    return False, [f"{finer} the {each}: {remedy}" for each in words]
 
 
 def _agreement(evidence: Evidence) -> tuple[Verdict, list[str]]:

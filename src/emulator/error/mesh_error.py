@@ -5,33 +5,42 @@ An equilibrium :math:`u_h` on a mesh of size h, and one on the next finer mesh
 
 .. math:: u_h - u_{h/2} = (u_h - u)\,(1 - 2^{-k}), \qquad |u_h - u| \sim h^k ,
 
-most of the error: seven eighths at :math:`k = 3`, as quadratic elements have on smooth solutions,
-a half at :math:`k = 1`, as at the edge of a clamp; from linear to quadratic elements nearly all of
-it. So the difference has an effectivity of one half to one. It is a solve, not an estimate of one:
-FEM's iteration starts at the prolonged solution, moved by what the last one needed, and two or
-three steps end it. Locked elements are far away and are solved for all the same.
+most of the error: seven eighths at :math:`k = 3`, as quadratic elements have on smooth solutions, a
+half at :math:`k = 1`, as at the edge of a clamp; from linear to quadratic elements nearly all of
+it. So the difference has an effectivity of one half to one.
+
+It takes no solve from rest: from the prolonged solution, moved by what another theta needed, a
+Newton step on the finer mesh is checked by a second back-substitution
+(:func:`emulator.error.step.newton_distance`), and another step follows if that is not much shorter.
+Where steps do not contract, as for locked elements far from any theta known, FEM's iteration takes
+over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.error.step import Distance, newton_distance
 from emulator.errors import InputError
-from emulator.fem.options import NewtonOptions
+from emulator.fem.assembly import System
+from emulator.fem.factorisations import REFUSALS
 from emulator.fem.simulator import Simulator
 from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene
 
 LARGEST = 60_000
-"""Nodes of a finer mesh that is still solved on; beyond, a factorisation takes minutes and the
-memory of a workstation."""
+"""Nodes of a finer mesh that is still looked at; beyond, a factorisation takes a minute."""
+
+_TOLERANCE = 1e-7  # of a solve on the finer mesh: far below the difference between the meshes
+_CONTRACTION = 0.1  # largest part of the last step that another one would correct
+_GOES_ON, _STEPS = 0.5, 3  # as much of a step before it, and steps at most
 
 Quantity = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -40,12 +49,13 @@ class MeshErrorEstimate(NamedTuple):
     """The mesh's error at one theta.
 
     theta : (p,). coarse : (n, 3) mm, the equilibrium on the mesh. fine : (f, 3) mm, on the finer
-    one, whose first n nodes are the mesh's.
+    one, whose first n nodes are the mesh's. solved : whether FEM's iteration took over.
     """
 
     theta: jax.Array
     coarse: jax.Array
     fine: jax.Array
+    solved: bool
 
     @property
     def field(self) -> jax.Array:
@@ -64,38 +74,70 @@ class MeshErrorEstimate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeshError:
-    """Errors of a simulator's mesh; made by :func:`mesh_error`."""
+    """Errors of a simulator's mesh; made by :func:`mesh_error`.
+
+    fine : the simulator on the finer mesh.
+    """
 
     simulator: Simulator
     finer: Finer
-    options: NewtonOptions = field(default_factory=NewtonOptions)
+    fine: Simulator
+
+    def __call__(
+        self,
+        theta: jax.Array,
+        start: jax.Array | None = None,
+        *,
+        near: MeshErrorEstimate | None = None,
+    ) -> MeshErrorEstimate:
+        """The error at ``theta`` (p,).
+
+        Parameters
+        ----------
+        start : (n, 3) mm, where the solve on the mesh begins; at rest by default.
+        near : the error at another theta, from which the finer mesh's iteration begins.
+
+        Raises
+        ------
+        SolverError
+            No equilibrium was found on one of the meshes.
+        """
+        theta = jnp.asarray(theta, dtype=float)
+        what = "the error of the mesh"
+        coarse = self.simulator.solve(theta, start).require_converged(what).displacement
+        begin = self._carried(coarse)
+        if near is not None:
+            begin = begin + near.fine - self._carried(near.coarse)
+        stepped = self._stepped(theta, begin)
+        if stepped is not None:
+            return MeshErrorEstimate(theta, coarse, stepped, solved=False)
+        solution = self.fine.solve(theta, begin).require_converged(f"{what}, on the finer one")
+        return MeshErrorEstimate(theta, coarse, solution.displacement, solved=True)
+
+    def _carried(self, u: jax.Array) -> jax.Array:
+        return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))
 
     @cached_property
-    def fine(self) -> Simulator:
-        """The simulator on the finer mesh."""
-        return Simulator(self.finer.scene, self.options, self.simulator.factorisation)
+    def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:
+        return jax.jit(partial(newton_distance, System(self.finer.scene, "cholmod")))
 
-    def __call__(self, theta: jax.Array) -> MeshErrorEstimate:
-        """The error at ``theta`` (p,); :class:`SolverError` where either mesh has no solution."""
-        return next(self.many([theta]))
-
-    def many(
-        self, thetas: Iterable[jax.Array], starts: Iterable[jax.Array | None] | None = None
-    ) -> Iterator[MeshErrorEstimate]:
-        """The error at each theta, each solve started from what the last one found.
-
-        starts : (n, 3) mm, where the coarse solves begin; from rest by default.
-        """
-        step = np.zeros((len(self.finer.scene.mesh.nodes), 3))
-        given = iter(starts) if starts is not None else None
-        for theta in thetas:
-            begin = None if given is None else next(given)
-            coarse = self.simulator.solve(theta, begin).require_converged("the mesh's error")
-            carried = self.finer.refinement.carry(np.asarray(coarse.displacement))
-            solution = self.fine.solve(theta, jnp.asarray(carried + step))
-            fine = solution.require_converged("the mesh's error, on the finer mesh").displacement
-            step = np.asarray(fine) - carried
-            yield MeshErrorEstimate(jnp.asarray(theta), coarse.displacement, fine)
+    def _stepped(self, theta: jax.Array, u: jax.Array) -> jax.Array | None:
+        """The finer mesh's displacement (f, 3) a few steps from ``u``; None if one is not sound."""
+        if self.fine.system.forces:  # CHOLMOD needs a symmetric tangent
+            return None
+        for _ in range(_STEPS):
+            try:
+                step = jax.block_until_ready(self._step(u, theta))
+            except REFUSALS as error:
+                if "not positive definite" not in str(error):
+                    raise
+                return None
+            if not float(step.contraction) <= _GOES_ON:
+                return None
+            u = u - step.move
+            if step.settled and float(step.contraction) <= _CONTRACTION:
+                return u
+        return None
 
 
 def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshError:
@@ -103,7 +145,7 @@ def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshErro
 
     Parameters
     ----------
-    most : nodes of a finer mesh that is still solved on.
+    most : nodes of a finer mesh that is still looked at.
 
     Raises
     ------
@@ -115,6 +157,7 @@ def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshErro
     if (count := len(found.scene.mesh.nodes)) > most:
         raise InputError(
             f"mesh error: the mesh finer than that of '{given.scene.name}' has {count} nodes, more "
-            f"than {most}; ask for more with 'most', or check a coarser mesh of the same body"
+            f"than {most}; allow more with 'most', or check a coarser mesh of the same body"
         )
-    return MeshError(given, found, given.options)
+    options = replace(given.options, tolerance=max(given.options.tolerance, _TOLERANCE))
+    return MeshError(given, found, Simulator(found.scene, options, given.factorisation))

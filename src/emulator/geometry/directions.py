@@ -12,8 +12,8 @@ the average is made unit length again.
   .. math:: \min_{G_e} \sum_j w_j\, |s_j f_j - f_e - G_e (x_j - x_e)|^2 ,
             \qquad w_j = |x_j - x_e|^{-2} .
 
-  A field that is linear up to its length comes out exactly, and at the centroid every field does
-  (patch recovery; Zienkiewicz & Zhu 1992).
+  At the centroid every field comes out exactly, elsewhere with an error of second order (patch
+  recovery; Zienkiewicz & Zhu 1992).
 """
 
 from __future__ import annotations

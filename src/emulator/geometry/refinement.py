@@ -84,9 +84,7 @@ class Refinement:
         inside = np.einsum("qa,mcab->mcqb", quadrature_points(2), self.corners)
         weights = from_quadrature_points(2, inside.reshape(-1, 4))
         weights = weights.reshape(*inside.shape[:3], -1)
-        return unit(np.einsum("mcqp,mpi->mcqi", weights, at_points)).reshape(
-            -1, inside.shape[2], 3
-        )
+        return unit(np.einsum("mcqp,mpi->mcqi", weights, at_points)).reshape(-1, inside.shape[2], 3)
 
 
 def refined(mesh: Mesh) -> Refinement:

@@ -45,7 +45,7 @@ def once_clamped_beam(cells: Cells | None = None, order: int = 2) -> Scene:
     ----------
     cells : along x, y, z; by default what the elements' order needs.
     order : 2, quadratic elements; 1, linear ones as published, which lock: the tip of 12 x 4 x 5
-        cells sinks by 31 mm instead of 40.
+        cells sinks by 38 mm instead of 59, at the centre of the box.
     """
     return _beam("once_clamped_beam", cells, order, ("left",))
 

@@ -58,7 +58,7 @@ TARGETS = {
 
 @cache
 def scene() -> Scene:
-    return em.scenes.once_clamped_beam((2, 1, 1))
+    return em.scenes.once_clamped_beam((2, 1, 1), order=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ FACTOR = 3.0  # an error bar is right within it
 @cache
 def ventricle(exponent: float) -> Scene:
     """A coarse ventricle, its exponents ``b`` and ``b_f`` times ``exponent``."""
-    scene = em.scenes.left_ventricle(4, 8, 1)
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
     grown = {"b", "b_f"}
     stiffer = tuple(
         replace(p, low=exponent * p.low, high=exponent * p.high) if p.name in grown else p

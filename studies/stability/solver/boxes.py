@@ -35,7 +35,7 @@ def _corner(name: str, corner: tuple[int, ...], stretch: float) -> Case:
 
 
 for _name in BUILT_IN:
-    for _bits in corners(len(BUILT_IN[_name]().parameters)):
+    for _bits in corners(len(BUILT_IN[_name](order=1).parameters)):
         _label = f"{_name}_" + "".join("lh"[bit] for bit in _bits)
         CASES[_label] = ("corners of the boxes", partial(_corner, _name, _bits, 1.0))
         CASES[_label + "_outside"] = (

@@ -100,7 +100,7 @@ def test_on_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path)
     assert sum(report["displacement"]["first_together"]) == pytest.approx(1.0, abs=0.2)
     folder = tmp_path / "new" / "folder"
     tree = xr.open_datatree(folder / "sensitivity.nc", engine="h5netcdf")
-    assert tree["field"]["total"].shape == (2, 390)
+    assert tree["field"]["total"].shape == (2, 1025)
     written = meshio.read(folder / "sensitivity.vtu")
     assert {"first mu", "total lam"} <= set(written.point_data)
     assert (folder / "sensitivity.png").stat().st_size > 10_000

@@ -1,9 +1,13 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from emulator.fem.functional import dead_force, potential_energy, strain_energy
+from emulator.geometry.bodies.box import box
+from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity
 from scene_support import block, rotation
 
@@ -19,6 +23,48 @@ def test_a_uniform_deformation_has_the_law_energy_times_the_volume():
     density = 0.5 * mu * (np.sum(F * F) - 3.0) - mu * np.log(J) + 0.5 * lam * np.log(J) ** 2
     energy = potential_energy(scene)(jnp.asarray(u), jnp.array([mu, lam]))
     assert energy == pytest.approx(VOLUME * density, rel=1e-12)
+
+
+def sheeted(fibres, sheets):
+    """A quadratic block of fibres and sheets, and a homogeneous displacement of it."""
+    scene = block()
+    mesh = box((2.0, 3.0, 4.0), (2, 1, 1), order=2)
+    law = find_law("holzapfel_ogden_orthotropic")
+    values = {name: 1.0 + 0.1 * k for k, name in enumerate(law.parameters)}
+    free = replace(scene.parameters[0], name=law.parameters[0], unit="kPa")
+    values.pop(free.name)
+    H = 0.2 * np.random.default_rng(0).normal(size=(3, 3))
+    directed = replace(
+        scene, mesh=mesh, law=law, parameters=(free,), constants=values,
+        fibres=fibres, sheets=sheets, origin={},
+    )  # fmt: skip
+    return directed, jnp.asarray(mesh.nodes @ H.T)
+
+
+@pytest.mark.parametrize("dilatation", ["pointwise", "mean"])
+def test_each_point_has_its_own_fibre_and_sheet(dilatation):
+    """Directions of elements are those of all their points; two kinds add up by their volumes."""
+    count = 12
+    kinds = [np.eye(3)[[0, 1]], np.array([[0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])]
+    of_elements, of_points, weights = [], [], None
+    for fibre, sheet in kinds:
+        energies = []
+        for shape in ((count, 3), (count, 4, 3)):
+            scene, u = sheeted(np.broadcast_to(fibre, shape), np.broadcast_to(sheet, shape))
+            scene = replace(scene, dilatation=dilatation)
+            energies.append(float(strain_energy(scene)(u, scene.centre)))
+        of_elements.append(energies[0])
+        of_points.append(energies[1])
+        weights = scene.discretisation.weights
+    np.testing.assert_allclose(of_points, of_elements, rtol=1e-14)
+    first = np.random.default_rng(1).random((count, 4)) < 0.5
+    fibres, sheets = (np.where(first[:, :, None], kinds[0][k], kinds[1][k]) for k in (0, 1))
+    scene, u = sheeted(fibres, sheets)
+    scene = replace(scene, dilatation=dilatation)
+    share = weights[first].sum() / weights.sum()
+    expected = share * of_points[0] + (1.0 - share) * of_points[1]
+    assert float(strain_energy(scene)(u, scene.centre)) == pytest.approx(expected, rel=1e-12)
+    assert of_points[0] != pytest.approx(of_points[1], rel=1e-3)
 
 
 def test_a_rigid_rotation_costs_no_energy_and_no_force():

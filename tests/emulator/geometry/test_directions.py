@@ -177,4 +177,4 @@ def test_directions_of_points_are_written_and_read(tmp_path, order):
     body = read_body(tmp_path / "body.vtu")
     for found, given in ((body.fibres, fibres), (body.sheets, sheets)):
         wanted = given[:, 0] if order == 1 else given
-        np.testing.assert_allclose(found, wanted, rtol=1e-14)
+        np.testing.assert_allclose(found, wanted, atol=1e-14)

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.geometry.discretisation import quadrature_points
+from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import LAWS
 from emulator.mechanics.laws.identity import law_identity, probed
 from emulator.scenes import Parameter, Support
@@ -86,6 +88,45 @@ def test_listing_elements_in_another_order_changes_nothing(ventricle):
     assert listed.identity.agrees(ventricle.identity)
     mixed = replace(listed, fibres=ventricle.fibres)
     assert not mixed.identity.agrees(ventricle.identity)
+
+
+def turned(mesh, which):
+    """``mesh`` with the corners of some elements listed from the second on, and all points' places.
+
+    The last are (m, 4) numbers of the quadrature points in the mesh given, found by where they are.
+    """
+    # Corners, then the midpoints of 01, 12, 02, 03, 13 and 23.
+    round_once = [1, 2, 0, 3, 5, 6, 4, 8, 9, 7]
+    elements = np.where(which[:, None], mesh.elements[:, round_once], mesh.elements)
+    before, after = (
+        np.einsum("qa,mai->mqi", quadrature_points(2), mesh.nodes[rows[:, :4]])
+        for rows in (mesh.elements, elements)
+    )
+    apart = np.linalg.norm(after[:, :, None] - before[:, None], axis=-1)
+    return Mesh(mesh.nodes, elements, mesh.node_sets, mesh.facet_sets), apart.argmin(axis=2)
+
+
+def test_points_belong_to_their_corners_however_these_are_listed():
+    scene = em.scenes.left_ventricle(3, 6, 1)
+    count = len(scene.mesh.elements)
+    assert scene.fibres.shape == (count, 4, 3)
+    mesh, places = turned(scene.mesh, np.arange(count) % 2 == 0)
+    assert (np.sort(places, axis=1) == np.arange(4)).all()
+    assert (places != np.arange(4)).any(axis=1).sum() == count // 2
+    moved = np.take_along_axis(scene.fibres, places[:, :, None], axis=1)
+    order = np.random.default_rng(0).permutation(count)
+    listed = replace(
+        scene, mesh=replace(mesh, elements=mesh.elements[order]), fibres=moved[order], origin={}
+    )
+    assert listed.fingerprint == scene.fingerprint
+    assert listed.identity.agrees(scene.identity)
+    # Fibres left where they were now lie at other points; so do two that change places.
+    stayed = replace(scene, mesh=mesh, origin={})
+    swapped = np.array(scene.fibres)
+    swapped[5, [0, 3]] = swapped[5, [3, 0]]
+    for other in (stayed, replace(scene, fibres=swapped, origin={})):
+        assert other.fingerprint != scene.fingerprint
+        assert not other.identity.agrees(scene.identity)
 
 
 def test_the_box_and_the_order_of_theta_are_in_the_fingerprint_only(beam):

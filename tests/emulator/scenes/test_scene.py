@@ -7,6 +7,7 @@ import pytest
 import emulator as em
 from emulator.catalogue import find_scene, scene_from_origin
 from emulator.errors import InputError
+from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import BUILT_IN, Parameter, Support
 from emulator.scenes.loads import FollowerPressure, Gravity
@@ -89,6 +90,40 @@ def one_line_held():
 def test_scenes_that_make_no_sense(change, message):
     with pytest.raises(InputError, match=message):
         replace(block(), **change)
+
+
+@pytest.mark.parametrize("kind", ["fibres", "sheets"])
+@pytest.mark.parametrize(("order", "shapes"), [(1, "(6, 3)"), (2, "(6, 3) or (6, 4, 3)")])
+def test_directions_of_another_shape(kind, order, shapes):
+    """Of elements or of their points; a linear element has one, so that both are the same."""
+    sheeted = find_law("holzapfel_ogden_orthotropic")
+    constants = dict.fromkeys(sheeted.parameters[1:], 1.0)
+    free = (Parameter(sheeted.parameters[0], "kPa", 1.0, 2.0),)
+    points = 1 if order == 1 else 4
+    right = {
+        name: np.broadcast_to(np.eye(3)[k], (6, points, 3))
+        for k, name in enumerate(("fibres", "sheets"))
+    }
+    scene = replace(
+        block(), mesh=box((1.0, 1.0, 1.0), (1, 1, 1), order), law=sheeted, parameters=free,
+        constants=constants, **right,
+    )  # fmt: skip
+    of_elements = replace(scene, fibres=right["fibres"][:, 0], sheets=right["sheets"][:, 0])
+    assert (scene.fingerprint == of_elements.fingerprint) == (order == 1)
+    for each in (scene, of_elements):
+        np.testing.assert_array_equal(each.fibres_at_points, right["fibres"])
+        assert each.tissue.directions.shape == (6, points, 2, 3)
+    for shape in ((5, 3), (6, 2), (6, 3, 3), (6, points, 3, 1), (24, 3)):
+        with pytest.raises(InputError) as caught:
+            replace(scene, **{kind: np.ones(shape)})
+        said = str(caught.value)
+        assert f"{kind} have shape {shape}; expected {shapes}" in said
+        assert "\n" not in said
+
+
+def test_a_scene_without_fibres_has_none_at_its_points():
+    with pytest.raises(InputError, match="scene 'block' has no fibres"):
+        _ = block().fibres_at_points
 
 
 MU, LAM = block().parameters

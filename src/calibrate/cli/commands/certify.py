@@ -24,6 +24,14 @@ def register(commands: Any) -> None:
     parser = commands.add_parser("certify", help="check a posterior against FEM")
     parser.add_argument("folder", metavar="DIR", help="written by calibrate infer")
     parser.add_argument("--draws", type=int, help="FEM runs (default 200)")
+    finer = parser.add_mutually_exclusive_group()
+    finer.add_argument(
+        "--mesh-runs",
+        type=int,
+        metavar="N",
+        help="solves on the next finer mesh (default: four more than unknowns, at most 15)",
+    )
+    finer.add_argument("--no-mesh", action="store_true", help="leave the error of the mesh out")
     parser.add_argument(
         "--reweight", metavar="DIR2", help="write FEM's posterior, reweighted from the check, there"
     )
@@ -47,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         posterior,
         arguments.folder,
         draws=arguments.draws,
+        mesh=0 if arguments.no_mesh else arguments.mesh_runs,
         reweight_to=arguments.reweight,
         scheduler=scheduler,
         progress=progress,

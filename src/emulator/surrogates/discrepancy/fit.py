@@ -34,7 +34,7 @@ Mean = Callable[[jax.Array], jax.Array]
 # Weight of a sensitivity among the snapshots: a typical step as a fraction of the unit box.
 _SENSITIVITY_WEIGHT = 0.3
 _TRUNCATION = 1e-7  # relative to the largest singular value
-_MOST_MODES = 120
+_MOST_MODES = 96
 # The lengths are fitted to at most so many modes and observations.
 _FITTED_MODES = 20
 _MOST_OBSERVATIONS = 500

@@ -57,6 +57,20 @@ def test_volume_converges(order, expected):
     assert order_of(np.array(errors)).min() > expected
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_graded_rings_are_closer_at_the_base(order):
+    even, graded = (truncated_ellipsoid(LAND, 6, 14, 2, order, grading=g) for g in (1.0, 1.5))
+    assert_sound(graded)
+    for mesh in (even, graded):
+        assert volume(mesh) == pytest.approx(LAND.volume, rel=0.06 if order == 1 else 5e-3)
+    # The next ring below the base, of 6: a sixth of the way, or (1/6)^1.5.
+    first = [
+        5.0 - np.unique(mesh.nodes[mesh.facet_set("epicardium")[:, :3], 2].round(6))[-2]
+        for mesh in (even, graded)
+    ]
+    assert first[1] < 0.6 * first[0]
+
+
 def test_volume_by_quadrature():
     # Disc by disc: pi (outer^2 - inner^2) over height, from each surface's apex to the base.
     def below(short, long):
@@ -76,5 +90,8 @@ def test_bad_dimensions_are_named():
         land_ventricle(rings=1)
     with pytest.raises(InputError, match="0 layers"):
         land_ventricle(layers=0)
+    for grading in (0.0, -1.0, float("inf")):
+        with pytest.raises(InputError, match="grading .* of the rings; expected above 0"):
+            truncated_ellipsoid(LAND, 6, 14, 2, grading=grading)
     with pytest.raises(InputError, match="order 3; expected 1 or 2"):
         land_ventricle(order=3)
