@@ -11,8 +11,8 @@ error is the jackknife's over the solves on the finer mesh, and over the pool.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,8 @@ from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.pool import ENOUGH, Pool, corrected_again, effective, normalised, step
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs
-from calibrate.observations import Observations, observations_from_json
+from calibrate.mesh_error import on_finer
+from calibrate.observations import Observations
 from emulator.error.mesh_error import MeshError, MeshErrorEstimate, mesh_error
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
@@ -44,35 +45,11 @@ def points_for(unknowns: int, states: int, most: int | None) -> int:
     return int(np.clip((most or MOST_RUNS) // states, _FEWEST, max(wanted, _FEWEST)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Finer:
-    """FEM on both meshes at points z."""
+Differences = Callable[[np.ndarray], Iterable[np.ndarray | None]]
+"""Data of FEM on a finer mesh less those on the mesh, flat (m,), of each point z (k, p).
 
-    predictive: Predictive
-    error: MeshError
-    observe: Observations
-
-    def differences(self, z: np.ndarray) -> Iterator[np.ndarray | None]:
-        """Finer mesh's data less the mesh's, flat (m,), of each point; None where FEM failed."""
-        model = self.predictive.model
-        draws = self.predictive.constrain(z)
-        near: dict[int, MeshErrorEstimate] = {}
-        for k in range(len(z)):
-            thetas = model.states.thetas({name: values[k] for name, values in draws.items()})
-            try:
-                for s, theta in enumerate(thetas):
-                    near[s] = self.error(theta, model.full(theta), near=near.get(s))
-            except SolverError:
-                yield None
-                continue
-            yield self._flat(self.observe, thetas, [near[s].fine for s in range(len(thetas))]) - (
-                self._flat(model.observe, thetas, [near[s].coarse for s in range(len(thetas))])
-            )
-
-    @staticmethod
-    def _flat(observe: Observations, thetas: jax.Array, fields: list[jax.Array]) -> np.ndarray:
-        seen = jnp.stack([u[observe.nodes] for u in fields])
-        return np.asarray(ravel_pytree(observe(seen, thetas))[0])
+None where FEM failed on one of the meshes.
+"""
 
 
 def mesh_change(
@@ -96,58 +73,86 @@ def mesh_change(
         return MeshChange(why="the simulator is not FEM's")
     try:
         error = mesh_error(simulator)
-        observe = observations_from_json(error.finer.scene, predictive.model.observe.to_json())
+        observe = on_finer(error, predictive.model.observe)
     except InputError as reason:
         return MeshChange(why=str(reason))
-    found = _Finer(predictive, error, observe)
     states = len(predictive.model.states.states)
-    return _change(found, runs, pool, points_for(predictive.dimension, states, count), rng)
+    points = points_for(predictive.dimension, states, count)
+    told = changed(predictive, _by_fem(predictive, error, observe), runs, pool, points, rng)
+    nodes, linear = len(error.finer.scene.mesh.nodes), simulator.scene.mesh.order == 1
+    return replace(told, runs=points * states, nodes=nodes, linear=linear)
 
 
-def _change(
-    finer: _Finer, runs: Runs, pool: Pool, count: int, rng: np.random.Generator
+def _by_fem(predictive: Predictive, error: MeshError, observe: Observations) -> Differences:
+    """FEM's differences; each solve on the finer mesh begins near the last one."""
+    model, near = predictive.model, dict[int, MeshErrorEstimate]()
+
+    def flat(seen: Observations, thetas: jax.Array, fields: list[jax.Array]) -> np.ndarray:
+        stacked = jnp.stack([u[seen.nodes] for u in fields])
+        return np.asarray(ravel_pytree(seen(stacked, thetas))[0])
+
+    def one(thetas: jax.Array) -> np.ndarray | None:
+        try:
+            for s, theta in enumerate(thetas):
+                near[s] = error(theta, model.full(theta), near=near.get(s))
+        except SolverError:
+            return None
+        told = [near[s] for s in range(len(thetas))]
+        fine = flat(observe, thetas, [each.fine for each in told])
+        return fine - flat(model.observe, thetas, [each.coarse for each in told])
+
+    def differences(z: np.ndarray) -> Iterator[np.ndarray | None]:
+        draws = predictive.constrain(z)
+        for k in range(len(z)):
+            yield one(model.states.thetas({name: values[k] for name, values in draws.items()}))
+
+    return differences
+
+
+def changed(
+    predictive: Predictive,
+    differences: Differences,
+    runs: Runs,
+    pool: Pool,
+    count: int,
+    rng: np.random.Generator,
 ) -> MeshChange:
-    predictive, scene = finer.predictive, finer.error.finer.scene
-    nodes = len(scene.mesh.nodes)
+    """What ``differences`` at ``count`` points change of the corrected posterior."""
     first = -(-count // 2)
-    z, D = _solved(finer, _spread(pool, first, rng))
     corrected = _Corrected(predictive, runs)
+    z, D = _solved(differences, _drawn(pool, first, rng), predictive)
     moved = _followed(pool, predictive, corrected(z, D), rng)
-    more, others = _solved(finer, _spread(moved, count - first, rng))
+    more, others = _solved(differences, _drawn(moved, count - first, rng), predictive)
     z, D = np.concatenate([z, more]), np.concatenate([D, others])
     failed = count - len(z)
     if len(z) < _FEWEST:
-        return MeshChange(nodes=nodes, runs=count, failed=failed)
-    correction = corrected(z, D)
-    moved = _followed(moved, predictive, correction, rng)
+        return MeshChange(runs=count, failed=failed)
+    moved = _followed(moved, predictive, corrected(z, D), rng)
     # Of the corrected posterior on the mesh, over the same points.
     before = corrected_again(moved, predictive, corrected(z[:0], D[:0])).corrected
     names = predictive.model.names
     here = predictive.constrain(moved.z)
     x = np.stack([here[name] for name in names], axis=1)
 
-    def change(after: np.ndarray, used: np.ndarray) -> np.ndarray:
+    def change(after: np.ndarray, used: np.ndarray | float = 1.0) -> np.ndarray:
         p, old, new = len(names), moments(x, before * used), moments(x, after * used)
         return np.concatenate([(new - old)[:p] / np.exp(old[p : 2 * p]), (new - old)[p : 2 * p]])
 
     value, error = jackknife(lambda used: change(moved.corrected, used), len(x))
-    everything = np.ones(len(x), dtype=bool)
-    without = []
-    for k in range(len(z)):
-        kept = np.arange(len(z)) != k
-        again = corrected_again(moved, predictive, corrected(z[kept], D[kept]))
-        without.append(change(again.corrected, everything))
+    without = [
+        change(corrected_again(moved, predictive, corrected(z[kept], D[kept])).corrected)
+        for kept in ~np.eye(len(z), dtype=bool)
+    ]
     spread = np.sum((np.array(without) - value) ** 2, axis=0) * (len(z) - 1) / len(z)
-    error = np.sqrt(error**2 + spread)
-    figures = [Figure(float(v), float(e)) for v, e in zip(value, error, strict=True)]
-    p = len(names)
+    figures = [
+        Figure(float(v), float(e)) for v, e in zip(value, np.hypot(error, spread**0.5), strict=True)
+    ]
+    shift, log_sd = figures[: len(names)], figures[len(names) :]
     return MeshChange(
-        nodes=nodes,
-        runs=count * len(predictive.model.states.states),
+        dict(zip(names, shift, strict=True)),
+        dict(zip(names, log_sd, strict=True)),
+        runs=count,
         failed=failed,
-        shift=dict(zip(names, figures[:p], strict=True)),
-        log_sd=dict(zip(names, figures[p:], strict=True)),
-        linear=finer.error.simulator.scene.mesh.order == 1,
     )
 
 
@@ -179,20 +184,19 @@ def _values(correction: Correction, features: jax.Array) -> jax.Array:
     return jax.vmap(lambda x: correct(correction, x)[0])(features)
 
 
-def _solved(finer: _Finer, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _solved(
+    differences: Differences, z: np.ndarray, predictive: Predictive
+) -> tuple[np.ndarray, np.ndarray]:
     """The points (k, p) at which FEM converged on both meshes, and its differences (k, m)."""
-    found = list(finer.differences(z))
+    found = list(differences(z))
     fine = np.array([difference is not None for difference in found], dtype=bool)
-    width = len(finer.predictive.scales)
     kept = [difference for difference in found if difference is not None]
-    return z[fine], np.array(kept).reshape(-1, width)
+    return z[fine], np.array(kept).reshape(-1, len(predictive.scales))
 
 
-def _spread(pool: Pool, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, p) of the corrected posterior, each once as far as there are any."""
-    weights = pool.corrected
-    rows = rng.choice(len(weights), size=count, p=weights)
-    return pool.z[rows]
+def _drawn(pool: Pool, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Points (count, p) of the corrected posterior."""
+    return pool.z[rng.choice(len(pool.z), size=count, p=pool.corrected)]
 
 
 def _followed(

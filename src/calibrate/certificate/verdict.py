@@ -29,7 +29,6 @@ SMALLEST_P_WORST = 0.001
 # different whatever the tail; at 1.5 a tenth of the FEM runs would count.
 LARGEST_SPREAD = 1.5
 SMALLEST_POOL = 200.0  # effective points under the corrected map
-_ALLOW = "allow for the mesh's error with infer --mesh-error"
 _QUADRATIC = "make the elements quadratic (order = 2)"
 _REFINE = "refine the mesh"
 
@@ -128,12 +127,12 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[str]]:
     within = mesh.within()
     if within:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
-        return True, [f"{finer} no mean would move by more than {worst:.2f} posterior sd"]
+        return True, [f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"]
     words = [w for w, figure, limit in mesh.judged() if figure.within(limit) is within]
     if within is None:
         more = "give more runs on the finer mesh (--mesh-runs)"
         return None, [f"{finer} the {words[0]}, too close to the limit for its error: {more}"]
-    remedy = f"{_QUADRATIC if mesh.linear else _REFINE}, or {_ALLOW}"
+    remedy = _QUADRATIC if mesh.linear else _REFINE
     return False, [f"{finer} the {each}: {remedy}" for each in words]
 
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.figures.drawing import pyplot
+from calibrate.figures.drawing import pyplot, save
 from calibrate.figures.palette import BLUE, VERMILION
 from calibrate.sbc import LEVELS, Calibration
-from emulator.store import replacing
 
 _INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ for all readers
 
@@ -47,9 +46,7 @@ def draw(found: Calibration, title: str, path: str | Path) -> None:
         axes.set_ylabel("distribution less uniform")
     verdict = "inside the 95 % band" if found.passed else "outside the 95 % band"
     figure.suptitle(f"{title}: {found.replicates} data sets, {verdict}")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=140)
-    plt.close(figure)
+    save(figure, path)
 
 
 def draw_prior_predictive(
@@ -73,6 +70,4 @@ def draw_prior_predictive(
         low, high = np.quantile(sizes, [0.05, 0.95])
         axes.set_title(f"90 %: {low:.3g} to {high:.3g} {units[name]}", fontsize=9)
     figure.suptitle(title)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=140)
-    plt.close(figure)
+    save(figure, path)

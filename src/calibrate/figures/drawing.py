@@ -62,6 +62,11 @@ def title_and_save(
         f"{posterior.model.forward.scene.name}: posterior by {posterior.model.forward.kind}, "
         f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"
     )
+    save(figure, path)
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write the figure, whole or not at all, and close it."""
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=140)
     pyplot().close(figure)

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import gaussian_kde
 
-from calibrate.figures.drawing import pyplot
+from calibrate.figures.drawing import pyplot, save
 from emulator.error.comparison import UNITS, Errors, quantiles
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.store import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,11 +45,8 @@ def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
             scene, evaluated.inside.fields["err_u"].mean(axis=0), title
         ),
     }
-    plt = pyplot()
     for name, figure in figures.items():
-        with replacing(folder / name) as temporary:
-            figure.savefig(temporary, dpi=140)
-        plt.close(figure)
+        save(figure, folder / name)
     return [folder / name for name in figures]
 
 
@@ -222,7 +218,12 @@ def surface_mesh(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return nodes, places.reshape(triangles.shape)
 
 
-def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
+def surface_figure(
+    scene: Scene,
+    error: np.ndarray,
+    title: str,
+    label: str = f"mean err_u of the cases ({UNITS['err_u']})",
+) -> Any:
     """The undeformed body's surface coloured by ``error`` (n,) mm at its nodes, from two sides."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -252,7 +253,6 @@ def surface_figure(scene: Scene, error: np.ndarray, title: str) -> Any:
                 getattr(axes, f"set_{name}label")(f"{name} (mm)", labelpad=14 if thin.any() else 4)
         axes.set_box_aspect(extent, zoom=0.88)
         panels.append(axes)
-    label = f"mean err_u of the cases ({UNITS['err_u']})"
     figure.colorbar(colour, ax=panels, label=label, shrink=0.75)
     figure.suptitle(title)
     return figure

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from calibrate.figures.drawing import pyplot
+from calibrate.figures.drawing import pyplot, save
 from calibrate.figures.evaluation import surface_triangles
 from calibrate.figures.palette import BLUE, VERMILION
 from calibrate.sensitivity_analysis import FIELD
 from emulator.scenes.scene import Scene
-from emulator.store import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,11 +36,8 @@ def draw(found: xr.DataTree, scene: Scene, folder: str | Path) -> list[Path]:
     figures = {"sensitivity.png": index_figure(found)}
     if FIELD in found.children:
         figures["sensitivity_on_body.png"] = body_figure(found, scene)
-    plt = pyplot()
     for name, figure in figures.items():
-        with replacing(Path(folder) / name) as temporary:
-            figure.savefig(temporary, dpi=140)
-        plt.close(figure)
+        save(figure, Path(folder) / name)
     return [Path(folder) / name for name in figures]
 
 

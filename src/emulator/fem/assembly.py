@@ -7,7 +7,7 @@ r"""Residual and tangent of a scene's potential energy over its free degrees of 
 
 with :math:`B` the shape-function gradients. Dead loads have no tangent; elastic supports and loads
 that follow the deformation add the Hessians of their own potentials, or the derivatives of their
-forces, facet by facet. With mean dilatation the points of an element are coupled; its block is in
+forces, facet by facet. With mean dilatation the points of a block are coupled; its tangent is in
 :mod:`emulator.fem.mixed`.
 """
 
@@ -89,11 +89,11 @@ class System:
 
     @cached_property
     def pattern(self) -> Pattern:
-        """Sparsity of the tangent: bulk elements, then springs, then the loads."""
+        """Sparsity of the tangent: the bulk's blocks, then springs, then the loads."""
         free_index = np.full(self.scene.held.size, -1)
         free_index[self.free] = np.arange(len(self.free))
         local: list[LocalTerm | LocalForce] = [*self.springs, *self.terms, *self.forces]
-        groups = [self.scene.discretisation.connectivity, *(part.nodes for part in local)]
+        groups = [self.scene.blocks.connectivity, *(part.nodes for part in local)]
         dofs = [(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1) for nodes in groups]
         # A definite factorisation reads the upper triangle whatever the loads are.
         symmetric = self.direct.triangle and (self.direct.definite or not self.forces)
@@ -170,8 +170,8 @@ class System:
 
     @property
     def mixed(self) -> bool:
-        """Whether each element has a volume and a pressure as unknowns."""
-        return self.scene.dilatation == "mean"
+        """Whether each block has a volume and a pressure as unknowns."""
+        return self.scene.dilatation != "pointwise"
 
     def mixed_residual(
         self,
@@ -182,15 +182,15 @@ class System:
         move: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
         """Residual (f,) with the volumes eliminated, and its change along ``move`` (n, 3)."""
-        nodes = self.scene.discretisation.connectivity
+        nodes = self.scene.blocks.connectivity
         force, change = jax.jvp(lambda v: self.others(v, theta, load), (u,), (move,))
         local = move[nodes].reshape(len(nodes), -1)
         change = change + self.scatter(jnp.einsum("mij,mj->mi", condensed.tangent, local))
         return self.restrict(self.scatter(condensed.force) + force), self.restrict(change)
 
     def scatter(self, local: jax.Array) -> jax.Array:
-        """Nodal sums (n, 3) of element vectors (m, ...)."""
-        nodes = self.scene.discretisation.connectivity
+        """Nodal sums (n, 3) of the blocks' vectors (b, ...)."""
+        nodes = self.scene.blocks.connectivity
         at_nodes = local.reshape(*nodes.shape, 3)
         return jnp.zeros(self.scene.held.shape, local.dtype).at[nodes].add(at_nodes)
 
@@ -207,7 +207,7 @@ class System:
     def assemble(
         self, bulk: jax.Array, u: jax.Array, theta: jax.Array, load: jax.Array | float
     ) -> jax.Array:
-        """Nonzeros (nnz,) of the tangent from element blocks ``bulk``, springs and loads."""
+        """Nonzeros (nnz,) of the tangent from that of the blocks ``bulk``, springs and loads."""
         values = self.scene.resolve(theta)
         blocks = [bulk]
         blocks += [spring.tangents(u, values) for spring in self.springs]
@@ -216,9 +216,9 @@ class System:
         return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
 
     def bulk(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Second derivatives (m, ...) of the strain energy, element by element."""
+        """Second derivatives (b, ...) of the strain energy, block by block."""
         scene = self.scene
-        if scene.dilatation == "mean":
+        if self.mixed:
             return linearise(scene, u, consistent(scene, u, theta), theta).tangent
         H = displacement_gradient(scene, u)
         return self.element_blocks(at_points(scene, jax.hessian(point_energy(scene, theta)), H))

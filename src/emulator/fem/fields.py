@@ -15,8 +15,8 @@ import numpy as np
 from emulator.fem.functional import (
     at_points,
     displacement_gradient,
+    energy_of_gradient,
     point_energy,
-    with_mean_dilatation,
 )
 from emulator.geometry.directions import unit
 from emulator.mechanics.kinematics import determinant
@@ -68,13 +68,8 @@ def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
     """First Piola-Kirchhoff stress (m, q, 3, 3) in kPa, from the strain energy's gradient."""
     if scene.dilatation == "pointwise":
         return at_points(scene, jax.grad(point_energy(scene, theta)), H)
-    weights = jnp.asarray(scene.discretisation.weights)
-
-    def energy(H: jax.Array) -> jax.Array:
-        evened = jax.vmap(with_mean_dilatation)(H, weights)
-        return jnp.sum(weights * at_points(scene, point_energy(scene, theta), evened))
-
-    return jax.grad(energy)(H) / weights[..., None, None]
+    slope = jax.grad(energy_of_gradient, argnums=1)(scene, H, theta)
+    return slope / scene.discretisation.weights[..., None, None]
 
 
 def _symmetric(A: jax.Array) -> jax.Array:

@@ -14,7 +14,8 @@ With mean dilatation the volume ratio of an element is its mean,
     \bar J = \frac{\int_e J\, dX}{\int_e dX},
 
 and W is evaluated at :math:`\hat F`: one volume constraint an element, which quadratic tetrahedra
-can meet without locking (Simo, Taylor & Pister 1985).
+can meet without locking (Simo, Taylor & Pister 1985). With patch dilatation the mean is that of a
+patch of linear tetrahedra (:mod:`emulator.geometry.patches`).
 """
 
 from __future__ import annotations
@@ -74,19 +75,23 @@ def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = Non
     return energy
 
 
-def at_points(scene: Scene, function: Callable, *fields: jax.Array) -> Any:
+def at_points(
+    scene: Scene, function: Callable, *fields: jax.Array, tissue: Tissue | None = None
+) -> Any:
     """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...); leaves (m, q, ...).
 
+    The points are the elements' unless ``tissue`` (m, q, ...) says what is at others.
     All points are one batch: a ``vmap`` in a ``vmap`` takes half as long again to trace.
     """
     shape = fields[0].shape[:2]
-    flat = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), (*fields, scene.tissue))
+    every = (*fields, scene.tissue if tissue is None else tissue)
+    flat = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), every)
     found = jax.vmap(function)(*flat)
     return jax.tree.map(lambda array: array.reshape(*shape, *array.shape[1:]), found)
 
 
 def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -> jax.Array:
-    """Mean of ``J - 1`` over an element with ``u`` (a, 3), ``gradients`` (q, a, 3), ``weights``."""
+    """Mean of ``J - 1`` over a block with ``u`` (a, 3), ``gradients`` (q, a, 3), ``weights``."""
     H = jnp.einsum("ai,qaj->qij", u, gradients)
     return jnp.vdot(weights, jax.vmap(lambda h: Strain(h).J_minus_1)(H)) / jnp.sum(weights)
 
@@ -103,13 +108,13 @@ def with_volume_change(
 def with_mean_dilatation(
     H: jax.Array, weights: jax.Array, barriers: Barriers | None = None
 ) -> jax.Array:
-    """Displacement gradients (q, 3, 3) of one element, each point's J replaced by their mean."""
+    """Displacement gradients (q, 3, 3) of one block, each point's J replaced by their mean."""
     J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
     return with_volume_change(H, jnp.vdot(weights, J_minus_1) / jnp.sum(weights), barriers)
 
 
 def at_volume(scene: Scene, theta: jax.Array) -> Callable:
-    """``(change, u, gradients, weights, tissue) -> ()``: strain energy of an element, mN mm.
+    """``(change, u, gradients, weights, tissue) -> ()``: strain energy of a block, mN mm.
 
     ``change``, the volume ratio less 1, replaces the one that follows from ``u`` (a, 3) mm at every
     point; ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``tissue`` of its points.
@@ -133,13 +138,20 @@ def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
     """``(u, theta) -> int W dX`` in mN mm."""
 
     def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
-        weights = scene.discretisation.weights
-        H = displacement_gradient(scene, u)
-        if scene.dilatation == "mean":
-            H = jax.vmap(lambda h, w: with_mean_dilatation(h, w, barriers))(H, weights)
-        return jnp.sum(weights * at_points(scene, point_energy(scene, theta, barriers), H))
+        return energy_of_gradient(scene, displacement_gradient(scene, u), theta, barriers)
 
     return energy
+
+
+def energy_of_gradient(
+    scene: Scene, H: jax.Array, theta: jax.Array, barriers: Barriers | None = None
+) -> jax.Array:
+    """``int W dX`` in mN mm from the displacement gradient ``H`` (m, q, 3, 3)."""
+    weights, H = scene.blocks.weights, scene.blocks.gather(H)
+    if scene.dilatation != "pointwise":
+        H = jax.vmap(lambda h, w: with_mean_dilatation(h, w, barriers))(H, weights)
+    density = point_energy(scene, theta, barriers)
+    return jnp.sum(weights * at_points(scene, density, H, tissue=scene.block_tissue))
 
 
 def spring_terms(scene: Scene) -> list[LocalTerm]:

@@ -1,8 +1,10 @@
-r"""Newton steps for mean dilatation, with each element's volume and pressure as iterates.
+r"""Newton steps for mean dilatation, with each block's volume and pressure as iterates.
+
+A block is a quadratic element, or a patch of linear ones (:mod:`emulator.geometry.patches`).
 
 With displacements alone, a stiff volume term limits Newton's steps to where the constraint is
 nearly linear: hundreds of tiny steps at nu = 0.4999 (docs/experiments.md, "Mean dilatation on the
-displacements alone"). So each element's volume ratio :math:`\theta` and
+displacements alone"). So each block's volume ratio :math:`\theta` and
 pressure :math:`p` become unknowns (Simo, Taylor & Pister 1985), stationary points of
 
 .. math::
@@ -10,7 +12,7 @@ pressure :math:`p` become unknowns (Simo, Taylor & Pister 1985), stationary poin
     E_e(u, \theta) = \sum_q w_q\, W\!\left((\theta / J_q)^{1/3} F_q\right).
 
 With :math:`g = E_{u\theta}`, :math:`b = V \bar J_u`, :math:`r_\theta = E_\theta - pV` and
-:math:`r_p = V(\bar J - \theta)`, the two are eliminated element by element,
+:math:`r_p = V(\bar J - \theta)`, the two are eliminated block by block,
 
 .. math::
     V \Delta\theta &= r_p + b^T \Delta u, \qquad
@@ -34,7 +36,7 @@ from emulator.scenes.scene import Scene
 
 
 class Volumes(NamedTuple):
-    """Iterates of the elements: volume ratio less 1 and pressure in kPa, both (m,)."""
+    """Iterates of the blocks: volume ratio less 1 and pressure in kPa, both (b,)."""
 
     change: jax.Array
     pressure: jax.Array
@@ -43,8 +45,8 @@ class Volumes(NamedTuple):
 class Condensed(NamedTuple):
     """Linearisation with the volumes eliminated.
 
-    force : (m, a, 3) mN. tangent : (m, 3a, 3a) mN/mm.
-    b, g : (m, a, 3) couplings; r_change, r_pressure, stiffness : (m,).
+    force : (b, a, 3) mN. tangent : (b, 3a, 3a) mN/mm.
+    b, g : (b, a, 3) couplings; r_change, r_pressure, stiffness : (b,).
     """
 
     force: jax.Array
@@ -57,25 +59,25 @@ class Condensed(NamedTuple):
 
 
 def _arguments(scene: Scene, u: jax.Array) -> tuple:
-    """Displacements, gradients, weights and tissue of every element, for ``vmap``."""
-    grid = scene.discretisation
+    """Displacements, gradients, weights and tissue of every block, for ``vmap``."""
+    grid = scene.blocks
     local = (u[grid.connectivity], jnp.asarray(grid.gradients), jnp.asarray(grid.weights))
-    return (*local, scene.tissue)
+    return (*local, scene.block_tissue)
 
 
 def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:
     """Volumes and pressures that follow from the displacement ``u`` (n, 3)."""
 
-    def one(*element: Any) -> Volumes:
-        change = mean_volume_change(*element[:3])
-        slope = jax.grad(at_volume(scene, theta), argnums=0)(change, *element)
-        return Volumes(change, slope / jnp.sum(element[2]))
+    def one(*block: Any) -> Volumes:
+        change = mean_volume_change(*block[:3])
+        slope = jax.grad(at_volume(scene, theta), argnums=0)(change, *block)
+        return Volumes(change, slope / jnp.sum(block[2]))
 
     return jax.vmap(one)(*_arguments(scene, u))
 
 
 def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) -> Condensed:
-    """Force and tangent of every element at ``u`` (n, 3) and ``volumes``."""
+    """Force and tangent of every block at ``u`` (n, 3) and ``volumes``."""
     energy = at_volume(scene, theta)
 
     def one(change, pressure, local, gradients, weights, own):  # noqa: ANN001, ANN202
@@ -112,7 +114,7 @@ def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) ->
 def carried(
     scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array, at: Condensed
 ) -> jax.Array:
-    """Force (m, a, 3) of every element at ``u`` and ``volumes``, eliminated with ``at``.
+    """Force (b, a, 3) of every block at ``u`` and ``volumes``, eliminated with ``at``.
 
     The force of :func:`linearise`, but with the couplings of an earlier iterate: solving with that
     iterate's tangent gives the simplified Newton step.
@@ -134,8 +136,8 @@ def advance(
     scene: Scene, volumes: Volumes, at: Condensed, move: jax.Array, fraction: jax.Array
 ) -> Volumes:
     """``volumes`` after ``fraction`` of the step whose displacement is ``move`` (n, 3)."""
-    local = move[scene.discretisation.connectivity]
-    V = jnp.sum(jnp.asarray(scene.discretisation.weights), axis=1)
+    local = move[scene.blocks.connectivity]
+    V = jnp.sum(jnp.asarray(scene.blocks.weights), axis=1)
     change = (at.r_pressure + jnp.einsum("mai,mai->m", at.b, local)) / V
     pressure = at.r_change + jnp.einsum("mai,mai->m", at.g, local) + at.stiffness * change
     return Volumes(volumes.change + fraction * change, volumes.pressure + fraction * pressure / V)

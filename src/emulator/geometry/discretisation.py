@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 from skfem import ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2
 from skfem.quadrature import get_quadrature
@@ -14,21 +15,33 @@ from emulator.geometry.mesh import Mesh, frozen_array
 
 
 @dataclass(frozen=True, eq=False)
-class Discretisation:
-    """A mesh with its shape functions; ``m`` elements, ``q`` quadrature points, ``a`` local nodes.
+class Blocks:
+    """Groups of quadrature points that share nodes; ``b`` blocks, ``q`` points, ``a`` nodes each.
+
+    connectivity : (b, a) node of each local shape function.
+    gradients : (b, q, a, 3) reference gradients of the shape functions, 1/mm.
+    weights : (b, q) quadrature weights times volume, mm3.
+    """
+
+    connectivity: np.ndarray
+    gradients: np.ndarray
+    weights: np.ndarray
+
+    def gather[A: (jax.Array, np.ndarray)](self, field: A) -> A:
+        """Values (b, q, ...) at the blocks' points of a ``field`` (m, q, ...) at the elements'."""
+        return field
+
+
+@dataclass(frozen=True, eq=False)
+class Discretisation(Blocks):
+    """A mesh with its shape functions; each of its ``m`` elements is a block.
 
     mesh : linear or quadratic tetrahedra.
-    connectivity : (m, a) node of each local shape function.
-    gradients : (m, q, a, 3) reference gradients of the shape functions, 1/mm.
     values : (q, a) shape functions at the quadrature points.
-    weights : (m, q) quadrature weights times volume, mm3.
     """
 
     mesh: Mesh
-    connectivity: np.ndarray
-    gradients: np.ndarray
     values: np.ndarray
-    weights: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

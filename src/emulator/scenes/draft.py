@@ -16,6 +16,7 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.geometry.io import Body, read_body, write_mesh
 from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import EDGES
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.file import read_scene
@@ -41,6 +42,10 @@ _RANGES = {
 }
 _CONSTANTS = {"kappa": 25.0}
 _MODULUS, _NUMBER = (1.0, 10.0), (1.0, 5.0)
+_MOST_QUADRATIC = 20_000  # nodes that are simulated in seconds
+_LINEAR = (
+    "the mesh has linear tetrahedra, which lock: a ventricle of them fills by a quarter too little"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +90,8 @@ def draft(
     unit = unit or _guessed_unit(body.mesh, notes)
     out.parent.mkdir(parents=True, exist_ok=True)
     body, mesh_name = _in_mm(body, mesh_path, out, unit, notes)
+    if body.mesh.order == 1:
+        notes.append(_LINEAR)
     chosen = _law(body, law, notes)
     support = _support(body.mesh, notes)
     for load in _loads(body.mesh, notes):
@@ -198,7 +205,7 @@ def _text(
         "",
         f'law = "{law.name}"   # see docs/extending.md for others',
         f'mesh = "{mesh_name}"',
-        '# order = 2, dilatation = "mean": quadratic elements that do not lock',
+        *_elements(mesh),
         "",
     ]
     walls = _helix(mesh)
@@ -223,6 +230,25 @@ def _text(
     if fixed:
         parts += ["[constants]", *(f"{q.name} = {_CONSTANTS[q.name]}" for q in fixed), ""]
     return "\n".join(parts)
+
+
+def _elements(mesh: Mesh) -> list[str]:
+    """Lines that keep linear tetrahedra from locking."""
+    if mesh.order == 2:
+        return []
+    count = _quadratic_nodes(mesh)
+    if count <= _MOST_QUADRATIC:
+        return [f"order = 2   # quadratic elements, {count} nodes"]
+    return [
+        'dilatation = "patch"   # linear elements share their volume changes, lest they lock',
+        f"# order = 2: quadratic elements are better, but {count} nodes; mesh the body coarser",
+    ]
+
+
+def _quadratic_nodes(mesh: Mesh) -> int:
+    """Nodes of a linear mesh made quadratic: one on every edge more."""
+    edges = np.sort(mesh.elements[:, EDGES], axis=2).reshape(-1, 2)
+    return len(mesh.nodes) + len(np.unique(edges, axis=0))
 
 
 def _sets(mesh: Mesh) -> list[str]:

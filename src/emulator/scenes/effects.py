@@ -1,8 +1,9 @@
 """The effects of a scene that it can do without, and the scene without each.
 
 Laws, loads and supports say which effect of theirs can be left out, and what stands in its place;
-the rest is the scene's: the elements' order and their mean dilatation, and regions of different
-stiffness. A simpler scene takes some of the scene's parameters and lives on some of its nodes.
+the rest is the scene's: the elements' order, their mean or patch dilatation, and regions of
+different stiffness. A simpler scene takes some of the scene's parameters and lives on some of its
+nodes.
 """
 
 from __future__ import annotations
@@ -113,8 +114,9 @@ def _changes(scene: Scene) -> Iterator[_Change]:
             yield name, {field: kept}, remedy or f"leave out '{part.kind}' in {table}"
     if scene.regions is not None:
         yield "regional stiffness", {"regions": None}, "leave out regions"
-    if scene.dilatation == "mean":
-        yield "mean dilatation", {"dilatation": "pointwise"}, 'dilatation = "pointwise"'
+    if scene.dilatation != "pointwise":
+        name = f"{scene.dilatation} dilatation"
+        yield name, {"dilatation": "pointwise"}, 'dilatation = "pointwise"'
     if scene.mesh.order == 2:
         linear = {"mesh": to_linear(scene.mesh), "dilatation": "pointwise"}
         for kind in ("fibres", "sheets"):

@@ -34,7 +34,8 @@ A ventricle, whose mesh file has groups named base, endocardium and epicardium:
     law = "guccione"
     mesh = "ventricle.vtu"
     order = 2                                # quadratic elements, from linear ones if need be
-    dilatation = "mean"                      # their way not to lock; or "pointwise"
+    dilatation = "mean"                      # their way not to lock; or "pointwise";
+                                             # "patch" helps linear ones (order = 1)
 
     [fibres]                                 # without it, they come from the mesh file
     rule = "helix"

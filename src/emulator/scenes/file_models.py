@@ -50,8 +50,9 @@ class SceneFile(Table):
     """what moves the body."""
     constants: dict[str, float] = Field(default_factory=dict)
     """parameters that do not vary, in the unit that law or load expect."""
-    dilatation: Literal["pointwise", "mean"] = "pointwise"
-    """mean: one volume ratio an element, so that quadratic tetrahedra do not lock."""
+    dilatation: Literal["pointwise", "mean", "patch"] = "pointwise"
+    """mean: one volume ratio an element, so that quadratic tetrahedra do not lock; patch: one for
+    about six linear ones, which then lock much less."""
     order: Literal[1, 2] | None = None
     """2 for quadratic tetrahedra, made from linear ones if need be; as the mesh file without it."""
     regions: str | None = None

@@ -46,6 +46,8 @@ def finer(scene: Scene) -> Finer:
         mesh=refinement.mesh,
         fibres=fibres,
         sheets=sheets,
+        # A finer mesh is quadratic, and patches are for linear elements.
+        dilatation="mean" if scene.dilatation == "patch" else scene.dilatation,
         regions=None if scene.regions is None else np.repeat(scene.regions, children),
         supports=tuple(_on(support, refinement.mesh, moved) for support in scene.supports),
         origin={},

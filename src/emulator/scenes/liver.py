@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from emulator.geometry.bodies.organ import organ
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity
@@ -10,7 +12,7 @@ from emulator.scenes.resolution import resolved
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import ElasticSupport, Support
 
-SIZES = {
+SIZES: dict[int, dict[str, Any]] = {
     1: {"shells": 6, "clustering": 0.0, "ligament_shells": 6, "ligament": None},
     2: {"shells": 5, "clustering": 0.5, "ligament_shells": 5, "ligament": 2.0},
 }

@@ -13,8 +13,14 @@ import jax
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.discretisation import Discretisation, discretise, quadrature_points
+from emulator.geometry.discretisation import (
+    Blocks,
+    Discretisation,
+    discretise,
+    quadrature_points,
+)
 from emulator.geometry.mesh import Mesh, frozen_array
+from emulator.geometry.patches import patchwise
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
@@ -47,7 +53,9 @@ class Scene(Shown):
         accuracy.
     origin : how a built-in scene was made: its name and arguments, written to scene files.
     dilatation : ``pointwise``, or ``mean`` to use the mean volume change of each element, which
-        keeps quadratic elements from locking when the material is nearly incompressible.
+        keeps quadratic elements from locking when the material is nearly incompressible, or
+        ``patch`` to use that of about six neighbouring linear ones, which helps these
+        (:mod:`emulator.geometry.patches`).
     sheets : unit sheet directions across the fibres, likewise.
     regions : (m,) whole number of the region each element lies in. Region 3 takes a parameter or a
         constant ``stiffness_3``, by which the law's energy there is multiplied, except its
@@ -63,7 +71,7 @@ class Scene(Shown):
     constants: Mapping[str, float] = field(default_factory=dict)
     fibres: np.ndarray | None = None
     origin: Mapping[str, Any] = field(default_factory=dict)
-    dilatation: Literal["pointwise", "mean"] = "pointwise"
+    dilatation: Literal["pointwise", "mean", "patch"] = "pointwise"
     sheets: np.ndarray | None = None
     regions: np.ndarray | None = None
 
@@ -144,14 +152,20 @@ class Scene(Shown):
                 )
 
     def _check_dilatation(self) -> None:
-        if self.dilatation not in ("pointwise", "mean"):
+        if self.dilatation not in ("pointwise", "mean", "patch"):
             raise InputError(
-                f"scene '{self.name}': dilatation '{self.dilatation}'; use pointwise or mean"
+                f"scene '{self.name}': dilatation '{self.dilatation}'; use pointwise or mean, "
+                "or patch on linear tetrahedra"
             )
         if self.dilatation == "mean" and self.mesh.order == 1:
             raise InputError(
                 f"scene '{self.name}': mean dilatation on linear tetrahedra changes nothing, "
-                "they have one point each; make the mesh quadratic"
+                "they have one point each; make the mesh quadratic, or write dilatation 'patch'"
+            )
+        if self.dilatation == "patch" and self.mesh.order == 2:
+            raise InputError(
+                f"scene '{self.name}': patch dilatation is for linear tetrahedra; on quadratic "
+                "ones write dilatation 'mean'"
             )
 
     def _check_supports(self) -> None:
@@ -259,6 +273,11 @@ class Scene(Shown):
         """Shape functions and quadrature of the mesh."""
         return discretise(self.mesh)
 
+    @cached_property
+    def blocks(self) -> Blocks:
+        """What the strain energy is a sum over: the elements, or patches of them."""
+        return patchwise(self.discretisation) if self.dilatation == "patch" else self.discretisation
+
     def _at_points(self, of_elements: np.ndarray) -> np.ndarray:
         """Directions (m, 3) or (m, q, 3) at every quadrature point, (m, q, 3)."""
         points = len(quadrature_points(self.mesh.order))
@@ -279,13 +298,18 @@ class Scene(Shown):
         if self.fibres is not None:
             directions = self.fibres_at_points
         if self.fibres is not None and self.sheets is not None:
-            directions = np.stack([directions, self._at_points(self.sheets)], axis=2)
+            directions = np.stack([self.fibres_at_points, self._at_points(self.sheets)], axis=2)
         if self.regions is not None:
             points = len(quadrature_points(self.mesh.order))
             index = np.unique(self.regions, return_inverse=True)[1]
             region = np.broadcast_to(index[:, None], (len(index), points))
         # NumPy arrays: JAX arrays made inside jit would be tracers, and this is cached.
         return Tissue(cast(Any, directions), cast(Any, region))
+
+    @cached_property
+    def block_tissue(self) -> Tissue:
+        """The same stacked over :attr:`blocks` and their points, leading axes (b, q)."""
+        return jax.tree.map(self.blocks.gather, self.tissue)
 
     @cached_property
     def prescribed(self) -> tuple[np.ndarray, np.ndarray]:
@@ -305,7 +329,9 @@ class Scene(Shown):
     def shown(self) -> tuple[str, list[Row]]:
         """Name, mesh, law, loads, supports, theta."""
         mesh = self.mesh
-        order = "linear" if mesh.order == 1 else f"quadratic, {self.dilatation} dilatation"
+        order = "linear" if mesh.order == 1 else "quadratic"
+        if (mesh.order, self.dilatation) != (1, "pointwise"):
+            order = f"{order}, {self.dilatation} dilatation"
         kinds = (", ".join(part.kind for part in parts) for parts in (self.loads, self.supports))
         loads, supports = kinds
         ranges = [f"{p.name} {p.low:.4g} to {p.high:.4g} {p.unit}".strip() for p in self.parameters]

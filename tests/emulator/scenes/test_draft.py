@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import emulator as em
 from calibrate.cli import main
 from emulator.errors import InputError
 from emulator.geometry.bodies.box import box
 from emulator.geometry.bodies.ellipsoid import human_ventricle
+from emulator.geometry.fibres import rule_based_fibres
 from emulator.geometry.io import write_mesh
+from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes.draft import draft
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity
 
@@ -28,9 +29,9 @@ def test_a_ventricle_of_named_groups(ventricle_file):
     assert scene.law.name == "holzapfel_ogden"
     assert scene.loads == (CavityPressure("endocardium"),)
     assert scene.parameter_names == ("a", "b", "a_f", "b_f", "pressure")
-    reference = em.scenes.left_ventricle(4, 8, 1, order=1)
+    reference = rule_based_fibres(to_quadratic(human_ventricle(4, 8, 1)), angles=(60.0, -60.0))
     # Coordinates go through a file of text.
-    np.testing.assert_allclose(np.abs(scene.fibres), np.abs(reference.fibres), atol=1e-6)
+    np.testing.assert_allclose(np.abs(scene.fibres), np.abs(reference), atol=1e-6)
     assert "its walls are named" in " ".join(made.notes)
     text = made.path.read_text()
     assert "# CHANGE: what you think possible" in text
@@ -42,13 +43,15 @@ def test_metres_are_seen_and_written_in_mm(tmp_path):
     write_mesh(tmp_path / "lv.vtu", replace(mesh, nodes=0.001 * mesh.nodes))
     made = draft(tmp_path / "lv.vtu", tmp_path / "new" / "lv.toml")
     assert "taken to be m" in made.notes[0]
-    np.testing.assert_allclose(made.scene.mesh.nodes, mesh.nodes, rtol=1e-6, atol=1e-9)
+    corners = made.scene.mesh.nodes[: len(mesh.nodes)]  # made quadratic, they come first
+    np.testing.assert_allclose(corners, mesh.nodes, rtol=1e-6, atol=1e-9)
     assert (tmp_path / "new" / "lv_mm.vtu").is_file()
     write_mesh(tmp_path / "cm.vtu", replace(mesh, nodes=0.1 * mesh.nodes))
     said = draft(tmp_path / "cm.vtu", tmp_path / "cm.toml")
     assert "if it is in cm, give --unit cm" in said.notes[0]
     in_cm = draft(tmp_path / "cm.vtu", tmp_path / "cm2.toml", unit="cm")
-    np.testing.assert_allclose(in_cm.scene.mesh.nodes, mesh.nodes, rtol=1e-6, atol=1e-9)
+    corners = in_cm.scene.mesh.nodes[: len(mesh.nodes)]
+    np.testing.assert_allclose(corners, mesh.nodes, rtol=1e-6, atol=1e-9)
 
 
 def test_a_rim_that_is_not_held_takes_a_follower_pressure(tmp_path):
@@ -68,7 +71,7 @@ def test_a_bare_block_hangs_by_its_end(tmp_path):
     assert made.scene.law.name == "neo_hookean"
     assert isinstance(made.scene.loads[0], Gravity)
     assert any("held where x is least, 0 mm; change it" in note for note in made.notes)
-    assert made.scene.held[:, 0].sum() == 9
+    assert made.scene.held[:, 0].sum() == 25  # made quadratic
     other = draft(tmp_path / "block.vtu", tmp_path / "other.toml", law="neo_hookean_E_nu")
     nu = other.scene.parameters[1]
     assert (nu.name, nu.low < nu.high < 0.5) == ("nu", True)
@@ -95,3 +98,17 @@ def test_command_and_bad_input(ventricle_file, capsys):
     assert not (folder / "c.toml").exists()
     with pytest.raises(InputError, match="unit 'ft'"):
         draft(ventricle_file, folder / "d.toml", unit="ft")
+
+
+def test_linear_tetrahedra_are_kept_from_locking(tmp_path, monkeypatch):
+    mesh = human_ventricle(4, 8, 1)
+    write_mesh(tmp_path / "lv.vtu", mesh)
+    made = draft(tmp_path / "lv.vtu", tmp_path / "lv.toml")
+    assert made.scene.mesh.order == 2
+    assert "linear tetrahedra, which lock" in " ".join(made.notes)
+    monkeypatch.setattr("emulator.scenes.draft._MOST_QUADRATIC", 100)
+    large = draft(tmp_path / "lv.vtu", tmp_path / "large.toml").scene
+    assert (large.mesh.order, large.dilatation) == (1, "patch")
+    write_mesh(tmp_path / "quadratic.vtu", to_quadratic(mesh))
+    said = draft(tmp_path / "quadratic.vtu", tmp_path / "quadratic.toml")
+    assert "lock" not in " ".join(said.notes)

@@ -1,4 +1,4 @@
-"""``calibrate check``: whether a model means what it says, before any data."""
+"""``calibrate check``: whether a model and its mesh mean what they say, before any data."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from calibrate.cli.common import (
     DONE,
     FAILED,
     add_json,
+    add_scene,
     add_scheduler,
+    assignments,
     emit,
+    scene_words,
     scheduler_word,
     show_progress,
     table,
@@ -50,9 +53,78 @@ def register(commands: Any) -> None:
         help="noise of the data, as for --noise, where it is not the model's: the check must fail",
     )
     add_scheduler(sbc, "with --fem-data, the FEM runs")
+    _add_mesh(kinds)
     sbc.add_argument("--warmup", type=int, default=200)
     sbc.add_argument("--draws", type=int, default=250)
     sbc.add_argument("--chains", type=int, default=2)
+
+
+def _add_mesh(kinds: Any) -> None:
+    mesh = kinds.add_parser("mesh", help="how far a scene's mesh is from a finer one of its body")
+    add_scene(mesh)
+    mesh.add_argument(
+        "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
+    )
+    mesh.add_argument(
+        "--observe",
+        metavar="WHAT",
+        help="errors of these observations, as for infer, e.g. landmarks:24+volume (default: "
+        "displacements, and the cavity's volume if there is one)",
+    )
+    mesh.add_argument("--seed", type=int, default=0, help="of random landmarks")
+    mesh.add_argument("--out", metavar="DIR", help="write mesh_error.json and a picture")
+    add_json(mesh)
+    mesh.set_defaults(run=run_mesh)
+
+
+def run_mesh(arguments: argparse.Namespace) -> int:
+    """The error of the mesh at one theta: displacements, observations, and a picture."""
+    import numpy as np
+
+    from calibrate.mesh_error import errors_of
+    from emulator.catalogue import find_scene
+    from emulator.error.mesh_error import mesh_error
+    from emulator.store import check_folder, write_json
+
+    folder = None if arguments.out is None else check_folder(arguments.out)
+    scene = find_scene(*scene_words(arguments))
+    theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
+    found = mesh_error(scene)
+    told = found(theta)
+    rows = errors_of(found, told, arguments.observe, arguments.seed)
+    length = np.linalg.norm(told.coarse, axis=1)
+    result: dict[str, Any] = {
+        "scene": scene.name,
+        "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
+        "nodes": len(scene.mesh.nodes),
+        "finer_nodes": len(found.finer.scene.mesh.nodes),
+        "err_u": {"median": float(np.median(told.err_u)), "max": float(np.max(told.err_u))},
+        "displacement": {"median": float(np.median(length)), "max": float(length.max())},
+        "observations": rows,
+    }
+    header = ("observed", "on the mesh", "error of the mesh", "%")
+    cells = [
+        (f"{name} ({row['unit']})", row["value"], row["error"], 100.0 * row["relative"])
+        for name, row in rows.items()
+    ]
+    text = (
+        f"{scene.name}: {result['nodes']} nodes, beside {result['finer_nodes']} on a finer mesh of "
+        f"the same body\ndisplacement: off by {result['err_u']['median']:.3g} mm (median of the "
+        f"nodes), {result['err_u']['max']:.3g} mm at most, of {result['displacement']['max']:.4g}\n"
+        + table(header, cells)
+    )
+    if folder is not None:
+        from calibrate.figures.drawing import save
+        from calibrate.figures.evaluation import surface_figure
+
+        write_json(folder / "mesh_error.json", result)
+        title = f"{scene.name}: error of a mesh of {result['nodes']} nodes"
+        label = "displacement less that on a finer mesh (mm)"
+        error = np.asarray(told.err_u)
+        save(surface_figure(scene, error, title, label), folder / "mesh_error.png")
+        text += f"\nwritten to {folder}"
+    emit(result, as_json=arguments.json, text=text)
+    return DONE
 
 
 def run_sbc(arguments: argparse.Namespace) -> int:

@@ -1,0 +1,129 @@
+"""What a finer mesh changes of a posterior, where that is known in closed form, and by FEM."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import calibrate as cal
+import emulator as em
+from calibrate.certificate import examine
+from calibrate.certificate.evidence import Figure, MeshChange
+from calibrate.certificate.mesh import changed, points_for
+from calibrate.certificate.verdict import judge
+from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
+from emulator.surrogates.taylor import expand
+from linear_support import LinearSimulator, linear_forward
+
+
+@pytest.fixture(scope="module")
+def fem(beam):
+    return linear_forward(beam, size=0.02)
+
+
+@pytest.fixture(scope="module")
+def check(beam, fem):
+    data = exact_data(linear_model(beam, forward=fem))
+    posterior = exact_posterior(linear_model(beam, forward=fem), data)
+    return data, examine(posterior, LinearSimulator(fem), draws=100)
+
+
+def finer_than(fem, model, stretch, shift):
+    """FEM on a finer mesh, whose answer to theta differs by a factor and by ``shift`` mm."""
+    fine = replace(fem, matrix=(1.0 + stretch) * fem.matrix, shift=fem.shift + shift)
+    nodes = model.forward.nodes
+
+    def differences(z, predictive):
+        draws = predictive.constrain(z)
+        for theta in np.stack([draws[name] for name in model.names], axis=1):
+            yield np.asarray((fine(theta) - fem(theta))[nodes]).ravel()
+
+    return fine, differences
+
+
+@pytest.mark.parametrize(("stretch", "shift"), [(0.0, 0.01), (0.02, 0.0), (0.0, 0.3)])
+def test_shifts_are_those_of_the_quadrature(fem, check, stretch, shift):
+    data, found = check
+    model = found.posterior.model
+    fine, differences = finer_than(fem, model, stretch, shift)
+    told = changed(
+        found.predictive, lambda z: differences(z, found.predictive),
+        found.tests.runs, found.pool, 8, np.random.default_rng(0),
+    )  # fmt: skip
+    points, weights, moved = grid_of(), quadrature(fem, data), quadrature(fine, data)
+    mean, after = weights @ points, moved @ points
+    sd, sd_after = (np.sqrt(w @ (points - m) ** 2) for w, m in ((weights, mean), (moved, after)))
+    for k, name in enumerate(model.names):
+        exact, figure = (after - mean)[k] / sd[k], told.shift[name]
+        assert abs(figure.value - exact) < 4.0 * figure.error + 0.02
+        assert figure.error < 0.1 + 0.1 * abs(exact)
+        assert abs(told.log_sd[name].value - np.log(sd_after / sd)[k]) < (
+            4.0 * told.log_sd[name].error + 0.02
+        )
+
+
+def test_failures_on_the_finer_mesh_leave_it_open(check):
+    _, found = check
+    told = changed(
+        found.predictive, lambda z: [None] * len(z),
+        found.tests.runs, found.pool, 8, np.random.default_rng(0),
+    )  # fmt: skip
+    assert told.failed == 8
+    assert told.within() is None
+    certificate = judge(replace(found.certificate.evidence, mesh=told))
+    assert certificate.verdict == "undecided"
+    assert "FEM failed at 8 of 8 points on a finer mesh" in certificate.reason
+
+
+def test_the_verdict_follows_the_mesh(check):
+    _, found = check
+    evidence = found.certificate.evidence
+    assert found.certificate.verdict == "accepted"
+    assert found.certificate.reason.endswith("on this mesh")
+
+    def verdict(shift, error=0.01, log_sd=0.0):
+        row = MeshChange({"mu": Figure(shift, error)}, {"mu": Figure(log_sd, 0.01)}, 900, 8)
+        return judge(replace(evidence, mesh=row))
+
+    assert verdict(0.1).verdict == "accepted"
+    assert "mesh: on a finer mesh (900 nodes) no mean would move by more than 0.10" in str(
+        verdict(0.1)
+    )
+    assert verdict(-3.0).verdict == "not certified"
+    assert "the mean of mu would move by -3.00 sd: refine the mesh" in str(verdict(-3.0))
+    assert verdict(0.1, log_sd=0.5).verdict == "not certified"
+    for open_ in (verdict(0.45, 0.1), verdict(float("nan")), verdict(0.1, float("nan"))):
+        assert open_.verdict == "undecided"
+    linear = replace(verdict(2.0).evidence.mesh, linear=True)
+    assert "order = 2" in str(judge(replace(evidence, mesh=linear)))
+    assert verdict(0.1).to_json()["mesh"]["shift"] == {"mu": 0.1}
+
+
+def test_solves_are_counted_in_every_load_state():
+    assert points_for(2, 1, None) == 6
+    assert points_for(18, 1, None) == 15
+    assert points_for(4, 3, None) == 5
+    assert points_for(2, 1, 12) == 12
+    assert points_for(2, 10, None) == 4  # fewer say nothing of the error
+
+
+@pytest.mark.slow
+def test_locked_elements_are_not_certified():
+    """Data of a fine mesh, inferred with linear elements that lock."""
+    scene = em.scenes.once_clamped_beam(cells=(6, 1, 2), order=1)
+    truth, body = jnp.array([75.0, 70.0]), em.scenes.once_clamped_beam(cells=(12, 2, 2))
+    tip = np.array([[95.0, 5.0, 5.0], [60.0, 5.0, 5.0]])
+    observe = cal.landmarks(body, tip)
+    data = observe(em.Simulator(body)(truth)[observe.nodes], truth)
+    simulator = em.Simulator(scene)
+    emulator = em.Emulator(scene, taylor=expand(simulator))
+    model = cal.model(
+        emulator.cache(), cal.landmarks(scene, tip), cal.GaussianNoise(sd=0.5), check_scale=False
+    )
+    posterior = cal.sample(model, np.asarray(data), options=cal.NUTSOptions(200, 300, 2, rounds=1))
+    alone = cal.certify(posterior, simulator, draws=60, mesh=0)
+    whole = cal.certify(posterior, simulator, draws=60)
+    assert "no finer mesh was asked" in str(alone)
+    assert whole.verdict == "not certified"
+    assert any("on a finer mesh" in finding for finding in whole.findings)
