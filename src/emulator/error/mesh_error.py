@@ -111,8 +111,11 @@ class MeshError:
         stepped = self._stepped(theta, begin)
         if stepped is not None:
             return MeshErrorEstimate(theta, coarse, stepped, solved=False)
-        solution = self.fine.solve(theta, begin).require_converged(f"{what}, on the finer one")
-        return MeshErrorEstimate(theta, coarse, solution.displacement, solved=True)
+        solution = self.fine.solve(theta, begin)
+        if not solution.converged:  # strains of locked elements may be too rough to begin with
+            solution = self.fine.solve(theta)
+        fine = solution.require_converged(f"{what}, on the finer one").displacement
+        return MeshErrorEstimate(theta, coarse, fine, solved=True)
 
     def _carried(self, u: jax.Array) -> jax.Array:
         return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))

@@ -31,6 +31,7 @@ from emulator.fem.functional import (
     displacement_gradient,
     local_forces,
     local_terms,
+    nodal_matrices,
     point_energy,
     spring_terms,
     strain_energy,
@@ -225,9 +226,7 @@ class System:
 
     def element_blocks(self, A: jax.Array) -> jax.Array:
         """Blocks (m, a, 3, a, 3) in mN/mm from the moduli ``A = d2W/dH2`` (m, q, 3, 3, 3, 3)."""
-        grid = self.scene.discretisation
-        A = A * grid.weights[:, :, None, None, None, None]
-        return jnp.einsum("mqak,mqikjl,mqbl->maibj", grid.gradients, A, grid.gradients)
+        return nodal_matrices(self.scene.discretisation, A)
 
     @compiled
     def safe_tangent(

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.geometry.discretisation import Blocks
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain, determinant
 from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
@@ -90,18 +91,11 @@ def at_points(
     return jax.tree.map(lambda array: array.reshape(*shape, *array.shape[1:]), found)
 
 
-def mean_volume_change(u: jax.Array, gradients: jax.Array, weights: jax.Array) -> jax.Array:
-    """Mean of ``J - 1`` over a block with ``u`` (a, 3), ``gradients`` (q, a, 3), ``weights``."""
-    H = jnp.einsum("ai,qaj->qij", u, gradients)
-    return jnp.vdot(weights, jax.vmap(lambda h: Strain(h).J_minus_1)(H)) / jnp.sum(weights)
-
-
 def with_volume_change(
     H: jax.Array, change: jax.Array, barriers: Barriers | None = None
 ) -> jax.Array:
-    """Displacement gradients ``H`` (q, 3, 3) scaled isotropically to ``J - 1 = change``."""
-    ln_J = jax.vmap(lambda h: Strain(h, barriers).ln_J)(H)
-    stretch = jnp.expm1((jnp.log1p(change) - ln_J) / 3.0)[:, None, None]
+    """Displacement gradient ``H`` (3, 3) of a point scaled isotropically to ``J - 1 = change``."""
+    stretch = jnp.expm1((jnp.log1p(change) - Strain(H, barriers).ln_J) / 3.0)
     return H + stretch * (H + jnp.eye(3, dtype=H.dtype))
 
 
@@ -110,28 +104,19 @@ def with_mean_dilatation(
 ) -> jax.Array:
     """Displacement gradients (q, 3, 3) of one block, each point's J replaced by their mean."""
     J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
-    return with_volume_change(H, jnp.vdot(weights, J_minus_1) / jnp.sum(weights), barriers)
+    change = jnp.vdot(weights, J_minus_1) / jnp.sum(weights)
+    return jax.vmap(lambda h: with_volume_change(h, change, barriers))(H)
 
 
-def at_volume(scene: Scene, theta: jax.Array) -> Callable:
-    """``(change, u, gradients, weights, tissue) -> ()``: strain energy of a block, mN mm.
+def nodal_vectors(blocks: Blocks, P: jax.Array) -> jax.Array:
+    """Derivatives (b, a, 3) in the nodal displacements from ``P = dW/dH`` (b, q, 3, 3)."""
+    return jnp.einsum("bq,bqij,bqaj->bai", blocks.weights, P, blocks.gradients)
 
-    ``change``, the volume ratio less 1, replaces the one that follows from ``u`` (a, 3) mm at every
-    point; ``gradients`` (q, a, 3) 1/mm, ``weights`` (q,) mm3, ``tissue`` of its points.
-    """
-    at_point = point_energy(scene, theta)
 
-    def energy(
-        change: jax.Array,
-        u: jax.Array,
-        gradients: jax.Array,
-        weights: jax.Array,
-        at: Tissue,
-    ) -> jax.Array:
-        H = with_volume_change(jnp.einsum("ai,qaj->qij", u, gradients), change)
-        return jnp.vdot(weights, jax.vmap(at_point)(H, at))
-
-    return energy
+def nodal_matrices(blocks: Blocks, A: jax.Array) -> jax.Array:
+    """Second ones (b, a, 3, a, 3) from ``A = d2W/dH2`` (b, q, 3, 3, 3, 3)."""
+    A = A * blocks.weights[:, :, None, None, None, None]
+    return jnp.einsum("mqak,mqikjl,mqbl->maibj", blocks.gradients, A, blocks.gradients)
 
 
 def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:

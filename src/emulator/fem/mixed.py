@@ -26,12 +26,21 @@ the energy in u alone, so both formulations have the same solutions.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.functional import at_volume, mean_volume_change
+from emulator.fem.functional import (
+    at_points,
+    displacement_gradient,
+    nodal_matrices,
+    nodal_vectors,
+    point_energy,
+    with_volume_change,
+)
+from emulator.mechanics.kinematics import Strain
 from emulator.scenes.scene import Scene
 
 
@@ -58,57 +67,96 @@ class Condensed(NamedTuple):
     stiffness: jax.Array
 
 
-def _arguments(scene: Scene, u: jax.Array) -> tuple:
-    """Displacements, gradients, weights and tissue of every block, for ``vmap``."""
-    grid = scene.blocks
-    local = (u[grid.connectivity], jnp.asarray(grid.gradients), jnp.asarray(grid.weights))
-    return (*local, scene.block_tissue)
+def _density(scene: Scene, theta: jax.Array) -> Callable:
+    """``(H, change, tissue) -> W`` in kPa: at ``H`` (3, 3) scaled to ``J - 1 = change``."""
+    energy = point_energy(scene, theta)
+    return lambda H, change, at: energy(with_volume_change(H, change), at)
+
+
+def _at_points(scene: Scene, function: Callable, H: jax.Array, change: jax.Array) -> Any:
+    """``function(H, change, tissue)`` at the blocks' points, with the ``change`` (b,) of each."""
+    wide = jnp.broadcast_to(change[:, None], H.shape[:2])
+    return at_points(scene, function, H, wide, tissue=scene.block_tissue)
+
+
+def _over_points(function: Callable, H: jax.Array) -> Any:
+    """``function`` of each displacement gradient of ``H`` (b, q, 3, 3)."""
+    return jax.vmap(jax.vmap(function))(H)
+
+
+def _volume_change(H: jax.Array) -> jax.Array:
+    """``J - 1`` of a displacement gradient (3, 3)."""
+    return Strain(H).J_minus_1
+
+
+def _integral(scene: Scene, density: jax.Array) -> jax.Array:
+    """Integral (b,) over each block of ``density`` (b, q)."""
+    return jnp.sum(scene.blocks.weights * density, axis=1)
+
+
+def _volume(scene: Scene) -> jax.Array:
+    """Volume (b,) of each block at rest, mm3."""
+    return jnp.sum(jnp.asarray(scene.blocks.weights), axis=1)
+
+
+def _gradient(scene: Scene, u: jax.Array) -> jax.Array:
+    """Displacement gradient (b, q, 3, 3) at the blocks' points."""
+    return scene.blocks.gather(displacement_gradient(scene, u))
 
 
 def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:
     """Volumes and pressures that follow from the displacement ``u`` (n, 3)."""
+    H, V = _gradient(scene, u), _volume(scene)
+    change = _integral(scene, _over_points(_volume_change, H)) / V
+    slope = _at_points(scene, jax.grad(_density(scene, theta), 1), H, change)
+    return Volumes(change, _integral(scene, slope) / V)
 
-    def one(*block: Any) -> Volumes:
-        change = mean_volume_change(*block[:3])
-        slope = jax.grad(at_volume(scene, theta), argnums=0)(change, *block)
-        return Volumes(change, slope / jnp.sum(block[2]))
 
-    return jax.vmap(one)(*_arguments(scene, u))
+class _Residuals(NamedTuple):
+    """Derivatives of ``L``: in u (b, a, 3), in the volumes (b,), in the pressures (b,)."""
+
+    force: jax.Array
+    change: jax.Array
+    pressure: jax.Array
+
+
+def _residuals(scene: Scene, H: jax.Array, volumes: Volumes, theta: jax.Array) -> _Residuals:
+    V, p = _volume(scene), volumes.pressure
+    P, slope = _at_points(scene, jax.grad(_density(scene, theta), (0, 1)), H, volumes.change)
+    change, cofactor = _over_points(jax.value_and_grad(_volume_change), H)
+    return _Residuals(
+        nodal_vectors(scene.blocks, P + p[:, None, None, None] * cofactor),
+        _integral(scene, slope) - p * V,
+        _integral(scene, change) - V * volumes.change,
+    )
+
+
+def _eliminated(
+    r: _Residuals, b: jax.Array, g: jax.Array, stiffness: jax.Array, V: jax.Array
+) -> jax.Array:
+    """``f_e`` (b, a, 3) of the module docstring."""
+    along_g, along_b = r.pressure / V, (r.change + stiffness * r.pressure / V) / V
+    return r.force + along_g[:, None, None] * g + along_b[:, None, None] * b
 
 
 def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) -> Condensed:
     """Force and tangent of every block at ``u`` (n, 3) and ``volumes``."""
-    energy = at_volume(scene, theta)
-
-    def one(change, pressure, local, gradients, weights, own):  # noqa: ANN001, ANN202
-        V = jnp.sum(weights)
-
-        def E(v: jax.Array, t: jax.Array) -> jax.Array:
-            return energy(t, v, gradients, weights, own)
-
-        def volume(v: jax.Array) -> jax.Array:
-            return V * mean_volume_change(v, gradients, weights)
-
-        # One pass of second derivatives gives E_u, E_t and their derivatives.
-        (E_u, E_t), ((E_uu, g), (_, E_tt)) = (
-            jax.grad(E, (0, 1))(local, change),
-            jax.jacfwd(jax.grad(E, (0, 1)), (0, 1))(local, change),
-        )
-        b, b_u = jax.grad(volume)(local), jax.hessian(volume)(local)
-        r_change, r_pressure = E_t - pressure * V, volume(local) - V * change
-        outer = jnp.einsum("ai,bj->aibj", g, b)
-        tangent = (
-            E_uu
-            + pressure * b_u
-            + (outer + outer.transpose(2, 3, 0, 1)) / V
-            + E_tt / V**2 * jnp.einsum("ai,bj->aibj", b, b)
-        )
-        force = E_u + pressure * b
-        force = force + g * r_pressure / V + b * (r_change + E_tt * r_pressure / V) / V
-        size = local.size
-        return Condensed(force, tangent.reshape(size, size), b, g, r_change, r_pressure, E_tt)
-
-    return jax.vmap(one)(*volumes, *_arguments(scene, u))
+    grid, H, V = scene.blocks, _gradient(scene, u), _volume(scene)
+    slopes = jax.grad(_density(scene, theta), (0, 1))
+    (A, coupling), (_, curvature) = _at_points(scene, jax.jacfwd(slopes, (0, 1)), H, volumes.change)
+    p = volumes.pressure[:, None, None, None, None, None]
+    A = A + p * _over_points(jax.hessian(_volume_change), H)
+    b = nodal_vectors(grid, _over_points(jax.grad(_volume_change), H))
+    g, stiffness = nodal_vectors(grid, coupling), _integral(scene, curvature)
+    # g b^T + b g^T + stiffness b b^T / V, half of it and its transpose.
+    half = (g + 0.5 * (stiffness / V)[:, None, None] * b) / V[:, None, None]
+    pair = jnp.einsum("mai,mbj->maibj", half, b)
+    tangent = nodal_matrices(grid, A) + pair + pair.transpose(0, 3, 4, 1, 2)
+    size = 3 * grid.connectivity.shape[1]
+    r = _residuals(scene, H, volumes, theta)
+    force = _eliminated(r, b, g, stiffness, V)
+    tangent = tangent.reshape(-1, size, size)
+    return Condensed(force, tangent, b, g, r.change, r.pressure, stiffness)
 
 
 def carried(
@@ -119,17 +167,8 @@ def carried(
     The force of :func:`linearise`, but with the couplings of an earlier iterate: solving with that
     iterate's tangent gives the simplified Newton step.
     """
-    energy = at_volume(scene, theta)
-
-    def one(change, pressure, at, local, gradients, weights, own):  # noqa: ANN001, ANN202
-        V = jnp.sum(weights)
-        E_t, E_u = jax.grad(energy, (0, 1))(change, local, gradients, weights, own)
-        mean, slope = jax.value_and_grad(mean_volume_change)(local, gradients, weights)
-        r_change, r_pressure = E_t - pressure * V, V * (mean - change)
-        force = E_u + pressure * V * slope + at.g * r_pressure / V
-        return force + at.b * (r_change + at.stiffness * r_pressure / V) / V
-
-    return jax.vmap(one)(*volumes, at, *_arguments(scene, u))
+    r = _residuals(scene, _gradient(scene, u), volumes, theta)
+    return _eliminated(r, at.b, at.g, at.stiffness, _volume(scene))
 
 
 def advance(
@@ -137,7 +176,7 @@ def advance(
 ) -> Volumes:
     """``volumes`` after ``fraction`` of the step whose displacement is ``move`` (n, 3)."""
     local = move[scene.blocks.connectivity]
-    V = jnp.sum(jnp.asarray(scene.blocks.weights), axis=1)
+    V = _volume(scene)
     change = (at.r_pressure + jnp.einsum("mai,mai->m", at.b, local)) / V
     pressure = at.r_change + jnp.einsum("mai,mai->m", at.g, local) + at.stiffness * change
     return Volumes(volumes.change + fraction * change, volumes.pressure + fraction * pressure / V)
