@@ -26,6 +26,7 @@ QUICK = {
     "certificate": "--quick",
     "decoder_speed": "--quick",
     "effects": "--quick",
+    "elements": "--quick",
     "error_bar": "--scenes once_clamped_beam --cases 3 --outside 1",
     "fem_posterior": "--quick",
     # No dolfin here: compiling its forms alone takes longer than all the rest.

@@ -65,7 +65,7 @@ def test_certify_restores_the_map_and_runs_no_campaign(infer_once, folder, monke
     monkeypatch.setattr(
         em.Simulator, "solve", lambda self, *a, **k: (solved.append(0), solve(self, *a, **k))[1]
     )
-    assert main(["certify", str(folder), "--draws", "25", "--json"]) in (0, 1)
+    assert main(["certify", str(folder), "--draws", "25", "--no-mesh", "--json"]) in (0, 1)
     assert json.loads(capsys.readouterr().out)["certificate"]["failed"] == 0
     assert 18 <= len(solved) <= 25  # a point drawn twice is solved once; a campaign: six more
     before, (run, after) = infer_once[1], read_posterior(folder)

@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from emulator.geometry.directions import across
-from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
-from emulator.scenes.supports.boundary_condition import BoundaryCondition
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +46,7 @@ def finer(scene: Scene) -> Finer:
         # A finer mesh is quadratic, and patches are for linear elements.
         dilatation="mean" if scene.dilatation == "patch" else scene.dilatation,
         regions=None if scene.regions is None else np.repeat(scene.regions, children),
-        supports=tuple(_on(support, refinement.mesh, moved) for support in scene.supports),
+        supports=tuple(support.on_finer(refinement.mesh, moved) for support in scene.supports),
         origin={},
     )
     return Finer(scene, fine, refinement)
-
-
-def _on(support: BoundaryCondition, mesh: Mesh, moved: np.ndarray) -> BoundaryCondition:
-    """``support`` on the finer mesh, nodes between held ones moved between them."""
-    if isinstance(support, Support) and support.displacement.ndim == 2:
-        return replace(support, displacement=moved[mesh.node_set(support.node_set)])
-    return support

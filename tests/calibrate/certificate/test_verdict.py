@@ -39,7 +39,7 @@ def sampling(**entries):
 
 def test_what_is_right_is_accepted():
     assert judge(RIGHT).verdict == "accepted"
-    assert judge(RIGHT).reason == "no mean moves by more than 0.00 posterior sd"
+    assert judge(RIGHT).reason == "no mean moves by more than 0.00 posterior sd on this mesh"
 
 
 @pytest.mark.parametrize("name", ["shift", "log_sd", "correlation"])

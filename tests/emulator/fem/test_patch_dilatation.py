@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 import emulator as em
 from calibrate.verify.cook import deflection, membrane
+from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.fields import element_fields
@@ -23,6 +24,7 @@ from emulator.fem.functional import (
 )
 from emulator.fem.mip import applies
 from emulator.geometry.bodies.box import box
+from emulator.geometry.io import write_mesh
 from emulator.geometry.patches import patches
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes.effects import effects_of
@@ -217,6 +219,17 @@ def test_what_else_asks_for_the_dilatation(body):
     assert finer(body).scene.dilatation == "mean"
     assert body.fingerprint != replace(body, dilatation="pointwise").fingerprint
     assert em.scenes.left_ventricle(order=1).fingerprint == "e8ec992e64589595"
+
+
+def test_scene_files_take_it(tmp_path):
+    write_mesh(tmp_path / "block.vtu", box((2.0, 3.0, 4.0), (1, 1, 1)))
+    (tmp_path / "block.toml").write_text(
+        'law = "neo_hookean"\nmesh = "block.vtu"\ndilatation = "patch"\n'
+        'node_sets.left = {axis = "x", at = 0.0}\nsupports = [{node_set = "left"}]\n'
+        'parameters.mu = {unit = "kPa", range = [5, 20]}\nconstants.lam = 30.0\n'
+        'loads = [{kind = "gravity", density = 1.0}]\n'
+    )
+    assert find_scene(str(tmp_path / "block.toml")).dilatation == "patch"
 
 
 def test_refusals_name_the_other_form():

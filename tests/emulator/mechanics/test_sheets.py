@@ -46,7 +46,7 @@ def ventricle():
 
 @pytest.mark.slow
 def test_an_orthotropic_ventricle_fills(ventricle):
-    assert ventricle.directions.shape == (len(ventricle.mesh.elements), 2, 3)
+    assert ventricle.tissue.directions.shape == (len(ventricle.mesh.elements), 1, 2, 3)
     solution = em.Simulator(ventricle).solve(ventricle.centre)
     assert Status(int(solution.status)) is Status.CONVERGED
 

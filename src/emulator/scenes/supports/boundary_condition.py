@@ -57,6 +57,11 @@ class BoundaryCondition(ABC):
         """Potential of its springs, or None."""
         return None
 
+    def on_finer(self, mesh: Mesh, moved: np.ndarray) -> BoundaryCondition:
+        """The support on a finer ``mesh``, whose held nodes move by ``moved`` (f, 3) mm."""
+        del mesh, moved
+        return self
+
     @abstractmethod
     def resisted(self, mesh: Mesh) -> Resisted:
         """Points, and directions at them, in which a rigid motion of the body is resisted."""

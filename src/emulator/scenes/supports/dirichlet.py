@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -52,6 +52,12 @@ class Support(BoundaryCondition):
             )
         axes = [k for k, axis in enumerate(_AXES) if axis in self.components]
         return Held(self.node_set, nodes, np.broadcast_to(self.displacement, (len(nodes), 3)), axes)
+
+    def on_finer(self, mesh: Mesh, moved: np.ndarray) -> Support:
+        """Nodes between held ones move between them."""
+        if self.displacement.ndim == 1:
+            return self
+        return replace(self, displacement=moved[mesh.node_set(self.node_set)])
 
     def resisted(self, mesh: Mesh) -> Resisted:
         """Every node of the set along each axis that is held."""
