@@ -129,7 +129,10 @@ def effectivity(
 ) -> Case:
     """The estimated errors over the true ones, at the centre of the box."""
     error = em.mesh_error(scene)
-    told = error(jnp.asarray(theta))
+    try:
+        told = error(jnp.asarray(theta))
+    except em.SolverError as reason:
+        return {"effectivity": {"failed": str(reason)}}
     there = measured(error.finer.scene, np.asarray(told.fine)[None], points)
     estimated, wrong = (
         np.nanmedian(np.linalg.norm(found.landmarks[0] - other.landmarks[0], axis=1))
@@ -188,7 +191,8 @@ def check(cases: list[Case]) -> None:
         if case.get("rung") != "default":
             continue
         assert case["landmark_mm"]["centre"] < 0.13, case["name"]
-        assert case["landmark_percent"]["corners"] < 2.0, case["name"]
+        small = case["landmark_mm"]["corners"] < 0.05
+        assert small or case["landmark_percent"]["corners"] < 2.0, case["name"]
         if "growth_percent" in case:
             assert abs(case["growth_percent"]["centre"]) < 0.7, case["name"]
 

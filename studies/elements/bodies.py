@@ -96,7 +96,6 @@ VENTRICLE = Body(
         "linear": lambda: linear(15, 30, 3),
         "linear, finer": lambda: linear(22, 44, 4),
         "linear, patches": lambda: linear(15, 30, 3, dilatation="patch"),
-        "linear, patches, finer": lambda: linear(22, 44, 4, dilatation="patch"),
         "quadratic, 8 x 16 x 1": lambda: ventricle(8, 16, 1),
         "quadratic, 10 x 20 x 2": lambda: ventricle(10, 20, 2),
         "quadratic, rings even": lambda: ventricle(10, 20, 2, grading=1.0),
@@ -168,7 +167,7 @@ CUBE = Body(
     },
 )
 
-BODIES = {body.name: body for body in (VENTRICLE, BEAM, LIVER, CUBE)}
+BODIES = {body.name: body for body in (BEAM, CUBE, VENTRICLE, LIVER)}
 
 
 # ---- what is measured -----------------------------------------------------------------------
