@@ -1,13 +1,14 @@
 r"""Patches of neighbouring linear tetrahedra that share one volume change.
 
-A linear tetrahedron has one volume constraint and, in a mesh, about half a node: nearly
-incompressible, it locks. On patches :math:`P` of about six that do not overlap,
+A mesh has five or six tetrahedra a node. Nearly incompressible, each is a constraint on volume, and
+three displacements a node cannot meet them all: linear elements lock. With patches :math:`P` of
+about six, which do not overlap,
 
 .. math::
     \hat F_e = \left(\bar J_P / J_e\right)^{1/3} F_e, \qquad
     \bar J_P = \frac{\sum_{e \in P} V_e J_e}{\sum_{e \in P} V_e},
 
-leaves one constraint for about one node (de Souza Neto, Andrade Pires & Owen 2005, Int. J. Numer.
+there is about one constraint a node (de Souza Neto, Andrade Pires & Owen 2005, Int. J. Numer.
 Meth. Engng 62, 353-383). Here W at :math:`\hat F` is one energy, as with mean dilatation.
 
 Patches depend on the mesh's connections only, not on the order in which its elements are listed.
