@@ -21,6 +21,9 @@ V, and :math:`b = V^T W\,(y - g)`, it changes the log likelihood of the residual
 
 (matrix determinant lemma and Woodbury's identity). The error has no mean: it does not correct the
 map, it says how far to believe it.
+
+Where the runs were on a finer mesh, the error is the mesh's as well, and FEM on the mesh is allowed
+the same.
 """
 
 from __future__ import annotations
@@ -62,6 +65,7 @@ class ApproximationError:
     modes : (r, d), :math:`V^T`, for replicated data.
     x, log_sizes, width : runs (n, q), the logarithms of their sizes (n,), and the kernel's width.
     centre, scale : (q,) that standardise the unknowns.
+    of_mesh : whether FEM on the map's mesh has this error, too.
     """
 
     weights: np.ndarray
@@ -72,6 +76,7 @@ class ApproximationError:
     width: float
     centre: np.ndarray
     scale: np.ndarray
+    of_mesh: bool = False
 
     def size(self, unknowns: jax.Array) -> jax.Array:
         r"""The size :math:`\alpha`, (), at ``unknowns`` (q,)."""
@@ -91,14 +96,16 @@ class ApproximationError:
         return fingerprint_of(*self.arrays().values())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All it consists of, by name."""
-        return {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        """All it consists of, by name; ``of_mesh`` where it is."""
+        kept = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        return kept if self.of_mesh else {n: a for n, a in kept.items() if n != "of_mesh"}
 
     @classmethod
     def restore(cls, arrays: Mapping[str, np.ndarray]) -> ApproximationError:
         """The error model with these :meth:`arrays`."""
-        values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(cls)}
-        return cls(**{**values, "width": float(values["width"])})
+        names = [field.name for field in fields(cls) if field.name != "of_mesh"]
+        values: dict[str, Any] = {name: arrays[name] for name in names}
+        return cls(**{**values, "width": float(values["width"])}, of_mesh="of_mesh" in arrays)
 
     def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
         """Data without noise as FEM might have made it: ``means`` plus a draw of the error."""
@@ -107,7 +114,9 @@ class ApproximationError:
         return unravel(flat + self.size(unknowns) * (coefficients @ self.modes))
 
 
-def fit(unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray) -> ApproximationError:
+def fit(
+    unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray, *, of_mesh: bool = False
+) -> ApproximationError:
     """The error model of FEM runs.
 
     Parameters
@@ -115,6 +124,7 @@ def fit(unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray) -> Ap
     unknowns : (n, q), where FEM was run.
     errors : (n, d), FEM's data less the map's, all observations raveled.
     information : (d, d), of the noise about its mean.
+    of_mesh : whether FEM was run on a finer mesh.
     """
     root = np.linalg.cholesky(information)  # W = root root^T
     centre, scale = unknowns.mean(axis=0), np.maximum(unknowns.std(axis=0), 1e-12)
@@ -136,6 +146,7 @@ def fit(unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray) -> Ap
         width=float(width),
         centre=centre,
         scale=scale,
+        of_mesh=of_mesh,
     )
 
 

@@ -26,7 +26,8 @@ from emulator.fem.functional import volume_ratio
 class Likelihoods(NamedTuple):
     """Log likelihoods of the data at one draw.
 
-    fem : with FEM's displacement; ``-inf`` where FEM did not converge in a load state.
+    fem : with FEM's displacement, and the error of its mesh where the model allows for that;
+        ``-inf`` where FEM did not converge in a load state.
     cheap : with the model's forward map and its error, where the model allows for one; ``-inf``
         where the map has no answer.
     converged : whether FEM did, in every load state.
@@ -120,9 +121,8 @@ class FEMLikelihood:
         stability: bool,
     ) -> Likelihoods:
         """Log likelihoods from FEM's displacements (n, 3) mm, one a load state."""
-        noise = self.model.noise_values(draw)
         cheap = float(self._cheap(dict(draw), data))
-        fem, means, smallest = self._fem(jnp.stack(fields), thetas, noise, data)
+        fem, means, smallest = self._fem(jnp.stack(fields), thetas, dict(draw), data)
         stable = self._stable(fields, thetas) if stability else None
         return Likelihoods(float(fem), cheap, True, float(smallest), means, stable)
 
@@ -148,10 +148,10 @@ class FEMLikelihood:
 
     @cached_property
     def _fem(self):  # noqa: ANN202
-        def fem(displacement, thetas, noise, data):  # noqa: ANN001, ANN202
-            observed = displacement[:, self.model.observe.nodes]
-            value = self.model.log_likelihood(observed, thetas, noise, data)
+        def fem(displacement, thetas, draw, data):  # noqa: ANN001, ANN202
+            means = self.model.observe(displacement[:, self.model.observe.nodes], thetas)
+            value = self.model.fem_log_likelihood(draw, means, data)
             ratios = [volume_ratio(self.simulator.scene, u) for u in displacement]
-            return value, self.model.observe(observed, thetas), jnp.min(jnp.stack(ratios))
+            return value, means, jnp.min(jnp.stack(ratios))
 
         return jax.jit(fem)

@@ -42,6 +42,7 @@ class Run:
         options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
     error_runs : FEM runs from which the forward map's own error is learned, so that the likelihood
         allows for it (:mod:`calibrate.approximation_error`); 0 takes the map as exact.
+    mesh_error_runs : the same on the next finer mesh, so that the mesh's error is allowed for, too.
     sampler, sampler_options : a name of :data:`calibrate.samplers.SAMPLERS`, and its options by
         name, e.g. ``{"target_accept": 0.95}``.
     """
@@ -61,6 +62,7 @@ class Run:
     emulator: str | None = None
     forward_options: dict[str, Any] = field(default_factory=dict)
     error_runs: int = 0
+    mesh_error_runs: int = 0
     sampler: str = "nuts"
     sampler_options: dict[str, Any] = field(default_factory=dict)
     warmup: int = 500
@@ -76,8 +78,13 @@ class Run:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be 1 or more")
         if self.truth and self.data != "synthetic":
             raise InputError(f"truth has no effect beside data file {self.data}; leave one out")
-        if self.error_runs < 0:
-            raise InputError(f"error_runs is {self.error_runs}; it must be 0 or more")
+        for name in ("error_runs", "mesh_error_runs"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be 0 or more")
+        if self.error_runs and self.mesh_error_runs:
+            raise InputError(
+                "error_runs and mesh_error_runs are both given; the latter see the map's error, too"
+            )
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be 0 or more")
 

@@ -182,18 +182,21 @@ class Model:
         parts = self.distributions(means, values)
         return sum((d.log_prob(data[name]) for name, d in parts.items()), jnp.zeros(()))
 
-    def log_likelihood(
-        self, displacement: jax.Array, thetas: jax.Array, values: NoiseValues, data: Data
-    ) -> jax.Array:
-        """Log density of ``data``, shape ().
+    def fem_log_likelihood(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
+        """Log density of ``data``, (), around FEM's ``means`` at ``draw``.
 
-        Parameters
-        ----------
-        displacement : (S, k, 3) mm, of the observed nodes in each load state.
-        thetas : (S, p).
-        values : inferred numbers of the noises (:meth:`noise_values`).
+        Where the likelihood allows for the error of the mesh, FEM on the mesh has it, too.
         """
-        return self.log_density(self.observe(displacement, thetas), values, data)
+        found = self.log_density(means, self.noise_values(draw), data)
+        if self.error is not None and self.error.of_mesh:
+            found += self._error_ratio(draw, means, data)
+        return found
+
+    def fem_means(self, rng_key: jax.Array, draw: Mapping[str, Any], means: Data) -> Data:
+        """FEM's ``means`` at ``draw``, with a draw of the mesh's error where it is allowed for."""
+        if self.error is None or not self.error.of_mesh:
+            return means
+        return self.error.draw(rng_key, self._stacked(draw), means)
 
     def map_log_likelihood(self, draw: Mapping[str, Any], data: Data) -> jax.Array:
         """Log density of ``data``, (), with the forward map and what is allowed for its error.

@@ -129,13 +129,14 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
     run = run.named(observe)
     built = build_model(run, scene, observe, progress=progress)
     kept: Mapping[str, Any] = data
-    if run.error_runs:
+    if runs := run.error_runs or run.mesh_error_runs:
         built, kept = built.given(data)
         # Now that the data is checked, sampling need not check it again.
         built = with_error(
             replace(built, check_scale=False),
             simulator_of(scene),
-            run.error_runs,
+            runs,
+            of_mesh=bool(run.mesh_error_runs),
             seed=run.seed,
             progress=progress,
         )
@@ -189,7 +190,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     # Its data was checked when it was sampled, or the check was overruled.
     prior = prior_of(run.prior, scene)
     built: Model = model(forward, observe, noises, prior, known=run.known, check_scale=False)
-    if run.error_runs:
+    if run.error_runs or run.mesh_error_runs:
         error = restore_error(path, tree, folder / ERROR)
         built = replace(built, error=error)
     kept = tree["observed_data"]

@@ -9,10 +9,12 @@ from typing import Any
 from emulator.errors import InputError
 from emulator.released.scenes import published_scene
 from emulator.scenes.file import read_scene
+from emulator.scenes.finer import FINER, Finer, finer
 from emulator.scenes.registry import BUILT_IN
 from emulator.scenes.scene import Scene
 
 _RELEASED = "published:"
+_FINER = f"{FINER}:"
 
 
 def find_scene(name: str, root: str | Path | None = None) -> Scene:
@@ -20,14 +22,17 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
 
     Parameters
     ----------
-    name : a built-in scene, a ``.toml`` file, or ``published:<Model>``.
-    root : folder of the published data, for the last of these.
+    name : a built-in scene, a ``.toml`` file, or ``published:<Model>``; ``finer:`` before any of
+        them is that scene on the next finer mesh of its body.
+    root : folder of the published data, for a published model.
 
     Raises
     ------
     InputError
         No such scene or file.
     """
+    if name.startswith(_FINER):
+        return finer(find_scene(name.removeprefix(_FINER), root)).scene
     if name.startswith(_RELEASED):
         if root is None:
             raise InputError(f"scene '{name}': say where the published data is with --root DIR")
@@ -37,7 +42,7 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
     if name not in BUILT_IN:
         raise InputError(
             f"scene '{name}' is unknown; built in: {', '.join(sorted(BUILT_IN))}; "
-            "or give a .toml file, or published:<Model> with --root DIR"
+            "or give a .toml file, or published:<Model> with --root DIR; finer:SCENE refines"
         )
     return BUILT_IN[name]()
 
@@ -46,6 +51,8 @@ def scene_from_origin(origin: Mapping[str, Any]) -> Scene:
     """The scene that ``origin``, plain JSON, says how to make: see :class:`Scene`."""
     options = dict(origin)
     name = options.pop("scene", None)
+    if name == FINER:
+        return finer(scene_from_origin(options["of"])).scene
     if name == "file":
         return read_scene(options["path"])
     if isinstance(name, str) and name.startswith(_RELEASED):
@@ -56,3 +63,18 @@ def scene_from_origin(origin: Mapping[str, Any]) -> Scene:
     return BUILT_IN[name](
         **{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()}
     )
+
+
+def finer_of(scene: Scene) -> Finer:
+    """How ``scene`` was made from one on a coarser mesh, that scene included.
+
+    Raises
+    ------
+    InputError
+        It is not a scene on the next finer mesh of another.
+    """
+    if scene.origin.get("scene") != FINER:
+        raise InputError(
+            f"scene '{scene.name}' is not on a mesh made finer; name it finer:{scene.name}"
+        )
+    return finer(scene_from_origin(scene.origin["of"]))

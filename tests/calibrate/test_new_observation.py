@@ -90,9 +90,8 @@ def test_in_a_model_with_a_noise_of_its_own(beam):
     theta = jnp.array([[70.0, 60.0]])
     value = model.predict({"mu": 70.0, "lam": 60.0})[0]["area:3,14,20"]
     checked = model.check_data(np.asarray(value))
-    density = model.log_likelihood(
-        model.forward(theta[0])[None], theta, {"area:3,14,20": {"noise_sd": 0.5}}, checked
-    )
+    means = model.observe(model.forward(theta[0])[None], theta)
+    density = model.log_density(means, {"area:3,14,20": {"noise_sd": 0.5}}, checked)
     assert float(density) == pytest.approx(-np.log(0.5 * np.sqrt(2.0 * np.pi)))
     with pytest.raises(InputError, match=r"area:3,14,20 is -1.0 mm2; it must be above 0"):
         model.check_data(-1.0)

@@ -79,7 +79,7 @@ def test_a_measured_pressure_is_data(ventricle):
 
     def density(model, data):
         u = model.evaluate(thetas).displacement
-        return float(model.log_likelihood(u, thetas, model.noise_values({}), data))
+        return float(model.log_density(model.observe(u, thetas), model.noise_values({}), data))
 
     change = density(both, data) - density(alone, {"volume": data["volume"]})
     assert change == pytest.approx(-0.5 * 1.5**2 - np.log(0.1 * np.sqrt(2.0 * np.pi)))

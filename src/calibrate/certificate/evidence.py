@@ -16,6 +16,8 @@ LARGEST_CORRELATION_CHANGE = 0.2
 # Of the mesh: beyond, the posterior is about the mesh and not about the tissue.
 LARGEST_MESH_SHIFT = 0.5
 LARGEST_MESH_LOG_SD = float(np.log(1.25))
+# Of a posterior that is widened for the mesh: the finer mesh's mean inside its 90 % interval.
+LARGEST_WIDENED_SHIFT = 1.5
 # Weights of FEM runs of which none exceeds this multiple of their mean have no tail that matters:
 # proposals cover the prior, so that the ratios are bounded (docs/experiments.md, "When k-hat cries
 # wolf").
@@ -125,7 +127,8 @@ class MeshChange:
 
     shift : of the mean, in posterior sd. log_sd : of the sd. Both are empty where nothing is known.
     nodes : of the finer mesh. runs, failed : solves on it, and those that did not converge.
-    linear : whether the mesh has linear elements. why : the reason that it was not asked.
+    linear : whether the mesh has linear elements. widened : whether the likelihood allows for the
+    error of the mesh. why : the reason that it was not asked.
     """
 
     shift: dict[str, Figure] = field(default_factory=dict)
@@ -134,12 +137,14 @@ class MeshChange:
     runs: int = 0
     failed: int = 0
     linear: bool = False
+    widened: bool = False
     why: str = ""
 
     def judged(self) -> list[tuple[str, Figure, float]]:
         """Every figure in words, with its limit."""
+        largest = LARGEST_WIDENED_SHIFT if self.widened else LARGEST_MESH_SHIFT
         return [
-            *((f"mean of {n} would move by {f.value:+.2f} sd", f, LARGEST_MESH_SHIFT)
+            *((f"mean of {n} would move by {f.value:+.2f} sd", f, largest)
               for n, f in self.shift.items()),
             *((f"sd of {n} would change by a factor of {np.exp(f.value):.2f}", f,
                LARGEST_MESH_LOG_SD) for n, f in self.log_sd.items()),

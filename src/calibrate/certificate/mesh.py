@@ -80,7 +80,9 @@ def mesh_change(
     points = points_for(predictive.dimension, states, count)
     told = changed(predictive, _by_fem(predictive, error, observe), runs, pool, points, rng)
     nodes, linear = len(error.finer.scene.mesh.nodes), simulator.scene.mesh.order == 1
-    return replace(told, runs=points * states, nodes=nodes, linear=linear)
+    model_error = predictive.model.error
+    widened = model_error is not None and model_error.of_mesh
+    return replace(told, runs=points * states, nodes=nodes, linear=linear, widened=widened)
 
 
 def _by_fem(predictive: Predictive, error: MeshError, observe: Observations) -> Differences:

@@ -59,11 +59,13 @@ def misfits(
 
     def one(flat: jax.Array, draw: dict[str, jax.Array], key: jax.Array) -> Any:
         values = predictive.model.noise_values(draw)
-        parts = predictive.model.distributions(unravel(flat), values)
-        keys = jax.random.split(key, len(parts))
         means = unravel(flat)
+        parts = predictive.model.distributions(means, values)
+        key, own = jax.random.split(key)
+        moved = predictive.model.fem_means(own, draw, means)
+        keys = jax.random.split(key, len(parts))
         return {
-            name: _compared(d, means[name], predictive.data[name], k)
+            name: _compared(d, means[name], moved[name] - means[name], predictive.data[name], k)
             for (name, d), k in zip(parts.items(), keys, strict=True)
         }
 
@@ -72,10 +74,10 @@ def misfits(
 
 
 def _compared(
-    d: Any, mean: jax.Array, y: jax.Array, rng_key: jax.Array
+    d: Any, mean: jax.Array, error: jax.Array, y: jax.Array, rng_key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """At one draw: whether simulated data is as unlikely as y, and both their distances."""
-    simulated = d.sample(rng_key)
+    simulated = d.sample(rng_key) + error
     return d.log_prob(simulated) <= d.log_prob(y), jnp.abs(simulated - mean), jnp.abs(y - mean)
 
 

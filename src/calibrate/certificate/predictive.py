@@ -37,7 +37,7 @@ class Evaluated(NamedTuple):
 
     prior : of z, its Jacobian included.
     cheap : likelihood that the draws are from: the map's, with what is allowed for its error.
-    corrected : likelihood of the map with its correction, and nothing allowed.
+    corrected : likelihood of the map with its correction, and nothing allowed but for the mesh.
     variance : of the correction, in squared noise sd.
     """
 
@@ -143,7 +143,7 @@ class Predictive:
         step, variance = correct(correction, self._features(draws))
         moved = unravel(flat + step)
         cheap = self.model.map_log_likelihood(draws, self.data)
-        corrected = self.model.log_density(moved, self.model.noise_values(draws), self.data)
+        corrected = self.model.fem_log_likelihood(draws, moved, self.data)
         prior = self._density.log_prior(z)
         prior, cheap, corrected = (
             jnp.where(fine & jnp.isfinite(value), value, -jnp.inf)

@@ -29,8 +29,9 @@ SMALLEST_P_WORST = 0.001
 # different whatever the tail; at 1.5 a tenth of the FEM runs would count.
 LARGEST_SPREAD = 1.5
 SMALLEST_POOL = 200.0  # effective points under the corrected map
-_QUADRATIC = "make the elements quadratic (order = 2)"
-_REFINE = "refine the mesh"
+_WIDEN = "or allow for it in the likelihood (--mesh-error)"
+_QUADRATIC = f"make the elements quadratic (order = 2), {_WIDEN}"
+_REFINE = f"emulate the finer mesh (calibrate train finer:SCENE --recipe two_meshes), {_WIDEN}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -127,12 +128,15 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[str]]:
     within = mesh.within()
     if within:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
-        return True, [f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"]
+        told = f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"
+        return True, [f"{told}, which is widened for it" if mesh.widened else told]
     words = [w for w, figure, limit in mesh.judged() if figure.within(limit) is within]
     if within is None:
         more = "give more runs on the finer mesh (--mesh-runs)"
         return None, [f"{finer} the {words[0]}, too close to the limit for its error: {more}"]
     remedy = _QUADRATIC if mesh.linear else _REFINE
+    if mesh.widened:
+        remedy = "learn the error of the mesh from more runs, or emulate the finer mesh"
     return False, [f"{finer} the {each}: {remedy}" for each in words]
 
 

@@ -32,19 +32,25 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 def add_scene(parser: argparse.ArgumentParser) -> None:
     """Add the scene and, for published ones, the folder of the data."""
     parser.add_argument(
-        "scene", metavar="SCENE", help="built-in name, .toml file, or published:<Model>"
+        "scene",
+        metavar="SCENE",
+        help="built-in name, .toml file, or published:<Model>; finer:SCENE refines its mesh",
     )
     parser.add_argument("--root", metavar="DIR", help="folder of the published data")
 
 
 def scene_words(arguments: argparse.Namespace) -> tuple[str, str | None]:
     """Name and folder that :func:`add_scene` read; a folder belongs to published scenes alone."""
-    if arguments.root is not None and not arguments.scene.startswith("published:"):
+    if arguments.root is not None and not _published(arguments.scene):
         raise InputError(
             f"--root has no effect with scene '{arguments.scene}': it is the folder of the "
             "published data, for published:<Model>"
         )
     return arguments.scene, arguments.root
+
+
+def _published(scene: str) -> bool:
+    return scene.removeprefix("finer:").startswith("published:")
 
 
 def add_scheduler(parser: argparse.ArgumentParser, which: str) -> None:

@@ -54,13 +54,22 @@ def add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
     )
-    parser.add_argument(
+    allowed = parser.add_mutually_exclusive_group()
+    allowed.add_argument(
         "--error-runs",
         type=int,
         default=0,
         metavar="N",
         help="FEM runs (8 or more) from which the forward map's own error is learned, so that a "
         "poor map widens the posterior instead of moving it",
+    )
+    allowed.add_argument(
+        "--mesh-error",
+        type=int,
+        default=0,
+        metavar="N",
+        help="the same with solves on the next finer mesh, so that the error of the mesh widens "
+        "the posterior, too",
     )
 
 
@@ -74,7 +83,7 @@ def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
                 f"--{option} has no effect beside --data {arguments.data}: it is for synthetic data"
             )
     return {
-        "scene": _absolute(scene, is_path=scene.endswith(".toml")),
+        "scene": _scene(scene),
         "root": root and _absolute(root),
         "data": _absolute(arguments.data, is_path=measured),
         "truth": assignments(arguments.truth),
@@ -89,6 +98,7 @@ def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
         "emulator": emulator_word(arguments.emulator),
         "forward_options": forward_options(arguments),
         "error_runs": arguments.error_runs,
+        "mesh_error_runs": arguments.mesh_error,
     }
 
 
@@ -131,6 +141,13 @@ def prior_word(word: str) -> str | dict[str, Any]:
     from calibrate.population import read_population
 
     return asdict(read_population(word)) if word.endswith(".json") else word
+
+
+def _scene(word: str) -> str:
+    """A scene's name as it is, its file as an absolute path; ``finer:`` stays before either."""
+    refined = "finer:" * word.startswith("finer:")
+    name = word.removeprefix(refined)
+    return refined + (_scene(name) if refined else _absolute(name, is_path=name.endswith(".toml")))
 
 
 def _absolute(word: str, *, is_path: bool = True) -> str:

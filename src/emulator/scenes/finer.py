@@ -10,6 +10,9 @@ from emulator.geometry.directions import across
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.scene import Scene
 
+FINER = "finer"
+"""What the origin of such a scene calls itself."""
+
 
 @dataclass(frozen=True, eq=False)
 class Finer:
@@ -47,6 +50,6 @@ def finer(scene: Scene) -> Finer:
         dilatation="mean" if scene.dilatation == "patch" else scene.dilatation,
         regions=None if scene.regions is None else np.repeat(scene.regions, children),
         supports=tuple(support.on_finer(refinement.mesh, moved) for support in scene.supports),
-        origin={},
+        origin={"scene": FINER, "of": dict(scene.origin)} if scene.origin else {},
     )
     return Finer(scene, fine, refinement)

@@ -1,7 +1,8 @@
 r"""The emulator of a scene: a sum of parts, any of which may be absent.
 
 .. math:: u(\theta) = \bar u \quad\text{where held},\qquad
-    u(\theta) = \underbrace{\sum_\alpha \frac{(x - x_0)^\alpha}{\alpha!}\, u_{,\alpha}
+    u(\theta) = \underbrace{P\, u_c(\theta)}_\text{on a coarser mesh}
+        + \underbrace{\sum_\alpha \frac{(x - x_0)^\alpha}{\alpha!}\, u_{,\alpha}
         }_\text{Taylor series of FEM at } x_0
         + \underbrace{s\, \text{net}(x)}_\text{network}
         + \underbrace{\textstyle\sum_k c_k(x)\, \phi_k}_\text{discrepancy model}
@@ -26,6 +27,7 @@ import numpy as np
 
 from emulator.scenes.scene import Scene
 from emulator.shown import Row, Shown
+from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.part import Network
@@ -41,6 +43,7 @@ from emulator.surrogates.protocol import (
 from emulator.surrogates.taylor import Expansion
 
 KINDS: dict[str, type[Part]] = {
+    "coarse": Coarse,
     "taylor": Expansion,
     "network": Network,
     "family": FamilyNetwork,
@@ -57,6 +60,7 @@ class Emulator(Shown):
     Parameters
     ----------
     scene : what it emulates.
+    coarse : emulator of the same body on a coarser mesh.
     taylor : Taylor series of the equilibrium; of order 0, an offset.
     network : graph network.
     family : network that has learned a family of bodies, on this one.
@@ -65,6 +69,7 @@ class Emulator(Shown):
     """
 
     scene: Scene
+    coarse: Coarse | None = None
     taylor: Expansion | None = None
     network: Network | None = None
     family: FamilyNetwork | None = None

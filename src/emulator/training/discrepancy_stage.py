@@ -56,7 +56,7 @@ def add_discrepancy(
 
     sums = _sums(emulator, series)
     errors: dict[str, float] = {}
-    best = "taylor" if "taylor" in sums else "nothing"
+    best = next((n for n in ("coarse", "taylor") if n in sums), "nothing")
     if count >= FEWEST:
         test = np.arange(count) % _HELD_OUT == _HELD_OUT - 1
         for name, bare in sums.items():
@@ -73,7 +73,9 @@ def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:
     """The sums of parts a discrepancy model may be added to, by name."""
     bare = replace(emulator, discrepancy=None)
     nothing = replace(bare, taylor=None, network=None, family=None)
-    if emulator.family is not None:
+    if emulator.coarse is not None:  # on the same body, it has learned from many runs
+        candidates = [bare]
+    elif emulator.family is not None:
         alone = replace(bare, taylor=None)
         candidates = [nothing, replace(nothing, taylor=series), alone, bare]
     else:

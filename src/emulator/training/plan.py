@@ -105,6 +105,11 @@ class Plan:
         return not self.steps and self.recipe == "family"
 
     @property
+    def on_coarse(self) -> bool:
+        """Whether an emulator on a coarser mesh is what the discrepancy model stands on."""
+        return self.recipe == "two_meshes"
+
+    @property
     def idle(self) -> dict[str, str]:
         """Settings that change nothing, and why."""
         found = {}
@@ -148,6 +153,9 @@ RECIPES: dict[str, Plan] = {
         simulations=60,
         steps=0,
     ),
+    "two_meshes": Plan(
+        recipe="two_meshes", objective="energy", discrepancy=True, simulations=10, steps=0
+    ),
     "family": Plan(recipe="family", objective="energy", steps=0),
     "network": Plan(),
     "modal": Plan(
@@ -173,12 +181,13 @@ RECIPES: dict[str, Plan] = {
 }
 """``hybrid``: a Taylor series, a network trained on the energy in mechanical modes, and a
 discrepancy model. ``mechanics``: the same without a network, from a mesh to an emulator in a
-minute. ``family``: a network that has learned a family of bodies, on this one, without any FEM run.
-``modal``: a network alone about the FEM solution at the centre, its modes by variable
-projection, their coefficients from values and slopes of FEM runs. ``network``: Algorithm 1 about
-the FEM solution at the centre, trained on FEM runs and the energy. ``paper``: Algorithm 1 from
-zero, the energy at one theta a step, Adam at 1e-4 and then 1e-5, as released by Dalton et al.
-(2023)."""
+minute. ``two_meshes``: an emulator on a coarser mesh of the same body, and a discrepancy model of
+a few runs on the scene's own. ``family``: a network that has learned a family of bodies, on this
+one, without any FEM run. ``modal``: a network alone about the FEM solution at the centre, its modes
+by variable projection, their coefficients from values and slopes of FEM runs. ``network``:
+Algorithm 1 about the FEM solution at the centre, trained on FEM runs and the energy. ``paper``:
+Algorithm 1 from zero, the energy at one theta a step, Adam at 1e-4 and then 1e-5, as released by
+Dalton et al. (2023)."""
 
 
 def recipe(name: str) -> Plan:

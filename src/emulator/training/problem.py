@@ -13,6 +13,7 @@ import optax
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs, StoredRuns, run_campaign
+from emulator.fem.campaign.starts import Predictor
 from emulator.fem.designs import design, sobol
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
@@ -27,7 +28,7 @@ from emulator.training.discrepancy_stage import FEWEST
 from emulator.training.modal import ARCHITECTURE, Modal
 from emulator.training.objectives import Scales, make_loss, mean_square_gradient
 from emulator.training.plan import Plan
-from emulator.training.start import architecture_from, family_on, with_network_of
+from emulator.training.start import architecture_from, family_on, on_finer, with_network_of
 from emulator.training.step import Step, batch_descent, clipped_adam, make_step
 
 # Standard deviation of the displacements as a fraction of the centre's, where no FEM run tells it.
@@ -43,7 +44,8 @@ class Problem:
     runs : FEM solutions, the centre's first.
     optimiser, step : of the network (:func:`~emulator.training.step.make_step`), or None.
     modal : what teaches the network modes and then coefficients, for plans that do.
-    series : FEM's own, where the emulator's is of what a family's network leaves.
+    series : FEM's own, where the emulator's is of what a family's network leaves or on a coarser
+        mesh.
     """
 
     plan: Plan
@@ -97,7 +99,7 @@ def prepare(
     Parameters
     ----------
     start : the emulator whose network to begin from, on any mesh; its architecture then is the
-        default.
+        default. Of a plan on a coarser mesh, the emulator there.
     campaign : FEM runs that are there already; the centre's alone is then solved.
     budget : ends FEM runs in time, except the fewest that a discrepancy model can be judged by.
 
@@ -107,6 +109,8 @@ def prepare(
         The budget is over before training begins.
     """
     deadline = np.inf if budget is None else budget.fem_deadline(plan)
+    if plan.on_coarse:
+        return _on_coarse(scene, plan, start, campaign, deadline, progress)
     family = None
     if start is not None and start.family is not None:
         family = family_on(start, scene, plan)
@@ -154,8 +158,29 @@ def prepare(
     return Problem(plan, emulator, runs, optimiser, step)
 
 
+def _on_coarse(
+    scene: Scene,
+    plan: Plan,
+    start: Emulator | None,
+    campaign: StoredRuns | None,
+    deadline: float,
+    progress: bool,
+) -> Problem:
+    """Runs on the scene's own mesh, and the emulator ``start`` on a coarser one."""
+    emulator = on_finer(start, scene)
+    cached, simulator = emulator.cache(), Simulator(scene)
+    before = lambda position: cached(scene.from_unit(position))  # noqa: E731
+    if campaign is None:
+        runs = _run(simulator, plan, before, deadline, progress)
+    else:
+        runs = _taken(simulator, plan, before, campaign)
+    plan = replace(plan, simulations=len(runs.theta) - 1)
+    assert start is not None, "checked by on_finer"
+    return Problem(plan, emulator, runs, None, None, series=start.taylor)
+
+
 def _run(
-    simulator: Simulator, plan: Plan, series: Expansion | None, deadline: float, progress: bool
+    simulator: Simulator, plan: Plan, series: Predictor | None, deadline: float, progress: bool
 ) -> Runs:
     """The FEM solutions of a plan, the centre's first."""
     scene = simulator.scene
@@ -175,7 +200,7 @@ def _run(
 
 
 def _taken(
-    simulator: Simulator, plan: Plan, series: Expansion | None, campaign: StoredRuns
+    simulator: Simulator, plan: Plan, series: Predictor | None, campaign: StoredRuns
 ) -> Runs:
     """The centre's solution, and those of a campaign that a plan needs."""
     scene, there = simulator.scene, len(campaign.runs.theta)

@@ -13,9 +13,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from emulator.catalogue import finer_of
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
+from emulator.surrogates.coarse import carried
 from emulator.surrogates.network.family import FamilyNetwork, on_body
 from emulator.surrogates.network.graph import node_inputs
 from emulator.surrogates.network.pignn import Architecture
@@ -52,6 +54,27 @@ def family_on(start: Emulator, scene: Scene, plan: Plan) -> FamilyNetwork:
             "bodies; use recipe family, without any FEM run, or mechanics"
         )
     return on_body(start.family.learned, scene)
+
+
+def on_finer(start: Emulator | None, scene: Scene) -> Emulator:
+    """``start``, an emulator on the mesh that the scene's is finer than, on ``scene``.
+
+    Raises
+    ------
+    InputError
+        No such emulator, a scene that is not on a finer mesh, or one of another body.
+    """
+    body = finer_of(scene)
+    if start is None:
+        raise InputError(
+            "recipe 'two_meshes' stands on an emulator on the coarser mesh; give it as the start"
+        )
+    if start.scene.fingerprint != body.coarse.fingerprint:
+        raise InputError(
+            f"the emulator to start from is of scene '{start.scene.name}' on another mesh; "
+            f"expected one of the mesh that finer:{scene.name} refines"
+        )
+    return Emulator(scene, coarse=carried(start.parts, body))
 
 
 def start_record(start: Emulator) -> dict[str, Any]:

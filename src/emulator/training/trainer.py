@@ -7,17 +7,19 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from emulator.catalogue import finer_of
 from emulator.errors import InputError
 from emulator.fem.campaign import StoredRuns
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
+from emulator.surrogates.files import load, save_emulator
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.aim import Aim
 from emulator.training.budget import Budget
 from emulator.training.checkpoint import CHECKPOINT, Checkpoint, State, Writer, read_checkpoint
 from emulator.training.discrepancy_stage import add_discrepancy
 from emulator.training.loop import Bar, Hook, Keep, Steps, optimise, require_finite
-from emulator.training.plan import Plan
+from emulator.training.plan import Plan, recipe
 from emulator.training.problem import Problem, prepare
 from emulator.training.start import family_on, start_record, with_weights
 
@@ -40,7 +42,8 @@ def train(
     ----------
     folder : where checkpoints go. The finished emulator is returned, not written; remove the last
         checkpoint with :func:`remove_checkpoint` once it is safe.
-    start : begin from the network of this emulator, which may be of another geometry.
+    start : begin from the network of this emulator, which may be of another geometry; of recipe
+        two_meshes, the emulator on the coarser mesh, made by recipe mechanics if none is given.
     campaign : FEM runs to take the first ``plan.simulations`` of, instead of making them; needed
         again to resume.
     budget : seconds for everything (FEM runs, compilation, training, the discrepancy model). It
@@ -57,12 +60,15 @@ def train(
     if plan.as_learned:
         return _as_learned(scene, plan, start, began)
     saved = read_checkpoint(path, scene.fingerprint, scene.name) if resume else None
+    if plan.on_coarse and start is None:
+        start = _coarse(scene, Path(folder) / "coarse", progress=progress, resume=resume)
     source = {} if start is None else start_record(start)
     plan = replace(plan, campaign="" if campaign is None else campaign.digest)
     if saved is not None:
         _check_campaign(saved.plan, plan)
         plan, architecture, source = saved.plan, saved.architecture or architecture, saved.start
-        start = budget = None  # both are in the checkpoint
+        budget = None  # it is in the checkpoint, and so is a network to start from
+        start = start if plan.on_coarse else None
     limit = None if budget is None else Budget(budget, began)
     problem = prepare(
         scene,
@@ -80,6 +86,17 @@ def train(
     emulator, record = _finish(problem, state, progress=progress)
     record |= {"start": source} if source else {}
     return replace(emulator, record={**record, "seconds": round(clock(), 1)})
+
+
+def _coarse(scene: Scene, folder: Path, *, progress: bool, resume: bool) -> Emulator:
+    """An emulator on the mesh that the scene's is finer than, kept in ``folder``."""
+    coarse = finer_of(scene).coarse
+    if resume and (folder / "emulator.json").is_file():
+        return load(folder, coarse)
+    found = train(coarse, recipe("mechanics"), folder, progress=progress)
+    save_emulator(found, folder)
+    remove_checkpoint(folder)
+    return found
 
 
 def _check_campaign(saved: Plan, given: Plan) -> None:

@@ -1,0 +1,105 @@
+r"""An emulator of the same body on a coarser mesh, as a part of one on the finer mesh.
+
+.. math:: u(x) = P \Big[ \sum_\text{parts} u_p(x) \Big]
+
+with :math:`P` the prolongation (:mod:`emulator.geometry.refinement`), so that the part is the same
+function of place on both meshes, and of theta. What the coarse mesh gets wrong varies little with
+theta, compared with the displacement: a discrepancy model of a few runs on the finer mesh, with
+their sensitivities, adds it (recipe ``two_meshes``; two levels of the model of Kennedy and O'Hagan
+2000, of fields and their slopes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from emulator.errors import InputError
+from emulator.scenes.finer import Finer
+from emulator.scenes.scene import Scene
+from emulator.store import inside
+from emulator.surrogates.discrepancy import Discrepancy
+from emulator.surrogates.part import CachedPart, Part, widened
+from emulator.surrogates.taylor import Expansion
+
+_KINDS: dict[str, type[Part]] = {"taylor": Expansion, "discrepancy": Discrepancy}
+
+
+@dataclass(frozen=True, eq=False)
+class Coarse:
+    """Parts of an emulator on a coarser mesh, carried to the nodes of the finer one.
+
+    parts : by name, over the coarse nodes. prolongation : (fine nodes, coarse nodes).
+    """
+
+    parts: Mapping[str, Part]
+    prolongation: csr_matrix
+
+    def __call__(self, position: jax.Array) -> jax.Array:
+        """Displacement (n, 3) in mm of the finer mesh's nodes at ``position`` (p,)."""
+        cached = self.cache(np.arange(self.prolongation.shape[0]))
+        return jnp.asarray(cached.offset) + jnp.tensordot(
+            cached.coefficients(position), cached.modes, axes=1
+        )
+
+    def cache(self, nodes: np.ndarray) -> CachedPart:
+        """The part over ``nodes`` (k,) of the finer mesh."""
+        rows = self.prolongation[nodes]
+        used = np.unique(rows.indices)
+        carry, cached = rows[:, used], [part.cache(used) for part in self.parts.values()]
+        offset = carry @ sum((part.offset for part in cached), np.zeros((len(used), 3)))
+        modes = np.concatenate([part.modes for part in cached])
+        flat = carry @ modes.transpose(1, 0, 2).reshape(len(used), -1)
+        return CachedPart(
+            offset,
+            flat.reshape(len(nodes), len(modes), 3).transpose(1, 0, 2),
+            lambda position: jnp.concatenate([part.coefficients(position) for part in cached]),
+        )
+
+    def arrays(self) -> dict[str, Any]:
+        """Arrays of all parts, as ``taylor/derivatives`` and so on, and of the prolongation."""
+        rows = self.prolongation
+        kept = {f"{n}/{k}": a for n, part in self.parts.items() for k, a in part.arrays().items()}
+        places = {name: getattr(rows, name) for name in ("data", "indices", "indptr")}
+        return kept | {f"prolongation/{name}": array for name, array in places.items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """Nodes of the coarse mesh, and what the parts say."""
+        told = {name: part.to_json() for name, part in self.parts.items()}
+        return {"nodes": self.prolongation.shape[1], "parts": told}
+
+    @classmethod
+    def restore(
+        cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> Self:
+        """The part with this description and these arrays."""
+        places = inside(arrays, "prolongation")
+        shape = len(scene.mesh.nodes), description["nodes"]
+        rows = csr_matrix((widened(places["data"]), places["indices"], places["indptr"]), shape)
+        parts = {
+            name: _KINDS[name].restore(scene, told, inside(arrays, name))
+            for name, told in description["parts"].items()
+        }
+        return cls(parts, rows)
+
+
+def carried(parts: Mapping[str, Part], body: Finer) -> Coarse:
+    """``parts`` of an emulator of ``body.coarse``, on the finer mesh.
+
+    Raises
+    ------
+    InputError
+        No parts, or one that is not a sum of a series and discrepancies.
+    """
+    if not parts or not set(parts) <= set(_KINDS):
+        raise InputError(
+            f"two_meshes: the emulator on the coarser mesh is {' + '.join(parts) or 'empty'}; give "
+            "one of a series and a discrepancy, as recipe mechanics makes"
+        )
+    return Coarse(dict(parts), csr_matrix(body.refinement.prolongation))

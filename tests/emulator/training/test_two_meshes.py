@@ -1,0 +1,83 @@
+"""An emulator of a finer mesh from one on the coarser mesh and a few runs."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.catalogue import find_scene, finer_of
+from emulator.errors import InputError
+from emulator.fem import sobol
+from emulator.scenes.finer import finer
+from emulator.surrogates import load, save_emulator
+from emulator.training import recipe, train
+
+PLAN = replace(recipe("two_meshes"), simulations=5)
+MECHANICS = replace(recipe("mechanics"), simulations=12)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return finer(em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1))
+
+
+@pytest.fixture(scope="module")
+def coarse(body, tmp_path_factory):
+    return train(body.coarse, MECHANICS, tmp_path_factory.mktemp("coarse"))
+
+
+@pytest.fixture(scope="module")
+def fine(body, coarse, tmp_path_factory):
+    return train(body.scene, PLAN, tmp_path_factory.mktemp("fine"), start=coarse)
+
+
+def test_a_few_runs_take_it_to_the_finer_mesh(body, fine):
+    simulator, cached = em.Simulator(body.scene), fine.cache()
+    without = replace(fine, discrepancy=None).cache()
+    for theta in sobol(body.scene, 4, seed=7):
+        exact = simulator(theta)
+        size = jnp.linalg.norm(without(theta) - exact)
+        assert jnp.linalg.norm(cached(theta) - exact) < 0.01 * size
+
+
+def test_the_coarse_part_is_the_same_function_of_place(body, coarse, fine):
+    theta = body.scene.from_unit(jnp.array([0.2, 0.7]))
+    below = body.refinement.carry(np.asarray(coarse.cache()(theta)))
+    position = body.scene.to_unit(theta)
+    part = fine.parts["coarse"]
+    np.testing.assert_allclose(part(position), below, atol=1e-12)
+    some = np.array([3, 30, 7])
+    cached = part.cache(some)
+    at = cached.offset + np.tensordot(cached.coefficients(position), cached.modes, axes=1)
+    np.testing.assert_allclose(at, below[some], atol=1e-12)
+
+
+def test_it_is_kept_and_found_again(body, fine, tmp_path):
+    save_emulator(fine, tmp_path)
+    again = load(tmp_path)
+    assert again.fingerprint == fine.fingerprint
+    assert again.scene.fingerprint == body.scene.fingerprint
+    theta = body.scene.centre
+    np.testing.assert_array_equal(
+        jax.jit(again.cache())(theta),
+        jax.jit(fine.cache(np.arange(len(body.scene.mesh.nodes))))(theta),
+    )
+
+
+def test_a_finer_scene_has_a_name():
+    refined = find_scene("finer:twisting_cube")
+    assert refined.mesh.order == 2
+    assert finer_of(refined).coarse.fingerprint == find_scene("twisting_cube").fingerprint
+
+
+def test_what_it_cannot_stand_on_is_refused(body, coarse, tmp_path):
+    with pytest.raises(InputError, match="not on a mesh made finer; name it finer:"):
+        train(body.coarse, PLAN, tmp_path, start=coarse)
+    other = finer(em.scenes.once_clamped_beam(cells=(3, 1, 1), order=1)).scene
+    with pytest.raises(InputError, match="expected one of the mesh that finer:"):
+        train(other, PLAN, tmp_path, start=coarse)
+    with pytest.raises(InputError, match="as recipe mechanics makes"):
+        train(body.scene, PLAN, tmp_path, start=replace(coarse, taylor=None, discrepancy=None))
