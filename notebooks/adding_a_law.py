@@ -323,10 +323,11 @@ for name, row in strong.summary().items():
     assert row["sd"] < 0.5 * weak.summary()[name]["sd"]
 
 # %% [markdown]
-# Finite elements with the same law have the last word.
+# Finite elements with the same law have the last word, on the mesh that made the data (`mesh=0`). A finer mesh of this thin sheet
+# of linear tetrahedra would not agree: with your own data, take quadratic ones.
 
 # %%
-certificate = cal.certify(strong, simulator, draws=80)
+certificate = cal.certify(strong, simulator, draws=80, mesh=0)
 print(certificate)
 assert certificate.verdict == "accepted"
 

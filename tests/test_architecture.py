@@ -11,7 +11,7 @@ from calibrate.cli import build_parser
 from calibrate.noise.registry import KINDS as NOISES
 from calibrate.observations.registry import KINDS as OBSERVATIONS
 from calibrate.samplers.registry import SAMPLERS
-from emulator.fem.factorisations import FACTORISATIONS
+from emulator.fem.linear import SOLVERS
 from emulator.mechanics.laws import LAWS
 from emulator.scenes.loads import LOADS
 from emulator.scenes.supports import SUPPORTS
@@ -25,7 +25,7 @@ REGISTRIES = {
     "an observation": OBSERVATIONS,
     "a noise": NOISES,
     "a sampler": SAMPLERS,
-    "a factorisation": FACTORISATIONS,
+    "a linear solver": SOLVERS,
 }
 
 

@@ -28,7 +28,7 @@ from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.factorisations import mumps
 from emulator.fem.factorisations.suitesparse import CHOLMOD, remember_factors
-from emulator.fem.sparse import Pattern
+from emulator.fem.linear.pattern import Pattern
 from emulator.scenes.scene import Scene
 
 # PETSC_OPTIONS of MUMPS: as it is, factors on disk, and block low-rank factors to six digits with

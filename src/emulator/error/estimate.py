@@ -58,7 +58,7 @@ from emulator.error.step import (
 )
 from emulator.errors import InputError
 from emulator.fem.assembly import System
-from emulator.fem.factorisations import REFUSALS
+from emulator.fem.programs import cond
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
@@ -123,11 +123,7 @@ class ErrorBar:
         return self.forward.scene
 
     def __call__(self, theta: jax.Array) -> ErrorEstimate:
-        """Error of the forward map at ``theta`` (p,), inside the box or not.
-
-        Outside ``jit`` CHOLMOD factorises the tangent, and refuses it if it is indefinite; inside,
-        UMFPACK does, and an indefinite tangent may go unnoticed.
-        """
+        """Error of the forward map at ``theta`` (p,), inside the box or not."""
         theta = jnp.asarray(theta, dtype=float)
         self._check_shape("theta", theta, (len(self.scene.parameters),))
         traced = isinstance(theta, jax.core.Tracer)
@@ -138,20 +134,19 @@ class ErrorBar:
         u, theta = jnp.asarray(u, dtype=float), jnp.asarray(theta, dtype=float)
         self._check_shape("theta", theta, (len(self.scene.parameters),))
         self._check_shape("displacement", u, self.scene.held.shape)
-        traced = isinstance(u, jax.core.Tracer) or isinstance(theta, jax.core.Tracer)
-        if traced or self.tangent == "centre" or self.simulator.system.forces:
-            return self._estimate(u, theta)
         sound, safe_theta = self._prepare(u, theta)
-        try:
-            step = jax.block_until_ready(self._definite_step(sound, safe_theta))
-        except REFUSALS as error:
-            if "not positive definite" not in str(error):
-                raise
-            step = self._guarded(sound, safe_theta)._replace(indefinite=jnp.array(True))
-        else:
-            if not step.settled:
-                step = self._guarded(sound, safe_theta)
-        return self._finish(u, theta, sound, step)
+        return self._finish(u, theta, sound, self._distance(sound, safe_theta))
+
+    def _distance(self, sound: jax.Array, theta: jax.Array) -> Distance:
+        """Distance of a state that can be linearised; FEM's iteration where one step is no good."""
+        if self.tangent == "centre":
+            return self._by_gradients(sound, theta)
+        step = self._step(sound, theta)
+        return cond(
+            step.settled,
+            lambda: step,
+            lambda: self._guarded(sound, theta)._replace(indefinite=step.indefinite),
+        )
 
     def _check_shape(self, name: str, array: jax.Array, expected: tuple[int, ...]) -> None:
         if array.shape != expected:
@@ -169,43 +164,23 @@ class ErrorBar:
         return jax.jit(partial(sound_state, self.scene, self.centre))
 
     @cached_property
-    def _definite_step(self):  # noqa: ANN202
-        return jax.jit(partial(newton_distance, System(self.scene, "cholmod")))
+    def _step(self):  # noqa: ANN202
+        return jax.jit(partial(newton_distance, self.simulator.system))
 
     @cached_property
     def _guarded(self):  # noqa: ANN202
         return jax.jit(partial(guarded_distance, self.simulator))
 
     @cached_property
+    def _by_gradients(self):  # noqa: ANN202
+        system = self.simulator.system
+        with jax.ensure_compile_time_eval():
+            values = np.asarray(self.simulator.tangent(self.centre, self.scene.centre))
+        return jax.jit(partial(gradients_distance, system, values, self.iterations))
+
+    @cached_property
     def _finish(self):  # noqa: ANN202
         return jax.jit(partial(_report, self.simulator.system, self.centre))
-
-    @cached_property
-    def _centre_tangent(self) -> tuple[System, np.ndarray]:
-        """The system with CHOLMOD, and the tangent (nnz,) at the centre's solution."""
-        system = System(self.scene, "cholmod")
-        with jax.ensure_compile_time_eval():
-            values = jax.jit(system.tangent)(self.centre, self.scene.centre)
-            return system, np.asarray(system.pattern.safe_values(values))
-
-    @cached_property
-    def _estimate(self):  # noqa: ANN202
-        def estimate(u: jax.Array, theta: jax.Array) -> ErrorEstimate:
-            sound, safe_theta = sound_state(self.scene, self.centre, u, theta)
-            if self.tangent == "centre":
-                step = gradients_distance(*self._centre_tangent, self.iterations, sound, safe_theta)
-            else:
-                step = newton_distance(self.simulator.system, sound, safe_theta)
-                step = jax.lax.cond(
-                    step.settled,
-                    lambda: step,
-                    lambda: guarded_distance(self.simulator, sound, safe_theta)._replace(
-                        indefinite=step.indefinite
-                    ),
-                )
-            return _report(self.simulator.system, self.centre, u, theta, sound, step)
-
-        return jax.jit(estimate)
 
 
 def error_bar(

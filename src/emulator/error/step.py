@@ -16,7 +16,10 @@ import numpy as np
 
 from emulator.fem.assembly import System, balance
 from emulator.fem.functional import volume_ratio
+from emulator.fem.linear import Outcome
+from emulator.fem.linear.reuse import conjugate_gradients
 from emulator.fem.newton import Newton, NewtonState
+from emulator.fem.programs import while_loop
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Status
 from emulator.fem.state import UNBALANCED
@@ -82,12 +85,13 @@ def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
     """Newton's step with the opposite sign, and a check by one more back-substitution."""
     (residual, out_of_balance), tangent = balance(system, u, theta), system.tangent(u, theta)
     values = system.pattern.safe_values(tangent)
-    move = system.extend(system.solve(values, residual))
+    step, outcome = system.attempt(values, residual)
+    move = system.extend(step)
     after = u - move
     open_ = _least_J(system.scene, after) > _SHRINK * _least_J(system.scene, u)
     left = system.residual(jnp.where(open_, after, u), theta)
     length = _norm(move)
-    again = _norm(system.solve(values, left)) / jnp.where(length > 0.0, length, 1.0)
+    again = _norm(system.attempt(values, left)[0]) / jnp.where(length > 0.0, length, 1.0)
     gap = 0.5 * jnp.vdot(residual, system.restrict(move))
     sound = system.pattern.solvable(tangent) & jnp.isfinite(length) & open_ & (gap >= 0.0)
     exact = length <= _ROUND_OFF * _norm(u)
@@ -98,7 +102,7 @@ def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
         gap=gap,
         contraction=jnp.where(exact, jnp.minimum(again, 1.0), again),
         iterations=jnp.array(0),
-        indefinite=gap < 0.0,
+        indefinite=(outcome == Outcome.INDEFINITE) | (gap < 0.0),
         settled=sound & (exact | good),
     )
 
@@ -124,7 +128,7 @@ def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Di
 
     begun = newton.begin(u)
     at_once = begun.status == Status.CONVERGED
-    state, near, ratio = jax.lax.while_loop(unfinished, advance, (begun, at_once, jnp.array(0.0)))
+    state, near, ratio = while_loop(unfinished, advance, (begun, at_once, jnp.array(0.0)))
     follower = system.follower_force(u, theta)
     gap = system.potential(u, theta, 1.0, follower)[0]
     gap = gap - system.potential(state.u, theta, 1.0, follower)[0]
@@ -141,29 +145,15 @@ def gradients_distance(
         along = (system.extend(v),)
         return jax.jvp(lambda w: system.residual(w, theta), (u,), along)[1]
 
-    force = left = system.residual(u, theta)
-    move = direction = jnp.zeros_like(force)
-    first = before = jnp.array(0.0)
-    convex = jnp.array(True)
-    for k in range(iterations):
-        nearer = system.solve(values, left)
-        size = jnp.vdot(left, nearer)
-        first = size if k == 0 else first
-        direction = nearer + (0.0 if k == 0 else size / jnp.where(before > 0, before, 1.0)) * (
-            direction
-        )
-        pull = stiffness(direction)
-        curvature = jnp.vdot(direction, pull)
-        convex &= (curvature > 0.0) | (size == 0.0)
-        length = jnp.where(convex & (size > 0.0), size / jnp.where(convex, curvature, 1.0), 0.0)
-        length = jnp.where(jnp.isfinite(length), length, 0.0)
-        move, left, before = move + length * direction, left - length * pull, size
-    last = jnp.vdot(left, system.solve(values, left))
+    force = system.residual(u, theta)
+    found = conjugate_gradients(
+        stiffness, lambda left: system.attempt(values, left)[0], force, iterations, 0.0
+    )
     return Distance(
-        move=system.extend(move),
-        gap=0.5 * jnp.vdot(force, move),
-        contraction=jnp.sqrt(jnp.abs(last) / jnp.where(first > 0.0, first, 1.0)),
+        move=system.extend(found.x),
+        gap=0.5 * jnp.vdot(force, found.x),
+        contraction=found.reduction,
         iterations=jnp.array(0),
-        indefinite=~convex,
-        settled=convex & jnp.all(jnp.isfinite(move)),
+        indefinite=~found.convex,
+        settled=found.convex & jnp.all(jnp.isfinite(found.x)),
     )

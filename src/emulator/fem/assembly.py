@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.fem.factorisations import Factorisation, find_factorisation
 from emulator.fem.functional import (
     DeadForce,
     at_points,
@@ -37,10 +36,11 @@ from emulator.fem.functional import (
     strain_energy,
     volume_ratio,
 )
-from emulator.fem.kept import KeptFactor
+from emulator.fem.linear import Direct, Pattern, block_pattern, find_solver
+from emulator.fem.linear.reuse import KeptFactor
+from emulator.fem.linear.solve import attempt, solve
 from emulator.fem.mixed import Condensed, consistent, linearise
 from emulator.fem.programs import compiled
-from emulator.fem.sparse import Pattern, block_pattern
 from emulator.scenes.local_terms import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
@@ -49,16 +49,16 @@ from emulator.scenes.scene import Scene
 class System:
     """The discrete equations of a scene; vectors of free displacements have shape (f,).
 
-    factorisation : by its name in :data:`emulator.fem.factorisations.FACTORISATIONS`.
+    factorisation : by its name in :data:`emulator.fem.linear.SOLVERS`.
     """
 
     scene: Scene
-    factorisation: str = "umfpack"
+    factorisation: str = "suitesparse"
 
     @property
-    def direct(self) -> Factorisation:
+    def direct(self) -> Direct:
         """What solves with the tangent."""
-        return find_factorisation(self.factorisation)
+        return find_solver(self.factorisation)
 
     @cached_property
     def programs(self) -> dict[Callable, Callable]:
@@ -90,15 +90,16 @@ class System:
 
     @cached_property
     def pattern(self) -> Pattern:
-        """Sparsity of the tangent: the bulk's blocks, then springs, then the loads."""
+        """Sparsity of the tangent: the bulk's blocks, then springs, then the loads.
+
+        The upper triangle, where every load has a potential.
+        """
         free_index = np.full(self.scene.held.size, -1)
         free_index[self.free] = np.arange(len(self.free))
         local: list[LocalTerm | LocalForce] = [*self.springs, *self.terms, *self.forces]
         groups = [self.scene.blocks.connectivity, *(part.nodes for part in local)]
         dofs = [(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1) for nodes in groups]
-        # A definite factorisation reads the upper triangle whatever the loads are.
-        symmetric = self.direct.triangle and (self.direct.definite or not self.forces)
-        return block_pattern(dofs, free_index, symmetric=symmetric)
+        return block_pattern(dofs, free_index, symmetric=not self.forces)
 
     @cached_property
     def dead(self) -> DeadForce:
@@ -242,32 +243,51 @@ class System:
         return jnp.min(volume_ratio(self.scene, u))
 
     def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
-        """Solve ``K x = rhs`` over the free degrees of freedom, shape (f,)."""
+        """``x`` (f,) with ``K x = rhs`` over the free degrees of freedom; NaN where K is singular.
+
+        Whatever the signs of its eigenvalues.
+        """
         if self.direct.on_host:
-            return self.direct.solve(self.pattern, tangent, rhs)
+            return solve(self.direct, self.pattern, tangent, rhs)
         return self._solve(tangent, rhs)
 
     @compiled
     def _solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
-        return self.direct.solve(self.pattern, tangent, rhs)
+        return solve(self.direct, self.pattern, tangent, rhs)
 
-    def step(self, tangent: jax.Array, rhs: jax.Array, *, near: bool = True) -> jax.Array:
-        """:meth:`solve` for a step of Newton's method, with the factor of another one if it serves.
+    def attempt(
+        self, tangent: jax.Array, rhs: jax.Array, *, near: bool = True
+    ) -> tuple[jax.Array, jax.Array]:
+        """:meth:`solve` of a tangent that ought to be positive definite, and the outcome.
 
-        On a large mesh, where tangent and right-hand side are numbers. ``near`` says whether the
-        tangent may be like that other one.
+        INDEFINITE, and NaN, where it is symmetric and is not. On a large mesh, where tangent and
+        right-hand side are numbers, the factor of another tangent may serve; ``near`` says whether
+        this one may be like that.
         """
         traced = any(isinstance(x, jax.core.Tracer) for x in (tangent, rhs))
-        if self.kept is None or traced:
-            return self.solve(tangent, rhs)
-        return self.kept.solve(tangent, rhs, near=near)
+        if self.kept is not None and not traced:
+            return self.kept.attempt(tangent, rhs, near=near)
+        if self.direct.on_host:
+            return attempt(self.direct, self.pattern, tangent, rhs)
+        return self._attempt(tangent, rhs)
+
+    @compiled
+    def _attempt(self, tangent: jax.Array, rhs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return attempt(self.direct, self.pattern, tangent, rhs)
+
+    @property
+    def stepwise(self) -> bool:
+        """Whether a loop over solves is better Python's, where the numbers are known.
+
+        A factor that is kept, and a solver on the host, are reached from there only.
+        """
+        return self.direct.on_host or self.kept is not None
 
     @cached_property
     def kept(self) -> KeptFactor | None:
-        """The factor that steps keep while it serves; None where the matrices are small."""
-        wanted = self.direct.definite and not self.mixed
-        pays = wanted and KeptFactor.pays(self.pattern)
-        return KeptFactor(self.pattern, self.direct) if pays else None
+        """The factor that serves other tangents; None where the matrices are small."""
+        pays = not self.mixed and KeptFactor.pays(self.pattern)
+        return KeptFactor(self.direct, self.pattern) if pays else None
 
 
 def relative_residual(

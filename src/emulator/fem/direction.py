@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System
+from emulator.fem.linear import Outcome
 from emulator.fem.mixed import Condensed, linearise
 from emulator.fem.programs import compiled, cond
 from emulator.fem.state import UNBALANCED, NewtonState
@@ -29,6 +30,8 @@ class Direction(NamedTuple):
     move : (n, 3) mm. residual : (f,) mN where it starts. pull : (f,) mN, the change of the residual
     when the supports are moved. slope : residual . move in mN mm, before the move was reversed.
     settled : whether the supports are where they belong. singular : whether the tangent is.
+    definite : whether a factorisation found it positive definite. refused : whether there is no
+    step, because it is not and only such a one was wanted.
     tangent : (nnz,) mN/mm. condensed : the linearisation of mean dilatation, or None.
     """
 
@@ -38,6 +41,8 @@ class Direction(NamedTuple):
     slope: jax.Array
     settled: jax.Array
     singular: jax.Array
+    definite: jax.Array
+    refused: jax.Array
     tangent: jax.Array
     condensed: Condensed | None
 
@@ -64,8 +69,13 @@ def supports_met(system: System, u: jax.Array, level: jax.Array) -> jax.Array:
     return jnp.all(support_offset(system, u, level) == 0.0)
 
 
-def newton_direction(system: System, theta: jax.Array, state: NewtonState) -> Direction:
-    """Newton's step at ``state``, reversed where it would climb the potential."""
+def newton_direction(
+    system: System, theta: jax.Array, state: NewtonState, *, any_tangent: jax.Array | bool
+) -> Direction:
+    """Newton's step at ``state``, reversed where it would climb the potential.
+
+    any_tangent : whether a tangent that is not positive definite will do.
+    """
     settled = supports_met(system, state.u, state.level)
     linearised = (
         _on_displacements(system, theta, state, settled)
@@ -73,11 +83,17 @@ def newton_direction(system: System, theta: jax.Array, state: NewtonState) -> Di
         else _on_volumes(system, theta, state)
     )
     tangent, solvable, residual, pull, condensed = linearised
-    full = system.step(tangent, -(residual + pull))
+    full, outcome = system.attempt(tangent, -(residual + pull))
+    indefinite = outcome == Outcome.INDEFINITE
+    again = indefinite & any_tangent
+    full = cond(again, lambda: system.solve(tangent, -(residual + pull)), lambda: full)
     move, slope, singular = _full_step(
         system, state.u, state.level, tangent, solvable, residual, pull, settled, full
     )
-    return Direction(move, residual, pull, slope, settled, singular, tangent, condensed)
+    refused = indefinite & ~again
+    return Direction(
+        move, residual, pull, slope, settled, singular, ~indefinite, refused, tangent, condensed
+    )
 
 
 @compiled

@@ -33,24 +33,29 @@ _ROUND_OFF = 1e-13  # of the energy's parts, in which a decrease near the soluti
 
 
 class _Trial(NamedTuple):
-    """A fraction of the step, and the verdicts on it.
+    """A fraction of the step, its potential, and the verdicts on it.
 
     good : whether it is sound and makes progress. sound : whether no element is crushed.
     crushed : whether twice the fraction was not sound.
     """
 
     fraction: jax.Array
+    energy: jax.Array
     good: jax.Array
     sound: jax.Array
     crushed: jax.Array
 
 
 class _Valley(NamedTuple):
-    """A fraction of the step, its potential, and the potential of half the fraction."""
+    """A fraction of the step, its potential, and whether half of it may be lower."""
 
     fraction: jax.Array
     energy: jax.Array
-    of_half: jax.Array
+    falls: jax.Array
+
+
+Judge = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+"""Of a fraction: whether it makes progress, and its potential, mN mm."""
 
 
 def choose_fraction(
@@ -87,53 +92,52 @@ def choose_fraction(
         J = system.least_volume_ratio(u + fraction * direction.move)
         return floor < J  # False for NaN
 
-    least = _LEAST_FRACTION if nearer is None else _LEAST_NATURAL
-    lowers = _progress(system, u, level, theta, direction, potential) if nearer is None else nearer
-    trial = _largest_good(sound, lowers, least)
-    fraction = trial.fraction
-    if nearer is None:
-        fraction = _valley(lambda f: potential(f)[0], fraction, direction.settled & trial.good)
+    if nearer is not None:
+        trial = _largest_good(sound, lambda f: (nearer(f), jnp.zeros(())), _LEAST_NATURAL)
+        return jnp.where(trial.good, trial.fraction, 0.0), trial.crushed
+    progress = _progress(system, u, level, theta, direction, potential)
+    trial = _largest_good(sound, progress, _LEAST_FRACTION)
+    begin = _Valley(trial.fraction, trial.energy, direction.settled & trial.good)
+    fraction = _lowest(lambda f: potential(f)[0], begin)
     return jnp.where(trial.good, fraction, 0.0), trial.crushed
 
 
 def largest_sound(sound: Callable[[jax.Array], jax.Array], least: float) -> jax.Array:
     """The largest of 1, 1/2, 1/4, ... that is ``sound``; 0 where that is below ``least``."""
-    trial = _largest_good(sound, lambda _: jnp.array(True), least)
+    trial = _largest_good(sound, lambda _: (jnp.array(True), jnp.zeros(())), least)
     return jnp.where(trial.good, trial.fraction, 0.0)
 
 
-def _largest_good(
-    sound: Callable[[jax.Array], jax.Array],
-    lowers: Callable[[jax.Array], jax.Array],
-    least: float,
-) -> _Trial:
+def _largest_good(sound: Callable[[jax.Array], jax.Array], judge: Judge, least: float) -> _Trial:
     """Halve the step until it is sound and makes progress, or would go below ``least``."""
 
-    def judge(fraction: jax.Array, crushed: jax.Array) -> _Trial:
-        fine = sound(fraction)
-        return _Trial(fraction, fine & lowers(fraction), fine, crushed)
+    def halve(trial: _Trial) -> _Trial:
+        fraction = 0.5 * trial.fraction
+        fine, (lower, energy) = sound(fraction), judge(fraction)
+        return _Trial(fraction, energy, fine & lower, fine, ~trial.sound)
 
     def wanted(trial: _Trial) -> jax.Array:
         return ~trial.good & (trial.fraction >= 2.0 * least)
 
-    first = judge(jnp.ones(()), jnp.array(False))
-    return while_loop(wanted, lambda t: judge(0.5 * t.fraction, ~t.sound), first)
+    no = jnp.array(False)
+    twice = _Trial(jnp.full((), 2.0), jnp.zeros(()), good=no, sound=~no, crushed=no)
+    return while_loop(wanted, halve, twice)
 
 
-def _valley(
-    potential: Callable[[jax.Array], jax.Array], fraction: jax.Array, wanted: jax.Array
-) -> jax.Array:
-    """``fraction`` halved as long as that lowers the potential, where ``wanted``."""
-
-    def falls(at: _Valley) -> jax.Array:
-        return wanted & (at.fraction > _SMALLEST_HALVED) & (at.of_half < at.energy)
+def _lowest(potential: Callable[[jax.Array], jax.Array], begin: _Valley) -> jax.Array:
+    """The fraction halved as long as that lowers the potential."""
 
     def halve(at: _Valley) -> _Valley:
         half = 0.5 * at.fraction
-        return _Valley(half, at.of_half, potential(0.5 * half))
+        energy = potential(half)
+        lower = energy < at.energy
+        fraction = jnp.where(lower, half, at.fraction)
+        return _Valley(fraction, jnp.where(lower, energy, at.energy), lower)
 
-    first = _Valley(fraction, potential(fraction), potential(0.5 * fraction))
-    return while_loop(falls, halve, first).fraction
+    def wanted(at: _Valley) -> jax.Array:
+        return at.falls & (at.fraction > _SMALLEST_HALVED)
+
+    return while_loop(wanted, halve, begin).fraction
 
 
 def _progress(
@@ -143,18 +147,19 @@ def _progress(
     theta: jax.Array,
     direction: Direction,
     potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
-) -> Callable[[jax.Array], jax.Array]:
+) -> Judge:
     """Whether a fraction of the step makes progress, besides crushing no element."""
     energy, size = potential(jnp.zeros(()))
     ceiling = energy + _ROUND_OFF * size
     descent = jnp.where(direction.settled, -_ARMIJO * jnp.abs(direction.slope), jnp.inf)
 
-    def lowers(fraction: jax.Array) -> jax.Array:
-        lower = potential(fraction)[0] <= ceiling + fraction * descent
+    def judge(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = potential(fraction)[0]
+        lower = found <= ceiling + fraction * descent
         if system.forces:
             left = balance(system, u + fraction * direction.move, theta, level)[0]
             before = jnp.sum(direction.residual**2)
             lower |= jnp.sum(left**2) < (1.0 - _ARMIJO * fraction) * before
-        return lower
+        return lower, found
 
-    return lowers
+    return judge

@@ -11,18 +11,17 @@ CLIMB   Newton's method from rest, load step by load step
 ======  ==================================================================================
 
 Every route but the last has to be short and convex: Newton's method takes full steps only, each
-down the potential with, as far as is known, a positive definite tangent, and no more than a few.
+down the potential with a positive definite tangent, and no more than a few.
 Otherwise the next route is tried, from rest. Scenes whose stresses cannot be iterates have no
 ramps.
 
-:class:`LoadingPath` has the steps of all routes as pure functions of one state. One strategy then
-runs in two ways: inside ``jit`` (:func:`find_equilibrium`) and driven from Python
-(:mod:`emulator.fem.driver`).
+:class:`LoadingPath` has the steps of all routes as pure functions of one state, and
+:func:`find_equilibrium` is the one loop over them: Python's where theta is numbers, ``jax.lax``'s
+inside ``jit`` (:mod:`emulator.fem.programs`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, partial
@@ -36,7 +35,7 @@ from emulator.fem.assembly import System
 from emulator.fem.mip import MipNewton, MipState, applies
 from emulator.fem.newton import Newton
 from emulator.fem.options import NewtonOptions
-from emulator.fem.programs import cond
+from emulator.fem.programs import cond, while_loop
 from emulator.fem.solution import Solution, Status
 from emulator.fem.state import NEAR, UNBALANCED, NewtonState
 
@@ -84,6 +83,7 @@ class PathState(NamedTuple):
     mip : the stress iterates, or None where the scene has no ramps.
     route : a :class:`Route`. ramping : whether stress iterates are on their way up its ramp.
     level : load level on the ramp. on_ramp : steps taken there.
+    entering : whether the route is yet to be begun, at ``newton.u``, on its ramp if ``ramping``.
     """
 
     newton: NewtonState
@@ -92,11 +92,12 @@ class PathState(NamedTuple):
     ramping: jax.Array
     level: jax.Array
     on_ramp: jax.Array
+    entering: jax.Array
 
     @property
     def running(self) -> jax.Array:
         """Whether the search has not ended."""
-        return self.newton.running
+        return self.newton.running | self.entering
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,16 +127,27 @@ class LoadingPath:
         # A load increment of the caller's choice is meant to be followed from rest.
         warm = _warm(newton, ramps=self.ramps) & (self.options.increment == 1.0)
         cold = np.int64(Route.RAMP if self.ramps else Route.CLIMB)
-        route = jnp.where(warm, Route.WARM, cold)
+        mip = self._mip(jnp.ones(())).begin(newton.u) if self.ramps else None
+        entering = ~warm & newton.running
+        return PathState(
+            newton=newton._replace(u=jnp.where(entering, 0.0, newton.u)),
+            mip=mip,
+            route=jnp.where(warm, np.int64(Route.WARM), cold),
+            ramping=(entering | (newton.error > NEAR)) & newton.running & self.ramps,
+            level=jnp.ones(()),
+            on_ramp=jnp.zeros((), dtype=int),
+            entering=entering,
+        )
 
-        def stay() -> PathState:
-            mip = self._mip(jnp.ones(())).begin(newton.u) if self.ramps else None
-            ramping = (newton.error > NEAR) & self.ramps
-            count = jnp.zeros((), dtype=int)
-            return PathState(newton, mip, route, ramping, jnp.ones(()), count)
+    def step(self, state: PathState) -> PathState:
+        """A route's beginning, or its next step."""
 
-        rest = jnp.zeros_like(start)
-        return cond(warm | ~newton.running, stay, lambda: self._enter(newton, rest, route, True))
+        def onwards(state: PathState) -> PathState:
+            if not self.ramps:
+                return self.newton_step(state)
+            return cond(state.ramping, self.ramp_step, self.newton_step, state)
+
+        return cond(state.entering, self._enter, onwards, state)
 
     def ramp_step(self, state: PathState) -> PathState:
         """One step of the stress iterates."""
@@ -144,50 +156,23 @@ class LoadingPath:
             state.level, state.route, state.on_ramp, state.newton.error
         )
         mip = self._mip(state.level).step(state.mip, stiffening, geometric)
-        level, lost, leaves = _judged(
-            state.level, state.route, state.on_ramp, mip.error, mip.fraction, mip.definite
-        )
-        newton = state.newton
-        newton = newton._replace(
-            iterations=newton.iterations + 1, factorisations=newton.factorisations + 1
-        )
-        newton = newton._replace(status=_limited(newton, self.options.max_iterations))
-        after = state._replace(newton=newton, mip=mip, level=level, on_ramp=state.on_ramp + 1)
-
-        def enter() -> PathState:
-            u = jnp.where(lost, 0.0, mip.u)
-            return self._enter(newton, u, jnp.where(lost, state.route + 1, state.route), lost)
-
-        return cond(leaves & newton.running, enter, lambda: after)
+        return _after_ramp_step(state, mip, self.options.max_iterations)
 
     def newton_step(self, state: PathState) -> PathState:
         """One iteration of Newton's method."""
-        after = state._replace(newton=self._newton.step(state.newton))
-        newton = after.newton
-        astray = _astray(newton.status, newton.convex, newton.level, newton.at_level, after.route)
-        return cond(astray, self.give_up, lambda state: state, after)
+        any_tangent = state.route == Route.CLIMB
+        after = state._replace(newton=self._newton.step(state.newton, any_tangent))
+        return _after_newton_step(after, ramps=self.ramps)
 
-    def give_up(self, state: PathState) -> PathState:
-        """The state at the beginning of the next route."""
-        rest = jnp.zeros_like(state.newton.u)
-        return self._enter(state.newton, rest, self._next(state.route), True)
-
-    def _next(self, route: jax.Array) -> jax.Array:
-        return route + 1 if self.ramps else jnp.full_like(route, Route.CLIMB)
-
-    def _enter(
-        self, before: NewtonState, u: jax.Array, route: jax.Array, ramping: jax.Array | bool
-    ) -> PathState:
-        """The state at ``u`` (n, 3) mm on ``route``, at the foot of its ramp if ``ramping``.
-
-        Iterations are counted on.
-        """
-        newton, level, mip = self._newton.begin(u, before.negligible), jnp.ones(()), None
+    def _enter(self, state: PathState) -> PathState:
+        """The state at the beginning of its route; iterations are counted on."""
+        before, level, mip = state.newton, jnp.ones(()), None
+        newton = self._newton.begin(before.u, before.negligible)
         if self.ramps:
-            level = _first_level(route)
-            mip = self._mip(level).begin(u)
+            level = _first_level(state.route)
+            mip = self._mip(level).begin(before.u)
         newton = newton._replace(iterations=before.iterations, factorisations=before.factorisations)
-        return _entered(newton, mip, route, ramping, level)
+        return _entered(newton, mip, state.route, state.ramping, level)
 
 
 @partial(jax.jit, static_argnames="ramps")
@@ -233,9 +218,45 @@ def _judged(
     return jnp.where(error < _CARRIED, higher, level), lost, lost | found
 
 
-def _limited(newton: NewtonState, most: int) -> jax.Array:
-    """Status where ``most`` iterations are allowed."""
-    return jnp.where(newton.iterations >= most, np.int64(Status.ITERATION_LIMIT), newton.status)
+@partial(jax.jit, static_argnames="most")
+def _after_ramp_step(state: PathState, mip: MipState, most: int) -> PathState:
+    """The state after a step of the stress iterates; ``most`` iterations are allowed."""
+    level, lost, leaves = _judged(
+        state.level, state.route, state.on_ramp, mip.error, mip.fraction, mip.definite
+    )
+    newton = state.newton
+    iterations = newton.iterations + 1
+    ended = jnp.asarray(Status.ITERATION_LIMIT, newton.status.dtype)
+    status = jnp.where(iterations >= most, ended, newton.status)
+    leaves &= status == Status.RUNNING
+    return state._replace(
+        newton=newton._replace(
+            u=jnp.where(leaves, jnp.where(lost, 0.0, mip.u), newton.u),
+            iterations=iterations,
+            factorisations=newton.factorisations + 1,
+            status=status,
+        ),
+        mip=mip,
+        route=jnp.where(leaves & lost, state.route + 1, state.route),
+        ramping=jnp.where(leaves, lost, state.ramping),
+        level=level,
+        on_ramp=state.on_ramp + 1,
+        entering=leaves,
+    )
+
+
+@partial(jax.jit, static_argnames="ramps")
+def _after_newton_step(state: PathState, *, ramps: bool) -> PathState:
+    """The state, or the beginning of the next route where another has to be tried."""
+    newton = state.newton
+    astray = _astray(newton.status, newton.convex, newton.level, newton.at_level, state.route)
+    following = state.route + 1 if ramps else jnp.full_like(state.route, Route.CLIMB)
+    return state._replace(
+        newton=newton._replace(u=jnp.where(astray, 0.0, newton.u)),
+        route=jnp.where(astray, following, state.route),
+        ramping=astray & ramps,
+        entering=astray,
+    )
 
 
 @jax.jit
@@ -275,13 +296,14 @@ def _entered(
         ramping=ramping & newton.running & (route < Route.CLIMB) & ramps,
         level=level,
         on_ramp=jnp.zeros((), dtype=int),
+        entering=jnp.array(False),
     )
 
 
 def find_equilibrium(
     system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array
 ) -> Solution:
-    """Minimise the potential energy of ``system``, as one loop inside ``jax.jit``.
+    """Minimise the potential energy of ``system``.
 
     Parameters
     ----------
@@ -293,10 +315,5 @@ def find_equilibrium(
     Solution, whose status is CONVERGED or names the failure; its displacement is always finite.
     """
     path = LoadingPath(system, options, theta)
-    step: Callable[[PathState], PathState] = path.newton_step
-    if path.ramps:
-        step = lambda state: jax.lax.cond(  # noqa: E731
-            state.ramping, path.ramp_step, path.newton_step, state
-        )
-    state = jax.lax.while_loop(lambda state: state.running, step, path.begin(start))
+    state = while_loop(lambda state: state.running, path.step, path.begin(start))
     return state.newton.solution()

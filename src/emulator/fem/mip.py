@@ -27,17 +27,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
-from emulator.fem.definiteness import inverse_is_positive
 from emulator.fem.functional import at_points, displacement_gradient, strain_law
 from emulator.fem.line_search import largest_sound
-from emulator.fem.programs import compiled
+from emulator.fem.linear import Outcome
+from emulator.fem.programs import compiled, cond
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
@@ -104,12 +104,17 @@ class MipNewton:
             geometric,
         )
         # On the way from rest each tangent is unlike the one before.
-        full = self.system.step(values, -residual, near=False)
-        move, definite = _promised_step(self.system, values, solvable, residual, full)
+        full, outcome = self.system.attempt(values, -residual, near=False)
+        move, definite = _promised_step(self.system, solvable, residual, full, outcome)
+        lost = state._replace(fraction=jnp.zeros(()), definite=definite)
+        return cond(definite, lambda: self._moved(state, move), lambda: lost)
+
+    def _moved(self, state: MipState, move: jax.Array) -> MipState:
+        """The state after as much of a step as crushes no element."""
         fraction = self._fraction(state.u, move)
         ahead, measures = _taken(self.system, state.u, state.measures, self.theta, move, fraction)
         _, error = balance(self.system, ahead, self.theta, self.level)
-        return MipState(ahead, measures, error, fraction, definite)
+        return MipState(ahead, measures, error, fraction, jnp.array(True))
 
     def _fraction(self, u: jax.Array, move: jax.Array) -> jax.Array:
         """How much of a step crushes no element; 0 if almost none of it does."""
@@ -153,13 +158,15 @@ def _promised(
 @compiled
 def _promised_step(
     system: System,
-    values: jax.Array,
     solvable: jax.Array,
     residual: jax.Array,
     move: jax.Array,
+    outcome: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """The full step (n, 3) mm, NaN where there is none, and whether its tangent is definite."""
-    definite = _definite(system, values, residual, move)
+    definite = outcome == Outcome.OK
+    if system.forces:  # not symmetric: at least the step goes down
+        definite &= jnp.vdot(residual, move) <= 0.0
     return system.extend(jnp.where(solvable, move, jnp.nan)), definite
 
 
@@ -178,15 +185,6 @@ def _taken(
     after = at_points(system.scene, point.at_stress, H, change, measures)
     taken = fraction > 0.0
     return jnp.where(taken, u + fraction * move, u), jnp.where(taken, after, measures)
-
-
-def _definite(system: System, values: jax.Array, residual: jax.Array, move: jax.Array) -> jax.Array:
-    """Whether the tangent ``values`` (nnz,) is positive definite, as far as can be told."""
-    if system.direct.definite:
-        return jnp.array(True)  # it refuses any other
-    if system.forces:  # not symmetric: at least the step goes down
-        return jnp.vdot(residual, move) <= 0.0
-    return inverse_is_positive(partial(system.solve, values), system.pattern.size)
 
 
 def _measures(scene: Scene) -> Measures:

@@ -82,8 +82,12 @@ class Newton:
         extent = np.ptp(X, axis=0).max()
         return Negligible(jnp.where(jnp.isfinite(size), size, 0.0), _STILL * extent)
 
-    def step(self, state: NewtonState) -> NewtonState:
-        """One iteration."""
+    def step(self, state: NewtonState, any_tangent: jax.Array | bool = True) -> NewtonState:
+        """One iteration.
+
+        any_tangent : whether a tangent that is not positive definite will do; without, the state
+            stays where it is at such a one, and is no longer convex.
+        """
         system, theta = self.system, self.theta
         residual, error = cond(
             state.at_level == 0,
@@ -91,8 +95,14 @@ class Newton:
             lambda: (state.residual, state.error),
         )
         state = state._replace(residual=residual, error=error)
-        direction = newton_direction(system, theta, state)
-        outcome = take_step(system, theta, state, direction, self.options)
+        direction = newton_direction(system, theta, state, any_tangent=any_tangent)
+        convex = state.convex & direction.definite
+        state = state._replace(convex=convex)
+        return cond(direction.refused, lambda: state, lambda: self._after(state, direction))
+
+    def _after(self, state: NewtonState, direction: Direction) -> NewtonState:
+        """The state after the part of a step that is taken."""
+        outcome = take_step(self.system, self.theta, state, direction, self.options)
         state = state._replace(tangent=direction.tangent, singular=direction.singular)
         after = next_state(state, outcome, direction.descends, direction.move, self.options)
         if state.volumes is None:

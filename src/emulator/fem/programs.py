@@ -63,6 +63,26 @@ def while_loop[S](wanted: Callable[[S], jax.Array], body: Callable[[S], S], stat
     return state
 
 
+def one_by_one[R](function: Callable[..., R]) -> Callable[..., R]:
+    """``function(*arrays)`` whose ``vmap`` takes one after the other.
+
+    Side by side, every one would take the iterations of the slowest, and both branches of every
+    decision.
+    """
+    alone = jax.custom_batching.custom_vmap(function)
+
+    @alone.def_vmap
+    def together(size: int, batched: list[bool], *arrays: jax.Array) -> tuple[R, Any]:
+        every = tuple(
+            x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+            for x, is_batched in zip(arrays, batched, strict=True)
+        )
+        found = jax.lax.map(lambda each: alone(*each), every)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return alone
+
+
 def _strong(value: Any) -> Any:
     """``value`` as an array of a type of its own, which decides which program it is for."""
     if isinstance(value, float | int):

@@ -10,7 +10,6 @@ gives forward derivatives by one more solve with the tangent, and reverse ones b
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 
@@ -19,16 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator._precision import require_float64
-from emulator.errors import InputError
+from emulator.errors import InputError, SolverError
 from emulator.fem.assembly import System
-from emulator.fem.driver import Driver
-from emulator.fem.factorisations import REFUSALS, Choice, find_choice
-from emulator.fem.factorisations.suitesparse import CHOLMOD, quiet_blas
+from emulator.fem.linear import Outcome, find_solver
 from emulator.fem.loading_path import find_equilibrium
-from emulator.fem.near import NearSolver
 from emulator.fem.options import NewtonOptions
+from emulator.fem.programs import compiled, one_by_one
 from emulator.fem.reactions import balanced, nodes_of, reactions
-from emulator.fem.solution import Solution, Status
+from emulator.fem.solution import Solution
 from emulator.scenes.scene import Scene
 from emulator.shown import Row, Shown
 
@@ -41,11 +38,8 @@ class Simulator(Shown):
     ----------
     scene : what to simulate.
     options : controls of Newton's method.
-    factorisation : ``umfpack`` (any tangent), ``cholmod`` (faster; raises where the tangent is
-        indefinite, as it often is on the way from rest), or ``auto``: CHOLMOD where it works and
-        UMFPACK where it does not, which under ``jit``, ``vmap`` and ``grad`` means UMFPACK.
-        ``petsc`` (an extra) is MUMPS in both places, for meshes whose factors do not fit
-        (docs/large_meshes.md).
+    factorisation : ``suitesparse``: CHOLMOD where it works and UMFPACK where it does not; or
+        ``petsc`` (an extra): MUMPS, for meshes whose factors do not fit (docs/large_meshes.md).
 
     Raises
     ------
@@ -55,15 +49,10 @@ class Simulator(Shown):
 
     scene: Scene
     options: NewtonOptions = field(default_factory=NewtonOptions)
-    factorisation: str = "auto"
+    factorisation: str = "suitesparse"
 
     def __post_init__(self) -> None:
-        find_choice(self.factorisation)
-        quiet_blas()
-
-    @property
-    def _choice(self) -> Choice:
-        return find_choice(self.factorisation)
+        find_solver(self.factorisation)
 
     def shown(self) -> tuple[str, list[Row]]:
         """What it simulates and how."""
@@ -75,12 +64,7 @@ class Simulator(Shown):
     @cached_property
     def system(self) -> System:
         """Residual and tangent of the scene."""
-        return System(self.scene, self._choice.general.name)
-
-    @cached_property
-    def _driver(self) -> Driver:
-        definite = self._choice.definite or CHOLMOD
-        return Driver(System(self.scene, definite.name), self.system, self.options)
+        return System(self.scene, self.factorisation)
 
     @cached_property
     def _balanced(self) -> System:
@@ -115,15 +99,7 @@ class Simulator(Shown):
         """
         require_float64("FEM")
         theta, start = self._checked(theta, self.rest if start is None else start)
-        try:
-            solution = self._equilibrium(theta, jax.lax.stop_gradient(start))
-            if not isinstance(solution.status, jax.core.Tracer):
-                jax.block_until_ready(solution)
-        except REFUSALS as error:
-            if "singular" not in str(error):
-                raise
-            return self._singular()
-        return solution
+        return self._equilibrium(theta, jax.lax.stop_gradient(start))
 
     def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Derivatives (p, n, 3) of the equilibrium ``u`` (n, 3) mm in each entry of ``theta`` (p,).
@@ -134,12 +110,16 @@ class Simulator(Shown):
 
         Raises
         ------
-        jax.errors.JaxRuntimeError
-            A tangent singular to the last bit.
+        SolverError
+            The tangent is singular.
         """
         theta, u = self._checked(theta, u, "displacement")
-        system, tangent = self.linearised(u, theta)
-        return self._columns[system.factorisation](tangent, u, theta)
+        found = _columns(self.system, self.tangent(u, theta), u, theta)
+        if not isinstance(found, jax.core.Tracer) and not np.isfinite(found).all():
+            raise SolverError(
+                f"scene '{self.scene.name}': the equilibrium has no derivatives: singular tangent"
+            )
+        return found
 
     def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
         """Whether the equilibrium ``u`` (n, 3) mm at ``theta`` (p,) is a minimum of the energy.
@@ -160,7 +140,8 @@ class Simulator(Shown):
                 "not a question of its tangent's sign"
             )
         sound = bool(np.isfinite(u).all() and self.system.least_volume_ratio(u) > 0.0)
-        return sound and self._driver.linearise(u, theta)[0].direct.definite
+        nothing = jnp.zeros(len(self.system.free))
+        return sound and int(self.system.attempt(self.tangent(u, theta), nothing)[1]) == Outcome.OK
 
     def reactions(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Force (n, 3) in mN of the supports on the body at the equilibrium ``u`` (n, 3) mm.
@@ -183,30 +164,9 @@ class Simulator(Shown):
         """
         return _resultant(self.reactions(u, theta), nodes_of(self.scene.mesh, name))
 
-    def _drives(self, *arguments: jax.Array) -> bool:
-        """Whether Python sees the numbers and a definite factorisation could work."""
-        traced = any(isinstance(argument, jax.core.Tracer) for argument in arguments)
-        return not (self._choice.definite is None or traced or self.system.forces)
-
-    def linearised(self, u: jax.Array, theta: jax.Array) -> tuple[System, jax.Array]:
-        """The system that can factorise the tangent at ``u``, and that tangent (nnz,)."""
-        if self._drives(u, theta):
-            return self._driver.linearise(u, theta)
-        return self.system, self.system.pattern.safe_values(self.system.tangent(u, theta))
-
-    def near(self, u: jax.Array, theta: jax.Array) -> NearSolver:
-        """For solves inside ``jit`` with tangents like that at ``u`` (n, 3) mm and ``theta`` (p,).
-
-        Both are numbers. Where that tangent is not positive definite, or no load has a potential,
-        each is factorised.
-        """
-        theta, u = self._checked(theta, u, "displacement")
-        reference = None
-        if self._drives(u, theta):
-            system, tangent = self._driver.linearise(u, theta)
-            if system.direct.definite:
-                reference = np.asarray(tangent)
-        return NearSolver(self.system, self._driver.definite, reference)
+    def tangent(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Nonzeros (nnz,) of the tangent at ``u`` (n, 3) mm and ``theta`` (p,), for the system."""
+        return self.system.safe_tangent(u, theta, 1.0)[0]
 
     def _checked(
         self, theta: jax.Array, start: jax.Array, what: str = "start"
@@ -223,17 +183,6 @@ class Simulator(Shown):
                 )
         return theta, start
 
-    def _singular(self) -> Solution:
-        """The result where the direct solver refuses an exactly singular tangent."""
-        return Solution(
-            displacement=self.rest,
-            status=jnp.asarray(Status.SINGULAR_TANGENT, dtype=jnp.int64),
-            iterations=jnp.asarray(0),
-            factorisations=jnp.asarray(0),
-            residual=jnp.asarray(jnp.inf),
-            load_reached=jnp.asarray(0.0),
-        )
-
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (n, 3) in mm; :class:`SolverError` when it does not converge.
 
@@ -246,58 +195,32 @@ class Simulator(Shown):
 
     @cached_property
     def _equilibrium(self):  # noqa: ANN202 - closures, private
-        closed = jax.jit(_one_by_one(partial(find_equilibrium, self.system, self.options)))
+        find = partial(find_equilibrium, self.system, self.options)
+        alone = one_by_one(find)
+
+        @jax.jit
+        def closed(theta: jax.Array, start: jax.Array) -> Solution:
+            return alone(theta, start)
 
         @jax.custom_jvp
         def equilibrium(theta: jax.Array, start: jax.Array) -> Solution:
-            drives = self._drives(theta, start)
-            return (self._driver.solve if drives else closed)(theta, start)
+            traced = any(isinstance(x, jax.core.Tracer) for x in (theta, start))
+            stepwise = self.system.stepwise and not traced
+            found = (find if stepwise else closed)(theta, start)
+            return found if traced else jax.block_until_ready(found)
 
         @equilibrium.defjvp
         def derivative(primals, tangents):  # noqa: ANN001, ANN202
             theta, start = primals
             solution = equilibrium(theta, start)
-            system, tangent = self.linearised(solution.displacement, theta)
-            moved = self._moved[system.factorisation](
-                tangent, solution.displacement, theta, tangents[0]
-            )
+            u = solution.displacement
+            moved = _moved(self.system, self.tangent(u, theta), u, theta, tangents[0])
             return solution, _inert(solution)._replace(displacement=moved)
 
         return equilibrium
 
-    @cached_property
-    def _systems(self) -> tuple[System, ...]:
-        return (self.system,) if self._choice.definite is None else self._driver.systems
 
-    @cached_property
-    def _moved(self):  # noqa: ANN202
-        return {s.factorisation: jax.jit(partial(_moved, s)) for s in self._systems}
-
-    @cached_property
-    def _columns(self):  # noqa: ANN202
-        return {s.factorisation: jax.jit(partial(_columns, s)) for s in self._systems}
-
-
-def _one_by_one(solve: Callable[..., Solution]) -> Callable[..., Solution]:
-    """``solve`` whose ``vmap`` takes theta after theta.
-
-    Solved side by side, every theta would take the iterations of the slowest, and each iteration
-    the factorisations of all routes.
-    """
-    alone = jax.custom_batching.custom_vmap(solve)
-
-    @alone.def_vmap
-    def together(size, batched, theta, start):  # noqa: ANN001, ANN202
-        theta, start = (
-            x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
-            for x, is_batched in zip((theta, start), batched, strict=True)
-        )
-        solutions = jax.lax.map(lambda each: alone(*each), (theta, start))
-        return solutions, jax.tree.map(lambda _: True, solutions)
-
-    return alone
-
-
+@compiled
 def _moved(
     system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
 ) -> jax.Array:
@@ -306,6 +229,7 @@ def _moved(
     return system.extend(-system.solve(tangent, force))
 
 
+@compiled
 def _columns(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Derivatives (p, n, 3) of the equilibrium ``u`` along each entry of theta."""
     forces = jax.jacfwd(lambda t: system.residual(u, t))(theta)

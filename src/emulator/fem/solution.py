@@ -47,7 +47,7 @@ class Solution(NamedTuple):
     iterations : of Newton's method and of the stress iterates, over all routes and load levels.
     factorisations : tangents used on the way; the other iterations kept the last one. Each is
         factorised, except on a large mesh where the factor of another serves
-        (:class:`emulator.fem.kept.KeptFactor`).
+        (:class:`emulator.fem.linear.reuse.KeptFactor`).
     residual : norm of the residual relative to the internal and external forces.
     load_reached : largest fraction of the load with a converged solution.
     """

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System
 from emulator.fem.mixed import Volumes
 from emulator.fem.solution import Solution, Status
 
@@ -41,7 +40,8 @@ class NewtonState(NamedTuple):
     negligible : residual in mN, and correction of a node in mm, that may be round-off.
     tangent : (nnz,) mN/mm, the last one assembled. refresh : whether the next iteration needs a
     new one.
-    convex : whether every step at this level was a full one, down the potential.
+    convex : whether every step at this level was a full one, down the potential, with a positive
+    definite tangent.
     careful : a level whose way is not convex is given up if its next increment would be this or
     more; inf for never.
     crushed : whether the last level was given up because elements would invert.
@@ -75,11 +75,6 @@ class NewtonState(NamedTuple):
     def running(self) -> jax.Array:
         """Whether the iteration has not ended."""
         return self.status == Status.RUNNING
-
-    def forget_tangent(self, system: System) -> NewtonState:
-        """The same state for a ``system`` that stores tangents in another way."""
-        empty = jnp.zeros(len(system.pattern.rows))
-        return self._replace(tangent=empty, refresh=jnp.array(True))
 
     def solution(self) -> Solution:
         """The result the iteration ended with."""

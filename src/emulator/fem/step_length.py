@@ -13,7 +13,7 @@ from emulator.fem.direction import Direction, support_offset
 from emulator.fem.line_search import choose_fraction
 from emulator.fem.natural import natural_monotonicity
 from emulator.fem.options import NewtonOptions
-from emulator.fem.programs import compiled, cond
+from emulator.fem.programs import compiled, cond, while_loop
 from emulator.fem.state import NEAR, NewtonState
 
 
@@ -46,6 +46,14 @@ def _where_met(system: System, u: jax.Array, level: jax.Array, error: jax.Array)
     return jnp.where(met & jnp.isfinite(error), error, jnp.inf)
 
 
+class _Tried(NamedTuple):
+    """Where the part of a step that was tried leads; whether it was searched for, and is it."""
+
+    outcome: Outcome
+    searched: jax.Array
+    done: jax.Array
+
+
 def take_step(
     system: System,
     theta: jax.Array,
@@ -53,37 +61,30 @@ def take_step(
     direction: Direction,
     options: NewtonOptions,
 ) -> Outcome:
-    """The full step where the residual alone shows that it is good, else a line search."""
-    quick = _full_step(system, theta, state, direction, options)
-    # A kept tangent is worth a full step or nothing: its direction is not searched along.
-    return cond(
-        (quick.fraction > 0.0) | ~state.refresh,
-        lambda: quick,
-        lambda: _searched_step(system, theta, state, direction, options),
-    )
+    """The full step where the residual alone shows that it is good, else a line search.
 
-
-def _full_step(
-    system: System,
-    theta: jax.Array,
-    state: NewtonState,
-    direction: Direction,
-    options: NewtonOptions,
-) -> Outcome:
-    """The full step where it halves a residual that is small already; else none."""
+    A kept tangent is worth a full step or nothing: its direction is not searched along.
+    """
     none = Outcome(state.u, state.residual, state.error, jnp.zeros(()), jnp.array(False))
-    if system.mixed:
-        return none
+    near = _near(direction.settled, state.error) & (not system.mixed)
 
-    def tried() -> Outcome:
-        trial = state.u + direction.move
-        residual, error = level_balance(system, trial, theta, state.level)
-        J, now = system.least_volume_ratio(trial), system.least_volume_ratio(state.u)
-        good = _good(error, state.error, J, options.shrink, now)
-        whole = Outcome(trial, residual, error, jnp.ones(()), jnp.array(False))
-        return cond(good, lambda: whole, lambda: none)
+    def attempt(before: _Tried) -> _Tried:
+        search = before.searched | ~near
+        fraction, crushed = cond(
+            search,
+            lambda: _searched(system, theta, state, direction, options),
+            lambda: (jnp.ones(()), jnp.array(False)),
+        )
+        u = _moved(system, state.u, direction.move, fraction, state.level)
+        residual, error = level_balance(system, u, theta, state.level)
+        J, now = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
+        good = search | _good(error, state.error, J, options.shrink, now)
+        outcome = Outcome(u, residual, error, fraction, crushed)
+        outcome = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), outcome, none)
+        return _Tried(outcome, jnp.array(True), good | ~state.refresh)
 
-    return cond(_near(direction.settled, state.error), tried, lambda: none)
+    begin = _Tried(none, jnp.array(False), ~near & ~state.refresh)
+    return while_loop(lambda tried: ~tried.done, attempt, begin).outcome
 
 
 @jax.jit
@@ -99,14 +100,14 @@ def _good(
     return (error <= 0.5 * before) & (shrink * now < J)
 
 
-def _searched_step(
+def _searched(
     system: System,
     theta: jax.Array,
     state: NewtonState,
     direction: Direction,
     options: NewtonOptions,
-) -> Outcome:
-    """The part of the step that makes most progress."""
+) -> tuple[jax.Array, jax.Array]:
+    """The part of the step that makes most progress, and whether elements forbade twice as much."""
     nearer = None
     if state.volumes is not None:
         natural = partial(
@@ -115,12 +116,7 @@ def _searched_step(
         # Where round-off is all that is left, it cannot be told from progress.
         drowned = state.error <= options.round_off
         nearer = lambda fraction: drowned | natural(fraction)  # noqa: E731
-    fraction, crushed = choose_fraction(
-        system, state.u, state.level, theta, direction, options.shrink, nearer
-    )
-    u = _moved(system, state.u, direction.move, fraction, state.level)
-    residual, error = level_balance(system, u, theta, state.level)
-    return Outcome(u, residual, error, fraction, crushed)
+    return choose_fraction(system, state.u, state.level, theta, direction, options.shrink, nearer)
 
 
 @compiled

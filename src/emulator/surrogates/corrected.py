@@ -11,7 +11,6 @@ more accurate.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,7 +21,6 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.functional import volume_ratio
-from emulator.fem.near import NearSolver
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 from emulator.surrogates.files import EMULATOR
@@ -35,18 +33,11 @@ from emulator.surrogates.protocol import (
     fingerprint_of,
 )
 
-Solve = Callable[[jax.Array, jax.Array], jax.Array]
 
-
-def newton_step(
-    system: System, u: jax.Array, theta: jax.Array, solve: Solve | None = None
-) -> jax.Array:
-    """``u`` (n, 3) mm after one full Newton step, without a line search.
-
-    solve : tangent (nnz,) and right-hand side (f,) to the solution (f,); the system's by default.
-    """
+def newton_step(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
+    """``u`` (n, 3) mm after one full Newton step, without a line search."""
     tangent = system.pattern.safe_values(system.tangent(u, theta))
-    return u - system.extend((solve or system.solve)(tangent, system.residual(u, theta)))
+    return u - system.extend(system.solve(tangent, system.residual(u, theta)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,21 +70,14 @@ class CorrectedForward:
         )
 
     @cached_property
-    def _solver(self) -> NearSolver:
-        """For tangents like that of the prediction in the middle of the box."""
-        with jax.ensure_compile_time_eval():  # numbers even inside jit
-            theta = self.scene.centre
-            return self.simulator.near(self.base(theta), theta)
-
-    @cached_property
     def _corrected(self):  # noqa: ANN202 - a closure with its derivative, private
-        system, solve = self.simulator.system, self._solver.solve
+        system = self.simulator.system
 
         @jax.custom_jvp
         def correct(theta: jax.Array) -> jax.Array:
             u = self.base(theta)
             for _ in range(self.steps):
-                u = newton_step(system, u, theta, solve)
+                u = newton_step(system, u, theta)
             return u
 
         @correct.defjvp
@@ -102,7 +86,7 @@ class CorrectedForward:
             u = correct(theta)
             tangent = system.pattern.safe_values(system.tangent(u, theta))
             _, force = jax.jvp(lambda t: system.residual(u, t), (theta,), (direction,))
-            return u, system.extend(-solve(tangent, force))
+            return u, system.extend(-system.solve(tangent, force))
 
         return correct
 

@@ -173,7 +173,7 @@ def expand_at(simulator: Simulator, u: jax.Array, theta: jax.Array, order: int) 
     _check_order(order)
     scene, theta, u = simulator.scene, jnp.asarray(theta, dtype=float), jnp.asarray(u, dtype=float)
     position = scene.to_unit(theta)
-    system, tangent = simulator.linearised(u, theta)
+    system, tangent = simulator.system, simulator.tangent(u, theta)
     count = len(position)
     found: dict[tuple[int, ...], jax.Array] = {}
     for degree in range(1, order + 1):

@@ -38,7 +38,7 @@ def test_newton_against_a_dense_solve(beam, simulator, near, dense):
 def test_conjugate_gradients_against_numpy(beam, simulator, near, dense):
     """Two iterations of the textbook, with dense matrices."""
     theta, centre = beam.from_unit(jnp.array([0.6, 0.4])), simulator(beam.centre)
-    system = System(beam, "cholmod")
+    system = System(beam)
     M, K = dense(centre, beam.centre), dense(near, theta)
     left = np.asarray(system.residual(near, theta))
     x, p, before = np.zeros_like(left), 0.0, 1.0

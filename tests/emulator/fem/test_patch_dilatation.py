@@ -131,10 +131,8 @@ def test_residual_and_tangent_are_derivatives_of_the_energy(name, request):
     size = float(jnp.abs(along).max())
     np.testing.assert_allclose(jax.jit(system.residual)(u, theta), expected, atol=1e-9 * size)
     pattern = system.pattern
-    K = np.zeros((pattern.size,) * 2)
-    K[pattern.rows, pattern.columns] = jax.jit(system.tangent)(u, theta)
-    np.testing.assert_allclose(K @ system.restrict(v), along, atol=1e-9 * size)
-    np.testing.assert_allclose(K, K.T, atol=1e-9 * size)
+    K = jax.jit(system.tangent)(u, theta)
+    np.testing.assert_allclose(pattern.product(K, system.restrict(v)), along, atol=1e-9 * size)
 
 
 def test_a_homogeneous_deformation_is_reproduced():

@@ -67,7 +67,7 @@ def test_solves_that_fail_outside_are_counted(hanging, simulator, out_of_balance
             return solution._replace(status=soft)
 
     brittle = Brittle(hanging)
-    vars(brittle).update(_driver=simulator._driver)  # compiled already
+    vars(brittle).update(_equilibrium=simulator._equilibrium)  # compiled already
     found = outside_reference(brittle, 8, 0.25, fem_reference(brittle, 2))
     soft = int((np.asarray(sample_outside(hanging, 8, 0.25))[:, 0] < MU.low).sum())
     assert 0 < soft < 8

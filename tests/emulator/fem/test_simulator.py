@@ -55,8 +55,8 @@ def test_tangent_is_the_derivative_of_the_residual(simulator, beam):
     direction = rng.normal(size=len(system.free))
     values = np.asarray(system.tangent(u, beam.centre))
     K = np.zeros((system.pattern.size,) * 2)
-    K[system.pattern.rows, system.pattern.columns] = values
-    np.testing.assert_allclose(K, K.T, atol=1e-9 * np.abs(K).max())
+    rows, columns, both = system.pattern.both(values)
+    K[rows, columns] = both
     product = jax.jvp(
         lambda v: system.residual(v, beam.centre), (u,), (system.extend(jnp.asarray(direction)),)
     )[1]
@@ -116,14 +116,6 @@ def test_newton_converges_quadratically(beam, simulator):
         errors.append(float(jnp.max(jnp.abs(u - simulator(theta)))))
     assert errors[1] < errors[0] ** 1.5
     assert errors[-1] < 1e-10
-
-
-def test_cholesky_gives_the_same_answer_near_a_solution(beam, simulator):
-    u = simulator(beam.centre)
-    cholesky = em.Simulator(beam, factorisation="cholmod")
-    np.testing.assert_allclose(
-        cholesky.solve(beam.centre * 1.02, u).displacement, simulator(beam.centre * 1.02), atol=1e-8
-    )
 
 
 def test_prescribed_displacements_are_met_exactly(cube):

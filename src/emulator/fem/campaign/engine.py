@@ -12,10 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.errors import InputError, SolverError
 from emulator.fem.assembly import relative_residual
 from emulator.fem.campaign.row import Row, Task
-from emulator.fem.factorisations import REFUSALS
 from emulator.fem.functional import potential_energy, volume_ratio
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
@@ -67,9 +66,7 @@ class Solver:
         try:
             slopes = self.simulator.sensitivities(solution.displacement, theta)
             return solution, jax.block_until_ready(slopes)
-        except REFUSALS as error:
-            if "singular" not in str(error):
-                raise
+        except SolverError:
             return solution._replace(status=jnp.asarray(Status.SINGULAR_TANGENT)), missing
 
     def _start(self, starts: Sequence[Any], theta: jax.Array) -> jax.Array | None:

@@ -16,13 +16,17 @@ from typing import Any
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.fem.factorisations.protocol import Structure
+from emulator.fem.linear.protocol import Structure
 
 INSTALL = "pip install dolfinx-solver-real mpich mpi4py, or petsc4py for a PETSc with MUMPS"
 # Residual relative to |A| |x| + |b| that a direct solver leaves at most. Block low-rank factors
 # without iterations leave more.
 _BACKWARD_ERROR = 1e-11
 _WORKSPACE_TOO_SMALL = (-8, -9, -11, -14, -15, -17, -20)  # of INFOG(1), raised by ICNTL(14)
+
+
+class SingularMatrix(ValueError):
+    """The matrix has no factor."""
 
 
 @cache
@@ -126,7 +130,7 @@ class Factor:
         code, detail = (pc.getFactorMatrix().getMumpsInfog(k) for k in (1, 2))
         said = f"INFOG(1) = {code}, INFOG(2) = {detail}"
         if failed in (kinds.FACTOR_NUMERIC_ZEROPIVOT, kinds.FACTOR_STRUCT_ZEROPIVOT):
-            raise ValueError(f"petsc: matrix is singular (MUMPS: {said})")
+            raise SingularMatrix(f"petsc: matrix is singular (MUMPS: {said})")
         if code in _WORKSPACE_TOO_SMALL:
             raise InputError(
                 f"petsc: MUMPS needs more working space than it estimated ({said}); "

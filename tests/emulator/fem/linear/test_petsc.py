@@ -13,10 +13,12 @@ import emulator as em
 from calibrate.verify.consistency import block as nearly_incompressible
 from emulator.errors import InputError
 from emulator.fem.assembly import System
-from emulator.fem.factorisations import CHOICES, FACTORISATIONS, REFUSALS, mumps
-from emulator.fem.factorisations.petsc import _LAST
-from emulator.fem.kept import KeptFactor
-from emulator.fem.sparse import Pattern
+from emulator.fem.linear import SOLVERS, Outcome, mumps
+from emulator.fem.linear.pattern import Pattern
+from emulator.fem.linear.petsc import _LAST
+from emulator.fem.linear.reuse import KeptFactor
+from emulator.fem.linear.solve import attempt
+from emulator.fem.linear.solve import solve as solve_any
 from emulator.scenes.loads import FollowerPressure
 from scene_support import block
 
@@ -41,8 +43,11 @@ def matrix(size=40, *, shift=4.0, symmetric=True):
     return A, pattern, jnp.asarray(A[rows, columns]), jnp.asarray(rng.normal(size=size))
 
 
+PETSC = SOLVERS["petsc"]
+
+
 def test_an_unknown_factorisation_is_refused():
-    with pytest.raises(InputError, match="'pardiso' is unknown; known: auto, umfpack, cholmod"):
+    with pytest.raises(InputError, match="'pardiso' is unknown; known: suitesparse, petsc"):
         em.Simulator(block(), factorisation="pardiso")
     with pytest.raises(InputError, match="factorisation 'lu' is unknown"):
         System(block(), "lu").direct  # noqa: B018
@@ -58,18 +63,12 @@ def test_without_petsc_one_line_says_what_to_install(monkeypatch):
     mumps.petsc.cache_clear()
 
 
-def test_choices_are_made_of_registered_factorisations():
-    parts = [p for c in CHOICES.values() for p in (c.general, c.definite) if p is not None]
-    assert {part.name for part in parts} == set(FACTORISATIONS)
-    assert all(choice.definite is None or choice.definite.definite for choice in CHOICES.values())
-
-
 @pytest.mark.usefixtures("petsc")
 @pytest.mark.parametrize("shift", [8.0, 0.0])
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_solves_and_derivatives_are_those_of_the_dense_matrix(shift, symmetric):
     A, pattern, values, b = matrix(shift=shift, symmetric=symmetric)
-    solve = partial(pattern.solve, method="petsc")
+    solve = partial(solve_any, PETSC, pattern)
     expected = np.linalg.solve(A, b)
     np.testing.assert_allclose(solve(values, b), expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(jax.jit(solve)(values, b), expected, rtol=1e-9, atol=1e-9)
@@ -96,27 +95,30 @@ def test_inertia_tells_a_definite_matrix_from_an_indefinite_one():
     factor = mumps.Factor(pattern)
     factor.factorise(np.asarray(values))
     assert factor.negative_eigenvalues() == (np.linalg.eigvalsh(A) < 0.0).sum()
-    with pytest.raises(REFUSALS, match="not positive definite"):
-        pattern.solve(values, b, "petsc_definite")
+    refused = partial(attempt, PETSC, pattern)
+    assert refused(values, b)[1] == Outcome.INDEFINITE
     # The factor of the refused matrix serves the one that takes any.
-    np.testing.assert_allclose(pattern.solve(values, b, "petsc"), np.linalg.solve(A, b), rtol=1e-8)
+    np.testing.assert_allclose(
+        solve_any(PETSC, pattern, values, b), np.linalg.solve(A, b), rtol=1e-8
+    )
     assert _LAST.factor.factorisations == 1
-    with pytest.raises(REFUSALS, match="not positive definite"):
-        jax.block_until_ready(jax.jit(partial(pattern.solve, method="petsc_definite"))(values, b))
+    assert jax.jit(refused)(values, b)[1] == Outcome.INDEFINITE
     A, pattern, values, b = matrix(shift=8.0)
     assert np.linalg.eigvalsh(A)[0] > 0.0
-    x = pattern.solve(values, b, "petsc_definite")
-    np.testing.assert_allclose(x, pattern.solve(values, b, "cholmod"), rtol=1e-9)
+    x, outcome = attempt(PETSC, pattern, values, b)
+    assert outcome == Outcome.OK
+    np.testing.assert_allclose(x, np.linalg.solve(A, b), rtol=1e-9)
 
 
 @pytest.mark.usefixtures("petsc")
 def test_a_singular_matrix_is_named():
     _, pattern, values, b = matrix()
-    with pytest.raises(REFUSALS, match="petsc: matrix is singular"):
-        pattern.solve(0.0 * values, b, "petsc")
+    x, outcome = PETSC.lu(pattern, 0.0 * values, b)
+    assert outcome == Outcome.SINGULAR
+    assert np.isnan(x).all()
     # The next matrix is not harmed.
     np.testing.assert_allclose(
-        pattern.product(values, pattern.solve(values, b, "petsc")), b, atol=1e-9
+        pattern.product(values, solve_any(PETSC, pattern, values, b)), b, atol=1e-9
     )
 
 
@@ -149,7 +151,7 @@ def test_iterations_make_an_approximate_factor_exact(petsc):
     system = System(scene, "petsc")
     K, _ = system.safe_tangent(jnp.zeros(scene.held.shape), scene.centre, 0.0)
     b = np.random.default_rng(0).normal(size=system.pattern.size)
-    exact = System(scene, "cholmod").solve(K, jnp.asarray(b))
+    exact = System(scene).solve(K, jnp.asarray(b))
     options = petsc.Options()
     approximate = {"mat_mumps_icntl_35": 2, "mat_mumps_cntl_7": 1e-3}
     given = approximate | {"ksp_type": "fgmres", "ksp_rtol": 1e-12}
@@ -230,12 +232,11 @@ def test_a_kept_factor_serves_from_python(monkeypatch):
     scene = em.scenes.left_ventricle(4, 8, 1, order=1)
     expected = em.Simulator(scene)(scene.centre)
     monkeypatch.setattr(KeptFactor, "pays", staticmethod(lambda pattern: True))
-    monkeypatch.setattr("emulator.fem.kept._LARGE", 300)
-    monkeypatch.setattr("emulator.fem.kept.remember_factors", lambda count: None)
+    monkeypatch.setattr("emulator.fem.linear.reuse._LARGE", 300)
     simulator = em.Simulator(scene, factorisation="petsc")
     found = simulator.solve(scene.centre)
     assert found.converged
     np.testing.assert_allclose(found.displacement, expected, atol=1e-7)
-    kept = simulator._driver.definite.kept
+    kept = simulator.system.kept
     assert kept is not None
     assert 1 <= kept.factorisations < found.factorisations

@@ -1,14 +1,13 @@
-"""The pattern that assembled tangents share, and its products and direct solves."""
+"""The pattern that assembled tangents share, and its products."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-from emulator.fem.factorisations import find_factorisation
 
 # Relative increase of the diagonal, four units of round-off: an exactly zero pivot becomes tiny.
 _RAISE = 2.0**-50
@@ -37,15 +36,27 @@ class Pattern:
         """Values (nnz,) from the entries of all blocks, flattened one after the other."""
         return jax.ops.segment_sum(entries[self.source], self.target, num_segments=len(self.rows))
 
-    def solve(self, values: jax.Array, rhs: jax.Array, method: str) -> jax.Array:
-        """``x`` with ``A x = rhs``, shape (size,), by the factorisation of that name.
+    @cached_property
+    def _whole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Row, column and source of every nonzero of both triangles, row by row."""
+        above = np.flatnonzero(self.rows < self.columns)
+        rows = np.concatenate([self.rows, self.columns[above]])
+        columns = np.concatenate([self.columns, self.rows[above]])
+        source = np.concatenate([np.arange(len(self.rows)), above])
+        order = np.lexsort((columns, rows))
+        return rows[order], columns[order], source[order]
 
-        Differentiable, usable under ``vmap``.
-        """
-        return find_factorisation(method).solve(self, values, rhs)
+    def both(self, values: jax.Array) -> tuple[np.ndarray, np.ndarray, jax.Array]:
+        """Rows, columns and values with both triangles."""
+        if not self.upper:
+            return self.rows, self.columns, values
+        rows, columns, source = self._whole
+        return rows, columns, values[source]
 
     def product(self, values: jax.Array, x: jax.Array) -> jax.Array:
-        """``A x``, shape (size,)."""
+        """``A x``, shape of ``x``: (size,) or (size, k)."""
+        if x.ndim == 2:
+            return jax.vmap(lambda column: self.product(values, column), 1, 1)(x)
         there = jax.ops.segment_sum(
             values * x[self.columns],
             self.rows,

@@ -1,4 +1,4 @@
-"""A factor that serves the tangents after it, and conjugate gradients beside it.
+"""A factor that serves other tangents: conjugate gradients preconditioned by it.
 
 On a large mesh a factorisation takes as long as many back-substitutions, and the tangents of
 Newton's method, of one theta and the next, are alike: so conjugate gradients, preconditioned by the
@@ -14,10 +14,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.factorisations import Factorisation
-from emulator.fem.factorisations.suitesparse import CHOLMOD, remember_factors
+from emulator.fem.linear.pattern import Pattern
+from emulator.fem.linear.protocol import Direct, Outcome
+from emulator.fem.linear.suitesparse import forget_factors
 from emulator.fem.programs import while_loop
-from emulator.fem.sparse import Pattern
 
 TOLERANCE = 1e-10  # of the residual, in the norm of the reference's inverse
 _PATIENCE = 6  # steps after which half the pace that the last allowed step needs is asked for
@@ -45,48 +45,64 @@ class _State(NamedTuple):
 class KeptFactor:
     """Solves with definite tangents, one after the other, that keep a factor while it serves.
 
-    For numbers, on meshes where a factorisation takes as long as many back-substitutions. Two
-    factors of such a mesh may not fit into memory, so the solver is told to remember one.
+    For numbers, on meshes where a factorisation takes as long as many back-substitutions.
 
-    pattern : upper triangle. definite : what factorises, and refuses any other matrix.
+    pattern : upper triangle.
     """
 
-    def __init__(self, pattern: Pattern, definite: Factorisation = CHOLMOD) -> None:
-        remember_factors(1)
+    def __init__(self, direct: Direct, pattern: Pattern) -> None:
         self._pattern = pattern
         self._kept: jax.Array | None = None
         as_long = int(_STEPS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
         self._steps = max(_PATIENCE, as_long)
-        jit = (lambda function: function) if definite.on_host else jax.jit
+        jit = (lambda function: function) if direct.on_host else jax.jit
         self._product = jax.jit(pattern.product)
-        self._factorised = jit(partial(definite.solve, pattern))
+        self._factorised = jit(partial(direct.cholesky, pattern))
         self._beside = jit(self._conjugate_gradients)
         self.factorisations = 0
 
     @staticmethod
     def pays(pattern: Pattern) -> bool:
         """Whether the matrices are large enough."""
-        return pattern.size >= _LARGE
+        return pattern.upper and pattern.size >= _LARGE
 
-    def solve(self, tangent: jax.Array, b: jax.Array, *, near: bool = True) -> jax.Array:
-        """``x`` (f,) with ``K x = b``; raises one of ``REFUSALS`` where K is seen not definite.
+    def attempt(
+        self, tangent: jax.Array, b: jax.Array, *, near: bool = True
+    ) -> tuple[jax.Array, jax.Array]:
+        """``x`` (f,) with ``K x = b``, and the outcome.
 
         near : whether the factor kept may serve; without, the tangent's own is made and kept.
         """
         if near and self._kept is not None:
-            x, is_solution = self._beside(tangent, self._kept, b)
-            if bool(is_solution):
-                return x
-        x = jax.block_until_ready(self._factorised(tangent, b))
-        self._kept = tangent
+            found = self._beside(tangent, self._kept, b)
+            if bool(found.convex & (found.reduction <= TOLERANCE)):
+                return found.x, jnp.asarray(Outcome.OK, jnp.int32)
+        forget_factors()  # two of such a mesh may not fit into memory
+        self._kept = None
+        x, outcome = self._factorised(tangent, b)
         self.factorisations += 1
-        return x
+        if int(outcome) == Outcome.OK:
+            self._kept = tangent
+        return x, outcome
 
-    def _conjugate_gradients(
-        self, tangent: jax.Array, kept: jax.Array, b: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        product, precondition = partial(self._product, tangent), partial(self._factorised, kept)
-        return conjugate_gradients(product, precondition, b, self._steps, TOLERANCE)
+    def _conjugate_gradients(self, tangent: jax.Array, kept: jax.Array, b: jax.Array) -> Gradients:
+        def precondition(residual: jax.Array) -> jax.Array:
+            return self._factorised(kept, residual)[0]
+
+        product = partial(self._product, tangent)
+        return conjugate_gradients(product, precondition, b, self._steps, TOLERANCE, _PATIENCE)
+
+
+class Gradients(NamedTuple):
+    """Where conjugate gradients ended.
+
+    x : (f,). reduction : () of the residual, in the norm of the preconditioner. convex : () whether
+    every direction had positive curvature.
+    """
+
+    x: jax.Array
+    reduction: jax.Array
+    convex: jax.Array
 
 
 def conjugate_gradients(
@@ -95,19 +111,21 @@ def conjugate_gradients(
     b: jax.Array,
     steps: int,
     tolerance: float,
-) -> tuple[jax.Array, jax.Array]:
-    """``x`` (f,) with ``product(x) = b``, and whether it is one, shape ().
-
-    Given up early where the residual falls too slowly.
+    patience: int | None = None,
+) -> Gradients:
+    """``x`` (f,) with ``product(x) = b``, after so many ``steps`` at most.
 
     tolerance : of the residual relative to ``b``, both in the norm of ``precondition``.
+    patience : steps after which they are given up where the residual falls more slowly than
+        ``steps`` allow; never by default.
     """
     first = precondition(b)
     begin = jnp.vdot(b, first)
     enough = tolerance**2 * begin
 
     def on_pace(k: jax.Array, size: jax.Array) -> jax.Array:
-        return (k < _PATIENCE) | (size <= begin * tolerance ** (k / steps))
+        allowed = begin * tolerance ** (k / steps)
+        return jnp.array(True) if patience is None else (k < patience) | (size <= allowed)
 
     def step(state: _State) -> _State:
         image = product(state.direction)
@@ -127,4 +145,5 @@ def conjugate_gradients(
 
     start = _State(jnp.array(0), jnp.zeros_like(b), b, first, begin, jnp.array(True))
     state = while_loop(running, step, start)
-    return state.x, state.convex & (state.size <= enough) & jnp.isfinite(state.size)
+    fell = jnp.sqrt(jnp.abs(state.size) / jnp.where(begin > 0.0, begin, 1.0))
+    return Gradients(state.x, fell, state.convex & jnp.isfinite(state.size))

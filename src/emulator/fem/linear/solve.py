@@ -1,0 +1,52 @@
+"""Solves with a tangent: definite first, any other way where that is refused."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+
+from emulator.fem.linear.pattern import Pattern
+from emulator.fem.linear.protocol import Direct, Outcome
+from emulator.fem.programs import cond, one_by_one
+
+
+def attempt(
+    direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """``x`` with ``A x = rhs`` and the outcome, without a second try; no derivatives.
+
+    A symmetric matrix has to be positive definite.
+    """
+    way = direct.cholesky if pattern.upper else direct.lu
+    return way(pattern, values, rhs)
+
+
+def solve(direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array) -> jax.Array:
+    """``x`` with ``A x = rhs``, (size,) or (size, k); NaN where ``A`` is singular.
+
+    Linear in ``rhs`` and differentiable in it; ``vmap`` takes one after the other.
+    """
+    if direct.on_host and not any(isinstance(x, jax.core.Tracer) for x in (values, rhs)):
+        return _any(direct, pattern, values, rhs, transposed=False)
+    constant = jax.lax.stop_gradient(values)
+
+    def solved(b: jax.Array, *, transposed: bool) -> jax.Array:
+        return one_by_one(partial(_any, direct, pattern, transposed=transposed))(constant, b)
+
+    return jax.lax.custom_linear_solve(
+        partial(pattern.product, values),
+        rhs,
+        lambda _, b: solved(b, transposed=False),
+        lambda _, b: solved(b, transposed=True),
+        symmetric=pattern.upper,
+    )
+
+
+def _any(
+    direct: Direct, pattern: Pattern, values: jax.Array, b: jax.Array, *, transposed: bool
+) -> jax.Array:
+    if not pattern.upper:
+        return direct.lu(pattern, values, b, transposed=transposed)[0]
+    x, outcome = direct.cholesky(pattern, values, b)
+    return cond(outcome == Outcome.INDEFINITE, lambda: direct.lu(pattern, values, b)[0], lambda: x)

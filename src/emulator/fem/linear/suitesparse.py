@@ -1,0 +1,104 @@
+"""SuiteSparse through sparsax, inside compiled programs.
+
+CHOLMOD for positive definite matrices, UMFPACK for any. A refusal is an outcome, not an exception
+(:mod:`emulator.fem.linear.foreign`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import sparsax
+import sparsax_cpp
+from threadpoolctl import ThreadpoolController
+
+from emulator.fem.linear.foreign import register
+from emulator.fem.linear.protocol import Outcome, Structure
+
+_CHOLMOD, _UMFPACK = "calibrate_cholmod", "calibrate_umfpack"
+
+
+def _outcome(message: str) -> int | None:
+    if "not positive definite" in message:
+        return int(Outcome.INDEFINITE)
+    return int(Outcome.SINGULAR) if "singular" in message else None
+
+
+register(_CHOLMOD, sparsax_cpp.solve_f64_capsule(), _outcome)
+register(_UMFPACK, sparsax_cpp.umf_solve_f64_capsule(), _outcome)
+
+
+@cache
+def _made_ready() -> None:
+    """Once a process.
+
+    The BLAS inside the sparse solver is held to one thread: a second pool beside XLA's
+    oversubscribes the cores, and a factorisation of 2.5 ms then took up to 250 ms. Only the library
+    bundled with sparsax is changed, not NumPy's.
+
+    By default sparsax caches up to 32 UMFPACK and 8 CHOLMOD factors of each pattern, for matrices
+    that recur. Ours recur only in consecutive solves, and a factor of a large mesh takes a
+    gigabyte.
+    """
+    for library in ThreadpoolController().lib_controllers:
+        if "sparsax" in library.filepath:
+            library.set_num_threads(1)
+    sparsax.set_umf_cache_size(2)
+    sparsax.set_num_cache_size(2)
+
+
+def forget_factors() -> None:
+    """Free all factors, for a matrix whose own may need the memory."""
+    sparsax.clear_cache()
+
+
+@dataclass(frozen=True)
+class SuiteSparse:
+    """CHOLMOD and UMFPACK."""
+
+    name = "suitesparse"
+    on_host = False
+
+    def check(self) -> None:
+        """Always there."""
+        _made_ready()
+
+    def cholesky(
+        self, structure: Structure, values: jax.Array, rhs: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """By CHOLMOD."""
+        return _call(_CHOLMOD, structure.rows, structure.columns, values, rhs, mode=np.int64(0))
+
+    def lu(
+        self,
+        structure: Structure,
+        values: jax.Array,
+        rhs: jax.Array,
+        *,
+        transposed: bool = False,
+    ) -> tuple[jax.Array, jax.Array]:
+        """By UMFPACK, which takes both triangles."""
+        return _call(_UMFPACK, *structure.both(values), rhs, trans=np.int64(transposed))
+
+
+SUITESPARSE = SuiteSparse()
+
+
+def _call(
+    target: str,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    values: jax.Array,
+    rhs: jax.Array,
+    **flags: Any,
+) -> tuple[jax.Array, jax.Array]:
+    _made_ready()
+    shapes = jax.ShapeDtypeStruct(rhs.shape, jnp.float64), jax.ShapeDtypeStruct((), jnp.int32)
+    call = jax.ffi.ffi_call(target, shapes, vmap_method="sequential")
+    x, outcome = call(rows, columns, values, rhs, **flags)
+    return x, outcome

@@ -1,0 +1,65 @@
+"""A factor that serves other tangents."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.fem.linear import Outcome
+from emulator.fem.linear.reuse import KeptFactor, conjugate_gradients
+
+
+@pytest.fixture(scope="module")
+def ventricle():
+    return em.Simulator(em.scenes.left_ventricle(4, 8, 1, order=1))
+
+
+def test_gradients_that_do_not_get_there_say_so():
+    values = jnp.logspace(0, 6, 200)
+    b = jnp.ones(200)
+    found = conjugate_gradients(lambda x: values * x, lambda r: r, b, 10, 1e-10, 6)
+    assert not found.reduction <= 1e-10
+    found = conjugate_gradients(lambda x: values * x, lambda r: r / values, b, 10, 1e-10)
+    assert found.reduction <= 1e-10
+    assert found.convex
+    np.testing.assert_allclose(found.x, b / values)
+    assert not conjugate_gradients(lambda x: -x, lambda r: r, b, 10, 1e-10).convex
+    nothing = conjugate_gradients(lambda x: x, lambda r: r, 0.0 * b, 10, 1e-10)
+    assert nothing.reduction == 0.0
+    assert nothing.convex
+
+
+def test_a_kept_factor_leads_to_the_same_equilibrium(monkeypatch):
+    """As on a mesh large enough for it, and with fewer factorisations than tangents."""
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
+    usual = em.Simulator(scene)
+    monkeypatch.setattr(KeptFactor, "pays", staticmethod(lambda pattern: True))
+    monkeypatch.setattr("emulator.fem.linear.reuse._LARGE", 300)
+    keeping = em.Simulator(scene)
+    keeping.system.kept  # noqa: B018 - decided while it pays
+    monkeypatch.setattr(KeptFactor, "pays", staticmethod(lambda pattern: False))
+    tangents = 0
+    for position in ([0.5] * 5, [0.55] * 5, [0.6, 0.5, 0.5, 0.5, 0.45], [0.0] * 5):
+        theta = scene.from_unit(jnp.asarray(position))
+        expected, found = usual.solve(theta), keeping.solve(theta)
+        assert found.converged
+        assert jnp.abs(found.displacement - expected.displacement).max() < 1e-7
+        tangents += int(found.factorisations)
+    kept = keeping.system.kept
+    assert kept is not None
+    assert 1 <= kept.factorisations < tangents
+
+
+def test_a_kept_factor_refuses_what_is_not_definite(ventricle):
+    system, scene = ventricle.system, ventricle.scene
+    kept = KeptFactor(system.direct, system.pattern)
+    K = ventricle.tangent(ventricle(scene.centre), scene.centre)
+    b = jnp.asarray(np.random.default_rng(0).normal(size=system.pattern.size))
+    x, outcome = kept.attempt(K, b)
+    assert outcome == Outcome.OK
+    np.testing.assert_allclose(kept.attempt(1.001 * K, b)[0], x / 1.001, rtol=1e-6, atol=1e-9)
+    assert kept.factorisations == 1
+    diagonal = system.pattern.rows == system.pattern.columns
+    x, outcome = kept.attempt(K - K.max() * diagonal, b)
+    assert outcome == Outcome.INDEFINITE
+    assert jnp.isnan(x).all()

@@ -1,0 +1,119 @@
+"""Solves and their outcomes, in Python, inside ``jit``, ``vmap`` and loops."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from emulator.errors import InputError
+from emulator.fem.linear import SOLVERS, Outcome, block_pattern, find_solver
+from emulator.fem.linear.foreign import register
+from emulator.fem.linear.solve import attempt, solve
+
+SUITESPARSE = find_solver("suitesparse")
+
+
+def matrix(size=12, shift=4.0, *, symmetric=True, seed=0):
+    """Dense matrix, pattern, values and right-hand side."""
+    rng = np.random.default_rng(seed)
+    dofs = [np.arange(size)[None], np.arange(size // 2)[None]]
+    pattern = block_pattern(dofs, np.arange(size), symmetric=symmetric)
+    A = rng.normal(size=(size, size))
+    A = (A + A.T if symmetric else A) + shift * np.eye(size)
+    return (
+        A,
+        pattern,
+        jnp.asarray(A[pattern.rows, pattern.columns]),
+        jnp.asarray(rng.normal(size=size)),
+    )
+
+
+@pytest.mark.parametrize("shift", [20.0, 0.0])
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_solutions_and_derivatives_are_those_of_the_dense_matrix(shift, symmetric):
+    A, pattern, values, b = matrix(shift=shift, symmetric=symmetric)
+    ours = partial(solve, SUITESPARSE, pattern)
+    expected = np.linalg.solve(A, b)
+    for found in (ours(values, b), jax.jit(ours)(values, b)):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    both = jnp.stack([b, 2.0 * b], axis=1)
+    np.testing.assert_allclose(ours(values, both)[:, 1], 2.0 * expected, rtol=1e-9, atol=1e-9)
+    in_rows = jax.vmap(ours, in_axes=(None, 0))(values, both.T)
+    np.testing.assert_allclose(in_rows[1], 2.0 * expected, rtol=1e-9, atol=1e-9)
+    matrices = jax.jit(jax.vmap(ours))(jnp.stack([values, 2.0 * values]), both.T)
+    np.testing.assert_allclose(matrices[1], expected, rtol=1e-9, atol=1e-9)
+
+    # d/db (c . x) = A^-T c, and d/dA_ij = -(A^-T c)_i x_j, twice over where A_ij is also A_ji.
+    c = np.linspace(0.0, 1.0, len(b))
+    by_values, by_rhs = jax.jit(jax.grad(lambda v, r: c @ ours(v, r), argnums=(0, 1)))(values, b)
+    adjoint = np.linalg.solve(A.T, c)
+    slope = -np.outer(adjoint, expected)
+    slope = slope + slope.T - np.diag(np.diag(slope)) if symmetric else slope
+    np.testing.assert_allclose(by_rhs, adjoint, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        by_values, slope[pattern.rows, pattern.columns], rtol=1e-9, atol=1e-8
+    )
+    curvature = jax.jit(jax.jacfwd(jax.grad(lambda r: 0.5 * ours(values, r) @ ours(values, r))))(b)
+    inverse = np.linalg.inv(A)
+    np.testing.assert_allclose(curvature, inverse.T @ inverse, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["python", "jit"])
+def test_an_outcome_is_data(wrap):
+    A, pattern, values, b = matrix(shift=20.0)
+    trial = wrap(partial(attempt, SUITESPARSE, pattern))
+    x, outcome = trial(values, b)
+    assert outcome == Outcome.OK
+    np.testing.assert_allclose(x, np.linalg.solve(A, b), rtol=1e-9)
+    diagonal = pattern.rows == pattern.columns
+    x, outcome = trial(values - 40.0 * diagonal, b)
+    assert outcome == Outcome.INDEFINITE
+    assert np.isnan(x).all()
+    _, whole, plain, _ = matrix(symmetric=False)
+    trial = wrap(partial(attempt, SUITESPARSE, whole))
+    assert trial(0.0 * plain, b)[1] == Outcome.SINGULAR
+    # What was refused harms nobody after it.
+    np.testing.assert_array_equal(wrap(partial(attempt, SUITESPARSE, pattern))(values, b)[1], 0)
+
+
+def test_outcomes_of_a_batch_and_in_a_loop():
+    _, pattern, values, b = matrix(shift=20.0)
+    diagonal = jnp.asarray(pattern.rows == pattern.columns, float)
+    trial = partial(attempt, SUITESPARSE, pattern)
+    shifts = jnp.array([0.0, -40.0, 1.0])
+    outcomes = jax.jit(jax.vmap(lambda s: trial(values + s * diagonal, b)[1]))(shifts)
+    np.testing.assert_array_equal(outcomes, [Outcome.OK, Outcome.INDEFINITE, Outcome.OK])
+
+    def lower(state):
+        shift, _ = state
+        return shift - 1.0, trial(values + shift * diagonal, b)[1]
+
+    wanted = lambda state: state[1] == Outcome.OK
+    shift, outcome = jax.jit(lambda: jax.lax.while_loop(wanted, lower, (0.0, jnp.int32(0))))()
+    assert outcome == Outcome.INDEFINITE
+    whole = np.zeros((pattern.size,) * 2)
+    whole[pattern.rows, pattern.columns] = values
+    least = np.linalg.eigvalsh(whole, UPLO="U")[0]
+    assert -least - 1.0 <= -(shift + 1.0) - 0.0 + 1.0
+    assert least + shift + 1.0 < 0.0 <= least + shift + 2.0
+
+
+def test_other_failures_still_end_the_program():
+    import sparsax_cpp
+
+    register("calibrate_test_strict", sparsax_cpp.solve_f64_capsule(), lambda message: None)
+    _, pattern, values, b = matrix(shift=-20.0)
+    shapes = jax.ShapeDtypeStruct(b.shape, b.dtype), jax.ShapeDtypeStruct((), jnp.int32)
+    call = jax.ffi.ffi_call("calibrate_test_strict", shapes)
+    with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match="not positive definite"):
+        jax.block_until_ready(call(pattern.rows, pattern.columns, values, b, mode=np.int64(0)))
+
+
+def test_an_unknown_solver_is_refused():
+    with pytest.raises(
+        InputError, match="factorisation 'lu' is unknown; known: suitesparse, petsc"
+    ):
+        find_solver("lu")
+    assert set(SOLVERS) == {"suitesparse", "petsc"}
