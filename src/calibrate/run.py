@@ -43,6 +43,7 @@ class Run:
     error_runs : FEM runs from which the forward map's own error is learned, so that the likelihood
         allows for it (:mod:`calibrate.approximation_error`); 0 takes the map as exact.
     mesh_error_runs : the same on the next finer mesh, so that the mesh's error is allowed for, too.
+    load_steps : in which every FEM solve follows the loading path from rest; 1 looks for its end.
     sampler, sampler_options : a name of :data:`calibrate.samplers.SAMPLERS`, and its options by
         name, e.g. ``{"target_accept": 0.95}``.
     """
@@ -63,6 +64,7 @@ class Run:
     forward_options: dict[str, Any] = field(default_factory=dict)
     error_runs: int = 0
     mesh_error_runs: int = 0
+    load_steps: int = 1
     sampler: str = "nuts"
     sampler_options: dict[str, Any] = field(default_factory=dict)
     warmup: int = 500
@@ -73,7 +75,7 @@ class Run:
     def __post_init__(self) -> None:
         registry.full_options(self.forward, self.forward_options)
         registry.check_emulator(self.forward, self.emulator)
-        for name in ("warmup", "draws", "chains"):
+        for name in ("warmup", "draws", "chains", "load_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be 1 or more")
         if self.truth and self.data != "synthetic":

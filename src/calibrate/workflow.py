@@ -35,7 +35,7 @@ from calibrate.statistical_model import Model, model
 from emulator import schema
 from emulator.catalogue import find_scene
 from emulator.errors import InputError
-from emulator.fem import Simulator
+from emulator.fem import NewtonOptions, Simulator
 from emulator.scenes.scene import Scene
 from emulator.store import read_json, save_arrays, write_json
 from emulator.surrogates import registry
@@ -49,14 +49,15 @@ SAMPLING = "sampling.safetensors"  # of a run under way, or killed
 
 
 @lru_cache(maxsize=2)
-def simulator_of(scene: Scene) -> Simulator:
+def simulator_of(scene: Scene, load_steps: int = 1) -> Simulator:
     """The simulator of a scene, compiled once for data, campaign and certificate."""
-    return Simulator(scene)
+    return Simulator(scene, NewtonOptions.load_steps(load_steps))
 
 
 def ingredients_of(run: Run, scene: Scene, *, progress: bool = False) -> Ingredients:
     """What the forward map of a run is built from."""
-    return Ingredients(scene, simulator_of(scene), run.emulator, run.seed, progress=progress)
+    simulator = simulator_of(scene, run.load_steps)
+    return Ingredients(scene, simulator, run.emulator, run.seed, progress=progress)
 
 
 def build_forward(run: Run, scene: Scene, *, progress: bool = False) -> ForwardMap:
@@ -78,7 +79,8 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
     observe = observed(run, scene)
     thetas = known_thetas(scene, observe.states, {**run.known, **run.truth})
     noises = run.synthetic_noise(observe)
-    fields = [simulator_of(scene)(theta)[observe.nodes] for theta in thetas]
+    simulator = simulator_of(scene, run.load_steps)
+    fields = [simulator(theta)[observe.nodes] for theta in thetas]
     exact = jax.jit(observe)(jnp.stack(fields), thetas)
     rng = np.random.default_rng([run.seed, 1])
     return observe, {
@@ -134,7 +136,7 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         # Now that the data is checked, sampling need not check it again.
         built = with_error(
             replace(built, check_scale=False),
-            simulator_of(scene),
+            simulator_of(scene, run.load_steps),
             runs,
             of_mesh=bool(run.mesh_error_runs),
             seed=run.seed,
@@ -147,7 +149,7 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         options=options,
         seed=run.seed,
         progress=progress,
-        simulator=simulator_of(scene) if sampler.solves_fem else None,
+        simulator=simulator_of(scene, run.load_steps) if sampler.solves_fem else None,
         checkpoint=None if folder is None else Path(folder) / SAMPLING,
     )
     if folder is not None:
@@ -206,13 +208,15 @@ def certify_and_keep(
     *,
     draws: int | None = None,
     mesh: int | None = None,
+    load_steps: int = 1,
     reweight_to: str | Path | None = None,
     scheduler: str | None = None,
     progress: bool = False,
 ) -> Certificate:
     """Check a posterior against FEM and write certificate.json.
 
-    ``mesh`` is the number of solves on a finer mesh, 0 for none. ``scheduler`` is the address of a
+    ``mesh`` is the number of solves on a finer mesh, 0 for none. ``load_steps`` are those of every
+    solve. ``scheduler`` is the address of a
     Dask scheduler whose workers solve. With ``reweight_to``, the
     reweighted posterior is kept in that folder, ready to be certified in its turn, where the
     verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
@@ -222,7 +226,7 @@ def certify_and_keep(
     InputError
         FEM has decided on the draws already.
     """
-    simulator = simulator_of(posterior.model.forward.scene)
+    simulator = simulator_of(posterior.model.forward.scene, load_steps)
     check = examine(
         posterior, simulator, draws=draws, mesh=mesh, scheduler=scheduler, progress=progress
     )

@@ -199,12 +199,12 @@ def _physics(p: Physics) -> list[str]:
     if not p.failed_mass <= LARGEST_FAILED:
         found.append(
             f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior: raise "
-            "NewtonOptions.load_steps, or narrow the prior to states that exist"
+            "--load-steps (NewtonOptions.load_steps), or narrow the prior to states that exist"
         )
     if p.unstable:
         found.append(
             f"FEM is at a saddle at {p.unstable} of {p.asked} draws: the body would leave that "
-            "state; follow the loading path with NewtonOptions.load_steps"
+            "state; follow the loading path with --load-steps 10 (NewtonOptions.load_steps)"
         )
     return found
 

@@ -54,6 +54,9 @@ def add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
     )
+    parser.add_argument(
+        "--load-steps", type=int, default=1, metavar="N", help="as for simulate (default 1)"
+    )
     allowed = parser.add_mutually_exclusive_group()
     allowed.add_argument(
         "--error-runs",
@@ -99,6 +102,7 @@ def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
         "forward_options": forward_options(arguments),
         "error_runs": arguments.error_runs,
         "mesh_error_runs": arguments.mesh_error,
+        "load_steps": arguments.load_steps,
     }
 
 

@@ -30,13 +30,20 @@ from emulator.fem.functional import (
     displacement_gradient,
     local_forces,
     local_terms,
-    nodal_matrices,
+    pair_matrices,
     point_energy,
     spring_terms,
     strain_energy,
     volume_ratio,
 )
-from emulator.fem.linear import Direct, Pattern, block_pattern, find_solver
+from emulator.fem.linear import (
+    Direct,
+    Pattern,
+    block_pattern,
+    find_solver,
+    upper_blocks,
+    whole_blocks,
+)
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.solve import attempt, solve
 from emulator.fem.mixed import Condensed, consistent, linearise
@@ -97,9 +104,9 @@ class System:
         free_index = np.full(self.scene.held.size, -1)
         free_index[self.free] = np.arange(len(self.free))
         local: list[LocalTerm | LocalForce] = [*self.springs, *self.terms, *self.forces]
-        groups = [self.scene.blocks.connectivity, *(part.nodes for part in local)]
-        dofs = [(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1) for nodes in groups]
-        return block_pattern(dofs, free_index, symmetric=not self.forces)
+        bulk = whole_blocks if self.mixed else upper_blocks
+        groups = [bulk(self.scene.blocks.connectivity), *(whole_blocks(p.nodes) for p in local)]
+        return block_pattern(groups, free_index, symmetric=not self.forces)
 
     @cached_property
     def dead(self) -> DeadForce:
@@ -218,7 +225,7 @@ class System:
         return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
 
     def bulk(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Second derivatives (b, ...) of the strain energy, block by block."""
+        """Second derivatives (b, ...) of the strain energy, block by block, as in the pattern."""
         scene = self.scene
         if self.mixed:
             return linearise(scene, u, consistent(scene, u, theta), theta).tangent
@@ -226,8 +233,8 @@ class System:
         return self.element_blocks(at_points(scene, jax.hessian(point_energy(scene, theta)), H))
 
     def element_blocks(self, A: jax.Array) -> jax.Array:
-        """Blocks (m, a, 3, a, 3) in mN/mm from the moduli ``A = d2W/dH2`` (m, q, 3, 3, 3, 3)."""
-        return nodal_matrices(self.scene.discretisation, A)
+        """Blocks (m, pairs, 3, 3) in mN/mm from the moduli ``A = d2W/dH2`` (m, q, 3, 3, 3, 3)."""
+        return pair_matrices(self.scene.discretisation, A)
 
     @compiled
     def safe_tangent(

@@ -60,7 +60,10 @@ def test_a_scene_that_does_not_match(folder):
             lambda d: d["parts"].update(discrepancy={}),
             "'discrepancy' lacks or garbles 'coefficients'",
         ),
-        (lambda d: d["parts"].update(magic={}), "part 'magic' is unknown; known: coarse, taylor, network"),
+        (
+            lambda d: d["parts"].update(magic={}),
+            "part 'magic' is unknown; known: coarse, taylor, network",
+        ),
         (lambda d: d.update(format=2), "has format 2; this version reads 3: train .* again"),
         (lambda d: d["scene"].update(scene="heart"), "origin names scene 'heart'"),
         (lambda d: d["parts"]["network"]["architecture"].update(latent=9), "has shape .* expected"),

@@ -250,7 +250,7 @@ def test_the_papers_recipe_is_the_papers():
     rates = [float(learning_rate(plan, jnp.asarray(k), jnp.asarray(100))) for k in (0, 49, 50, 99)]
     assert rates == pytest.approx([1e-4, 1e-4, 1e-5, 1e-5])
     with pytest.raises(
-        InputError, match="recipe 'quick' is unknown; known: hybrid, mechanics, fam"
+        InputError, match="recipe 'quick' is unknown; known: hybrid, mechanics, two_meshes, fam"
     ):
         recipe("quick")
 

@@ -33,6 +33,9 @@ def register(commands: Any) -> None:
     )
     finer.add_argument("--no-mesh", action="store_true", help="leave the error of the mesh out")
     parser.add_argument(
+        "--load-steps", type=int, metavar="N", help="as for simulate (default: the run's own)"
+    )
+    parser.add_argument(
         "--reweight", metavar="DIR2", help="write FEM's posterior, reweighted from the check, there"
     )
     add_scheduler(parser, "the FEM runs")
@@ -56,6 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.folder,
         draws=arguments.draws,
         mesh=0 if arguments.no_mesh else arguments.mesh_runs,
+        load_steps=plan.load_steps if arguments.load_steps is None else arguments.load_steps,
         reweight_to=arguments.reweight,
         scheduler=scheduler,
         progress=progress,

@@ -83,7 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
     posterior = run_inference(plan, folder, progress=progress)
     certificate = None
     if not (arguments.no_certify or find_sampler(plan.sampler).solves_fem):
-        certificate = certify_and_keep(posterior, folder, progress=progress)
+        certificate = certify_and_keep(
+            posterior, folder, load_steps=plan.load_steps, progress=progress
+        )
     result = report(plan, posterior, certificate)
     text = (
         f"{summary(result)}\nwritten to {arguments.out}; its page: calibrate report {arguments.out}"

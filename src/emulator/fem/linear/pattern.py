@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -86,23 +88,67 @@ class Pattern:
         return jnp.where(self.solvable(values), raised, diagonal)
 
 
-def block_pattern(groups: list[np.ndarray], free_index: np.ndarray, *, symmetric: bool) -> Pattern:
-    """Pattern of dense blocks.
+class Entries(NamedTuple):
+    """Where the entries of blocks belong, in their order.
+
+    rows, columns : (e,) global degrees of freedom. mirrored : (e,) whether an entry of a symmetric
+    block stands for its mirror image, too, which is not there. spare : (e,) whether its mirror
+    image is there and stands for it.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    mirrored: np.ndarray
+    spare: np.ndarray
+
+
+def whole_blocks(nodes: np.ndarray) -> Entries:
+    """Of blocks (k, 3a, 3a) of the degrees of freedom of ``nodes`` (k, a)."""
+    dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
+    shape = (*dofs.shape, dofs.shape[1])
+    rows = np.broadcast_to(dofs[:, :, None], shape).ravel()
+    columns = np.broadcast_to(dofs[:, None, :], shape).ravel()
+    return Entries(rows, columns, np.zeros(len(rows), dtype=bool), rows > columns)
+
+
+def upper_blocks(nodes: np.ndarray) -> Entries:
+    """Of symmetric blocks (k, pairs, 3, 3) of the pairs of ``nodes`` (k, a), each pair once.
+
+    Pairs are those of ``np.triu_indices``.
+    """
+    one, other = np.triu_indices(nodes.shape[1])
+    shape = (len(nodes), len(one), 3, 3)
+    component = np.arange(3)
+    rows = np.broadcast_to(3 * nodes[:, one, None, None] + component[:, None], shape).ravel()
+    columns = np.broadcast_to(3 * nodes[:, other, None, None] + component, shape).ravel()
+    mirrored = np.broadcast_to((one != other)[:, None, None], shape).ravel()
+    return Entries(rows, columns, mirrored, ~mirrored & (rows > columns))
+
+
+def block_pattern(groups: Sequence[Entries], free_index: np.ndarray, *, symmetric: bool) -> Pattern:
+    """Pattern of dense blocks, and where their entries go.
 
     Parameters
     ----------
-    groups : each (k, d): global degrees of freedom of the rows, and columns, of k blocks.
+    groups : of the entries, one after the other.
     free_index : (n_dofs,) position among the free ones, -1 where held.
     symmetric : keep only the upper triangle.
     """
     size = int(free_index.max()) + 1
-    pairs = [_block_entries(free_index[dofs]) for dofs in groups]
-    rows, columns = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    keep = (rows >= 0) & (columns >= 0)
+    rows, columns, mirrored, spare = map(np.concatenate, zip(*groups, strict=True))
+    rows, columns = free_index[rows], free_index[columns]
+    source = np.flatnonzero((rows >= 0) & (columns >= 0) & ~(spare & symmetric))
+    rows, columns = rows[source], columns[source]
     if symmetric:
-        keep &= rows <= columns
-    source = np.flatnonzero(keep)
-    keys, target = np.unique(rows[source] * size + columns[source], return_inverse=True)
+        rows, columns = np.minimum(rows, columns), np.maximum(rows, columns)
+    else:
+        again = mirrored[source]
+        source = np.concatenate([source, source[again]])
+        rows, columns = (
+            np.concatenate([rows, columns[again]]),
+            np.concatenate([columns, rows[again]]),
+        )
+    keys, target = np.unique(rows * size + columns, return_inverse=True)
     return Pattern(
         rows=(keys // size).astype(np.int32),
         columns=(keys % size).astype(np.int32),
@@ -111,10 +157,3 @@ def block_pattern(groups: list[np.ndarray], free_index: np.ndarray, *, symmetric
         size=size,
         upper=symmetric,
     )
-
-
-def _block_entries(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of every entry of the blocks of ``dofs`` (k, d), flattened."""
-    shape = (*dofs.shape, dofs.shape[1])
-    rows = np.broadcast_to(dofs[:, :, None], shape).ravel()
-    return rows, np.broadcast_to(dofs[:, None, :], shape).ravel()

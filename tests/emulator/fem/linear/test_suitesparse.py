@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
-from emulator.fem.linear import SOLVERS, Outcome, block_pattern, find_solver
+from emulator.fem.linear import SOLVERS, Outcome, block_pattern, find_solver, whole_blocks
 from emulator.fem.linear.foreign import register
 from emulator.fem.linear.solve import attempt, solve
 
@@ -18,8 +18,8 @@ SUITESPARSE = find_solver("suitesparse")
 def matrix(size=12, shift=4.0, *, symmetric=True, seed=0):
     """Dense matrix, pattern, values and right-hand side."""
     rng = np.random.default_rng(seed)
-    dofs = [np.arange(size)[None], np.arange(size // 2)[None]]
-    pattern = block_pattern(dofs, np.arange(size), symmetric=symmetric)
+    groups = [whole_blocks(np.arange(size // 3)[None]), whole_blocks(np.arange(size // 6)[None])]
+    pattern = block_pattern(groups, np.arange(size), symmetric=symmetric)
     A = rng.normal(size=(size, size))
     A = (A + A.T if symmetric else A) + shift * np.eye(size)
     return (
