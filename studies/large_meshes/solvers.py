@@ -26,9 +26,9 @@ from studies.common.processes import peak_gb, run
 
 from emulator.errors import InputError
 from emulator.fem.assembly import System
-from emulator.fem.factorisations import mumps
-from emulator.fem.factorisations.suitesparse import CHOLMOD, remember_factors
+from emulator.fem.linear import mumps
 from emulator.fem.linear.pattern import Pattern
+from emulator.fem.linear.suitesparse import SUITESPARSE, forget_factors
 from emulator.scenes.scene import Scene
 
 # PETSC_OPTIONS of MUMPS: as it is, factors on disk, and block low-rank factors to six digits with
@@ -46,7 +46,7 @@ SEED = 0
 
 def store(scene: Scene, path: Path) -> Case:
     """Write two tangents at rest, a right-hand side and the rigid motions."""
-    system, rest = System(scene, CHOLMOD.name), jnp.zeros(scene.held.shape)
+    system, rest = System(scene), jnp.zeros(scene.held.shape)
     tangents = [system.safe_tangent(rest, k * scene.centre, 0.0)[0] for k in (1.0, 1.02)]
     X = scene.mesh.nodes - scene.mesh.nodes.mean(axis=0)
     turned = [np.cross(axis, X) for axis in np.eye(3)]
@@ -81,8 +81,8 @@ def factorised(solver: str, matrix: Any, pattern: Pattern) -> Case:
         solution, x = both_times(factor.solve, b)
         row = {"iterations": factor._ksp.getIterationNumber()}
     else:
-        remember_factors(1)
-        solve = jax.jit(lambda values, b: CHOLMOD.solve(pattern, values, b))
+        forget_factors()
+        solve = jax.jit(lambda values, b: SUITESPARSE.cholesky(pattern, values, b)[0])
         with_solution = lambda *given: np.asarray(solve(*given))  # noqa: E731
         first, _ = both_times(with_solution, matrix["first"], b)
         second, _ = both_times(with_solution, matrix["second"], b)

@@ -14,12 +14,19 @@ def summary(report: dict[str, Any]) -> str:
     titles = ["mean", "sd", "5 %", "95 %", "R-hat", "ESS"]
     if any("truth" in row for row in parameters.values()):
         columns, titles = ["truth", *columns], ["truth", *titles]
-    shift = report.get("certificate", {}).get("shift")
+    certificate = report.get("certificate", {})
+    shifts = {
+        "FEM/sd": certificate.get("shift"),
+        "mesh/sd": certificate.get("mesh", {}).get("shift"),
+    }
+    shifts = {title: shift for title, shift in shifts.items() if shift}
     rows = []
     for name, row in parameters.items():
         cells: list[object] = [row.get(column) for column in columns]
-        rows.append((name, *cells, *([shift[name]] if shift else [])))
-    lines = [table(("parameter", *titles, *(["FEM shift / sd"] if shift else [])), rows)]
+        rows.append((name, *cells, *(shift.get(name) for shift in shifts.values())))
+    lines = [table(("parameter", *titles, *shifts), rows)]
+    if shifts:
+        lines.append("FEM, mesh: how far FEM, and a finer mesh, would move each mean, in sd")
     lines.append(
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
         f", forward map: {report['forward']}"

@@ -66,7 +66,7 @@ def html_of(
     simulator = simulator_of(scene) if fem else None
     sections = [
         ("Data against prediction", _data(posterior)),
-        ("Parameters", _parameters(run, posterior)),
+        ("Parameters", _parameters(run, posterior, certificate)),
         ("The body", _body(posterior, simulator)),
         ("What the data determine", _known(posterior)),
         ("Draws", _draws(posterior)),
@@ -103,18 +103,21 @@ def _data(posterior: Posterior) -> str:
     return "".join(found) or '<p class="note">The run kept no predictions.</p>'
 
 
-def _parameters(run: Run, posterior: Posterior) -> str:
+def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | None) -> str:
     labels, cut = charts.names_with_units(posterior), posterior.model.prior_cut
     head = ["", "mean", "sd", "5 %", "95 %", "R-hat", "ESS bulk", "ESS tail", "prior"]
     truth = run.truth if run.data == "synthetic" else {}
     priors = json.loads(posterior.tree.attrs.get("prior", "{}"))
     head += ["truth"] if truth else []
+    shifts = _shifts(certificate or {})
+    head += list(shifts)
     rows = []
     for name, row in posterior.summary().items():
         numbers = [f"{row[key]:.4g}" for key in ("mean", "sd", "low", "high")]
         numbers += [f"{row['r_hat']:.4f}", f"{row['ess_bulk']:.0f}", f"{row['ess_tail']:.0f}"]
         numbers.append(priors.get(name, priors.get(split(name)[0], "")))
         numbers += [f"{truth[name]:.4g}" if name in truth else ""] if truth else []
+        numbers += [f"{shift[name]:+.2f}" if name in shift else "" for shift in shifts.values()]
         rows.append((labels[name], *numbers))
     lost = "".join(
         f'<p class="note">{escape(n)}: {100 * share:.2g} % of the prior lies where the map has no '
@@ -122,6 +125,13 @@ def _parameters(run: Run, posterior: Posterior) -> str:
         for n, share in cut.items() if share
     )  # fmt: skip
     return _table(head, rows) + lost
+
+
+def _shifts(certificate: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """How far a certificate says that each mean would move, in posterior sd, by what moves it."""
+    found = {"by FEM / sd": certificate.get("shift", {})}
+    found["on a finer mesh / sd"] = certificate.get("mesh", {}).get("shift", {})
+    return {title: shift for title, shift in found.items() if shift}
 
 
 def _body(posterior: Posterior, simulator: Any) -> str:

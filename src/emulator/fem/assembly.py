@@ -31,7 +31,6 @@ from emulator.fem.functional import (
     local_forces,
     local_terms,
     pair_matrices,
-    point_energy,
     spring_terms,
     strain_energy,
     volume_ratio,
@@ -46,6 +45,7 @@ from emulator.fem.linear import (
 )
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.solve import attempt, solve
+from emulator.fem.material_point import moduli
 from emulator.fem.mixed import Condensed, consistent, linearise
 from emulator.fem.programs import compiled
 from emulator.scenes.local_terms import LocalForce, LocalTerm
@@ -230,7 +230,7 @@ class System:
         if self.mixed:
             return linearise(scene, u, consistent(scene, u, theta), theta).tangent
         H = displacement_gradient(scene, u)
-        return self.element_blocks(at_points(scene, jax.hessian(point_energy(scene, theta)), H))
+        return self.element_blocks(at_points(scene, moduli(scene, theta), H))
 
     def element_blocks(self, A: jax.Array) -> jax.Array:
         """Blocks (m, pairs, 3, 3) in mN/mm from the moduli ``A = d2W/dH2`` (m, q, 3, 3, 3, 3)."""

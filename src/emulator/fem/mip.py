@@ -25,26 +25,22 @@ six full steps to a residual of a few percent, all with positive definite tangen
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
-from emulator.fem.functional import at_points, displacement_gradient, strain_law
+from emulator.fem.functional import at_points, displacement_gradient
 from emulator.fem.line_search import largest_sound
 from emulator.fem.linear import Outcome
+from emulator.fem.material_point import MaterialPoint
 from emulator.fem.programs import compiled, cond
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
-from emulator.scenes.scene import Scene
 
 _SHORTEST = 2.0**-4  # fraction of a step; where less is left, the ramp of loads is lost
-_BISECTIONS = 7
-_REFINEMENTS = 3
 
 
 class MipState(NamedTuple):
@@ -127,7 +123,9 @@ class MipNewton:
 @compiled
 def _measures_of(system: System, u: jax.Array) -> jax.Array:
     """Strain measures (m, q, k) of the displacement ``u`` (n, 3) mm."""
-    measures, H = _measures(system.scene), displacement_gradient(system.scene, u)
+    names = measures_read(system.scene.law)
+    assert names is not None, "see applies"
+    measures, H = Measures(names), displacement_gradient(system.scene, u)
     return at_points(system.scene, lambda H, at: measures.of(H, at.directions), H)
 
 
@@ -187,71 +185,6 @@ def _taken(
     return jnp.where(taken, u + fraction * move, u), jnp.where(taken, after, measures)
 
 
-def _measures(scene: Scene) -> Measures:
-    names = measures_read(scene.law)
-    assert names is not None
-    return Measures(names)
-
-
-@dataclass(frozen=True)
-class MaterialPoint:
-    """What happens at one integration point, at ``theta`` (p,)."""
-
-    scene: Scene
-    theta: jax.Array
-
-    @cached_property
-    def measures(self) -> Measures:
-        """The strain measures that the law reads."""
-        return _measures(self.scene)
-
-    def energy(self, at: Tissue) -> Callable[[jax.Array], jax.Array]:
-        """Strain energy density in kPa as a function of the measures (k,)."""
-        law = strain_law(self.scene, self.theta)
-        return self.measures.energy(lambda strain: law(strain, at), at.directions)
-
-    def linearise(
-        self, H: jax.Array, own: jax.Array, at: Tissue, geometric: jax.Array | float = 1.0
-    ) -> tuple[jax.Array, jax.Array]:
-        """First Piola stress (3, 3) and tangent (3, 3, 3, 3) in kPa at a point.
-
-        geometric : fraction of the stresses' change since rest that the tangent knows.
-        """
-        phi = self.energy(at)
-
-        def stresses(own: jax.Array) -> tuple[jax.Array, jax.Array]:
-            s = jax.grad(phi)(own)
-            return s, s
-
-        def measures(H: jax.Array) -> jax.Array:
-            return self.measures.of(H, at.directions)
-
-        def pulled_back(H: jax.Array) -> tuple[jax.Array, jax.Array]:
-            now, pull_back = jax.vjp(measures, H)
-            return pull_back(known)[0], now
-
-        # Derivatives with their values beside them are traced once less.
-        C, s = jax.jacfwd(stresses, has_aux=True)(own)
-        at_rest = jax.grad(phi)(jnp.zeros_like(own))
-        known = at_rest + geometric * (s - at_rest)
-        curvature, now = jax.jacfwd(pulled_back, has_aux=True)(H)
-        slope = jax.jacfwd(measures)(H)
-        stress = jnp.tensordot(s + C @ (now - own), slope, 1)
-        return stress, jnp.einsum("kij,kl,lab->ijab", slope, C, slope) + curvature
-
-    def at_stress(self, H: jax.Array, change: jax.Array, own: jax.Array, at: Tissue) -> jax.Array:
-        """Measures (k,) of a point where the law has the stress that its step promises."""
-        phi = self.energy(at)
-        xi, along = jax.jvp(lambda H: self.measures.of(H, at.directions), (H,), (change,))
-        step = xi + along - own
-
-        def one(block: jax.Array) -> jax.Array:
-            return fraction_at_stress(lambda beta: phi(own + beta * block * step))
-
-        fractions = jax.vmap(one)(jnp.asarray(self.measures.blocks))
-        return own + (fractions @ self.measures.blocks) * step
-
-
 def applies(system: System) -> bool:
     """Whether a scene's stresses can be iterates of their own, and whether that pays.
 
@@ -260,41 +193,3 @@ def applies(system: System) -> bool:
     """
     law = system.scene.law
     return law.exponential and not system.mixed and measures_read(law) is not None
-
-
-def fraction_at_stress(energy: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    r"""The part of a step, in [0, 1], that takes a law to the stress its tangent promises.
-
-    That is :math:`\beta` with :math:`e'(\beta) = e'(0) + e''(0)` for ``energy`` e along the step;
-    1 where the whole step does not stiffen the law, and short of where the energy is not finite.
-    Where the law begins without stiffness it promises nothing: a fibre that pulls taut on the way
-    is taken just past that point, for its stiffness to be met there by the next iteration.
-    """
-
-    def slope(beta: jax.Array) -> jax.Array:
-        value, along = jax.jvp(energy, (beta,), (jnp.ones(()),))
-        # The slope of a logarithm is finite where the logarithm itself is not.
-        return jnp.where(jnp.isfinite(value), along, jnp.inf)
-
-    def both(beta: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return jax.jvp(slope, (beta,), (jnp.ones(()),))
-
-    start, stiffness = both(jnp.zeros(()))
-    wanted = start + stiffness
-
-    def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        below = slope(middle) <= wanted
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-    low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (jnp.zeros(()), jnp.ones(())))
-
-    def refine(_: int, beta: jax.Array) -> jax.Array:
-        value, rise = both(beta)
-        better = beta - (value - wanted) / jnp.where(rise > 0.0, rise, jnp.inf)
-        return jnp.where(jnp.isfinite(better), jnp.clip(better, low, high), beta)
-
-    beta = jax.lax.fori_loop(0, _REFINEMENTS, refine, 0.5 * (low + high))
-    beta = jnp.where(stiffness > 0.0, beta, high)
-    return jnp.where(slope(jnp.ones(())) <= wanted, 1.0, beta)

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.kinematics import Strain, cofactor
 from emulator.mechanics.laws.law import Law
 
 _SHAPES: dict[str, tuple[int, ...]] = {
@@ -31,6 +31,19 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "isochoric_I8fs": (),
     "green_lagrange": (3, 3),
 }
+
+
+_IN_CLOSED_FORM = set(_SHAPES) - {"green_lagrange"}
+
+
+def _metric(name: str, strain: Strain) -> jax.Array:
+    """The matrix (3, 3) that makes an isochoric measure."""
+    if name == "isochoric_I1_minus_3":
+        return jnp.eye(3)
+    one = strain.sheet if name == "isochoric_I4s_minus_1" else strain.fibre
+    other = strain.sheet if name != "isochoric_I4f_minus_1" else strain.fibre
+    product = jnp.outer(one, other)
+    return 0.5 * (product + product.T)
 
 
 class _GradientRead(Exception):
@@ -132,6 +145,69 @@ class Measures:
         """Measures (size,) of a displacement gradient (3, 3)."""
         strain = Strain(H, None, directions)
         return jnp.concatenate([jnp.ravel(getattr(strain, name)) for name in self.names])
+
+    def derivatives(
+        self, H: jax.Array, directions: jax.Array | None, s: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        r"""Slopes (size, 3, 3) of the measures, and their curvature (3, 3, 3, 3) weighted by ``s``.
+
+        With :math:`G = F^{-T}` and :math:`a = J^{-2/3}`, a measure :math:`\xi = a\, F : F M` less a
+        number, M symmetric (:math:`I` for :math:`\bar I_1`, :math:`f \otimes f` for
+        :math:`\bar I_{4f}`, the symmetric part of :math:`f \otimes s` for :math:`\bar I_{8fs}`),
+        has
+
+        .. math::
+            \xi_{,ij} &= a\left(2 (FM)_{ij} - \tfrac23 Q G_{ij}\right), \qquad Q = F : F M \\
+            \xi_{,ijkl} &= a\left(2 \delta_{ik} M_{jl}
+                - \tfrac43 \left[(FM)_{ij} G_{kl} + G_{ij} (FM)_{kl}\right]
+                + \tfrac49 Q G_{ij} G_{kl} + \tfrac23 Q G_{il} G_{kj}\right)
+
+        which is linear in M, so that one M weighted by s serves all; and
+        :math:`J_{,ij} = J G_{ij}`, :math:`J_{,ijkl} = J (G_{ij} G_{kl} - G_{il} G_{kj})`. Other
+        measures are differentiated by JAX.
+        """
+        if not set(self.names) <= _IN_CLOSED_FORM:
+            return self._differentiated(H, directions, s)
+        F, eye = H + jnp.eye(3, dtype=H.dtype), jnp.eye(3, dtype=H.dtype)
+        strain = Strain(H, None, directions)
+        J = 1.0 + strain.J_minus_1
+        G, power = cofactor(F) / J, jnp.exp(-2.0 / 3.0 * strain.ln_J)
+        zero = jnp.zeros((), H.dtype)
+        slopes, whole, plain, pressure = list[jax.Array](), zero * eye, zero, zero
+        for name, weight in zip(self.names, s, strict=True):
+            if name == "J_minus_1":
+                slopes.append(J * G)
+                pressure = weight
+            elif name == "I1_minus_3":
+                slopes.append(2.0 * F)
+                plain = weight
+            else:
+                M = _metric(name, strain)
+                FM = F @ M
+                slopes.append(power * (2.0 * FM - 2.0 / 3.0 * jnp.vdot(F, FM) * G))
+                whole = whole + weight * M
+        FM = F @ whole
+        Q, GG = jnp.vdot(F, FM), jnp.einsum("ij,kl->ijkl", G, G)
+        crossed = jnp.einsum("il,kj->ijkl", G, G)
+        mixed = jnp.einsum("ij,kl->ijkl", FM, G)
+        metric = jnp.einsum("ik,jl->ijkl", eye, power * whole + plain * eye)
+        curvature = 2.0 * metric - 4.0 / 3.0 * power * (mixed + mixed.transpose(2, 3, 0, 1))
+        curvature += (4.0 / 9.0 * power * Q + pressure * J) * GG
+        curvature += (2.0 / 3.0 * power * Q - pressure * J) * crossed
+        return jnp.stack(slopes), curvature
+
+    def _differentiated(
+        self, H: jax.Array, directions: jax.Array | None, s: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """:meth:`derivatives` of any measures."""
+
+        def measures(H: jax.Array) -> jax.Array:
+            return self.of(H, directions)
+
+        def pulled_back(H: jax.Array) -> jax.Array:
+            return jax.vjp(measures, H)[1](s)[0]
+
+        return jax.jacfwd(measures)(H), jax.jacfwd(pulled_back)(H)
 
     def energy(
         self, constitutive: Callable[[Strain], jax.Array], directions: jax.Array | None

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -101,6 +101,21 @@ def identity_of(
         indices=indices,
         description=description,
     )
+
+
+def plain_fields(part: Any, unused: Collection[str] = ()) -> list[Any]:
+    """Kind and every field of a load or support, a frozen dataclass, as plain JSON.
+
+    Numbers are floats, and -0.0 is 0.0; entries of a tuple stand one by one. A field that is
+    ``unused`` is None.
+    """
+    found: list[Any] = [part.kind]
+    for each in fields(part):
+        value = None if each.name in unused else getattr(part, each.name)
+        for entry in value if isinstance(value, tuple) else (value,):
+            number = isinstance(entry, int | float) and not isinstance(entry, bool)
+            found.append(float(entry) + 0.0 if number else entry)
+    return found
 
 
 def fingerprint(identity: Identity, space: ParameterSpace) -> str:

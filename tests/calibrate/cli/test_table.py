@@ -71,9 +71,13 @@ def compared():
                     "95 %",
                     "R-hat",
                     "ESS",
-                    "FEM shift / sd",
+                    "FEM/sd",
+                    "mesh/sd",
                 ),
-                [(name, *row.values(), SHIFTS["shift"][name]) for name, row in PARAMETERS.items()],
+                [
+                    (name, *row.values(), SHIFTS["shift"][name], -SHIFTS["shift"][name])
+                    for name, row in PARAMETERS.items()
+                ],
             ),
             id="certify",
         ),

@@ -10,7 +10,8 @@ import emulator as em
 from emulator.fem.assembly import System, relative_residual
 from emulator.fem.linear import Outcome
 from emulator.fem.loading_path import find_equilibrium
-from emulator.fem.mip import MaterialPoint, MipNewton, applies, fraction_at_stress
+from emulator.fem.material_point import MaterialPoint, fraction_at_stress
+from emulator.fem.mip import MipNewton, applies
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import modulus

@@ -32,6 +32,34 @@ def test_a_law_of_the_gradient_reads_no_measures():
     assert measures_read(Law("of H", (modulus("mu"),), energy)) is None
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("J_minus_1", "I1_minus_3"),
+        (
+            "isochoric_I4s_minus_1",
+            "isochoric_I8fs",
+            "J_minus_1",
+            "isochoric_I1_minus_3",
+            "isochoric_I4f_minus_1",
+        ),
+        ("green_lagrange", "J_minus_1"),
+    ],
+    ids=["plain", "isochoric", "tensor"],
+)
+def test_derivatives_are_those_of_the_measures(names):
+    """In closed form, against two differentiations of the measures themselves."""
+    rng, measures = np.random.default_rng(5), Measures(names)
+    s = jnp.asarray(rng.normal(size=measures.size))
+    for own in (jnp.eye(3)[:2], jnp.asarray(np.linalg.qr(rng.normal(size=(3, 3)))[0][:2])):
+        for at in (jnp.asarray(H), jnp.zeros((3, 3))):
+            of = lambda H, own=own: measures.of(H, own)
+            slope, curvature = jax.jit(measures.derivatives)(at, own, s)
+            np.testing.assert_allclose(slope, jax.jacfwd(of)(at), atol=1e-12)
+            second = jnp.tensordot(s, jax.hessian(of)(at), 1)
+            np.testing.assert_allclose(curvature, second, atol=1e-11)
+
+
 FAST = ("neo_hookean", "holzapfel_ogden")  # without fibres and with
 
 

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from emulator.mechanics.laws import LAWS
 from emulator.mechanics.laws.identity import law_identity, probed
 from emulator.scenes import Parameter, Support
 from emulator.scenes.identity import _as_set
-from emulator.scenes.loads import Gravity, Traction
-from emulator.scenes.supports import ElasticSupport
+from emulator.scenes.loads import LOADS, Gravity, GravityVector, Traction
+from emulator.scenes.supports import SUPPORTS, ElasticSupport
 from scene_support import block
 
 
@@ -153,3 +153,45 @@ def test_the_released_models_are_told_from_ours(published):
     ours = em.scenes.once_clamped_beam(order=1)
     assert ours.identity.agrees(published_scene("OnceClampedBeam", published).identity)
     assert not ours.identity.agrees(em.scenes.twice_clamped_beam(order=1).identity)
+
+
+# One of every kind of load and support, and another value of each of its fields; a field that is
+# not here fails the test.
+PARTS = {
+    "gravity": (Gravity(), {"density": 1.1, "direction": (0.0, 1.0, 0.0), "acceleration": 3.7}),
+    "gravity_vector": (GravityVector(), {"density": 1.1, "parameter": "g"}),
+    "traction": (Traction("top", (0.0, 0.1, 0.0)), {"facet_set": "left", "traction": (0.1, 0, 0)}),
+    **{
+        kind: (LOADS[kind]("top"), {"facet_set": "left", "pressure": 0.3, "parameter": "p"})
+        for kind in ("cavity_pressure", "follower_pressure", "dead_pressure", "published_pressure")
+    },
+    "held": (
+        Support("bottom"),
+        {"node_set": "right", "displacement": np.array([0.0, 0.0, 0.1]), "components": "xz"},
+    ),
+    "elastic": (
+        ElasticSupport("right", 0.5),
+        {"facet_set": "left", "stiffness": 0.6, "direction": "normal"},
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", [*LOADS, *SUPPORTS])
+def test_every_field_of_every_load_and_support_counts(kind):
+    part, others = PARTS[kind]
+    plain = block()
+
+    def scene(part):
+        names = {q.name: q for q in getattr(part, "quantities", ())}
+        own = tuple(Parameter(n, q.unit, 0.1, 1.0) for n, q in names.items())
+        base = replace(plain, loads=(), origin={})
+        parameters = tuple(p for p in base.parameters if p.name in base.law.parameters)
+        beside = () if kind == "held" else base.supports
+        given = {"loads": (part,)} if kind in LOADS else {"supports": (*beside, part)}
+        held = (*base.supports, *(Support(s) for s in ("top", "left") if "cavity" in kind))
+        given = given if kind in SUPPORTS else {**given, "supports": held}
+        return replace(base, parameters=(*parameters, *own), **given).fingerprint
+
+    assert set(others) == {each.name for each in fields(part)}
+    told = {scene(part)} | {scene(replace(part, **{name: v})) for name, v in others.items()}
+    assert len(told) == 1 + len(others)

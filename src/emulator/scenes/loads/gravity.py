@@ -93,10 +93,6 @@ class GravityVector(Load):
         """No weight."""
         return "gravity", None
 
-    def to_json(self) -> list[Any]:
-        """Kind, density and name."""
-        return [self.kind, float(self.density), self.parameter]
-
     def nodal_force_per_unit(self, grid: Discretisation) -> dict[str, np.ndarray]:
         """Consistent nodal forces (n, 3) in mN for 1 m/s2 along each axis."""
         weight = self.density * _KPA_PER_MM * _nodal_volumes(grid)[:, None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import ABC
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.identity import plain_fields
 from emulator.scenes.local_terms import LocalForce, LocalTerm
 
 
@@ -81,9 +82,9 @@ class Load(ABC):
         """Force of a load that follows the deformation and has no potential, or None."""
         return None
 
-    @abstractmethod
     def to_json(self) -> list[Any]:
-        """Plain JSON that differs between loads with different effects."""
+        """Plain JSON that differs between loads with different effects: every field."""
+        return plain_fields(self)
 
 
 def nodal_sums(mesh: Mesh, nodes: np.ndarray, amounts: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
 from emulator.scenes.local_terms import Values
 
@@ -53,9 +54,8 @@ class SurfacePressure(Load):
         return (Quantity(self.parameter, "kPa", -np.inf, hint=f"1 mmHg = {KPA_PER_MMHG} kPa"),)
 
     def to_json(self) -> list[Any]:
-        """Kind, facet set, pressure, name of the parameter; one of the last two is None."""
-        by_name = self.parameter if self.pressure is None else None
-        return [self.kind, self.facet_set, self.pressure, by_name]
+        """Every field; a parameter's name says nothing where the pressure is known."""
+        return plain_fields(self, () if self.pressure is None else ("parameter",))
 
     def value(self, values: Values) -> jax.Array | float:
         """The pressure in kPa, taken from the scene's resolved parameters if it is one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -38,10 +38,6 @@ class Traction(Load):
     def facet_sets(self) -> tuple[str, ...]:
         """The facet set it acts on."""
         return (self.facet_set,)
-
-    def to_json(self) -> list[Any]:
-        """Kind, facet set and traction."""
-        return [self.kind, self.facet_set, *(float(x) + 0.0 for x in self.traction)]
 
     def nodal_force(self, grid: Discretisation) -> np.ndarray:
         """Consistent nodal forces, (n, 3) in mN."""

@@ -18,6 +18,7 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.mesh import Mesh
+from emulator.scenes.identity import plain_fields
 from emulator.scenes.local_terms import LocalTerm, Values
 from emulator.scenes.supports.boundary_condition import BoundaryCondition, Resisted
 
@@ -63,8 +64,8 @@ class ElasticSupport(BoundaryCondition):
         return f"{way} '{self.facet_set}'", None
 
     def to_json(self) -> list[Any]:
-        """Kind, facet set, stiffness and direction."""
-        return [self.kind, self.facet_set, float(self.stiffness), self.direction]
+        """Every field."""
+        return plain_fields(self)
 
     def term(self, grid: Discretisation) -> LocalTerm:
         """Energy of the springs, facet by facet."""
