@@ -186,7 +186,7 @@ def test_every_field_of_every_load_and_support_counts(kind):
         own = tuple(Parameter(n, q.unit, 0.1, 1.0) for n, q in names.items())
         base = replace(plain, loads=(), origin={})
         parameters = tuple(p for p in base.parameters if p.name in base.law.parameters)
-        beside = () if kind == "held" else base.supports
+        beside = (ElasticSupport("left", 1.0),) if kind == "held" else base.supports
         given = {"loads": (part,)} if kind in LOADS else {"supports": (*beside, part)}
         held = (*base.supports, *(Support(s) for s in ("top", "left") if "cavity" in kind))
         given = given if kind in SUPPORTS else {**given, "supports": held}
