@@ -23,7 +23,7 @@ import numpy as np
 import calibrate as cal
 import emulator as em
 from calibrate.observations import spread_landmarks
-from calibrate.sbc import LEVELS, sbc
+from calibrate.simulation_based import LEVELS, sbc
 from calibrate.workflow import by_fem
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "0.85"
@@ -197,9 +197,8 @@ told, body = mesh_error(truth), mesh_error.finer.scene
 seen = cal.landmarks(body, observe.points)
 displaced = np.asarray(seen(told.fine[seen.nodes], truth))
 difference = np.linalg.norm(displaced - clean, axis=1).mean()
-print(
-    f"{len(body.mesh.nodes)} nodes for {len(scene.mesh.nodes)}: landmarks differ by {difference:.3f} mm"
-)
+counts = f"{len(body.mesh.nodes)} nodes for {len(scene.mesh.nodes)}"
+print(f"{counts}: landmarks differ by {difference:.3f} mm")
 biased = cal.sample(model, displaced, options=cal.NUTSOptions(warmup=300, draws=500), seed=2)
 second = cal.certify(biased, simulator, draws=80)
 print(second)

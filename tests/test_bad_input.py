@@ -17,7 +17,7 @@ from calibrate.cli import main
 from calibrate.cli.common import seconds
 from calibrate.data import read_data, write_data
 from calibrate.run import Run
-from calibrate.sbc import sbc
+from calibrate.simulation_based import sbc
 from calibrate.workflow import make_data
 from cli_support import write_block
 from emulator.errors import InputError

@@ -1,6 +1,7 @@
 from .campaigns import campaign
 from .certificate import Certificate, certify, reweight
 from .comparison import compare
+from .identifiability import identify
 from .joint_prior import Dependence, JointPrior
 from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from .observations import (
@@ -18,7 +19,9 @@ from .posterior import Posterior, sample
 from .priors import box_prior, log_normal, truncated, truncated_normal
 from .samplers import Density, NUTSOptions, density_of
 from .sensitivity_analysis import sensitivity
+from .simulation_based import sbc
 from .statistical_model import Model, model
+from .workflow import load
 
 __version__: str
 
@@ -42,14 +45,17 @@ __all__ = [
     "certify",
     "compare",
     "density_of",
+    "identify",
     "landmarks",
     "length_between",
+    "load",
     "log_normal",
     "model",
     "nodal_displacements",
     "population_of_fits",
     "reweight",
     "sample",
+    "sbc",
     "segment_strains",
     "sensitivity",
     "strains",

@@ -202,6 +202,17 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     return run, Posterior(tree, built, data)
 
 
+def load(folder: str | Path) -> Posterior:
+    """The posterior kept in ``folder`` by :func:`infer` or ``calibrate infer``.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_posterior`.
+    """
+    return read_posterior(folder)[1]
+
+
 def certify_and_keep(
     posterior: Posterior,
     folder: str | Path,

@@ -2,15 +2,20 @@ from . import fem, scenes
 from .catalogue import find_scene
 from .error.mesh_error import MeshError, mesh_error
 from .errors import InputError, SolverError
-from .fem import NewtonOptions, Simulator, Solution, Status
+from .fem import NewtonOptions, Simulator, Solution, Status, run_campaign
+from .fem.campaign.stored_runs import read_runs
 from .fem.functional import potential_energy
 from .geometry.io import Body, read_body, read_mesh
 from .geometry.mesh import Mesh
 from .scenes import Parameter, Scene, Support
+from .scenes.finer import finer
 from .surrogates import Emulator, load, save_emulator, shipped
+from .surrogates.corrected import corrected
 from .surrogates.fem import FEMForward, fem_forward
+from .surrogates.pod_gp import fit_reduced
 from .surrogates.protocol import ForwardMap, Prediction
 from .surrogates.released_network import released_network
+from .training import Plan, recipe, train
 
 __version__: str
 
@@ -24,6 +29,7 @@ __all__ = [
     "MeshError",
     "NewtonOptions",
     "Parameter",
+    "Plan",
     "Prediction",
     "Scene",
     "Simulator",
@@ -31,16 +37,23 @@ __all__ = [
     "SolverError",
     "Status",
     "Support",
+    "corrected",
     "fem",
     "fem_forward",
     "find_scene",
+    "finer",
+    "fit_reduced",
     "load",
     "mesh_error",
     "potential_energy",
     "read_body",
     "read_mesh",
+    "read_runs",
+    "recipe",
     "released_network",
+    "run_campaign",
     "save_emulator",
     "scenes",
     "shipped",
+    "train",
 ]

@@ -19,7 +19,7 @@ from calibrate.figures.calibration import draw
 from calibrate.provenance import study_header
 from calibrate.run import Run
 from calibrate.samplers import NUTSOptions
-from calibrate.sbc import Calibration, sbc
+from calibrate.simulation_based import Calibration, sbc
 from calibrate.statistical_model import Model
 from calibrate.workflow import by_fem, model_before_data
 from emulator.store import read_json, write_json

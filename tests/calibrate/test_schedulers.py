@@ -9,7 +9,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.certificate import examine
 from calibrate.cli import main
-from calibrate.sbc import sbc
+from calibrate.simulation_based import sbc
 from cli_support import write_block
 
 pytestmark = pytest.mark.slow

@@ -132,7 +132,7 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     from calibrate.figures.calibration import draw
     from calibrate.run import Run
     from calibrate.samplers import NUTSOptions
-    from calibrate.sbc import sbc
+    from calibrate.simulation_based import sbc
     from calibrate.workflow import by_fem, model_before_data
     from emulator.store import check_folder, write_json
 

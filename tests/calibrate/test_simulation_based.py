@@ -7,7 +7,7 @@ import numpyro.distributions as dist
 import pytest
 
 import calibrate as cal
-from calibrate.sbc import LOG_LIKELIHOOD, Calibration, Replicate, calibration_of, sbc
+from calibrate.simulation_based import LOG_LIKELIHOOD, Calibration, Replicate, calibration_of, sbc
 from emulator.errors import InputError
 from linear_support import closed_form, linear_forward
 
