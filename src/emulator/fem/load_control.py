@@ -58,7 +58,7 @@ def judge_level(
     if state.volumes is not None:
         spent |= at_level >= _MIXED_ITERATIONS
     spent |= (_squeezed(state, outcome) >= _SQUEEZES) & (_halved(state) >= options.min_increment)
-    spent |= ~_convex(state, outcome) & (_halved(state) >= state.careful)
+    spent |= ~_convex(state, outcome, options) & (_halved(state) >= state.careful)
     return Verdict(solved, ~solved & (stuck | spent), drowned)
 
 
@@ -81,7 +81,7 @@ def next_state(
     descends : whether the tangent's own direction lowers the potential, as far as that is known.
     move : (n, 3) mm, the full step.
     """
-    state = state._replace(convex=state.convex & descends)
+    state = state._replace(convex=state.convex & (descends | _quiet(state, options)))
     solved, failed, drowned = judge_level(state, outcome, move, options)
     complete, moved = solved & (state.level >= 1.0), solved | failed
     iterations = state.iterations + 1
@@ -105,7 +105,7 @@ def next_state(
         residual=outcome.residual,
         error=jnp.where(drowned, 0.0, outcome.error),
         refresh=moved | ~_keeps_tangent(state, outcome, options),
-        convex=(moved & ~complete) | _convex(state, outcome),
+        convex=(moved & ~complete) | _convex(state, outcome, options),
         crushed=crushed,
         squeezed=jnp.where(moved, 0, _squeezed(state, outcome)),
         status=jnp.asarray(status, dtype=state.status.dtype),
@@ -142,9 +142,15 @@ def _keeps_tangent(state: NewtonState, outcome: Outcome, options: NewtonOptions)
     return good & (state.volumes is None)
 
 
-def _convex(state: NewtonState, outcome: Outcome) -> jax.Array:
+def _quiet(state: NewtonState, options: NewtonOptions) -> jax.Array:
+    """Whether round-off decides which way a step goes."""
+    return state.error <= options.round_off
+
+
+def _convex(state: NewtonState, outcome: Outcome, options: NewtonOptions) -> jax.Array:
     """Whether the way so far was convex, and this step a full one.
 
     A step with a kept tangent that will not do is replaced, not cut short.
     """
-    return state.convex & (~state.refresh | (outcome.fraction == 1.0))
+    whole = (outcome.fraction == 1.0) | _quiet(state, options)
+    return state.convex & (~state.refresh | whole)

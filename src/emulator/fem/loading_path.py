@@ -5,7 +5,7 @@ A body with several equilibria has one that loading leads to from rest. These ro
 ======  ==================================================================================
 WARM    from the caller's start, at the whole load: stress iterates while the residual is
         above 5 %, then Newton's method
-RAMPS   stress iterates (:mod:`emulator.fem.mip`) from rest up a ramp of loads, three ramps
+RAMPS   stress iterates (:mod:`emulator.fem.mip`) from rest up a ramp of loads, four ramps
         of ever smaller increments, and Newton's method from where a ramp leads
 CLIMB   Newton's method from rest, load step by load step
 ======  ==================================================================================
@@ -44,8 +44,8 @@ class Route(IntEnum):
     """Ways to equilibrium, in the order in which they are tried."""
 
     WARM = 0
-    RAMP = 1  # the first of three
-    CLIMB = 4
+    RAMP = 1  # the first of four
+    CLIMB = 5
 
 
 class _Ramp(NamedTuple):
@@ -60,7 +60,13 @@ class _Ramp(NamedTuple):
 # ventricles from rest to all but their softest corners, in four to six steps: with the whole load
 # at once one in three is lost. The last is for beams that turn. (docs/experiments.md, "Stresses as
 # iterates")
-_RAMPS = (_Ramp(1.0, 0.0, 8), _Ramp(0.5, 0.25, 12), _Ramp(0.25, 0.125, 20), _Ramp(0.1, 0.1, 40))
+_RAMPS = (
+    _Ramp(1.0, 0.0, 8),
+    _Ramp(0.5, 0.25, 12),
+    _Ramp(0.25, 0.125, 20),
+    _Ramp(0.05, 0.05, 80),
+    _Ramp(0.02, 0.02, 160),
+)
 # Relative residual below which a level of a ramp is carried well enough to go up
 # (docs/experiments.md, "Stresses as iterates").
 _CARRIED = 0.9

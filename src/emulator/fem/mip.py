@@ -36,7 +36,7 @@ from emulator.fem.functional import at_points, displacement_gradient
 from emulator.fem.line_search import largest_sound
 from emulator.fem.linear import Outcome
 from emulator.fem.material_point import MaterialPoint
-from emulator.fem.programs import compiled, cond
+from emulator.fem.programs import compiled, cond, while_loop
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
 
@@ -58,6 +58,14 @@ class MipState(NamedTuple):
     error: jax.Array
     fraction: jax.Array
     definite: jax.Array
+
+
+class _Tried(NamedTuple):
+    """A full step (n, 3) mm, whether its tangent was definite, and how many were made."""
+
+    move: jax.Array
+    definite: jax.Array
+    count: jax.Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,20 +98,27 @@ class MipNewton:
         at rest plus ``geometric`` times what they have changed since. With neither it is definite
         for most laws, however rough the field.
         """
-        values, solvable, residual = _promised(
-            self.system,
-            state.u,
-            state.measures,
-            self.theta,
-            self.level,
-            stiffening,
-            geometric,
-        )
-        # On the way from rest each tangent is unlike the one before.
-        full, outcome = self.system.attempt(values, -residual, near=False)
-        move, definite = _promised_step(self.system, solvable, residual, full, outcome)
-        lost = state._replace(fraction=jnp.zeros(()), definite=definite)
-        return cond(definite, lambda: self._moved(state, move), lambda: lost)
+        first = _Tried(state.u, jnp.array(False), jnp.array(0))
+
+        def attempt(before: _Tried) -> _Tried:
+            known = jnp.where(before.count == 0, 1.0, 0.0)
+            values, solvable, residual = _promised(
+                self.system,
+                state.u,
+                state.measures,
+                self.theta,
+                self.level,
+                known * stiffening,
+                known * geometric,
+            )
+            # On the way from rest each tangent is unlike the one before.
+            full, outcome = self.system.attempt(values, -residual, near=False)
+            move, definite = _promised_step(self.system, solvable, residual, full, outcome)
+            return _Tried(move, definite, before.count + 1)
+
+        tried = while_loop(lambda t: ~t.definite & (t.count < 2), attempt, first)
+        lost = state._replace(fraction=jnp.zeros(()), definite=tried.definite)
+        return cond(tried.definite, lambda: self._moved(state, tried.move), lambda: lost)
 
     def _moved(self, state: MipState, move: jax.Array) -> MipState:
         """The state after as much of a step as crushes no element."""
