@@ -61,11 +61,11 @@ class MipState(NamedTuple):
 
 
 class _Tried(NamedTuple):
-    """A full step (n, 3) mm, whether its tangent was definite, and how many were made."""
+    """A full step (n, 3) mm, whether its tangent was definite, and how many were tried."""
 
     move: jax.Array
     definite: jax.Array
-    count: jax.Array
+    tries: jax.Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +96,12 @@ class MipNewton:
 
         Its tangent has ``stiffening`` times the stiffness of the loads, and that of the stresses as
         at rest plus ``geometric`` times what they have changed since. With neither it is definite
-        for most laws, however rough the field.
+        for most laws, however rough the field; an indefinite one is tried again so.
         """
         first = _Tried(state.u, jnp.array(False), jnp.array(0))
 
         def attempt(before: _Tried) -> _Tried:
-            known = jnp.where(before.count == 0, 1.0, 0.0)
+            known = jnp.where(before.tries == 0, 1.0, 0.0)
             values, solvable, residual = _promised(
                 self.system,
                 state.u,
@@ -114,9 +114,9 @@ class MipNewton:
             # On the way from rest each tangent is unlike the one before.
             full, outcome = self.system.attempt(values, -residual, near=False)
             move, definite = _promised_step(self.system, solvable, residual, full, outcome)
-            return _Tried(move, definite, before.count + 1)
+            return _Tried(move, definite, before.tries + 1)
 
-        tried = while_loop(lambda t: ~t.definite & (t.count < 2), attempt, first)
+        tried = while_loop(lambda t: ~t.definite & (t.tries < 2), attempt, first)
         lost = state._replace(fraction=jnp.zeros(()), definite=tried.definite)
         return cond(tried.definite, lambda: self._moved(state, tried.move), lambda: lost)
 
