@@ -70,6 +70,7 @@ _RAMPS = (
 # Relative residual below which a level of a ramp is carried well enough to go up
 # (docs/experiments.md, "Stresses as iterates").
 _CARRIED = 0.9
+_MOST_AT_LEVEL = 12  # steps at a level of a ramp; where more are needed, none will do
 # Relative residual up to which a start is begun from; that of rest is about 1 (docs/experiments.md,
 # "Rough starts").
 _FARTHEST = 0.9
@@ -85,10 +86,11 @@ _SHORT = 15  # iterations of Newton's method that a route may take, unless it is
 class PathState(NamedTuple):
     """Where the search for equilibrium stands.
 
-    newton : the iteration of Newton's method; its status and its counts are those of the search.
+    newton : the iteration of Newton's method; its status is that of the search.
     mip : the stress iterates, or None where the scene has no ramps.
     route : a :class:`Route`. ramping : whether stress iterates are on their way up its ramp.
-    level : load level on the ramp. on_ramp : steps taken there.
+    level : load level on the ramp. on_ramp : steps taken there, at_level : of them at this level.
+    ramped : steps on all ramps.
     entering : whether the route is yet to be begun, at ``newton.u``, on its ramp if ``ramping``.
     """
 
@@ -98,6 +100,8 @@ class PathState(NamedTuple):
     ramping: jax.Array
     level: jax.Array
     on_ramp: jax.Array
+    at_level: jax.Array
+    ramped: jax.Array
     entering: jax.Array
 
     @property
@@ -142,6 +146,8 @@ class LoadingPath:
             ramping=(entering | (newton.error > NEAR)) & newton.running & self.ramps,
             level=jnp.ones(()),
             on_ramp=jnp.zeros((), dtype=int),
+            at_level=jnp.zeros((), dtype=int),
+            ramped=jnp.zeros((), dtype=int),
             entering=entering,
         )
 
@@ -161,8 +167,10 @@ class LoadingPath:
         stiffening, geometric = _stiffnesses(
             state.level, state.route, state.on_ramp, state.newton.error
         )
-        mip = self._mip(state.level).step(state.mip, stiffening, geometric)
-        return _after_ramp_step(state, mip, self.options.max_iterations)
+        # A start whose tangent is indefinite is left for rest.
+        again = state.route != Route.WARM
+        mip = self._mip(state.level).step(state.mip, stiffening, geometric, again)
+        return _after_ramp_step(state, mip)
 
     def newton_step(self, state: PathState) -> PathState:
         """One iteration of Newton's method."""
@@ -178,7 +186,7 @@ class LoadingPath:
             level = _first_level(state.route)
             mip = self._mip(level).begin(before.u)
         newton = newton._replace(iterations=before.iterations, factorisations=before.factorisations)
-        return _entered(newton, mip, state.route, state.ramping, level)
+        return _entered(newton, mip, state.route, state.ramping, level, state.ramped)
 
 
 @partial(jax.jit, static_argnames="ramps")
@@ -206,47 +214,32 @@ def _stiffnesses(
     return jnp.where(first, 0.0, level), jnp.where(first, 0.0, 1.0)
 
 
-@jax.jit
-def _judged(
-    level: jax.Array,
-    route: jax.Array,
-    on_ramp: jax.Array,
-    error: jax.Array,
-    fraction: jax.Array,
-    definite: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _judged(state: PathState, mip: MipState) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Next level of a ramp after a step; whether the ramp is lost, and whether it is left."""
-    _, increment, steps = jnp.array(_RAMPS)[route]
-    sound = (fraction > 0.0) & jnp.isfinite(error) & definite
-    found = sound & (level == 1.0) & (error <= NEAR)
-    lost = ~sound | (~found & (on_ramp + 1 >= steps))
-    higher = jnp.minimum(1.0, level + increment)
-    return jnp.where(error < _CARRIED, higher, level), lost, lost | found
+    _, increment, steps = jnp.array(_RAMPS)[state.route]
+    sound = (mip.fraction > 0.0) & jnp.isfinite(mip.error) & mip.definite
+    found = sound & (state.level == 1.0) & (mip.error <= NEAR)
+    spent = (state.on_ramp + 1 >= steps) | (state.at_level + 1 >= _MOST_AT_LEVEL)
+    higher = jnp.minimum(1.0, state.level + increment)
+    level = jnp.where(mip.error < _CARRIED, higher, state.level)
+    lost = ~sound | (~found & spent)
+    return level, lost, lost | found
 
 
-@partial(jax.jit, static_argnames="most")
-def _after_ramp_step(state: PathState, mip: MipState, most: int) -> PathState:
-    """The state after a step of the stress iterates; ``most`` iterations are allowed."""
-    level, lost, leaves = _judged(
-        state.level, state.route, state.on_ramp, mip.error, mip.fraction, mip.definite
-    )
+@jax.jit
+def _after_ramp_step(state: PathState, mip: MipState) -> PathState:
+    """The state after a step of the stress iterates."""
+    level, lost, leaves = _judged(state, mip)
     newton = state.newton
-    iterations = newton.iterations + 1
-    ended = jnp.asarray(Status.ITERATION_LIMIT, newton.status.dtype)
-    status = jnp.where(iterations >= most, ended, newton.status)
-    leaves &= status == Status.RUNNING
     return state._replace(
-        newton=newton._replace(
-            u=jnp.where(leaves, jnp.where(lost, 0.0, mip.u), newton.u),
-            iterations=iterations,
-            factorisations=newton.factorisations + 1,
-            status=status,
-        ),
+        newton=newton._replace(u=jnp.where(leaves, jnp.where(lost, 0.0, mip.u), newton.u)),
         mip=mip,
         route=jnp.where(leaves & lost, state.route + 1, state.route),
         ramping=jnp.where(leaves, lost, state.ramping),
         level=level,
         on_ramp=state.on_ramp + 1,
+        ramped=state.ramped + 1,
+        at_level=jnp.where(level > state.level, 0, state.at_level + 1),
         entering=leaves,
     )
 
@@ -284,6 +277,7 @@ def _entered(
     route: jax.Array,
     ramping: jax.Array | bool,
     level: jax.Array,
+    ramped: jax.Array,
 ) -> PathState:
     """The state on ``route``, Newton's method and stress iterates begun."""
     ramps = mip is not None
@@ -302,6 +296,8 @@ def _entered(
         ramping=ramping & newton.running & (route < Route.CLIMB) & ramps,
         level=level,
         on_ramp=jnp.zeros((), dtype=int),
+        at_level=jnp.zeros((), dtype=int),
+        ramped=ramped,
         entering=jnp.array(False),
     )
 
@@ -322,4 +318,8 @@ def find_equilibrium(
     """
     path = LoadingPath(system, options, theta)
     state = while_loop(lambda state: state.running, path.step, path.begin(start))
-    return state.newton.solution()
+    found = state.newton.solution()
+    return found._replace(
+        iterations=found.iterations + state.ramped,
+        factorisations=found.factorisations + state.ramped,
+    )

@@ -90,13 +90,17 @@ class MipNewton:
         return MipState(u, _measures_of(self.system, u), unknown, jnp.ones(()), jnp.array(True))
 
     def step(
-        self, state: MipState, stiffening: jax.Array, geometric: jax.Array | float = 1.0
+        self,
+        state: MipState,
+        stiffening: jax.Array,
+        geometric: jax.Array | float = 1.0,
+        again: jax.Array | bool = False,
     ) -> MipState:
         """One iteration.
 
         Its tangent has ``stiffening`` times the stiffness of the loads, and that of the stresses as
         at rest plus ``geometric`` times what they have changed since. With neither it is definite
-        for most laws, however rough the field; an indefinite one is tried again so.
+        for most laws, however rough the field; ``again`` tries so where it is not.
         """
         first = _Tried(state.u, jnp.array(False), jnp.array(0))
 
@@ -116,7 +120,8 @@ class MipNewton:
             move, definite = _promised_step(self.system, solvable, residual, full, outcome)
             return _Tried(move, definite, before.tries + 1)
 
-        tried = while_loop(lambda t: ~t.definite & (t.tries < 2), attempt, first)
+        most = jnp.where(again, 2, 1)
+        tried = while_loop(lambda t: ~t.definite & (t.tries < most), attempt, first)
         lost = state._replace(fraction=jnp.zeros(()), definite=tried.definite)
         return cond(tried.definite, lambda: self._moved(state, tried.move), lambda: lost)
 
