@@ -76,7 +76,9 @@ def test_a_discrepancy_is_switched_on_by_name(beam):
 
 
 def test_synthetic_data_has_the_noise_of_the_run(beam, monkeypatch):
-    monkeypatch.setattr("calibrate.workflow.simulator_of", linear_forward)
+    monkeypatch.setattr(
+        "calibrate.workflow.simulator_of", lambda scene, load_steps: linear_forward(scene)
+    )
     word = {"kind": "correlated", "length": 500.0, "sd": 1e-9, "spatial_sd": 1.0}
     observe, noisy = make_data(run_of(noise={"displacement": word}), beam)
     _, exact = make_data(run_of(noise={"displacement": 1e-12}), beam)
