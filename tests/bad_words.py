@@ -221,6 +221,8 @@ INFERENCES = [
     ("--truth mu=73 lam=61 --fem-runs 9", "--fem-runs has no effect without --forward reduced"),
     ("--truth mu=73 lam=61 --forward reduced --fem-runs 0", "fem_runs is 0; it must be 3 or more"),
     ("--truth mu=73 lam=61 --error-runs -1", "error_runs is -1; it must be 0 or more"),
+    ("--truth mu=73 lam=61 --mesh-error -1", "mesh_error_runs is -1; it must be 0 or more"),
+    ("--truth mu=73 lam=61 --load-steps 0", "load_steps is 0; it must be 1 or more"),
     ("--truth mu=73 lam=61 --known E=3", "has no parameter 'E'; it has mu, lam"),
     ("--truth mu=73 lam=61 --prior luck", "prior 'luck' is unknown; known: box, ventricles"),
     ("--data missing.csv", "missing.csv does not exist"),

@@ -61,6 +61,28 @@ def test_the_density_is_that_of_the_sum_of_noise_and_error(aware, truth):
     assert float(found) == pytest.approx(wanted + prior, rel=1e-9)
 
 
+def test_fem_on_the_mesh_shares_the_error_of_the_mesh_only(aware, truth):
+    """Against SciPy's normal; the error of the map alone leaves FEM's likelihood as it is."""
+    data = aware.check_data(np.asarray(truth.at(NODES)(TRUTH)))
+    draw = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}
+    means = aware.predict(draw)[0]
+    size = float(aware.error.size(jnp.array([70.0, 81.0])))
+    of_noise = NOISE**2 * np.eye(aware.error.modes.shape[1])
+    of_mesh = size**2 * aware.error.modes.T @ aware.error.modes
+    whole = replace(aware, error=replace(aware.error, of_mesh=True))
+    mean, y = (np.ravel(d["displacement"]) for d in (means, data))
+    for model, covariance in ((aware, of_noise), (whole, of_noise + of_mesh)):
+        found = float(model.fem_log_likelihood(draw, means, data))
+        assert found == pytest.approx(multivariate_normal(mean, covariance).logpdf(y), rel=1e-9)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    moved = jax.vmap(lambda key: whole.fem_means(key, draw, means)["displacement"])(keys)
+    spread = np.cov(np.asarray(moved).reshape(len(keys), -1).T)
+    np.testing.assert_allclose(spread, of_mesh, atol=0.1 * np.abs(of_mesh).max())
+    again = ApproximationError.restore(whole.error.arrays())
+    assert again.of_mesh
+    assert again.fingerprint == whole.error.fingerprint != aware.error.fingerprint
+
+
 def test_the_covariance_is_that_of_the_errors():
     """Errors of one size everywhere: their second moment."""
     rng = np.random.default_rng(0)

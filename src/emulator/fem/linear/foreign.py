@@ -11,14 +11,22 @@ JAX's cache on disk; 15 microseconds a call (docs/experiments.md, "A refusal tha
 from __future__ import annotations
 
 import ctypes
+import sys
+from _thread import interrupt_main
 from collections.abc import Callable
 from math import prod
+from threading import Timer
 from typing import Any
 
 import jax
 
 Classify = Callable[[str], int | None]
 """An error's message to the number to report; None to let the error end the program."""
+
+INTERRUPTED = -1
+"""What is reported where Python raised in between."""
+
+_AGAIN = 0.05  # seconds after which an interrupt is repeated
 
 
 class _Buffer(ctypes.Structure):
@@ -84,7 +92,6 @@ class _ErrorArguments(ctypes.Structure):
 
 _HANDLER = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 _OF_ERRORS = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
-_NAN = float("nan")
 
 _get_name = ctypes.pythonapi.PyCapsule_GetName
 _get_name.restype, _get_name.argtypes = ctypes.c_char_p, (ctypes.py_object,)
@@ -109,6 +116,19 @@ def register(target: str, capsule: Any, classify: Classify) -> None:
         if frame.extension or frame.results_count != 2:  # XLA asks about the function itself
             return inner(address)
         told = ctypes.cast(_result(frame, 1).data, ctypes.POINTER(ctypes.c_int32))
+        try:
+            return told_by(frame, address, told)
+        except BaseException as error:  # it must not leave: ctypes would return what is no pointer
+            frame.results_count = 2
+            _fill(_result(frame, 0))
+            told[0] = INTERRUPTED
+            if isinstance(error, KeyboardInterrupt):
+                Timer(_AGAIN, interrupt_main).start()  # where the program has ended
+            else:
+                sys.excepthook(type(error), error, error.__traceback__)
+            return None
+
+    def told_by(frame: _CallFrame, address: int, told: Any) -> int | None:
         frame.results_count = 1
         error = inner(address)
         frame.results_count = 2
@@ -139,7 +159,6 @@ def _result(frame: _CallFrame, number: int) -> _Buffer:
 
 
 def _fill(buffer: _Buffer) -> None:
-    """Write NaN everywhere."""
+    """Write NaN everywhere: all bits are one."""
     count = prod(buffer.shape[k] for k in range(buffer.rank))
-    numbers = (ctypes.c_double * count).from_address(buffer.data)
-    numbers[:] = [_NAN] * count
+    ctypes.memset(buffer.data, 0xFF, 8 * count)

@@ -77,10 +77,10 @@ class Pattern:
         return jnp.all(jnp.isfinite(values)) & jnp.all(rows >= _LEAST_ROW)
 
     def safe_values(self, values: jax.Array) -> jax.Array:
-        """``values`` that UMFPACK does not raise on; the identity's where they are not solvable.
+        """``values`` to factorise; the identity's where they are not solvable.
 
-        UMFPACK raises on NaN, and on a pivot that is exactly zero. A diagonal larger by round-off
-        makes such a pivot tiny instead, and the step so long that Newton's method rejects it. Apply
+        A pivot that is exactly zero leaves no solution. A diagonal larger by round-off makes it
+        tiny, and the step so long that Newton's method rejects it. Apply
         once to each tangent (docs/experiments.md, "A tangent that was never the same").
         """
         diagonal = jnp.asarray(self.rows == self.columns, dtype=values.dtype)

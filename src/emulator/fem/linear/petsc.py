@@ -52,38 +52,27 @@ class Petsc:
         """Raise :class:`InputError` where PETSc or MUMPS is missing."""
         petsc()
 
-    def cholesky(
-        self, structure: Structure, values: jax.Array, rhs: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """By LDL^T whose pivots must be positive."""
-        return _solved(structure, values, rhs, definite=True, transposed=False)
-
-    def lu(
+    def solve(
         self,
         structure: Structure,
         values: jax.Array,
         rhs: jax.Array,
         *,
+        definite: bool,
         transposed: bool = False,
     ) -> tuple[jax.Array, jax.Array]:
-        """By LDL^T, or LU where the structure is not symmetric."""
+        """By LDL^T, whose pivots must be positive where ``definite``, or LU."""
         transposed = transposed and not structure.upper
-        return _solved(structure, values, rhs, definite=False, transposed=transposed)
+        numbers = partial(_numbers, structure, definite=definite, transposed=transposed)
+        if not any(isinstance(x, jax.core.Tracer) for x in (values, rhs)):
+            x, outcome = numbers(values, rhs)
+            return jnp.asarray(x), jnp.asarray(outcome)
+        shapes = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype), jax.ShapeDtypeStruct((), jnp.int32)
+        x, outcome = jax.pure_callback(numbers, shapes, values, rhs, vmap_method="sequential")
+        return x, outcome
 
 
 PETSC = Petsc()
-
-
-def _solved(
-    structure: Structure, values: jax.Array, rhs: jax.Array, *, definite: bool, transposed: bool
-) -> tuple[jax.Array, jax.Array]:
-    numbers = partial(_numbers, structure, definite=definite, transposed=transposed)
-    if not any(isinstance(x, jax.core.Tracer) for x in (values, rhs)):
-        x, outcome = numbers(values, rhs)
-        return jnp.asarray(x), jnp.asarray(outcome)
-    shapes = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype), jax.ShapeDtypeStruct((), jnp.int32)
-    x, outcome = jax.pure_callback(numbers, shapes, values, rhs, vmap_method="sequential")
-    return x, outcome
 
 
 def _numbers(

@@ -62,22 +62,18 @@ class Direct(Protocol):
         """Make its library ready; :class:`InputError` where it is not installed."""
         ...
 
-    def cholesky(
-        self, structure: Structure, values: jax.Array, rhs: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """``x`` with ``A x = rhs``, (size,) or (size, k), and the :class:`Outcome`, int32 ().
-
-        ``A`` is symmetric, its upper triangle given. INDEFINITE unless it is positive definite.
-        """
-        ...
-
-    def lu(
+    def solve(
         self,
         structure: Structure,
         values: jax.Array,
         rhs: jax.Array,
         *,
+        definite: bool,
         transposed: bool = False,
     ) -> tuple[jax.Array, jax.Array]:
-        """The same for any matrix, or its transpose."""
+        """``x`` with ``A x = rhs``, (size,) or (size, k), and the :class:`Outcome`, int32 ().
+
+        definite : INDEFINITE unless ``A``, its upper triangle given, is positive definite.
+        transposed : solve with the transpose.
+        """
         ...

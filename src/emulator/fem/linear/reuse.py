@@ -57,7 +57,7 @@ class KeptFactor:
         self._steps = max(_PATIENCE, as_long)
         jit = (lambda function: function) if direct.on_host else jax.jit
         self._product = jax.jit(pattern.product)
-        self._factorised = jit(partial(direct.cholesky, pattern))
+        self._factorised = jit(partial(direct.solve, pattern, definite=True))
         self._beside = jit(self._conjugate_gradients)
         self.factorisations = 0
 

@@ -18,8 +18,7 @@ def attempt(
 
     A symmetric matrix has to be positive definite.
     """
-    way = direct.cholesky if pattern.upper else direct.lu
-    return way(pattern, values, rhs)
+    return direct.solve(pattern, values, rhs, definite=pattern.upper)
 
 
 def solve(direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array) -> jax.Array:
@@ -46,7 +45,8 @@ def solve(direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array) -
 def _any(
     direct: Direct, pattern: Pattern, values: jax.Array, b: jax.Array, *, transposed: bool
 ) -> jax.Array:
+    general = partial(direct.solve, pattern, values, b, definite=False)
     if not pattern.upper:
-        return direct.lu(pattern, values, b, transposed=transposed)[0]
-    x, outcome = direct.cholesky(pattern, values, b)
-    return cond(outcome == Outcome.INDEFINITE, lambda: direct.lu(pattern, values, b)[0], lambda: x)
+        return general(transposed=transposed)[0]
+    x, outcome = attempt(direct, pattern, values, b)
+    return cond(outcome == Outcome.INDEFINITE, lambda: general()[0], lambda: x)

@@ -29,10 +29,6 @@ def _outcome(message: str) -> int | None:
     return int(Outcome.SINGULAR) if "singular" in message else None
 
 
-register(_CHOLMOD, sparsax_cpp.solve_f64_capsule(), _outcome)
-register(_UMFPACK, sparsax_cpp.umf_solve_f64_capsule(), _outcome)
-
-
 @cache
 def _made_ready() -> None:
     """Once a process.
@@ -45,6 +41,8 @@ def _made_ready() -> None:
     that recur. Ours recur only in consecutive solves, and a factor of a large mesh takes a
     gigabyte.
     """
+    register(_CHOLMOD, sparsax_cpp.solve_f64_capsule(), _outcome)
+    register(_UMFPACK, sparsax_cpp.umf_solve_f64_capsule(), _outcome)
     for library in ThreadpoolController().lib_controllers:
         if "sparsax" in library.filepath:
             library.set_num_threads(1)
@@ -68,37 +66,30 @@ class SuiteSparse:
         """Always there."""
         _made_ready()
 
-    def cholesky(
-        self, structure: Structure, values: jax.Array, rhs: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """By CHOLMOD."""
-        return _call(_CHOLMOD, structure.rows, structure.columns, values, rhs, mode=np.int64(0))
-
-    def lu(
+    def solve(
         self,
         structure: Structure,
         values: jax.Array,
         rhs: jax.Array,
         *,
+        definite: bool,
         transposed: bool = False,
     ) -> tuple[jax.Array, jax.Array]:
-        """By UMFPACK, which takes both triangles."""
-        return _call(_UMFPACK, *structure.both(values), rhs, trans=np.int64(transposed))
+        """By CHOLMOD, or by UMFPACK, which takes both triangles."""
+        if definite:
+            matrix = structure.rows, structure.columns, values
+            return _call(_CHOLMOD, matrix, rhs, mode=np.int64(0))
+        return _call(_UMFPACK, structure.both(values), rhs, trans=np.int64(transposed))
 
 
 SUITESPARSE = SuiteSparse()
 
 
 def _call(
-    target: str,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    values: jax.Array,
-    rhs: jax.Array,
-    **flags: Any,
+    target: str, matrix: tuple[np.ndarray, np.ndarray, jax.Array], rhs: jax.Array, **flags: Any
 ) -> tuple[jax.Array, jax.Array]:
     _made_ready()
     shapes = jax.ShapeDtypeStruct(rhs.shape, jnp.float64), jax.ShapeDtypeStruct((), jnp.int32)
     call = jax.ffi.ffi_call(target, shapes, vmap_method="sequential")
-    x, outcome = call(rows, columns, values, rhs, **flags)
+    x, outcome = call(*matrix, rhs, **flags)
     return x, outcome

@@ -64,31 +64,6 @@ def test_without_petsc_one_line_says_what_to_install(monkeypatch):
 
 
 @pytest.mark.usefixtures("petsc")
-@pytest.mark.parametrize("shift", [8.0, 0.0])
-@pytest.mark.parametrize("symmetric", [True, False])
-def test_solves_and_derivatives_are_those_of_the_dense_matrix(shift, symmetric):
-    A, pattern, values, b = matrix(shift=shift, symmetric=symmetric)
-    solve = partial(solve_any, PETSC, pattern)
-    expected = np.linalg.solve(A, b)
-    np.testing.assert_allclose(solve(values, b), expected, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(jax.jit(solve)(values, b), expected, rtol=1e-9, atol=1e-9)
-    both = jnp.stack([b, 2.0 * b], axis=1)
-    np.testing.assert_allclose(solve(values, both)[:, 1], 2.0 * expected, rtol=1e-9, atol=1e-9)
-    in_rows = jax.vmap(solve, in_axes=(None, 0))(values, both.T)
-    np.testing.assert_allclose(in_rows[1], 2.0 * expected, rtol=1e-9, atol=1e-9)
-
-    # d/db (c . x) = A^-T c, and d/dA_ij = -(A^-T c)_i x_j, twice over where A_ij is also A_ji.
-    c = np.linspace(0.0, 1.0, len(b))
-    by_values, by_rhs = jax.jit(jax.grad(lambda v, r: c @ solve(v, r), argnums=(0, 1)))(values, b)
-    adjoint = np.linalg.solve(A.T, c)
-    slope = -np.outer(adjoint, expected)
-    slope = slope + slope.T - np.diag(np.diag(slope)) if symmetric else slope
-    np.testing.assert_allclose(by_rhs, adjoint, rtol=1e-9, atol=1e-9)
-    at = slope[pattern.rows, pattern.columns]
-    np.testing.assert_allclose(by_values, at, rtol=1e-9, atol=1e-8)
-
-
-@pytest.mark.usefixtures("petsc")
 def test_inertia_tells_a_definite_matrix_from_an_indefinite_one():
     A, pattern, values, b = matrix(shift=0.0)
     assert np.linalg.eigvalsh(A)[0] < 0.0
@@ -113,7 +88,7 @@ def test_inertia_tells_a_definite_matrix_from_an_indefinite_one():
 @pytest.mark.usefixtures("petsc")
 def test_a_singular_matrix_is_named():
     _, pattern, values, b = matrix()
-    x, outcome = PETSC.lu(pattern, 0.0 * values, b)
+    x, outcome = PETSC.solve(pattern, 0.0 * values, b, definite=False)
     assert outcome == Outcome.SINGULAR
     assert np.isnan(x).all()
     # The next matrix is not harmed.
