@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
-from emulator.scenes.beams import BEAM, SIZES, Cells
+from emulator.scenes.beams import Cells, beam_mesh
 from emulator.scenes.left_ventricle import MYOCARDIUM
 from emulator.scenes.loads import Traction
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.resolution import resolved
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 
@@ -24,9 +22,9 @@ def _beam(
     fibre_angle: float,
     kappa: float,
     order: int,
+    grading: float | None,
 ) -> Scene:
-    made = resolved(SIZES, order, cells=cells)
-    mesh = box(BEAM, **made)
+    mesh, made = beam_mesh(cells, order, grading, ("left",))
     angle = np.radians(fibre_angle)
     return Scene(
         name=name,
@@ -39,8 +37,7 @@ def _beam(
         fibres=np.tile([np.cos(angle), np.sin(angle), 0.0], (len(mesh.elements), 1)),
         origin={
             "scene": name,
-            "cells": list(made["cells"]),
-            "order": order,
+            **made,
             "traction": traction,
             "fibre_angle": fibre_angle,
             "kappa": kappa,
@@ -54,6 +51,7 @@ def traction_beam_holzapfel_ogden(
     fibre_angle: float = 0.0,
     kappa: float = 25.0,
     order: int = 2,
+    grading: float | None = None,
 ) -> Scene:
     """A 100 x 10 x 10 mm Holzapfel-Ogden beam, one end held, the other pulled up.
 
@@ -67,10 +65,12 @@ def traction_beam_holzapfel_ogden(
     traction : along z on the free end, per reference area, kPa.
     fibre_angle : degrees from the beam's axis x towards y; any but 0 and 90 makes it twist.
     kappa : resistance to volume change, kPa.
-    order : of the elements.
+    order, grading : of the elements, as in :func:`~emulator.scenes.beams.once_clamped_beam`.
     """
     name = "traction_beam_holzapfel_ogden"
-    return _beam(name, "holzapfel_ogden", MYOCARDIUM, cells, traction, fibre_angle, kappa, order)
+    return _beam(
+        name, "holzapfel_ogden", MYOCARDIUM, cells, traction, fibre_angle, kappa, order, grading
+    )
 
 
 def traction_beam_guccione(
@@ -79,6 +79,7 @@ def traction_beam_guccione(
     fibre_angle: float = 0.0,
     kappa: float = 50.0,
     order: int = 2,
+    grading: float | None = None,
 ) -> Scene:
     """A 100 x 10 x 10 mm Guccione beam, one end held, the other pulled up.
 
@@ -92,7 +93,7 @@ def traction_beam_guccione(
     traction : along z on the free end, per reference area, kPa.
     fibre_angle : degrees from the beam's axis x towards y; any but 0 and 90 makes it twist.
     kappa : resistance to volume change, kPa.
-    order : of the elements.
+    order, grading : of the elements, as in :func:`~emulator.scenes.beams.once_clamped_beam`.
     """
     parameters = (
         Parameter("C", "kPa", 1.0, 4.0, "log"),
@@ -101,4 +102,4 @@ def traction_beam_guccione(
         Parameter("b_fs", "", 2.0, 8.0, "log"),
     )
     name = "traction_beam_guccione"
-    return _beam(name, "guccione", parameters, cells, traction, fibre_angle, kappa, order)
+    return _beam(name, "guccione", parameters, cells, traction, fibre_angle, kappa, order, grading)

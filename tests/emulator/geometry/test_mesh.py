@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from emulator.errors import InputError
-from emulator.geometry.bodies.box import box
+from emulator.geometry.bodies.box import box, toward_ends
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import orient, signed_volumes
@@ -21,6 +21,27 @@ def test_box_fills_its_volume_with_positive_elements():
     assert volumes.sum() == pytest.approx(24.0)
     np.testing.assert_array_equal(mesh.nodes[mesh.node_set("right"), 0], 2.0)
     assert len(mesh.node_set("top")) == 3 * 4
+
+
+@pytest.mark.parametrize(
+    ("ends", "expected"),
+    [
+        (("left",), [0.0, 1 / 16, 4 / 16, 9 / 16, 1.0]),
+        (("right",), [0.0, 7 / 16, 12 / 16, 15 / 16, 1.0]),
+        (("left", "right"), [0.0, 1 / 8, 1 / 2, 7 / 8, 1.0]),
+    ],
+)
+def test_cells_of_a_box_are_shorter_where_it_is_held(ends, expected):
+    np.testing.assert_allclose(toward_ends(4, 2.0, ends), expected)
+    mesh = box((10.0, 1.0, 1.0), (4, 1, 1), 2, toward_ends(4, 2.0, ends))
+    corners = np.unique(mesh.nodes[np.unique(mesh.elements[:, :4]), 0])
+    np.testing.assert_allclose(corners, 10.0 * np.array(expected))
+    assert discretise(mesh).weights.sum() == pytest.approx(10.0)
+
+
+def test_cells_that_are_longer_where_a_box_is_held_are_refused():
+    with pytest.raises(InputError, match=r"grading of cells is 0\.5; expected 1 \(even\) or more"):
+        toward_ends(4, 0.5, ("left",))
 
 
 def test_orient_swaps_only_what_is_inverted():

@@ -1,5 +1,6 @@
 """Solves and their outcomes, in Python, inside ``jit``, ``vmap`` and loops."""
 
+import signal
 import time
 from functools import partial
 
@@ -114,6 +115,15 @@ def test_other_failures_still_end_the_program():
         jax.block_until_ready(call(pattern.rows, pattern.columns, values, b, mode=np.int64(0)))
 
 
+@pytest.fixture
+def interruptible():
+    """Ctrl-C raises, as it does from a terminal; in the background it would be ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_what_python_raises_in_between_is_no_answer():
     """Ctrl-C in the middle of a solve: NaN, and the interrupt as soon as the program has ended."""
     import sparsax_cpp
