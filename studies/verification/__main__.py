@@ -22,6 +22,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results, parser, save
+from studies.common.two_meshes import on_mesh, on_two_meshes
 
 import calibrate as cal
 import emulator as em
@@ -33,7 +34,6 @@ from emulator.fem import Simulator, run_campaign
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene
-from emulator.scenes.finer import finer
 from emulator.scenes.left_ventricle import HELIX, PRESSURE
 
 HERE = Path(__file__).parent
@@ -129,29 +129,12 @@ TRUTHS: dict[str, Callable[[], Scene]] = {
 }
 
 
-def on_two_meshes(scene: Scene) -> Callable[[Path], em.Emulator]:
-    """Trains on ``scene`` and on the next finer mesh."""
-    on_mesh = replace(em.recipe("mechanics"), simulations=200)
-
-    def made(folder: Path) -> em.Emulator:
-        start = em.train(scene, on_mesh, folder)
-        return em.train(finer(scene).scene, em.recipe("two_meshes"), folder / "finer", start=start)
-
-    return made
-
-
-def linear_ventricle(folder: Path) -> em.Emulator:
-    """Trains on linear elements."""
-    plan = replace(em.recipe("mechanics"), simulations=200)
-    return em.train(em.scenes.left_ventricle(order=1), plan, folder)
-
-
 # Emulators that are not shipped.
 MADE: dict[str, Callable[[Path], em.Emulator]] = {
-    "ventricle_two_meshes": on_two_meshes(em.scenes.left_ventricle(8, 16, 1)),
-    "beam_two_meshes": on_two_meshes(em.scenes.once_clamped_beam()),
-    "liver_two_meshes": on_two_meshes(em.scenes.liver(shells=4)),
-    "linear_ventricle": linear_ventricle,
+    "ventricle_two_meshes": lambda at: on_two_meshes(em.scenes.left_ventricle(8, 16, 1), at).fine,
+    "beam_two_meshes": lambda at: on_two_meshes(em.scenes.once_clamped_beam(), at).fine,
+    "liver_two_meshes": lambda at: on_two_meshes(em.scenes.liver(shells=4), at).fine,
+    "linear_ventricle": lambda at: on_mesh(em.scenes.left_ventricle(order=1), at),
 }
 
 
