@@ -8,7 +8,7 @@ r"""Residual and tangent of a scene's potential energy over its free degrees of 
 with :math:`B` the shape-function gradients. Dead loads have no tangent; elastic supports and loads
 that follow the deformation add the Hessians of their own potentials, or the derivatives of their
 forces, facet by facet. With mean dilatation the points of a block are coupled; its tangent is in
-:mod:`emulator.fem.mixed`.
+:mod:`emulator.fem.condensation`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.fem.condensation import block_derivatives
 from emulator.fem.functional import (
     DeadForce,
     at_points,
@@ -30,7 +31,8 @@ from emulator.fem.functional import (
     displacement_gradient,
     local_forces,
     local_terms,
-    pair_matrices,
+    pair_products,
+    seen_by_law,
     spring_terms,
     strain_energy,
     volume_ratio,
@@ -45,8 +47,7 @@ from emulator.fem.linear import (
 )
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.solve import attempt, solve
-from emulator.fem.material_point import moduli
-from emulator.fem.mixed import Condensed, consistent, linearise
+from emulator.fem.material_point import stress_and_moduli
 from emulator.fem.programs import compiled
 from emulator.scenes.local_terms import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
@@ -104,8 +105,8 @@ class System:
         free_index = np.full(self.scene.held.size, -1)
         free_index[self.free] = np.arange(len(self.free))
         local: list[LocalTerm | LocalForce] = [*self.springs, *self.terms, *self.forces]
-        bulk = whole_blocks if self.mixed else upper_blocks
-        groups = [bulk(self.scene.blocks.connectivity), *(whole_blocks(p.nodes) for p in local)]
+        bulk = upper_blocks(self.scene.blocks.connectivity)
+        groups = [bulk, *(whole_blocks(part.nodes) for part in local)]
         return block_pattern(groups, free_index, symmetric=not self.forces)
 
     @cached_property
@@ -177,26 +178,6 @@ class System:
         """Residual (f,) in mN: internal less ``load`` times external force, free entries."""
         return self.restrict(self.internal_force(u, theta) - load * self.external_force(u, theta))
 
-    @property
-    def mixed(self) -> bool:
-        """Whether each block has a volume and a pressure as unknowns."""
-        return self.scene.dilatation != "pointwise"
-
-    def mixed_residual(
-        self,
-        u: jax.Array,
-        theta: jax.Array,
-        load: jax.Array | float,
-        condensed: Condensed,
-        move: jax.Array,
-    ) -> tuple[jax.Array, jax.Array]:
-        """Residual (f,) with the volumes eliminated, and its change along ``move`` (n, 3)."""
-        nodes = self.scene.blocks.connectivity
-        force, change = jax.jvp(lambda v: self.others(v, theta, load), (u,), (move,))
-        local = move[nodes].reshape(len(nodes), -1)
-        change = change + self.scatter(jnp.einsum("mij,mj->mi", condensed.tangent, local))
-        return self.restrict(self.scatter(condensed.force) + force), self.restrict(change)
-
     def scatter(self, local: jax.Array) -> jax.Array:
         """Nodal sums (n, 3) of the blocks' vectors (b, ...)."""
         nodes = self.scene.blocks.connectivity
@@ -225,24 +206,79 @@ class System:
         return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
 
     def bulk(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Second derivatives (b, ...) of the strain energy, block by block, as in the pattern."""
+        """Second derivatives (b, pairs, 3, 3) of the strain energy, mN/mm, as in the pattern."""
         scene = self.scene
-        if self.mixed:
-            return linearise(scene, u, consistent(scene, u, theta), theta).tangent
-        H = displacement_gradient(scene, u)
-        return self.element_blocks(at_points(scene, moduli(scene, theta), H))
+        H = seen_by_law(scene, displacement_gradient(scene, u))
+        law = stress_and_moduli(scene, theta)
+        stress, moduli = at_points(scene, law, H, tissue=scene.block_tissue)
+        return block_derivatives(scene, u, stress, moduli)[1]
 
-    def element_blocks(self, A: jax.Array) -> jax.Array:
-        """Blocks (m, pairs, 3, 3) in mN/mm from the moduli ``A = d2W/dH2`` (m, q, 3, 3, 3, 3)."""
-        return pair_matrices(self.scene.discretisation, A)
+    def equations(
+        self,
+        bulk: jax.Array,
+        u: jax.Array,
+        theta: jax.Array,
+        stiffening: jax.Array | float,
+        level: jax.Array | float,
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Tangent that a solver does not raise on, whether it is the tangent's, and the pull.
+
+        bulk : tangents (b, pairs, 3, 3) of the blocks. stiffening : level of the loads whose
+        stiffness is in the tangent. The pull (f,) in mN is what the tangent makes of the way that
+        the supports have to the load level ``level``.
+        """
+        K, scene = self.assemble(bulk, u, theta, stiffening), self.scene
+        offset = self.support_offset(u, level)
+
+        def pulled() -> jax.Array:
+            force = self.scatter(pair_products(bulk, offset[scene.blocks.connectivity]))
+            others = jax.jvp(lambda v: self.others(v, theta, stiffening), (u,), (offset,))[1]
+            return self.restrict(force + others)
+
+        nothing = jnp.zeros(len(self.free))
+        pull = jax.lax.cond(jnp.any(offset != 0.0), pulled, lambda: nothing)
+        return self.pattern.safe_values(K), self.pattern.solvable(K), pull
 
     @compiled
+    def step_equations(
+        self,
+        u: jax.Array,
+        theta: jax.Array,
+        stiffening: jax.Array | float,
+        level: jax.Array | float,
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """:meth:`equations` of the strain energy's own tangent."""
+        return self.equations(self.bulk(u, theta), u, theta, stiffening, level)
+
     def safe_tangent(
         self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
     ) -> tuple[jax.Array, jax.Array]:
         """Nonzeros (nnz,) that a solver does not raise on, and whether they are the tangent's."""
-        tangent = self.tangent(u, theta, load)
-        return self.pattern.safe_values(tangent), self.pattern.solvable(tangent)
+        return self.step_equations(u, theta, load, load)[:2]
+
+    def support_offset(self, u: jax.Array, level: jax.Array | float) -> jax.Array:
+        """Distance (n, 3) in mm of the held displacements from their values at ``level``."""
+        wanted = level * jnp.asarray(self.scene.held_displacement)
+        # Comparing first: fused multiply-add finds the last bit of the product missing in the
+        # difference (docs/experiments.md, "A fused multiply-add").
+        return jnp.where(self.scene.held & (u != wanted), wanted - u, 0.0)
+
+    @compiled
+    def supports_met(self, u: jax.Array, level: jax.Array) -> jax.Array:
+        """Whether the held displacements of ``u`` (n, 3) are those of ``level``, shape ()."""
+        return jnp.all(self.support_offset(u, level) == 0.0)
+
+    def level_balance(
+        self, u: jax.Array, theta: jax.Array, level: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """:func:`balance`, its relative size infinite unless finite and the supports are met."""
+        residual, error = balance(self, u, theta, level)
+        return residual, self._where_met(u, level, error)
+
+    @compiled
+    def _where_met(self, u: jax.Array, level: jax.Array, error: jax.Array) -> jax.Array:
+        met = jnp.all(self.support_offset(u, level) == 0.0)
+        return jnp.where(met & jnp.isfinite(error), error, jnp.inf)
 
     @compiled
     def least_volume_ratio(self, u: jax.Array) -> jax.Array:
@@ -293,7 +329,7 @@ class System:
     @cached_property
     def kept(self) -> KeptFactor | None:
         """The factor that serves other tangents; None where the matrices are small."""
-        pays = not self.mixed and KeptFactor.pays(self.pattern)
+        pays = self.scene.dilatation == "pointwise" and KeptFactor.pays(self.pattern)
         return KeptFactor(self.direct, self.pattern) if pays else None
 
 

@@ -151,6 +151,16 @@ def pair_matrices(blocks: Blocks, A: jax.Array) -> jax.Array:
     return found[:count]
 
 
+def pair_products(pairs: jax.Array, local: jax.Array) -> jax.Array:
+    """Products (b, a, 3) of symmetric blocks (b, pairs, 3, 3) and vectors ``local`` (b, a, 3)."""
+    one, other = np.triu_indices(local.shape[1])
+    below = jnp.where((one != other)[:, None], local[:, one], 0.0)
+    there = (
+        jnp.zeros_like(local).at[:, one].add(jnp.einsum("bpij,bpj->bpi", pairs, local[:, other]))
+    )
+    return there.at[:, other].add(jnp.einsum("bpij,bpi->bpj", pairs, below))
+
+
 def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
     """``(u, theta) -> int W dX`` in mN mm."""
 
@@ -164,11 +174,18 @@ def energy_of_gradient(
     scene: Scene, H: jax.Array, theta: jax.Array, barriers: Barriers | None = None
 ) -> jax.Array:
     """``int W dX`` in mN mm from the displacement gradient ``H`` (m, q, 3, 3)."""
-    weights, H = scene.blocks.weights, scene.blocks.gather(H)
-    if scene.dilatation != "pointwise":
-        H = jax.vmap(lambda h, w: with_mean_dilatation(h, w, barriers))(H, weights)
     density = point_energy(scene, theta, barriers)
-    return jnp.sum(weights * at_points(scene, density, H, tissue=scene.block_tissue))
+    seen = seen_by_law(scene, H, barriers)
+    values = at_points(scene, density, seen, tissue=scene.block_tissue)
+    return jnp.sum(scene.blocks.weights * values)
+
+
+def seen_by_law(scene: Scene, H: jax.Array, barriers: Barriers | None = None) -> jax.Array:
+    """Displacement gradients (b, q, 3, 3) that the law sees, of those of the elements' points."""
+    H = scene.blocks.gather(H)
+    if scene.dilatation == "pointwise":
+        return H
+    return jax.vmap(lambda h, w: with_mean_dilatation(h, w, barriers))(H, scene.blocks.weights)
 
 
 def spring_terms(scene: Scene) -> list[LocalTerm]:

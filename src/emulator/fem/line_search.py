@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from emulator.fem.assembly import System, balance
 from emulator.fem.direction import Direction
+from emulator.fem.halving import Judge, largest_good
 from emulator.fem.programs import while_loop
 
 _LEAST_FRACTION = 2.0**-19
@@ -32,30 +33,12 @@ _SMALLEST_HALVED = 0.02
 _ROUND_OFF = 1e-13  # of the energy's parts, in which a decrease near the solution drowns
 
 
-class _Trial(NamedTuple):
-    """A fraction of the step, its potential, and the verdicts on it.
-
-    good : whether it is sound and makes progress. sound : whether no element is crushed.
-    crushed : whether twice the fraction was not sound.
-    """
-
-    fraction: jax.Array
-    energy: jax.Array
-    good: jax.Array
-    sound: jax.Array
-    crushed: jax.Array
-
-
 class _Valley(NamedTuple):
     """A fraction of the step, its potential, and whether half of it may be lower."""
 
     fraction: jax.Array
     energy: jax.Array
     falls: jax.Array
-
-
-Judge = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
-"""Of a fraction: whether it makes progress, and its potential, mN mm."""
 
 
 def choose_fraction(
@@ -93,35 +76,13 @@ def choose_fraction(
         return floor < J  # False for NaN
 
     if nearer is not None:
-        trial = _largest_good(sound, lambda f: (nearer(f), jnp.zeros(())), _LEAST_NATURAL)
+        trial = largest_good(sound, lambda f: (nearer(f), jnp.zeros(())), _LEAST_NATURAL)
         return jnp.where(trial.good, trial.fraction, 0.0), trial.crushed
     progress = _progress(system, u, level, theta, direction, potential)
-    trial = _largest_good(sound, progress, _LEAST_FRACTION)
+    trial = largest_good(sound, progress, _LEAST_FRACTION)
     begin = _Valley(trial.fraction, trial.energy, direction.settled & trial.good)
     fraction = _lowest(lambda f: potential(f)[0], begin)
     return jnp.where(trial.good, fraction, 0.0), trial.crushed
-
-
-def largest_sound(sound: Callable[[jax.Array], jax.Array], least: float) -> jax.Array:
-    """The largest of 1, 1/2, 1/4, ... that is ``sound``; 0 where that is below ``least``."""
-    trial = _largest_good(sound, lambda _: (jnp.array(True), jnp.zeros(())), least)
-    return jnp.where(trial.good, trial.fraction, 0.0)
-
-
-def _largest_good(sound: Callable[[jax.Array], jax.Array], judge: Judge, least: float) -> _Trial:
-    """Halve the step until it is sound and makes progress, or would go below ``least``."""
-
-    def halve(trial: _Trial) -> _Trial:
-        fraction = 0.5 * trial.fraction
-        fine, (lower, energy) = sound(fraction), judge(fraction)
-        return _Trial(fraction, energy, fine & lower, fine, ~trial.sound)
-
-    def wanted(trial: _Trial) -> jax.Array:
-        return ~trial.good & (trial.fraction >= 2.0 * least)
-
-    no = jnp.array(False)
-    twice = _Trial(jnp.full((), 2.0), jnp.zeros(()), good=no, sound=~no, crushed=no)
-    return while_loop(wanted, halve, twice)
 
 
 def _lowest(potential: Callable[[jax.Array], jax.Array], begin: _Valley) -> jax.Array:
@@ -158,7 +119,7 @@ def _progress(
         lower = found <= ceiling + fraction * descent
         if system.forces:
             left = balance(system, u + fraction * direction.move, theta, level)[0]
-            before = jnp.sum(direction.residual**2)
+            before = jnp.sum(direction.equations.residual**2)
             lower |= jnp.sum(left**2) < (1.0 - _ARMIJO * fraction) * before
         return lower, found
 

@@ -22,9 +22,9 @@ from emulator.fem.step_length import Outcome
 # Shortened steps after which elements flattened again and again show that a level leads nowhere:
 # a lower load finds out sooner.
 _SQUEEZES = 8
-# A mixed load step that works takes about ten (docs/experiments.md, "Mean dilatation from far
-# away").
-_MIXED_ITERATIONS = 20
+# A load step towards a saddle that works takes about ten (docs/experiments.md, "Mean dilatation
+# from far away").
+_SADDLE_ITERATIONS = 20
 _EASY = 8  # iterations of a level that earns twice the increment
 _SLOW = 0.3  # of the residual left by a step with its own tangent: round-off, or far away
 
@@ -55,8 +55,8 @@ def judge_level(
     solved |= met & (jnp.linalg.norm(outcome.residual) <= options.absolute)
     stuck = state.refresh & ~(outcome.fraction > 0.0)
     spent = at_level >= options.level_iterations
-    if state.volumes is not None:
-        spent |= at_level >= _MIXED_ITERATIONS
+    if state.iterates is not None:
+        spent |= at_level >= _SADDLE_ITERATIONS
     spent |= (_squeezed(state, outcome) >= _SQUEEZES) & (_halved(state) >= options.min_increment)
     spent |= ~_convex(state, outcome, options) & (_halved(state) >= state.careful)
     return Verdict(solved, ~solved & (stuck | spent), drowned)
@@ -139,7 +139,7 @@ def _keeps_tangent(state: NewtonState, outcome: Outcome, options: NewtonOptions)
     """Whether the next step may use this tangent again: most of its cost is the factorisation."""
     good = (outcome.fraction == 1.0) & jnp.isfinite(outcome.error)
     good &= outcome.error <= options.keep_tangent * state.error
-    return good & (state.volumes is None)
+    return good & (state.iterates is None)
 
 
 def _quiet(state: NewtonState, options: NewtonOptions) -> jax.Array:

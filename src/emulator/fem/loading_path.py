@@ -5,8 +5,8 @@ A body with several equilibria has one that loading leads to from rest. These ro
 ======  ==================================================================================
 WARM    from the caller's start, at the whole load: stress iterates while the residual is
         above 5 %, then Newton's method
-RAMPS   stress iterates (:mod:`emulator.fem.mip`) from rest up a ramp of loads, four ramps
-        of ever smaller increments, and Newton's method from where a ramp leads
+RAMPS   stress iterates (:mod:`emulator.fem.formulations.stress_iterates`) from rest up a ramp of
+        loads, four ramps of ever smaller increments, and Newton's method from where one leads
 CLIMB   Newton's method from rest, load step by load step
 ======  ==================================================================================
 
@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem.assembly import System
-from emulator.fem.mip import MipNewton, MipState, applies
+from emulator.fem.formulations.stress_iterates import StressIterates, StressState, applies
 from emulator.fem.newton import Newton
 from emulator.fem.options import NewtonOptions
 from emulator.fem.programs import cond, while_loop
@@ -95,7 +95,7 @@ class PathState(NamedTuple):
     """
 
     newton: NewtonState
-    mip: MipState | None
+    mip: StressState | None
     route: jax.Array
     ramping: jax.Array
     level: jax.Array
@@ -122,14 +122,14 @@ class LoadingPath:
     def ramps(self) -> bool:
         """Whether stresses can be iterates, up ramps that begin at rest."""
         wanted = self.options.stress_iterates and self.options.increment == 1.0
-        return wanted and applies(self.system) and not self.system.scene.held_displacement.any()
+        return wanted and applies(self.system.scene)
 
     @property
     def _newton(self) -> Newton:
         return Newton(self.system, self.options, self.theta)
 
-    def _mip(self, level: jax.Array) -> MipNewton:
-        return MipNewton(self.system, self.options.shrink, self.theta, level)
+    def _mip(self, level: jax.Array) -> StressIterates:
+        return StressIterates(self.system, self.options.shrink, self.theta, level)
 
     def begin(self, start: jax.Array) -> PathState:
         """The state to search from, at ``start`` (n, 3) mm."""
@@ -214,7 +214,7 @@ def _stiffnesses(
     return jnp.where(first, 0.0, level), jnp.where(first, 0.0, 1.0)
 
 
-def _judged(state: PathState, mip: MipState) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _judged(state: PathState, mip: StressState) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Next level of a ramp after a step; whether the ramp is lost, and whether it is left."""
     _, increment, steps = jnp.array(_RAMPS)[state.route]
     sound = (mip.fraction > 0.0) & jnp.isfinite(mip.error) & mip.definite
@@ -227,7 +227,7 @@ def _judged(state: PathState, mip: MipState) -> tuple[jax.Array, jax.Array, jax.
 
 
 @jax.jit
-def _after_ramp_step(state: PathState, mip: MipState) -> PathState:
+def _after_ramp_step(state: PathState, mip: StressState) -> PathState:
     """The state after a step of the stress iterates."""
     level, lost, leaves = _judged(state, mip)
     newton = state.newton
@@ -273,7 +273,7 @@ def _astray(
 @jax.jit
 def _entered(
     newton: NewtonState,
-    mip: MipState | None,
+    mip: StressState | None,
     route: jax.Array,
     ramping: jax.Array | bool,
     level: jax.Array,

@@ -25,14 +25,17 @@ _BISECTIONS = 7
 _REFINEMENTS = 3
 
 
-def moduli(scene: Scene, theta: jax.Array) -> Callable[[jax.Array, Tissue], jax.Array]:
-    """``d2W/dH2`` (3, 3, 3, 3) in kPa of a displacement gradient (3, 3) and what is there."""
+def stress_and_moduli(
+    scene: Scene, theta: jax.Array
+) -> Callable[[jax.Array, Tissue], tuple[jax.Array, jax.Array]]:
+    """``dW/dH`` (3, 3) and ``d2W/dH2`` (3, 3, 3, 3) in kPa at a gradient (3, 3) and its tissue."""
     if measures_read(scene.law) is None:
-        return jax.hessian(point_energy(scene, theta))
+        energy = point_energy(scene, theta)
+        return lambda H, at: (jax.grad(energy)(H, at), jax.hessian(energy)(H, at))
     point = MaterialPoint(scene, theta)
 
-    def at_point(H: jax.Array, at: Tissue) -> jax.Array:
-        return point.linearise(H, point.measures.of(H, at.directions), at)[1]
+    def at_point(H: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
+        return point.linearise(H, point.measures.of(H, at.directions), at)
 
     return at_point
 

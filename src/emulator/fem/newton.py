@@ -10,15 +10,15 @@ Two things save factorisations, most of the cost. The tangent of the last iterat
 step with it cuts the residual at least tenfold. And as long as the loads are hardly balanced, as
 at rest, their own stiffness is left out of the tangent.
 
-With mean dilatation the elements' volumes and pressures are iterates of their own (see
-:mod:`emulator.fem.mixed`); the point sought is then a saddle, and steps are judged by
-:mod:`emulator.fem.natural` monotonicity.
+What is iterated besides the displacement, and how the equations are linearised, is the
+formulation's (:mod:`emulator.fem.formulations`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,13 +26,13 @@ import numpy as np
 
 from emulator.fem.assembly import System, forces_at
 from emulator.fem.direction import Direction, newton_direction
+from emulator.fem.formulations import formulation_of
 from emulator.fem.load_control import next_state
-from emulator.fem.mixed import Condensed, Volumes, advance, consistent
 from emulator.fem.options import NewtonOptions
-from emulator.fem.programs import compiled, cond
+from emulator.fem.programs import cond
 from emulator.fem.solution import Status
 from emulator.fem.state import Negligible, NewtonState
-from emulator.fem.step_length import Outcome, level_balance, take_step
+from emulator.fem.step_length import Outcome, take_step
 
 _ROUND_OFF = 1e-15  # strain that floating point cannot tell from none
 _STILL = 1e-12  # of the body's size: a correction that may be round-off
@@ -54,7 +54,7 @@ class Newton:
         """
         system, theta = self.system, self.theta
         negligible = self.negligible() if negligible is None else negligible
-        residual, error = level_balance(system, start, theta, jnp.ones(()))
+        residual, error = system.level_balance(start, theta, jnp.ones(()))
         least_J = system.least_volume_ratio(start)
         state = _first(
             theta,
@@ -66,7 +66,7 @@ class Newton:
             entries=len(system.pattern.rows),
             options=self.options,
         )
-        return state._replace(volumes=_consistent(system, state.u, theta) if system.mixed else None)
+        return state._replace(iterates=formulation_of(system).begin(state.u, theta))
 
     def negligible(self) -> Negligible:
         r"""Residual in mN that may be round-off: :math:`10^{-15} |K_0 X|`; and correction in mm.
@@ -91,7 +91,7 @@ class Newton:
         system, theta = self.system, self.theta
         residual, error = cond(
             state.at_level == 0,
-            lambda: level_balance(system, state.u, theta, state.level),
+            lambda: system.level_balance(state.u, theta, state.level),
             lambda: (state.residual, state.error),
         )
         state = state._replace(residual=residual, error=error)
@@ -103,24 +103,24 @@ class Newton:
     def _after(self, state: NewtonState, direction: Direction) -> NewtonState:
         """The state after the part of a step that is taken."""
         outcome = take_step(self.system, self.theta, state, direction, self.options)
-        state = state._replace(tangent=direction.tangent, singular=direction.singular)
+        state = state._replace(tangent=direction.equations.tangent, singular=direction.singular)
         after = next_state(state, outcome, direction.descends, direction.move, self.options)
-        if state.volumes is None:
+        if state.iterates is None:
             return after
-        return after._replace(volumes=self._volumes(state, outcome, direction, after))
+        return after._replace(iterates=self._iterates(state, outcome, direction, after))
 
-    def _volumes(
+    def _iterates(
         self, state: NewtonState, outcome: Outcome, direction: Direction, after: NewtonState
-    ) -> Volumes:
-        """Volumes after the step; of the last solution where the level has changed."""
-        volumes, condensed = state.volumes, direction.condensed
-        assert volumes is not None
-        assert condensed is not None
+    ) -> Any:
+        """Iterates after the step; of the last solution where the level has changed."""
+        formulation = formulation_of(self.system)
         move = jnp.where(outcome.fraction > 0.0, direction.move, 0.0)
         return cond(
             after.level == state.level,
-            lambda: _advance(self.system, volumes, condensed, move, outcome.fraction),
-            lambda: _consistent(self.system, after.u, self.theta),
+            lambda: formulation.advance(
+                state.iterates, direction.equations.eliminated, move, outcome.fraction
+            ),
+            lambda: formulation.begin(after.u, self.theta),
         )
 
 
@@ -136,7 +136,7 @@ def _first(
     entries: int,
     options: NewtonOptions,
 ) -> NewtonState:
-    """The state at ``start`` or at rest, for tangents of ``entries``; volumes left out."""
+    """The state at ``start`` or at rest, for tangents of ``entries``; iterates left out."""
     fine = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(theta))
     inverted = ~(least_J > 0.0)
     balanced = (error <= options.tolerance) | (jnp.linalg.norm(residual) <= options.absolute)
@@ -146,7 +146,7 @@ def _first(
     count, increment = jnp.zeros((), dtype=int), jnp.full((), options.increment, float)
     return NewtonState(
         u=u,
-        volumes=None,
+        iterates=None,
         level=increment,
         u_reached=jnp.zeros_like(u),
         reached=jnp.zeros(()),
@@ -166,15 +166,3 @@ def _first(
         squeezed=count,
         status=jnp.asarray(jnp.where(fine, status, Status.INVALID_INPUT), dtype=jnp.int64),
     )
-
-
-@compiled
-def _consistent(system: System, u: jax.Array, theta: jax.Array) -> Volumes:
-    return consistent(system.scene, u, theta)
-
-
-@compiled
-def _advance(
-    system: System, volumes: Volumes, at: Condensed, move: jax.Array, fraction: jax.Array
-) -> Volumes:
-    return advance(system.scene, volumes, at, move, fraction)

@@ -28,10 +28,10 @@ class NewtonOptions:
     keep_tangent : after a step that leaves less than this fraction of the residual, its tangent is
         used again; 0 is the full Newton method (docs/experiments.md, "Fewer factorisations from
         rest").
-    stress_iterates : begin, when far from equilibrium, with :mod:`emulator.fem.mip` where the scene
-        allows it (see :func:`emulator.fem.mip.applies`); never with load increments
-        (docs/experiments.md, "Stresses as iterates: the ventricle from rest in five
-        factorisations").
+    stress_iterates : begin, when far from equilibrium, with
+        :mod:`emulator.fem.formulations.stress_iterates` where the scene allows it (see ``applies``
+        there); never with load increments (docs/experiments.md, "Stresses as iterates: the
+        ventricle from rest in five factorisations").
     """
 
     tolerance: float = 1e-11

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.mixed import Volumes
 from emulator.fem.solution import Solution, Status
 
 # Relative residual below which a step is judged by the residual alone, and stress iterates hand
@@ -31,7 +30,7 @@ class Negligible(NamedTuple):
 class NewtonState(NamedTuple):
     """What the next iteration needs.
 
-    u : (n, 3) mm, current iterate. volumes : the iterates of mean dilatation, or None.
+    u : (n, 3) mm, current iterate. iterates : the formulation's own, or None.
     level : load level being solved. u_reached : (n, 3) mm, solution at ``reached``, the last level
     that converged. increment : of the load.
     at_level : iterations spent at this level. iterations, factorisations : all of them.
@@ -51,7 +50,7 @@ class NewtonState(NamedTuple):
     """
 
     u: jax.Array
-    volumes: Volumes | None
+    iterates: Any
     level: jax.Array
     u_reached: jax.Array
     reached: jax.Array

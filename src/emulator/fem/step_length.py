@@ -8,10 +8,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System, balance
-from emulator.fem.direction import Direction, support_offset
+from emulator.fem.assembly import System
+from emulator.fem.direction import Direction
+from emulator.fem.formulations import formulation_of
 from emulator.fem.line_search import choose_fraction
-from emulator.fem.natural import natural_monotonicity
 from emulator.fem.options import NewtonOptions
 from emulator.fem.programs import compiled, cond, while_loop
 from emulator.fem.state import NEAR, NewtonState
@@ -30,20 +30,6 @@ class Outcome(NamedTuple):
     error: jax.Array
     fraction: jax.Array
     crushed: jax.Array
-
-
-def level_balance(
-    system: System, u: jax.Array, theta: jax.Array, level: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Residual (f,) and its relative size, infinite unless finite and the supports are met."""
-    residual, error = balance(system, u, theta, level)
-    return residual, _where_met(system, u, level, error)
-
-
-@compiled
-def _where_met(system: System, u: jax.Array, level: jax.Array, error: jax.Array) -> jax.Array:
-    met = jnp.all(support_offset(system, u, level) == 0.0)
-    return jnp.where(met & jnp.isfinite(error), error, jnp.inf)
 
 
 class _Tried(NamedTuple):
@@ -66,7 +52,7 @@ def take_step(
     A kept tangent is worth a full step or nothing: its direction is not searched along.
     """
     none = Outcome(state.u, state.residual, state.error, jnp.zeros(()), jnp.array(False))
-    near = _near(direction.settled, state.error) & (not system.mixed)
+    near = _near(direction.settled, state.error) & (not formulation_of(system).saddle)
 
     def attempt(before: _Tried) -> _Tried:
         search = before.searched | ~near
@@ -76,7 +62,7 @@ def take_step(
             lambda: (jnp.ones(()), jnp.array(False)),
         )
         u = _moved(system, state.u, direction.move, fraction, state.level)
-        residual, error = level_balance(system, u, theta, state.level)
+        residual, error = system.level_balance(u, theta, state.level)
         J, now = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
         good = search | _good(error, state.error, J, options.shrink, now)
         outcome = Outcome(u, residual, error, fraction, crushed)
@@ -109,13 +95,12 @@ def _searched(
 ) -> tuple[jax.Array, jax.Array]:
     """The part of the step that makes most progress, and whether elements forbade twice as much."""
     nearer = None
-    if state.volumes is not None:
-        natural = partial(
-            natural_monotonicity, system, state.u, state.volumes, state.level, theta, direction
-        )
+    formulation = formulation_of(system)
+    if formulation.saddle:
         # Where round-off is all that is left, it cannot be told from progress.
-        drowned = state.error <= options.round_off
-        nearer = lambda fraction: drowned | natural(fraction)  # noqa: E731
+        unclear = state.error <= options.round_off
+        judge = partial(formulation.nearer, state, theta, direction.equations, direction.move)
+        nearer = lambda fraction: unclear | judge(fraction)  # noqa: E731
     return choose_fraction(system, state.u, state.level, theta, direction, options.shrink, nearer)
 
 

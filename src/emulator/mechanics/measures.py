@@ -7,7 +7,7 @@ A law is a function of measures of the displacement gradient,
 
 which are found by calling it with a strain that records every measure read. The exponentials and
 the bulk modulus are in :math:`\varphi`, which is convex or nearly so; :math:`\xi` is a polynomial
-or close to one. The solver uses the separation (:mod:`emulator.fem.mip`).
+or close to one. The solver uses the separation (:mod:`emulator.fem.formulations.stress_iterates`).
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.line_search import largest_sound
+from emulator.fem.halving import largest_sound
 from emulator.fem.loading_path import find_equilibrium
 
 

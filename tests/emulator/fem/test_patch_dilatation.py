@@ -15,6 +15,8 @@ from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.fields import element_fields
+from emulator.fem.formulations import formulation_of
+from emulator.fem.formulations.stress_iterates import applies
 from emulator.fem.functional import (
     at_points,
     displacement_gradient,
@@ -22,7 +24,6 @@ from emulator.fem.functional import (
     strain_energy,
     volume_ratio,
 )
-from emulator.fem.mip import applies
 from emulator.geometry.bodies.box import box
 from emulator.geometry.io import write_mesh
 from emulator.geometry.patches import patches
@@ -209,8 +210,8 @@ def test_solutions_their_sensitivities_and_jit(body):
 
 
 def test_what_else_asks_for_the_dilatation(body):
-    assert System(body).mixed
-    assert not applies(System(body))
+    assert formulation_of(System(body)).saddle
+    assert not applies(body)
     assert "linear, patch dilatation" in repr(body)
     effect = effects_of(body)["patch dilatation"]
     assert effect.without.dilatation == "pointwise"

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.mixed import Volumes, advance, carried, consistent, linearise
+from emulator.fem.condensation import Volumes, advance, carried, consistent, linearise
+from emulator.fem.functional import pair_products
 from emulator.geometry.bodies.box import box
 from emulator.geometry.bodies.ellipsoid import land_ventricle
 from emulator.geometry.quadratic import to_quadratic
@@ -57,8 +58,7 @@ def test_a_carried_force_falls_with_the_square_of_the_step(beam_scene):
     volumes = jax.jit(lambda u: consistent(beam_scene, u, theta))(u)
     at = jax.jit(lambda u: linearise(beam_scene, u, volumes, theta))(u)
     move = jnp.asarray(0.01 * rng.normal(size=u.shape))
-    local = move[beam_scene.discretisation.connectivity].reshape(len(at.force), -1)
-    pull = jnp.einsum("mij,mj->mi", at.tangent, local).reshape(at.force.shape)
+    pull = pair_products(at.tangent, move[beam_scene.discretisation.connectivity])
 
     @jax.jit
     def gap(fraction):

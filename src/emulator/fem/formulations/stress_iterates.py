@@ -19,8 +19,11 @@ limit and its order.
 
 This is the mixed integration point (MIP) Newton method of Magisano, Leonetti & Garcea (2017), made
 for geometric nonlinearity, with measures in place of stress components so that any law that reads
-nothing but measures has its inverse, one scalar equation each. A ventricle from rest takes four to
-six full steps to a residual of a few percent, all with positive definite tangents.
+nothing but measures has its inverse, one scalar equation each. With mean dilatation the measures
+are those of the gradients that the law sees, so that a block's volume is one of them.
+
+A ventricle from rest takes four to six full steps to a residual of a few percent, all with positive
+definite tangents.
 """
 
 from __future__ import annotations
@@ -31,23 +34,27 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System, balance
-from emulator.fem.functional import at_points, displacement_gradient
-from emulator.fem.line_search import largest_sound
+from emulator.fem.assembly import System
+from emulator.fem.condensation import block_derivatives
+from emulator.fem.formulations.protocol import Linearised
+from emulator.fem.functional import at_points, displacement_gradient, seen_by_law
+from emulator.fem.halving import largest_sound
 from emulator.fem.linear import Outcome
 from emulator.fem.material_point import MaterialPoint
 from emulator.fem.programs import compiled, cond, while_loop
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
+from emulator.scenes.scene import Scene
 
 _SHORTEST = 2.0**-4  # fraction of a step; where less is left, the ramp of loads is lost
 
 
-class MipState(NamedTuple):
+class StressState(NamedTuple):
     """What the next iteration needs.
 
     u : (n, 3) mm. measures : (m, q, k), the strain measures that the stresses belong to.
-    error : residual of u relative to the forces at work, supports met; inf before the first step.
+    error : residual of u relative to the forces at work; inf before the first step, and where the
+    supports are not met.
     fraction : of the last step that was taken; below 1 where elements would have been crushed, 0
     where there was no step.
     definite : whether the tangent of the last step was positive definite.
@@ -69,7 +76,7 @@ class _Tried(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class MipNewton:
+class StressIterates:
     """The iteration for one theta at one load level.
 
     Parameters
@@ -84,18 +91,18 @@ class MipNewton:
     theta: jax.Array
     level: jax.Array
 
-    def begin(self, u: jax.Array) -> MipState:
+    def begin(self, u: jax.Array) -> StressState:
         """The state at ``u`` (n, 3) mm that Newton's method would start from."""
         unknown = jnp.full((), jnp.inf, float)
-        return MipState(u, _measures_of(self.system, u), unknown, jnp.ones(()), jnp.array(True))
+        return StressState(u, _measures_of(self.system, u), unknown, jnp.ones(()), jnp.array(True))
 
     def step(
         self,
-        state: MipState,
+        state: StressState,
         stiffening: jax.Array,
         geometric: jax.Array | float = 1.0,
         again: jax.Array | bool = False,
-    ) -> MipState:
+    ) -> StressState:
         """One iteration.
 
         Its tangent has ``stiffening`` times the stiffness of the loads, and that of the stresses as
@@ -106,7 +113,7 @@ class MipNewton:
 
         def attempt(before: _Tried) -> _Tried:
             known = jnp.where(before.tries == 0, 1.0, 0.0)
-            values, solvable, residual = _promised(
+            promised = _promised(
                 self.system,
                 state.u,
                 state.measures,
@@ -115,9 +122,12 @@ class MipNewton:
                 known * stiffening,
                 known * geometric,
             )
+            force = promised.residual + promised.pull
             # On the way from rest each tangent is unlike the one before.
-            full, outcome = self.system.attempt(values, -residual, near=False)
-            move, definite = _promised_step(self.system, solvable, residual, full, outcome)
+            full, outcome = self.system.attempt(promised.tangent, -force, near=False)
+            move, definite = _promised_step(
+                self.system, state.u, self.level, promised.solvable, force, full, outcome
+            )
             return _Tried(move, definite, before.tries + 1)
 
         most = jnp.where(again, 2, 1)
@@ -125,12 +135,12 @@ class MipNewton:
         lost = state._replace(fraction=jnp.zeros(()), definite=tried.definite)
         return cond(tried.definite, lambda: self._moved(state, tried.move), lambda: lost)
 
-    def _moved(self, state: MipState, move: jax.Array) -> MipState:
+    def _moved(self, state: StressState, move: jax.Array) -> StressState:
         """The state after as much of a step as crushes no element."""
         fraction = self._fraction(state.u, move)
         ahead, measures = _taken(self.system, state.u, state.measures, self.theta, move, fraction)
-        _, error = balance(self.system, ahead, self.theta, self.level)
-        return MipState(ahead, measures, error, fraction, jnp.array(True))
+        _, error = self.system.level_balance(ahead, self.theta, self.level)
+        return StressState(ahead, measures, error, fraction, jnp.array(True))
 
     def _fraction(self, u: jax.Array, move: jax.Array) -> jax.Array:
         """How much of a step crushes no element; 0 if almost none of it does."""
@@ -140,13 +150,23 @@ class MipNewton:
         )
 
 
+def _seen(scene: Scene, u: jax.Array) -> jax.Array:
+    """Displacement gradients (b, q, 3, 3) that the law sees at ``u`` (n, 3) mm."""
+    return seen_by_law(scene, displacement_gradient(scene, u))
+
+
 @compiled
 def _measures_of(system: System, u: jax.Array) -> jax.Array:
-    """Strain measures (m, q, k) of the displacement ``u`` (n, 3) mm."""
-    names = measures_read(system.scene.law)
+    """Strain measures (b, q, k) of the displacement ``u`` (n, 3) mm."""
+    scene, names = system.scene, measures_read(system.scene.law)
     assert names is not None, "see applies"
-    measures, H = Measures(names), displacement_gradient(system.scene, u)
-    return at_points(system.scene, lambda H, at: measures.of(H, at.directions), H)
+    measures = Measures(names)
+    return at_points(
+        scene,
+        lambda H, at: measures.of(H, at.directions),
+        _seen(scene, u),
+        tissue=scene.block_tissue,
+    )
 
 
 @compiled
@@ -158,34 +178,42 @@ def _promised(
     level: jax.Array,
     stiffening: jax.Array,
     geometric: jax.Array | float,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Tangent (nnz,), whether it is solvable, and residual (f,)."""
-    point, grid = MaterialPoint(system.scene, theta), system.scene.discretisation
-    H = displacement_gradient(system.scene, u)
+) -> Linearised:
+    """The equations of a step."""
+    scene = system.scene
+    point = MaterialPoint(scene, theta)
 
     def linearise(H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
         return point.linearise(H, own, at, geometric)
 
-    stress, tangent = at_points(system.scene, linearise, H, measures)
-    force = jnp.einsum("mq,mqij,mqaj->mai", grid.weights, stress, grid.gradients)
-    residual = system.restrict(system.scatter(force) + system.others(u, theta, level))
-    K = system.assemble(system.element_blocks(tangent), u, theta, stiffening)
-    return system.pattern.safe_values(K), system.pattern.solvable(K), residual
+    stress, moduli = at_points(
+        scene, linearise, _seen(scene, u), measures, tissue=scene.block_tissue
+    )
+    forces, bulk = block_derivatives(scene, u, stress, moduli)
+    residual = system.restrict(system.scatter(forces) + system.others(u, theta, level))
+    tangent, solvable, pull = system.equations(bulk, u, theta, stiffening, level)
+    return Linearised(tangent, solvable, residual, pull, None)
 
 
 @compiled
 def _promised_step(
     system: System,
+    u: jax.Array,
+    level: jax.Array,
     solvable: jax.Array,
-    residual: jax.Array,
+    force: jax.Array,
     move: jax.Array,
     outcome: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """The full step (n, 3) mm, NaN where there is none, and whether its tangent is definite."""
+    """The full step (n, 3) mm, NaN where there is none, and whether its tangent is definite.
+
+    force : (f,) mN that it balances.
+    """
     definite = outcome == Outcome.OK
     if system.forces:  # not symmetric: at least the step goes down
-        definite &= jnp.vdot(residual, move) <= 0.0
-    return system.extend(jnp.where(solvable, move, jnp.nan)), definite
+        definite &= jnp.vdot(force, move) <= 0.0
+    move = system.extend(move) + system.support_offset(u, level)
+    return jnp.where(solvable, move, jnp.nan), definite
 
 
 @compiled
@@ -198,18 +226,19 @@ def _taken(
     fraction: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Displacement (n, 3) mm and measures (m, q, k) after ``fraction`` of the step."""
-    point = MaterialPoint(system.scene, theta)
-    H, change = (displacement_gradient(system.scene, field) for field in (u, move))
-    after = at_points(system.scene, point.at_stress, H, change, measures)
+    scene, point = system.scene, MaterialPoint(system.scene, theta)
+    H, change = jax.jvp(lambda v: _seen(scene, v), (u,), (move,))
+    after = at_points(scene, point.at_stress, H, change, measures, tissue=scene.block_tissue)
     taken = fraction > 0.0
     return jnp.where(taken, u + fraction * move, u), jnp.where(taken, after, measures)
 
 
-def applies(system: System) -> bool:
+def applies(scene: Scene) -> bool:
     """Whether a scene's stresses can be iterates of their own, and whether that pays.
 
-    Its law must be exponential and read measures only. Mean dilatation has volumes and pressures as
-    iterates already.
+    Its law must be exponential and read measures only. With mean dilatation Newton's method has
+    volumes and pressures as iterates already, and takes half as many steps (docs/experiments.md,
+    "Stress iterates with mean dilatation").
     """
-    law = system.scene.law
-    return law.exponential and not system.mixed and measures_read(law) is not None
+    exponential = scene.law.exponential and measures_read(scene.law) is not None
+    return exponential and scene.dilatation == "pointwise"
