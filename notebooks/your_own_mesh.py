@@ -34,8 +34,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import emulator as em
 from emulator.error.comparison import evaluate
-from emulator.fem.functional import strain_energy
-from emulator.fem.reference import fem_reference
+from emulator.fem.campaign.reference import fem_reference
+from emulator.fem.energy import strain_energy
 from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.fibres import depth

@@ -11,6 +11,7 @@ from calibrate.cli import build_parser
 from calibrate.noise.registry import KINDS as NOISES
 from calibrate.observations.registry import KINDS as OBSERVATIONS
 from calibrate.samplers.registry import SAMPLERS
+from emulator.fem.formulations import FORMULATIONS
 from emulator.fem.linear import SOLVERS
 from emulator.mechanics.laws import LAWS
 from emulator.scenes.loads import LOADS
@@ -25,6 +26,7 @@ REGISTRIES = {
     "an observation": OBSERVATIONS,
     "a noise": NOISES,
     "a sampler": SAMPLERS,
+    "a formulation": FORMULATIONS,
     "a linear solver": SOLVERS,
 }
 

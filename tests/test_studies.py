@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.functional import strain_energy
+from emulator.fem.energy import strain_energy
 from study_checks import CHECKS
 
 STUDIES = Path(__file__).parents[1] / "studies"

@@ -16,8 +16,8 @@ from calibrate.provenance import versions
 from emulator.errors import InputError
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.campaign import Executor, Neighbours, Solver, executor, solve_rows
+from emulator.fem.campaign.designs import DESIGNS
 from emulator.fem.campaign.zarr_rows import Question, ZarrRows, make_store, writing
-from emulator.fem.designs import DESIGNS
 from emulator.scenes.scene import Scene
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from calibrate.observations import Observation, Observations, observations
 from emulator.errors import InputError, SolverError, check_seed
 from emulator.fem import Simulator, Solution, Status, sobol
-from emulator.fem.functional import potential_energy
+from emulator.fem.energy import potential_energy
 from emulator.scenes.effects import Effect, Onto, effects_of, leave_out
 from emulator.scenes.scene import Scene
 

@@ -9,7 +9,7 @@ from typing import Any
 from emulator.error.comparison import Errors, case_errors
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
-from emulator.fem.reference import Reference, fem_reference, outside_reference
+from emulator.fem.campaign.reference import Reference, fem_reference, outside_reference
 from emulator.released.reference import published_reference
 from emulator.surrogates import load
 from emulator.surrogates.kind import Ingredients

@@ -20,7 +20,7 @@ from calibrate.statistical_model import Data, Model
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Executor, Solver, in_process, solve_rows
-from emulator.fem.functional import volume_ratio
+from emulator.fem.energy import volume_ratio
 
 
 class Likelihoods(NamedTuple):

@@ -4,7 +4,7 @@ from .error.mesh_error import MeshError, mesh_error
 from .errors import InputError, SolverError
 from .fem import NewtonOptions, Simulator, Solution, Status, run_campaign
 from .fem.campaign.stored_runs import read_runs
-from .fem.functional import potential_energy
+from .fem.energy import potential_energy
 from .geometry.io import Body, read_body, read_mesh
 from .geometry.mesh import Mesh
 from .scenes import Parameter, Scene, Support

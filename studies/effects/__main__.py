@@ -25,7 +25,7 @@ from calibrate.figures.palette import BLUE, GREEN, VERMILION
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import run_campaign
-from emulator.fem.designs import design
+from emulator.fem.campaign.designs import design
 from emulator.scenes import Scene
 from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.effects import effects_of, leave_out

@@ -22,7 +22,7 @@ import numpy as np
 import sparsax
 
 from emulator import Scene, Simulator, potential_energy
-from emulator.fem.functional import strain_energy
+from emulator.fem.energy import strain_energy
 from emulator.geometry.discretisation import quadrature_points
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Traction
 from emulator.scenes.supports import ElasticSupport

@@ -41,7 +41,7 @@ from calibrate.figures.palette import BLUE, GREEN, VERMILION
 from calibrate.provenance import hardware, study_header, versions
 from emulator.error.comparison import quantiles
 from emulator.fem.campaign import run_campaign
-from emulator.fem.designs import sobol
+from emulator.fem.campaign.designs import sobol
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.ventricle_family import ventricles
 from emulator.store import read_arrays, write_json

@@ -12,7 +12,7 @@ import numpy as np
 import emulator as em
 from emulator.error.comparison import case_errors, quantiles
 from emulator.fem.campaign import Runs, run_campaign
-from emulator.fem.designs import design, sobol
+from emulator.fem.campaign.designs import design, sobol
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.scene import Scene
 from emulator.store import save_arrays

@@ -21,7 +21,7 @@ import numpy as np
 
 from calibrate.posterior import Posterior
 from emulator.errors import InputError
-from emulator.fem.functional import point_energy
+from emulator.fem.energy import point_energy
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
 

@@ -12,7 +12,7 @@ import numpy as np
 from calibrate.verify.homogeneous import PARAMETERS
 from calibrate.verify.row import Row
 from emulator.fem import Simulator
-from emulator.fem.functional import strain_energy
+from emulator.fem.energy import strain_energy
 from emulator.geometry.bodies.box import box
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.mesh import Mesh

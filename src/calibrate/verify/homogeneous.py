@@ -22,7 +22,7 @@ from scipy.optimize import brentq
 
 from calibrate.verify.row import Row
 from emulator.fem import Simulator
-from emulator.fem.functional import strain_energy
+from emulator.fem.energy import strain_energy
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support

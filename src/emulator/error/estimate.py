@@ -57,9 +57,9 @@ from emulator.error.step import (
     sound_state,
 )
 from emulator.errors import InputError
-from emulator.fem.assembly import System
-from emulator.fem.programs import cond
+from emulator.fem.loop import cond
 from emulator.fem.simulator import Simulator
+from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 

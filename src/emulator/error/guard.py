@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.error.step import ENDLESS
-from emulator.fem.functional import at_points, displacement_gradient
+from emulator.fem.energy import at_points, displacement_gradient
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain
 from emulator.scenes.regions import Tissue

@@ -38,7 +38,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.functional import (
+from emulator.fem.energy import (
     at_points,
     displacement_gradient,
     nodal_vectors,
@@ -83,21 +83,30 @@ class _Residuals(NamedTuple):
 
 
 def block_derivatives(
-    scene: Scene, u: jax.Array, stress: jax.Array, moduli: jax.Array
+    scene: Scene,
+    u: jax.Array,
+    stress: jax.Array,
+    moduli: jax.Array,
+    known: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Forces (b, a, 3) in mN and tangents (b, pairs, 3, 3) in mN/mm of the blocks at ``u`` (n, 3).
 
     Of points with first Piola stress (b, q, 3, 3) and ``moduli`` (b, q, 3, 3, 3, 3) in kPa, the
-    derivatives of the energy in the displacement gradients that the law sees.
+    derivatives of the energy in the displacement gradients that the law sees. known : the stress
+    whose stiffness the tangents have, where it is not ``stress``.
     """
     if scene.dilatation == "pointwise":
         return nodal_vectors(scene.blocks, stress), pair_matrices(scene.blocks, moduli)
     H, V = _gradient(scene, u), _volume(scene)
     change = _mean_change(scene, H)
-    slope = _at_points(scene, _first, H, change, stress)[1]
-    volumes = Volumes(change, _integral(scene, slope) / V)
-    found = _condensed(scene, H, volumes, stress, moduli)
-    return found.force, found.tangent
+
+    def condensed(stress: jax.Array) -> Condensed:
+        slope = _at_points(scene, _first, H, change, stress)[1]
+        volumes = Volumes(change, _integral(scene, slope) / V)
+        return _condensed(scene, H, volumes, stress, moduli)
+
+    found = condensed(stress)
+    return found.force, (found if known is None else condensed(known)).tangent
 
 
 def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.functional import (
+from emulator.fem.energy import (
     at_points,
     displacement_gradient,
     energy_of_gradient,

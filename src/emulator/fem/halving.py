@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.programs import while_loop
+from emulator.fem.loop import while_loop
 
 
 class Trial(NamedTuple):

@@ -16,7 +16,7 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.functional import point_energy, strain_law
+from emulator.fem.energy import point_energy, strain_law
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
@@ -35,7 +35,7 @@ def stress_and_moduli(
     point = MaterialPoint(scene, theta)
 
     def at_point(H: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
-        return point.linearise(H, point.measures.of(H, at.directions), at)
+        return point.linearise(H, point.measures.of(H, at.directions), at)[:2]
 
     return at_point
 
@@ -65,10 +65,11 @@ class MaterialPoint:
 
     def linearise(
         self, H: jax.Array, own: jax.Array, at: Tissue, geometric: jax.Array | float = 1.0
-    ) -> tuple[jax.Array, jax.Array]:
-        """First Piola stress (3, 3) and tangent (3, 3, 3, 3) in kPa at a point.
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Stress P (3, 3), tangent (3, 3, 3, 3) and known stress (3, 3) in kPa at a point.
 
-        geometric : fraction of the stresses' change since rest that the tangent knows.
+        The known stress is that whose stiffness the tangent has. geometric : fraction of the
+        stresses' change since rest that is known.
         """
         phi = self.energy(at)
 
@@ -83,7 +84,8 @@ class MaterialPoint:
         now = self.measures.of(H, at.directions)
         slope, curvature = self.measures.derivatives(H, at.directions, known)
         stress = jnp.tensordot(s + C @ (now - own), slope, 1)
-        return stress, jnp.einsum("kij,kl,lab->ijab", slope, C, slope) + curvature
+        tangent = jnp.einsum("kij,kl,lab->ijab", slope, C, slope) + curvature
+        return stress, tangent, jnp.tensordot(known, slope, 1)
 
     def at_stress(self, H: jax.Array, change: jax.Array, own: jax.Array, at: Tissue) -> jax.Array:
         """Measures (k,) of a point where the law has the stress that its step promises."""

@@ -17,7 +17,7 @@ class NewtonOptions:
     absolute : residual in mN that is accepted whatever the forces; round-off of the forces at rest
         always is.
     max_iterations : of Newton's method, over all routes and load levels; ramps of loads have their
-        own limits (:mod:`emulator.fem.loading_path`).
+        own limits (:mod:`emulator.fem.continuation`).
     level_iterations : after which a load level is given up and its increment halved.
     increment : first and largest load increment, as a fraction of the whole. Small increments
         follow the loading path from rest, for bodies with several equilibria (docs/experiments.md,

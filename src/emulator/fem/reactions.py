@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.assembly import System
-from emulator.fem.functional import strain_energy
-from emulator.fem.programs import compiled
+from emulator.fem.energy import strain_energy
+from emulator.fem.loop import compiled
+from emulator.fem.system import System
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.scene import Scene
 

@@ -19,13 +19,13 @@ import numpy as np
 
 from emulator._precision import require_float64
 from emulator.errors import InputError, SolverError
-from emulator.fem.assembly import System
+from emulator.fem.continuation import find_equilibrium
 from emulator.fem.linear import Outcome, find_solver
-from emulator.fem.loading_path import find_equilibrium
+from emulator.fem.loop import compiled, one_by_one
 from emulator.fem.options import NewtonOptions
-from emulator.fem.programs import compiled, one_by_one
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
+from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 from emulator.shown import Row, Shown
 
@@ -79,7 +79,7 @@ class Simulator(Shown):
         """Equilibrium at ``theta`` (p,), from ``start`` (n, 3) mm or from rest.
 
         A soft body may have several equilibria. The one sought is the end of the loading path from
-        rest, in Python as under ``jit``, ``vmap`` and ``grad``; :mod:`emulator.fem.loading_path`
+        rest, in Python as under ``jit``, ``vmap`` and ``grad``; :mod:`emulator.fem.continuation`
         has the strategy. An answer from ``start`` is kept if Newton's method came to it at the full
         load in a few full steps, each down the potential; otherwise ``start`` is left and the body
         is loaded from rest.

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.fem.assembly import System
-from emulator.fem.functional import volume_ratio
+from emulator.fem.energy import volume_ratio
 from emulator.fem.simulator import Simulator
+from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 from emulator.surrogates.files import EMULATOR
 from emulator.surrogates.kind import ForwardKind, Ingredients, Option, Options

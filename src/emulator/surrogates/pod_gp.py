@@ -23,7 +23,7 @@ import numpy as np
 from emulator._precision import require_float64
 from emulator.errors import InputError
 from emulator.fem.campaign import Runs, run_campaign
-from emulator.fem.designs import sobol
+from emulator.fem.campaign.designs import sobol
 from emulator.scenes.scene import Scene
 from emulator.surrogates.kind import Arrays, ForwardKind, Ingredients, Option, Options
 from emulator.surrogates.protocol import (

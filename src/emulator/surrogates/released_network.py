@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.fem.functional import potential_energy
+from emulator.fem.energy import potential_energy
 from emulator.geometry.mesh import frozen_array
 from emulator.released.files import units
 from emulator.released.network import ReleasedNetwork, read_network

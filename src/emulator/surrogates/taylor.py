@@ -29,8 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError, SolverError
-from emulator.fem.assembly import System
 from emulator.fem.simulator import Simulator
+from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 from emulator.surrogates.part import CachedPart, widened
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.functional import displacement_gradient, potential_energy
+from emulator.fem.energy import displacement_gradient, potential_energy
 from emulator.mechanics.barriers import Barriers
 from emulator.scenes.scene import Scene
 from emulator.training.plan import Objective

@@ -13,8 +13,8 @@ import optax
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs, StoredRuns, run_campaign
+from emulator.fem.campaign.designs import design, sobol
 from emulator.fem.campaign.starts import Predictor
-from emulator.fem.designs import design, sobol
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.graph import augment

@@ -11,7 +11,7 @@ import optax
 from flax import nnx
 
 from emulator.fem.campaign import Runs
-from emulator.fem.designs import uniform
+from emulator.fem.campaign.designs import uniform
 from emulator.surrogates.additive import Emulator
 from emulator.training.objectives import Batch
 from emulator.training.plan import Plan

@@ -9,7 +9,7 @@ import emulator as em
 from calibrate.verify.consistency import block
 from emulator.errors import InputError
 from emulator.fem.condensation import advance, consistent, linearise
-from emulator.fem.functional import pair_products, strain_energy
+from emulator.fem.energy import pair_products, strain_energy
 
 
 @pytest.fixture(scope="module")

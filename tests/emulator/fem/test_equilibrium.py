@@ -7,10 +7,10 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.fem.assembly import System
+from emulator.fem.continuation import find_equilibrium
 from emulator.fem.linear import Outcome
-from emulator.fem.loading_path import find_equilibrium
-from emulator.fem.newton import Newton
+from emulator.fem.newton.iteration import Newton
+from emulator.fem.system import System
 from emulator.scenes.loads import Gravity
 
 

@@ -47,7 +47,7 @@ def test_uniaxial_stress_turned_in_space():
 
 
 def test_stress_is_symmetric_and_its_work_is_the_energy():
-    from emulator.fem.functional import strain_energy
+    from emulator.fem.energy import strain_energy
 
     scene = with_fibres()
     rng = np.random.default_rng(2)
@@ -103,7 +103,7 @@ def test_means_are_weighted_by_volume():
 
 def test_mean_dilatation_on_quadratic_elements():
     """Stress is symmetric, and its volume mean is the mean of what the nodal forces do."""
-    from emulator.fem.functional import displacement_gradient, strain_energy
+    from emulator.fem.energy import displacement_gradient, strain_energy
     from emulator.geometry.quadratic import to_quadratic
 
     plain = block()

@@ -9,7 +9,7 @@ import emulator as em
 from emulator.catalogue import find_scene, scene_from_origin
 from emulator.errors import InputError
 from emulator.fem import Status
-from emulator.fem.functional import volume_ratio
+from emulator.fem.energy import volume_ratio
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.discretisation import facet_rule
 from emulator.scenes import BUILT_IN

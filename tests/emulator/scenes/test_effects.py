@@ -7,7 +7,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.fem.functional import potential_energy
+from emulator.fem.energy import potential_energy
 from emulator.geometry.bodies.box import box
 from emulator.geometry.quadratic import corner_parents, to_linear, to_quadratic
 from emulator.mechanics.laws import find_law

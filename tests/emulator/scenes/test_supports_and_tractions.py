@@ -9,7 +9,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.fem.functional import dead_force, spring_terms, strain_energy
+from emulator.fem.energy import dead_force, spring_terms, strain_energy
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes.loads import Traction
 from emulator.scenes.supports import ElasticSupport

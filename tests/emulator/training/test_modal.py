@@ -10,7 +10,7 @@ import pytest
 import emulator as em
 from emulator.errors import InputError
 from emulator.fem.campaign import Runs, run_campaign
-from emulator.fem.designs import design, sobol
+from emulator.fem.campaign.designs import design, sobol
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training import Plan, pretrain, recipe, train
 from emulator.training.modal import Modal

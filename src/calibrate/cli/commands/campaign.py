@@ -21,7 +21,7 @@ from calibrate.cli.common import (
 
 def register(commands: Any) -> None:
     """Add the command."""
-    from emulator.fem.designs import DESIGNS
+    from emulator.fem.campaign.designs import DESIGNS
 
     parser = commands.add_parser(
         "campaign",

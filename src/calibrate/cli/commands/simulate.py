@@ -46,8 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     from emulator.catalogue import find_scene
     from emulator.fem import NewtonOptions, Simulator, Status
+    from emulator.fem.energy import potential_energy, volume_ratio
     from emulator.fem.fields import element_fields
-    from emulator.fem.functional import potential_energy, volume_ratio
     from emulator.fem.reactions import supported_sets
     from emulator.geometry.io import write_solution
 

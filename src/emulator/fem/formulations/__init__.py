@@ -3,23 +3,22 @@
 At equilibrium it is one of :data:`FORMULATIONS`; on the way there, :mod:`.stress_iterates`.
 """
 
-from emulator.fem.assembly import System
-
-from .displacement import Displacement
-from .mean_dilatation import MeanDilatation
-from .protocol import Formulation, Linearised
+from emulator.fem.formulations.displacement import Displacement
+from emulator.fem.formulations.mean_dilatation import MeanDilatation
+from emulator.fem.formulations.protocol import Formulation, Linearised
+from emulator.fem.system import System
 
 FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation]] = {
-    "pointwise": Displacement,
-    "mean": MeanDilatation,
-    "patch": MeanDilatation,
+    "mean dilatation": MeanDilatation,
+    "displacement alone": Displacement,
 }
-"""By the dilatation of the scene."""
+"""By name; the first that serves a scene is taken."""
 
 
 def formulation_of(system: System) -> Formulation:
     """How Newton's method solves the equations of ``system``."""
-    return FORMULATIONS[system.scene.dilatation](system)
+    serving = (each for each in FORMULATIONS.values() if each.serves(system.scene))
+    return next(serving)(system)
 
 
 __all__ = ["FORMULATIONS", "Formulation", "Linearised", "formulation_of"]

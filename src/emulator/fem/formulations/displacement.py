@@ -13,10 +13,11 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System
 from emulator.fem.formulations.protocol import Linearised
-from emulator.fem.programs import cond
+from emulator.fem.loop import cond
 from emulator.fem.state import UNBALANCED, NewtonState
+from emulator.fem.system import System
+from emulator.scenes.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +26,11 @@ class Displacement:
 
     system: System
     saddle: ClassVar[bool] = False
+
+    @staticmethod
+    def serves(scene: Scene) -> bool:
+        """Any scene whose points have volume ratios of their own."""
+        return scene.dilatation == "pointwise"
 
     def begin(self, u: jax.Array, theta: jax.Array) -> None:
         """Nothing else is iterated."""

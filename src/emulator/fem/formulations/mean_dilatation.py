@@ -24,7 +24,6 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System
 from emulator.fem.condensation import (
     Condensed,
     Volumes,
@@ -34,8 +33,10 @@ from emulator.fem.condensation import (
     linearise,
 )
 from emulator.fem.formulations.protocol import Linearised
-from emulator.fem.programs import compiled
+from emulator.fem.loop import compiled
 from emulator.fem.state import NewtonState
+from emulator.fem.system import System
+from emulator.scenes.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,11 @@ class MeanDilatation:
 
     system: System
     saddle: ClassVar[bool] = True
+
+    @staticmethod
+    def serves(scene: Scene) -> bool:
+        """A scene whose elements, or patches of them, share a volume ratio."""
+        return scene.dilatation != "pointwise"
 
     @property
     def programs(self) -> dict[Callable, Callable]:

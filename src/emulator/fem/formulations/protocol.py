@@ -6,8 +6,9 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 
-from emulator.fem.assembly import System
 from emulator.fem.state import NewtonState
+from emulator.fem.system import System
+from emulator.scenes.scene import Scene
 
 
 class Linearised(NamedTuple):
@@ -33,6 +34,10 @@ class Formulation(Protocol):
     """
 
     saddle: ClassVar[bool]
+
+    @staticmethod
+    def serves(scene: Scene) -> bool:
+        """Whether it can solve ``scene``."""
 
     @property
     def system(self) -> System:

@@ -34,14 +34,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System
 from emulator.fem.condensation import block_derivatives
+from emulator.fem.energy import at_points, displacement_gradient, seen_by_law
 from emulator.fem.formulations.protocol import Linearised
-from emulator.fem.functional import at_points, displacement_gradient, seen_by_law
 from emulator.fem.halving import largest_sound
 from emulator.fem.linear import Outcome
+from emulator.fem.loop import compiled, cond, while_loop
 from emulator.fem.material_point import MaterialPoint
-from emulator.fem.programs import compiled, cond, while_loop
+from emulator.fem.system import System
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
@@ -183,13 +183,13 @@ def _promised(
     scene = system.scene
     point = MaterialPoint(scene, theta)
 
-    def linearise(H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, jax.Array]:
+    def linearise(H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, ...]:
         return point.linearise(H, own, at, geometric)
 
-    stress, moduli = at_points(
+    stress, moduli, known = at_points(
         scene, linearise, _seen(scene, u), measures, tissue=scene.block_tissue
     )
-    forces, bulk = block_derivatives(scene, u, stress, moduli)
+    forces, bulk = block_derivatives(scene, u, stress, moduli, known)
     residual = system.restrict(system.scatter(forces) + system.others(u, theta, level))
     tangent, solvable, pull = system.equations(bulk, u, theta, stiffening, level)
     return Linearised(tangent, solvable, residual, pull, None)
@@ -236,9 +236,6 @@ def _taken(
 def applies(scene: Scene) -> bool:
     """Whether a scene's stresses can be iterates of their own, and whether that pays.
 
-    Its law must be exponential and read measures only. With mean dilatation Newton's method has
-    volumes and pressures as iterates already, and takes half as many steps (docs/experiments.md,
-    "Stress iterates with mean dilatation").
+    Its law must be exponential and read measures only.
     """
-    exponential = scene.law.exponential and measures_read(scene.law) is not None
-    return exponential and scene.dilatation == "pointwise"
+    return scene.law.exponential and measures_read(scene.law) is not None

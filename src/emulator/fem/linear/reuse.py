@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.protocol import Direct, Outcome
 from emulator.fem.linear.suitesparse import forget_factors
-from emulator.fem.programs import while_loop
+from emulator.fem.loop import while_loop
 
 TOLERANCE = 1e-10  # of the residual, in the norm of the reference's inverse
 _PATIENCE = 6  # steps after which half the pace that the last allowed step needs is asked for

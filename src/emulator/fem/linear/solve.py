@@ -8,7 +8,7 @@ import jax
 
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.protocol import Direct, Outcome
-from emulator.fem.programs import cond, one_by_one
+from emulator.fem.loop import cond, one_by_one
 
 
 def attempt(

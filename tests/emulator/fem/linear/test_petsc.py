@@ -12,13 +12,13 @@ import pytest
 import emulator as em
 from calibrate.verify.consistency import block as nearly_incompressible
 from emulator.errors import InputError
-from emulator.fem.assembly import System
 from emulator.fem.linear import SOLVERS, Outcome, mumps
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.petsc import _LAST
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.solve import attempt
 from emulator.fem.linear.solve import solve as solve_any
+from emulator.fem.system import System
 from emulator.scenes.loads import FollowerPressure
 from scene_support import block
 

@@ -9,7 +9,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.fem.functional import dead_force, potential_energy
+from emulator.fem.energy import dead_force, potential_energy
 from emulator.scenes.loads import Gravity, GravityVector
 from emulator.scenes.parameter_space import Parameter
 from scene_support import block

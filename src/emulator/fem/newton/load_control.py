@@ -14,10 +14,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from emulator.fem.newton.step_length import Outcome
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Status
 from emulator.fem.state import NewtonState
-from emulator.fem.step_length import Outcome
 
 # Shortened steps after which elements flattened again and again show that a level leads nowhere:
 # a lower load finds out sooner.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.loading_path import LoadingPath, Route
+from emulator.fem.continuation import LoadingPath, Route
 from emulator.scenes import Support
 from emulator.scenes.loads import Gravity
 from scene_support import block

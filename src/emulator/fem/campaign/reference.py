@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from emulator.errors import InputError
 from emulator.fem.campaign import Neighbours, Solver, run_campaign, solve_rows
+from emulator.fem.campaign.designs import sobol
 from emulator.fem.campaign.memory import MemoryRows
-from emulator.fem.designs import sobol
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 

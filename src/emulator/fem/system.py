@@ -24,7 +24,7 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.fem.condensation import block_derivatives
-from emulator.fem.functional import (
+from emulator.fem.energy import (
     DeadForce,
     at_points,
     dead_force,
@@ -47,8 +47,8 @@ from emulator.fem.linear import (
 )
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.solve import attempt, solve
+from emulator.fem.loop import compiled
 from emulator.fem.material_point import stress_and_moduli
-from emulator.fem.programs import compiled
 from emulator.scenes.local_terms import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
@@ -70,7 +70,7 @@ class System:
 
     @cached_property
     def programs(self) -> dict[Callable, Callable]:
-        """Its compiled functions (:mod:`emulator.fem.programs`)."""
+        """Its compiled functions (:mod:`emulator.fem.loop`)."""
         return {}
 
     @cached_property

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.programs import compiled, cond, while_loop
+from emulator.fem.loop import compiled, cond, while_loop
 
 
 class Spring:

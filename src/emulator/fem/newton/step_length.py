@@ -8,13 +8,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System
-from emulator.fem.direction import Direction
 from emulator.fem.formulations import formulation_of
-from emulator.fem.line_search import choose_fraction
+from emulator.fem.loop import compiled, cond, while_loop
+from emulator.fem.newton.direction import Direction
+from emulator.fem.newton.line_search import choose_fraction
 from emulator.fem.options import NewtonOptions
-from emulator.fem.programs import compiled, cond, while_loop
 from emulator.fem.state import NEAR, NewtonState
+from emulator.fem.system import System
 
 
 class Outcome(NamedTuple):

@@ -7,13 +7,18 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.assembly import System, relative_residual
+from emulator.fem.continuation import find_equilibrium
 from emulator.fem.formulations.stress_iterates import StressIterates, applies
 from emulator.fem.linear import Outcome
-from emulator.fem.loading_path import find_equilibrium
 from emulator.fem.material_point import MaterialPoint, fraction_at_stress
+from emulator.fem.options import NewtonOptions
+from emulator.fem.system import System, relative_residual
+from emulator.geometry.bodies.box import box
+from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import modulus
+from emulator.scenes import Scene, Support
+from emulator.scenes.left_ventricle import MYOCARDIUM
 from emulator.scenes.regions import Tissue
 from scene_support import block
 
@@ -62,7 +67,7 @@ def test_stress_and_tangent_of_a_point_whose_measures_are_others(ventricle):
 
         return jax.grad(model(others))(H), jax.hessian(model(xi(H)))(H)
 
-    stress, tangent = jax.jit(lambda H, others: own.linearise(H, others, at))(H, others)
+    stress, tangent, _ = jax.jit(lambda H, others: own.linearise(H, others, at))(H, others)
     expected = by_models(H, others)
     np.testing.assert_allclose(stress, expected[0], rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(tangent, expected[1], rtol=1e-10, atol=1e-9)
@@ -206,3 +211,49 @@ def test_a_good_start_keeps_its_load_and_a_poor_one_is_left(ventricle, monkeypat
     assert 0.5 in levels  # from rest
     for solution in (good, poor):
         np.testing.assert_allclose(solution.displacement, u, atol=1e-8)
+
+
+def test_with_mean_dilatation_they_end_where_newton_does():
+    """The law sees each element's mean volume ratio; so do the measures and their tangent."""
+    scene = replace(em.scenes.left_ventricle(3, 8, 1), dilatation="mean", origin={})
+    theta = scene.from_unit(jnp.array([1.0, 1.0, 1.0, 1.0, 0.0]))
+    own, errors = mip(scene, theta), []
+    state, step = own.begin(jnp.zeros(scene.held.shape)), jax.jit(own.step)
+    for iteration in range(8):
+        state = step(state, jnp.array(float(iteration > 0)))
+        errors.append(float(state.error))
+    assert errors[-1] < 1e-10
+    last = [error for error in errors if 1e-9 < error < 0.1]
+    assert all(after < 10.0 * before**1.6 for before, after in pairwise(last))
+    ramps, volumes = (
+        em.Simulator(scene, NewtonOptions(stress_iterates=used)).solve(scene.centre)
+        for used in (True, False)
+    )
+    np.testing.assert_allclose(ramps.displacement, volumes.displacement, atol=1e-8)
+    assert int(ramps.iterations) <= 0.6 * int(volumes.iterations)  # 10 and 22
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_body_that_is_pulled_by_its_face_climbs_the_ramps(order):
+    """Prescribed displacements: fewer than Newton's iterations, the same end."""
+    mesh = box((10.0, 10.0, 10.0), (2, 2, 2), order)
+    scene = Scene(
+        name="pulled",
+        mesh=mesh,
+        law=find_law("holzapfel_ogden"),
+        parameters=MYOCARDIUM,
+        supports=(Support("left"), Support("right", displacement=(2.0, 3.0, 0.0))),
+        constants={"kappa": 25.0},
+        fibres=np.tile([1.0, 0.0, 0.0], (len(mesh.elements), 1)),
+    )
+    theta = scene.from_unit(jnp.array([0.0, 1.0, 0.0, 1.0]))
+    with_ramps, without = (
+        em.Simulator(scene, NewtonOptions(stress_iterates=used)).solve(theta)
+        for used in (True, False)
+    )
+    assert with_ramps.converged
+    assert without.converged
+    np.testing.assert_allclose(with_ramps.displacement, without.displacement, atol=1e-8)
+    assert int(with_ramps.iterations) <= 0.8 * int(without.iterations)
+    compiled = jax.jit(em.Simulator(scene).solve)(theta)
+    assert int(compiled.iterations) == int(with_ramps.iterations)

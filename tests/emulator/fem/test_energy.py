@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emulator.fem.functional import dead_force, potential_energy, strain_energy
+from emulator.fem.energy import dead_force, potential_energy, strain_energy
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity

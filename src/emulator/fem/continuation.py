@@ -17,7 +17,7 @@ ramps.
 
 :class:`LoadingPath` has the steps of all routes as pure functions of one state, and
 :func:`find_equilibrium` is the one loop over them: Python's where theta is numbers, ``jax.lax``'s
-inside ``jit`` (:mod:`emulator.fem.programs`).
+inside ``jit`` (:mod:`emulator.fem.loop`).
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.assembly import System
 from emulator.fem.formulations.stress_iterates import StressIterates, StressState, applies
-from emulator.fem.newton import Newton
+from emulator.fem.loop import cond, while_loop
+from emulator.fem.newton.iteration import Newton
 from emulator.fem.options import NewtonOptions
-from emulator.fem.programs import cond, while_loop
 from emulator.fem.solution import Solution, Status
 from emulator.fem.state import NEAR, UNBALANCED, NewtonState
+from emulator.fem.system import System
 
 
 class Route(IntEnum):
@@ -67,6 +67,9 @@ _RAMPS = (
     _Ramp(0.05, 0.05, 80),
     _Ramp(0.02, 0.02, 160),
 )
+# Ramps of a body whose supports are moved: climbing finds what these do not
+# (docs/experiments.md, "Ramps for supports that move").
+_PULLED = 2
 # Relative residual below which a level of a ramp is carried well enough to go up
 # (docs/experiments.md, "Stresses as iterates").
 _CARRIED = 0.9
@@ -125,6 +128,12 @@ class LoadingPath:
         return wanted and applies(self.system.scene)
 
     @property
+    def _last_ramp(self) -> int:
+        """Route of the last ramp that is tried; none where there are no ramps."""
+        pulled = self.system.scene.held_displacement.any()
+        return (_PULLED if pulled else Route.CLIMB - 1) if self.ramps else 0
+
+    @property
     def _newton(self) -> Newton:
         return Newton(self.system, self.options, self.theta)
 
@@ -170,13 +179,13 @@ class LoadingPath:
         # A start whose tangent is indefinite is left for rest.
         again = state.route != Route.WARM
         mip = self._mip(state.level).step(state.mip, stiffening, geometric, again)
-        return _after_ramp_step(state, mip)
+        return _after_ramp_step(state, mip, last=self._last_ramp)
 
     def newton_step(self, state: PathState) -> PathState:
         """One iteration of Newton's method."""
         any_tangent = state.route == Route.CLIMB
         after = state._replace(newton=self._newton.step(state.newton, any_tangent))
-        return _after_newton_step(after, ramps=self.ramps)
+        return _after_newton_step(after, last=self._last_ramp)
 
     def _enter(self, state: PathState) -> PathState:
         """The state at the beginning of its route; iterations are counted on."""
@@ -226,15 +235,20 @@ def _judged(state: PathState, mip: StressState) -> tuple[jax.Array, jax.Array, j
     return level, lost, lost | found
 
 
-@jax.jit
-def _after_ramp_step(state: PathState, mip: StressState) -> PathState:
+def _following(route: jax.Array, last: int) -> jax.Array:
+    """The route after one that led nowhere; ``last`` is that of the last ramp."""
+    return jnp.where(route >= last, jnp.full_like(route, Route.CLIMB), route + 1)
+
+
+@partial(jax.jit, static_argnames="last")
+def _after_ramp_step(state: PathState, mip: StressState, *, last: int) -> PathState:
     """The state after a step of the stress iterates."""
     level, lost, leaves = _judged(state, mip)
     newton = state.newton
     return state._replace(
         newton=newton._replace(u=jnp.where(leaves, jnp.where(lost, 0.0, mip.u), newton.u)),
         mip=mip,
-        route=jnp.where(leaves & lost, state.route + 1, state.route),
+        route=jnp.where(leaves & lost, _following(state.route, last), state.route),
         ramping=jnp.where(leaves, lost, state.ramping),
         level=level,
         on_ramp=state.on_ramp + 1,
@@ -244,16 +258,15 @@ def _after_ramp_step(state: PathState, mip: StressState) -> PathState:
     )
 
 
-@partial(jax.jit, static_argnames="ramps")
-def _after_newton_step(state: PathState, *, ramps: bool) -> PathState:
+@partial(jax.jit, static_argnames="last")
+def _after_newton_step(state: PathState, *, last: int) -> PathState:
     """The state, or the beginning of the next route where another has to be tried."""
     newton = state.newton
     astray = _astray(newton.status, newton.convex, newton.level, newton.at_level, state.route)
-    following = state.route + 1 if ramps else jnp.full_like(state.route, Route.CLIMB)
     return state._replace(
         newton=newton._replace(u=jnp.where(astray, 0.0, newton.u)),
-        route=jnp.where(astray, following, state.route),
-        ramping=astray & ramps,
+        route=jnp.where(astray, _following(state.route, last), state.route),
+        ramping=astray & (last > 0),
         entering=astray,
     )
 

@@ -7,7 +7,7 @@ import pytest
 
 import emulator as em
 from emulator.fem.condensation import Volumes, advance, carried, consistent, linearise
-from emulator.fem.functional import pair_products
+from emulator.fem.energy import pair_products
 from emulator.geometry.bodies.box import box
 from emulator.geometry.bodies.ellipsoid import land_ventricle
 from emulator.geometry.quadratic import to_quadratic

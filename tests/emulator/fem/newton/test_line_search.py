@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.fem.continuation import find_equilibrium
 from emulator.fem.halving import largest_sound
-from emulator.fem.loading_path import find_equilibrium
 
 
 def conditions(jaxpr):

@@ -1,10 +1,10 @@
 r"""Newton's method with adaptive load steps: one iteration as a pure function of its state.
 
 At load level :math:`s \in (0, 1]` the loads are :math:`s f` and the held displacements
-:math:`s \bar u`. An iteration is a descent direction (:mod:`emulator.fem.direction`), the part of
-it that is taken (:mod:`emulator.fem.step_length`, :mod:`emulator.fem.line_search`) and the decision
-what comes next (:mod:`emulator.fem.load_control`). Loads without a potential are held at their
-present force while a step is judged, and a step that lowers the residual instead will do.
+:math:`s \bar u`. An iteration is a descent direction (:mod:`.direction`), the part of it that is
+taken (:mod:`.step_length`, :mod:`.line_search`) and the decision what comes next
+(:mod:`.load_control`). Loads without a potential are held at their present force while a step is
+judged, and a step that lowers the residual instead will do.
 
 Two things save factorisations, most of the cost. The tangent of the last iteration is kept while a
 step with it cuts the residual at least tenfold. And as long as the loads are hardly balanced, as
@@ -24,15 +24,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.assembly import System, forces_at
-from emulator.fem.direction import Direction, newton_direction
 from emulator.fem.formulations import formulation_of
-from emulator.fem.load_control import next_state
+from emulator.fem.loop import cond
+from emulator.fem.newton.direction import Direction, newton_direction
+from emulator.fem.newton.load_control import next_state
+from emulator.fem.newton.step_length import Outcome, take_step
 from emulator.fem.options import NewtonOptions
-from emulator.fem.programs import cond
 from emulator.fem.solution import Status
 from emulator.fem.state import Negligible, NewtonState
-from emulator.fem.step_length import Outcome, take_step
+from emulator.fem.system import System, forces_at
 
 _ROUND_OFF = 1e-15  # strain that floating point cannot tell from none
 _STILL = 1e-12  # of the body's size: a correction that may be round-off

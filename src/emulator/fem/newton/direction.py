@@ -15,11 +15,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.assembly import System
 from emulator.fem.formulations import Linearised, formulation_of
 from emulator.fem.linear import Outcome
-from emulator.fem.programs import compiled, cond
+from emulator.fem.loop import compiled, cond
 from emulator.fem.state import NewtonState
+from emulator.fem.system import System
 
 _ENDLESS = 1e13  # a step this much longer than force over stiffness: a singular tangent
 
