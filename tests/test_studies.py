@@ -35,6 +35,7 @@ QUICK = {
     "inverse_benchmark": "--quick",
     "large_meshes": "--quick",
     "many_solves": "--solves 3",
+    "mesh_row": "--quick",
     "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
     "networks_alone": "--quick",
     "new_ventricle": "--ventricles 1 --runs 8 --tests 3",

@@ -117,21 +117,23 @@ def recommend(
     effects = effects_of(scene)
     if not effects:
         raise InputError(f"scene '{scene.name}' has no effect that it can do without")
-    court = Comparison(scene, seen, samples, seed, say)
-    alone = [court.without((name,)) for name in effects]
+    compared = Comparison(scene, seen, samples, seed, say)
+    alone = [compared.without((name,)) for name in effects]
     chosen: tuple[str, ...] = ()
-    best = court.without(())
+    best = compared.without(())
     for each in sorted(alone, key=lambda m: m.ratio):
         if not each.within(limits) or each.ratio > _SAVES:
             continue
-        trial = court.without((*chosen, *each.left_out))
+        trial = compared.without((*chosen, *each.left_out))
         if trial.within(limits) and trial.ratio < _SAVES * best.ratio:
             chosen, best = (*chosen, *each.left_out), trial
-    whole = found = court.without(())
+    whole = found = compared.without(())
     trials = 0
     while chosen:
         trials += 1
-        judge = Comparison(scene, seen, samples, seed + trials * _HELD_OUT, say, court.simulators)
+        judge = Comparison(
+            scene, seen, samples, seed + trials * _HELD_OUT, say, compared.simulators
+        )
         found = judge.without(chosen)
         if found.within(limits):
             break

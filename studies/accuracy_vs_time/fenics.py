@@ -24,6 +24,7 @@ from calibrate.observations import landmarks
 from emulator.errors import InputError
 from emulator.fem import Simulator, uniform
 from emulator.fem.options import NewtonOptions
+from emulator.geometry.discretisation import quadrature_points
 from emulator.scenes import Scene
 from emulator.scenes.loads import CavityPressure, Gravity
 
@@ -36,14 +37,7 @@ Arrays = dict[str, Any]
 
 
 def arrays(scene: Scene) -> Arrays:
-    """The scene as plain arrays: what FEniCSx is told.
-
-    Raises
-    ------
-    InputError
-        Quadratic elements, which its program here has not.
-    """
-    scene.mesh.require_linear("FEniCSx")
+    """The scene as plain arrays: what FEniCSx is told."""
     found: Arrays = {
         "nodes": scene.mesh.nodes,
         "elements": scene.mesh.elements,
@@ -56,7 +50,9 @@ def arrays(scene: Scene) -> Arrays:
         "body_force": np.zeros(3),
     }
     if scene.fibres is not None:
-        found["fibres"] = scene.fibres
+        linear = scene.mesh.order == 1
+        found["fibres"] = scene.fibres if linear else scene.fibres_at_points
+        found["points"] = quadrature_points(scene.mesh.order)[:, 1:]
     for load in scene.loads:
         found |= _load(scene, load)
     return found

@@ -118,7 +118,7 @@ class Body:
         v, du = ufl.TestFunction(self.space), ufl.TrialFunction(self.space)
         dx = ufl.Measure("dx", self.mesh, metadata={"quadrature_degree": self.order})
         F = ufl.Identity(3) + ufl.grad(self.u)
-        fibre = self._fibres(problem["fibres"]) if "fibres" in problem else None
+        fibre = self._fibres(problem) if "fibres" in problem else None
         W = LAWS[str(problem["law"])](F, self.values, fibre)
         internal = ufl.derivative(W * dx, self.u, v)
         weight = fem.Constant(self.mesh, problem["body_force"].astype(PETSc.ScalarType))
@@ -141,12 +141,21 @@ class Body:
     def _form(self, form):
         return fem.form(form, jit_options=self.jit)
 
-    def _fibres(self, fibres):
-        """Fibres (m, 3), constant on each element."""
-        space = fem.functionspace(self.mesh, ("DG", 0, (3,)))
+    def _fibres(self, problem):
+        """Fibres (m, 3) of linear elements, (m, q, 3) at the ``points`` (q, 3) of quadratic ones."""
+        fibres, cells = problem["fibres"], self.mesh.topology.original_cell_index
+        if self.order == 1:
+            element, order = ("DG", 0, (3,)), [0]
+            fibres = fibres[:, None]
+        else:
+            element = basix.ufl.quadrature_element("tetrahedron", value_shape=(3,), degree=2)
+            there, _ = basix.make_quadrature(basix.CellType.tetrahedron, 2)
+            away = np.abs(there[:, None] - problem["points"]).max(axis=2)
+            order = away.argmin(axis=1)
+            assert away.min(axis=1).max() < 1e-9, "other points than ours"
+        space = fem.functionspace(self.mesh, element)
         field = fem.Function(space)
-        cells = space.dofmap.list[:, 0]
-        field.x.array.reshape(-1, 3)[cells] = fibres[self.mesh.topology.original_cell_index]
+        field.x.array.reshape(-1, 3)[space.dofmap.list] = fibres[cells][:, order]
         return field
 
     def _pressed(self, facets):

@@ -35,8 +35,8 @@ TRUTH = {"a": 0.33, "b": 2.2, "a_f": 6.0, "b_f": 2.4, "pressure": 1.0}
 NOISE = {"displacement": 0.3, "volume": 1.0}
 # Semi-axes of the wall (mm), rings, around, layers.
 VENTRICLES = {
-    "human": (EllipsoidalWall(23.0, 58.0, 34.0, 65.0, 20.0), (15, 30, 3)),
-    "dilated, thin": (EllipsoidalWall(30.0, 62.0, 38.0, 68.0, 22.0), (17, 34, 2)),
+    "human": (EllipsoidalWall(23.0, 58.0, 34.0, 65.0, 20.0), (8, 28, 3)),
+    "dilated, thin": (EllipsoidalWall(30.0, 62.0, 38.0, 68.0, 22.0), (10, 36, 2)),
 }
 SCENE = """
 law = "holzapfel_ogden"
@@ -84,7 +84,7 @@ kappa = 25.0
 
 def prepare(name: str, size: tuple[int, int, int], folder: Path) -> int:
     """What a user begins with: mesh, scene file and measurements; the number of nodes."""
-    mesh = truncated_ellipsoid(VENTRICLES[name][0], *size)
+    mesh = truncated_ellipsoid(VENTRICLES[name][0], *size, 2, grading=1.5)
     write_mesh(folder / "mesh.vtu", mesh)
     (folder / "scene.toml").write_text(SCENE)
     run = Run(
@@ -143,6 +143,7 @@ def one(name: str, size: tuple[int, int, int]) -> dict[str, Any]:
         "ess_tail": min(row["ess_tail"] for row in table.values()),
         "divergences": result["divergences"],
         "reason": certificate["certificate"]["reason"],
+        "mesh": certificate["certificate"]["mesh"],
         "truth_z": z,
     }
     print(

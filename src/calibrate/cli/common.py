@@ -123,7 +123,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], width: int | 
     lines = [list(header), *([_cell(value) for value in row] for row in rows)]
     widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
     if width is None:
-        width = shutil.get_terminal_size((_ENDLESS, 24)).columns
+        width = shutil.get_terminal_size((_UNLIMITED, 24)).columns
     blocks = [
         "\n".join(_aligned(line, widths, columns) for line in lines)
         for columns in _blocks(widths, width)
@@ -131,7 +131,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], width: int | 
     return "\n\n".join(blocks)
 
 
-_ENDLESS = 1_000_000  # columns of a file or a pipe
+_UNLIMITED = 1_000_000  # columns of a file or a pipe
 
 
 def _blocks(widths: Sequence[int], width: int) -> list[list[int]]:

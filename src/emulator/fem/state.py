@@ -45,7 +45,7 @@ class NewtonState(NamedTuple):
     more; inf for never.
     crushed : whether the last level was given up because elements would invert.
     singular : whether the last step came of a singular tangent.
-    squeezed : steps at this level shortened because elements would invert.
+    flattened : steps at this level shortened because elements would invert.
     status : a :class:`Status`.
     """
 
@@ -67,7 +67,7 @@ class NewtonState(NamedTuple):
     careful: jax.Array
     crushed: jax.Array
     singular: jax.Array
-    squeezed: jax.Array
+    flattened: jax.Array
     status: jax.Array
 
     @property

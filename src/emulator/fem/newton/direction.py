@@ -21,7 +21,7 @@ from emulator.fem.loop import compiled, cond
 from emulator.fem.state import NewtonState
 from emulator.fem.system import System
 
-_ENDLESS = 1e13  # a step this much longer than force over stiffness: a singular tangent
+_SINGULAR = 1e13  # a step this much longer than force over stiffness: a singular tangent
 
 
 class Direction(NamedTuple):
@@ -82,14 +82,14 @@ def _full_step(
     """
     force = equations.residual + equations.pull
     slope = jnp.vdot(equations.residual, move)
-    endless = _endless(equations.tangent, move, force)
+    singular = _is_singular(equations.tangent, move, force)
     move = jnp.where(turns & (slope > 0.0), -move, move)
     move = system.extend(move) + system.support_offset(u, level)
     solvable = equations.solvable
-    return jnp.where(solvable, move, jnp.nan), slope, ~solvable | endless
+    return jnp.where(solvable, move, jnp.nan), slope, ~solvable | singular
 
 
-def _endless(tangent: jax.Array, move: jax.Array, force: jax.Array) -> jax.Array:
+def _is_singular(tangent: jax.Array, move: jax.Array, force: jax.Array) -> jax.Array:
     """Whether a step is so long for its force that the tangent must be singular."""
     size = jnp.max(jnp.abs(tangent)) * jnp.max(jnp.abs(move))
-    return ~(size <= _ENDLESS * jnp.max(jnp.abs(force)))
+    return ~(size <= _SINGULAR * jnp.max(jnp.abs(force)))

@@ -163,6 +163,6 @@ def _first(
         careful=jnp.full((), jnp.inf, float),
         crushed=jnp.array(False),
         singular=jnp.array(False),
-        squeezed=count,
+        flattened=count,
         status=jnp.asarray(jnp.where(fine, status, Status.INVALID_INPUT), dtype=jnp.int64),
     )

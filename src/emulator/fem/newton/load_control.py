@@ -21,7 +21,7 @@ from emulator.fem.state import NewtonState
 
 # Shortened steps after which elements flattened again and again show that a level leads nowhere:
 # a lower load finds out sooner.
-_SQUEEZES = 8
+_MOST_FLATTENED = 8
 # A load step towards a saddle that works takes about ten (docs/experiments.md, "Mean dilatation
 # from far away").
 _SADDLE_ITERATIONS = 20
@@ -32,12 +32,12 @@ _SLOW = 0.3  # of the residual left by a step with its own tangent: round-off, o
 class Verdict(NamedTuple):
     """Whether a level is solved or given up; neither where the iteration goes on.
 
-    drowned : whether it is solved because what is left may be round-off.
+    round_off : whether it is solved because what is left may be round-off.
     """
 
     solved: jax.Array
     failed: jax.Array
-    drowned: jax.Array
+    round_off: jax.Array
 
 
 def judge_level(
@@ -50,19 +50,21 @@ def judge_level(
     error, at_level = outcome.error, state.at_level + 1
     slow = state.refresh & (error > _SLOW * state.error) & (at_level > 1)
     met = jnp.isfinite(state.error) & jnp.isfinite(error)
-    drowned = met & _drowned(state, move)
-    solved = (error <= options.tolerance) | (slow & (error <= options.round_off)) | drowned
+    round_off = met & _is_round_off(state, move)
+    solved = (error <= options.tolerance) | (slow & (error <= options.round_off)) | round_off
     solved |= met & (jnp.linalg.norm(outcome.residual) <= options.absolute)
     stuck = state.refresh & ~(outcome.fraction > 0.0)
     spent = at_level >= options.level_iterations
     if state.iterates is not None:
         spent |= at_level >= _SADDLE_ITERATIONS
-    spent |= (_squeezed(state, outcome) >= _SQUEEZES) & (_halved(state) >= options.min_increment)
+    spent |= (_flattened(state, outcome) >= _MOST_FLATTENED) & (
+        _halved(state) >= options.min_increment
+    )
     spent |= ~_convex(state, outcome, options) & (_halved(state) >= state.careful)
-    return Verdict(solved, ~solved & (stuck | spent), drowned)
+    return Verdict(solved, ~solved & (stuck | spent), round_off)
 
 
-def _drowned(state: NewtonState, move: jax.Array) -> jax.Array:
+def _is_round_off(state: NewtonState, move: jax.Array) -> jax.Array:
     """Whether both the residual and what Newton's step makes of it may be round-off."""
     quiet = jnp.linalg.norm(state.residual) <= state.negligible.residual
     return quiet & (jnp.max(jnp.abs(move)) <= state.negligible.correction)
@@ -82,7 +84,7 @@ def next_state(
     move : (n, 3) mm, the full step.
     """
     state = state._replace(convex=state.convex & (descends | _quiet(state, options)))
-    solved, failed, drowned = judge_level(state, outcome, move, options)
+    solved, failed, round_off = judge_level(state, outcome, move, options)
     complete, moved = solved & (state.level >= 1.0), solved | failed
     iterations = state.iterations + 1
     reached = jnp.where(solved, state.level, state.reached)
@@ -103,11 +105,11 @@ def next_state(
         iterations=iterations,
         factorisations=state.factorisations + state.refresh,
         residual=outcome.residual,
-        error=jnp.where(drowned, 0.0, outcome.error),
+        error=jnp.where(round_off, 0.0, outcome.error),
         refresh=moved | ~_keeps_tangent(state, outcome, options),
         convex=(moved & ~complete) | _convex(state, outcome, options),
         crushed=crushed,
-        squeezed=jnp.where(moved, 0, _squeezed(state, outcome)),
+        flattened=jnp.where(moved, 0, _flattened(state, outcome)),
         status=jnp.asarray(status, dtype=state.status.dtype),
     )
 
@@ -116,8 +118,8 @@ def _halved(state: NewtonState) -> jax.Array:
     return 0.5 * (state.level - state.reached)
 
 
-def _squeezed(state: NewtonState, outcome: Outcome) -> jax.Array:
-    return state.squeezed + (outcome.crushed & (outcome.fraction < 0.5))
+def _flattened(state: NewtonState, outcome: Outcome) -> jax.Array:
+    return state.flattened + (outcome.crushed & (outcome.fraction < 0.5))
 
 
 def _increment(
