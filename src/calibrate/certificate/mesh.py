@@ -79,6 +79,7 @@ def mesh_change(
     states = len(predictive.model.states.states)
     points = points_for(predictive.dimension, states, count)
     told = changed(predictive, _by_fem(predictive, error, observe), runs, pool, points, rng)
+    error.forget()
     nodes, linear = len(error.finer.scene.mesh.nodes), simulator.scene.mesh.order == 1
     model_error = predictive.model.error
     widened = model_error is not None and model_error.of_mesh

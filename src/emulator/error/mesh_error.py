@@ -29,6 +29,7 @@ import numpy as np
 
 from emulator.error.step import Distance, newton_distance
 from emulator.errors import InputError
+from emulator.fem.linear.suitesparse import forget_factors
 from emulator.fem.simulator import Simulator
 from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene
@@ -114,6 +115,10 @@ class MeshError:
             solution = self.fine.solve(theta)
         fine = solution.require_converged(f"{what}, on the finer one").displacement
         return MeshErrorEstimate(theta, coarse, fine, solved=True)
+
+    def forget(self) -> None:
+        """Free the factors of both meshes: a large one's are gigabytes, and would stay."""
+        forget_factors()
 
     def _carried(self, u: jax.Array) -> jax.Array:
         return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))
