@@ -142,7 +142,7 @@ class Body:
         return fem.form(form, jit_options=self.jit)
 
     def _fibres(self, problem):
-        """Fibres (m, 3) of linear elements, (m, q, 3) at the ``points`` (q, 3) of quadratic ones."""
+        """Fibres (m, 3) of linear elements, or (m, q, 3) at the ``points`` (q, 3) of others."""
         fibres, cells = problem["fibres"], self.mesh.topology.original_cell_index
         if self.order == 1:
             element, order = ("DG", 0, (3,)), [0]

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.ticker import FixedFormatter, FixedLocator
 from studies.common.output import Case, Results, parser, save
 from studies.common.two_meshes import Pair, on_two_meshes
 
@@ -175,8 +176,11 @@ def draw(cases: list[Case], path: Path) -> None:
                 x, y, e, fmt=mark, color=COLOURS[k % len(COLOURS)], ms=5, lw=0.8,
                 mfc="none" if verdict == "accepted" else None, label=f"{name}, {verdict}",
             )  # fmt: skip
-    axes.set_xscale("symlog", linthresh=0.5)
-    axes.set_yscale("symlog", linthresh=0.5)
+    ticks = [-100, -10, -1, 0, 1, 10, 100]
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.axes.set(**{f"{axis.axis_name}scale": "symlog"})
+        axis.set_major_locator(FixedLocator(ticks))
+        axis.set_major_formatter(FixedFormatter([f"{tick}" for tick in ticks]))
     ends = np.array(axes.get_xlim())
     line = np.sign(ends) * np.geomspace(1e-2, np.abs(ends).max(), 60)[:, None]
     axes.plot(np.sort(line.ravel()), np.sort(line.ravel()), color="0.6", lw=0.8, zorder=0)
