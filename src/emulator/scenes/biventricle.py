@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from emulator.geometry.bodies import biventricle as geometry
-from emulator.geometry.fibres import biventricular_directions
 from emulator.mechanics.laws import find_law
+from emulator.scenes.fibre_rules import Biventricle
 from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
 from emulator.scenes.resolution import resolved
@@ -46,6 +46,7 @@ def biventricle(
     """
     made = resolved(SIZES, order, rings=rings, around=around, layers=layers)
     mesh = geometry.biventricle(**made)
+    rule = Biventricle(angles)
     return Scene(
         name="biventricle",
         mesh=mesh,
@@ -57,7 +58,8 @@ def biventricle(
         ),
         supports=(Support("base"),),
         constants={"kappa": kappa, "right_pressure": right_pressure},
-        fibres=biventricular_directions(mesh, angles).fibres,
+        fibres=rule.directions(mesh)[0],
+        fibre_rule=rule,
         origin={
             "scene": "biventricle",
             **made,

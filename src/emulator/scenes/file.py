@@ -156,6 +156,7 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
             law=law,
             origin={"scene": "file", "path": str(path.resolve())},
             fibres=fibres,
+            fibre_rule=file.fibres,
             sheets=sheets,
             regions=regions,
             parameters=parameters,

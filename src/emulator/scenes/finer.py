@@ -8,6 +8,7 @@ import numpy as np
 
 from emulator.geometry.directions import across
 from emulator.geometry.refinement import Refinement, refined
+from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.scene import Scene
 
 FINER = "finer"
@@ -26,8 +27,10 @@ class Finer:
 def finer(scene: Scene) -> Finer:
     """``scene`` with quadratic elements for linear ones, or eight quadratic ones for each.
 
-    Fibres and sheets that are constant in an element are continued linearly. The body is the
-    mesh's own: what its elements miss of a curved surface is not put right.
+    Fibres and sheets are the rule's that made them, where it is known, else continued linearly:
+    what a coarse mesh makes of a rule may be most of its error (docs/experiments.md, "Fibres of the
+    finer mesh"). The body is the mesh's own: what its elements miss of a curved surface is not put
+    right.
 
     Raises
     ------
@@ -36,10 +39,7 @@ def finer(scene: Scene) -> Finer:
     """
     refinement = refined(scene.mesh)
     children = refinement.children
-    fibres = None if scene.fibres is None else refinement.directions(scene.fibres)
-    sheets = None if scene.sheets is None else refinement.directions(scene.sheets)
-    if fibres is not None and sheets is not None:
-        sheets = across(sheets, fibres)
+    fibres, sheets = _directions(scene, refinement)
     moved = refinement.carry(scene.held_displacement)
     fine = replace(
         scene,
@@ -53,3 +53,24 @@ def finer(scene: Scene) -> Finer:
         origin={"scene": FINER, "of": dict(scene.origin)} if scene.origin else {},
     )
     return Finer(scene, fine, refinement)
+
+
+def _directions(scene: Scene, refinement: Refinement) -> tuple[np.ndarray | None, ...]:
+    """Fibres and sheets on the finer mesh, None where the scene has none."""
+    rule = scene.fibre_rule
+    if rule is not None and _made_by(rule, scene):
+        made, across_them = rule.directions(refinement.mesh)
+        return made, None if scene.sheets is None else across_them
+    fibres = None if scene.fibres is None else refinement.directions(scene.fibres)
+    sheets = None if scene.sheets is None else refinement.directions(scene.sheets)
+    if fibres is not None and sheets is not None:
+        sheets = across(sheets, fibres)
+    return fibres, sheets
+
+
+def _made_by(rule: FibreRule, scene: Scene) -> bool:
+    """Whether the scene's fibres are the rule's: they may have been replaced since."""
+    if scene.fibres is None:
+        return False
+    made = rule.directions(scene.mesh)[0]
+    return made.shape == scene.fibres.shape and np.allclose(made, scene.fibres, atol=1e-9)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import astuple
 
 from emulator.geometry.bodies.ellipsoid import HUMAN, EllipsoidalWall, truncated_ellipsoid
-from emulator.geometry.fibres import rule_based_fibres
 from emulator.mechanics.laws import find_law
+from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.resolution import resolved
@@ -70,6 +70,7 @@ def left_ventricle(
     """
     made = resolved(SIZES, order, rings=rings, around=around, layers=layers, grading=grading)
     mesh = truncated_ellipsoid(EllipsoidalWall(*wall), **made, thicker=thicker)
+    rule = Helix(angles)
     return Scene(
         name="left_ventricle",
         mesh=mesh,
@@ -78,7 +79,8 @@ def left_ventricle(
         loads=(CavityPressure("endocardium"),),
         supports=(Support("base"),),
         constants={"kappa": kappa},
-        fibres=rule_based_fibres(mesh, angles=angles),
+        fibres=rule.directions(mesh)[0],
+        fibre_rule=rule,
         origin={
             "scene": "left_ventricle",
             **made,

@@ -24,6 +24,7 @@ from emulator.geometry.patches import patchwise
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
@@ -60,6 +61,8 @@ class Scene(Shown):
     regions : (m,) whole number of the region each element lies in. Region 3 takes a parameter or a
         constant ``stiffness_3``, by which the law's energy there is multiplied, except its
         volumetric part; see :mod:`emulator.scenes.regions`.
+    fibre_rule : what made the directions of this mesh, for another mesh of the body
+        (:mod:`emulator.scenes.finer`).
     """
 
     name: str
@@ -74,6 +77,7 @@ class Scene(Shown):
     dilatation: Literal["pointwise", "mean", "patch"] = "pointwise"
     sheets: np.ndarray | None = None
     regions: np.ndarray | None = None
+    fibre_rule: FibreRule | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
