@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from emulator.errors import InputError
 from emulator.geometry.directions import across
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.fibre_rules import FibreRule
@@ -72,5 +73,8 @@ def _made_by(rule: FibreRule, scene: Scene) -> bool:
     """Whether the scene's fibres are the rule's: they may have been replaced since."""
     if scene.fibres is None:
         return False
-    made = rule.directions(scene.mesh)[0]
+    try:
+        made = rule.directions(scene.mesh)[0]
+    except InputError:  # another mesh, without the rule's facet sets
+        return False
     return made.shape == scene.fibres.shape and np.allclose(made, scene.fibres, atol=1e-9)

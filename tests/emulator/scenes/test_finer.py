@@ -29,6 +29,13 @@ def test_fibres_that_replaced_a_rules_are_continued():
     assert np.abs(finer(constant).scene.fibres - made).max() > 0.05
 
 
+def test_a_mesh_without_the_rules_sets_keeps_its_fibres():
+    scene = em.scenes.left_ventricle(4, 10, 1)
+    sets = {name: facets for name, facets in scene.mesh.facet_sets.items() if name != "epicardium"}
+    other = replace(scene, mesh=replace(scene.mesh, facet_sets=sets), origin={})
+    assert finer(other).scene.fibres.shape[0] == 8 * len(scene.mesh.elements)
+
+
 def test_a_rule_is_not_part_of_what_a_scene_is():
     scene = em.scenes.left_ventricle(4, 10, 1)
     assert replace(scene, fibre_rule=None).fingerprint == scene.fingerprint
