@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -79,7 +80,9 @@ def emulators(name: str) -> Pair:
 
 def model_of(emulator: em.Emulator, at: np.ndarray, noise: float, volume: float) -> cal.Model:
     """The model of displacements of points ``at`` (d, 3), and of the volume."""
-    scene, parts, sd = emulator.scene, {}, {}
+    scene = emulator.scene
+    parts: dict[str, Any] = {}
+    sd: dict[str, float] = {}
     if len(at):
         parts["displacement"], sd["displacement"] = landmarks(scene, at), noise
     if volume > 0.0:
