@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from calibrate.verify.row import Row
 from emulator.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign, solve_together
+from emulator.fem.balance import relative_residual
 from emulator.fem.energy import potential_energy
-from emulator.fem.system import relative_residual
 from emulator.released.files import models_in, units
 from emulator.released.scenes import MODELS, published_scene, published_tests
 from emulator.scenes.scene import Scene

@@ -117,7 +117,7 @@ class MeshError:
         return MeshErrorEstimate(theta, coarse, fine, solved=True)
 
     def forget(self) -> None:
-        """Free the factors of both meshes: a large one's are gigabytes, and would stay."""
+        """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
         forget_factors()
 
     def _carried(self, u: jax.Array) -> jax.Array:

@@ -14,15 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.fem.balance import balance
 from emulator.fem.energy import volume_ratio
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
 from emulator.fem.loop import while_loop
-from emulator.fem.newton.iteration import Newton, NewtonState
+from emulator.fem.newton import Newton
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Status
-from emulator.fem.state import UNBALANCED
-from emulator.fem.system import System, balance
+from emulator.fem.state import UNBALANCED, NewtonState
+from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 
 ENDLESS = 1e100  # mm; larger displacements count as not finite: J, their cube, would overflow

@@ -33,7 +33,7 @@ import numpy as np
 
 from emulator.fem.formulations.stress_iterates import StressIterates, StressState, applies
 from emulator.fem.loop import cond, while_loop
-from emulator.fem.newton.iteration import Newton
+from emulator.fem.newton import Newton
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.fem.state import NEAR, UNBALANCED, NewtonState

@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -268,18 +267,6 @@ class System:
         """Whether the held displacements of ``u`` (n, 3) are those of ``level``, shape ()."""
         return jnp.all(self.support_offset(u, level) == 0.0)
 
-    def level_balance(
-        self, u: jax.Array, theta: jax.Array, level: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """:func:`balance`, its relative size infinite unless finite and the supports are met."""
-        residual, error = balance(self, u, theta, level)
-        return residual, self._where_met(u, level, error)
-
-    @compiled
-    def _where_met(self, u: jax.Array, level: jax.Array, error: jax.Array) -> jax.Array:
-        met = jnp.all(self.support_offset(u, level) == 0.0)
-        return jnp.where(met & jnp.isfinite(error), error, jnp.inf)
-
     @compiled
     def least_volume_ratio(self, u: jax.Array) -> jax.Array:
         """The smallest ``J``, shape (): NaN if any is."""
@@ -331,57 +318,3 @@ class System:
         """The factor that serves other tangents; None where the matrices are small."""
         pays = self.scene.dilatation == "pointwise" and KeptFactor.pays(self.pattern)
         return KeptFactor(self.direct, self.pattern) if pays else None
-
-
-def relative_residual(
-    system: System, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
-) -> jax.Array:
-    """Norm of the residual relative to the internal and external forces, shape ()."""
-    return balance(system, u, theta, load)[1]
-
-
-class Forces(NamedTuple):
-    """Balance of a state.
-
-    residual : (f,) in mN. internal : norm () in mN of the internal forces, reactions included.
-    relative : norm of the residual relative to internal and external forces, ().
-    """
-
-    residual: jax.Array
-    internal: jax.Array
-    relative: jax.Array
-
-
-@compiled
-def forces_at(
-    system: System,
-    u: jax.Array,
-    theta: jax.Array,
-    load: jax.Array | float,
-) -> Forces:
-    """Forces at ``u`` (n, 3) mm and ``load`` times the loads, see :func:`balance`."""
-    internal = system.internal_force(u, theta)
-    external = load * system.external_force(u, theta)
-    residual = system.restrict(internal - external)
-    size, norm = _norm(internal), _norm(residual)
-    scale = size + _norm(external)
-    return Forces(residual, size, norm / jnp.where(scale > 0.0, scale, 1.0))
-
-
-def balance(
-    system: System,
-    u: jax.Array,
-    theta: jax.Array,
-    load: jax.Array | float = 1.0,
-) -> tuple[jax.Array, jax.Array]:
-    """Residual (f,) in mN, and its norm relative to internal and external forces, shape ().
-
-    The forces include reactions. The relative residual of a body without any forces is 0. NaN stays
-    NaN.
-    """
-    forces = forces_at(system, u, theta, load)
-    return forces.residual, forces.relative
-
-
-def _norm(field: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.sum(field**2))

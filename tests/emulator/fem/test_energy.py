@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emulator.fem.energy import dead_force, potential_energy, strain_energy
+from emulator.fem.energy import dead_force, pair_products, potential_energy, strain_energy
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity
@@ -112,3 +112,14 @@ def test_barriers_leave_a_sound_state_untouched(beam, simulator):
     crushed = u.at[:, 0].add(-3.0 * beam.mesh.nodes[:, 0])
     assert np.isnan(potential_energy(beam)(crushed, beam.centre))
     assert np.isfinite(potential_energy(beam, Barriers())(crushed, beam.centre))
+
+
+def test_products_of_pairs_are_those_of_the_whole_blocks():
+    rng = np.random.default_rng(3)
+    whole = rng.normal(size=(2, 15, 15))
+    whole = whole + whole.transpose(0, 2, 1)
+    one, other = np.triu_indices(5)
+    pairs = whole.reshape(2, 5, 3, 5, 3)[:, one, :, other].transpose(1, 0, 2, 3)
+    x = rng.normal(size=(2, 5, 3))
+    expected = np.einsum("bij,bj->bi", whole, x.reshape(2, 15)).reshape(2, 5, 3)
+    np.testing.assert_allclose(pair_products(jnp.asarray(pairs), jnp.asarray(x)), expected)

@@ -9,7 +9,7 @@ import emulator as em
 from emulator.errors import InputError
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.linear import Outcome
-from emulator.fem.newton.iteration import Newton
+from emulator.fem.newton import Newton
 from emulator.fem.system import System
 from emulator.scenes.loads import Gravity
 

@@ -7,7 +7,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError, SolverError
-from emulator.fem.system import relative_residual
+from emulator.fem.balance import relative_residual
 from emulator.geometry.bodies.box import box
 from emulator.scenes import Support
 from emulator.scenes.loads import FollowerPressure, Gravity

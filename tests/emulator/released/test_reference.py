@@ -7,7 +7,7 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
-from emulator.fem.system import relative_residual
+from emulator.fem.balance import relative_residual
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.released import reference

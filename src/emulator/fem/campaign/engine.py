@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError, SolverError
+from emulator.fem.balance import relative_residual
 from emulator.fem.campaign.row import Row, Task
 from emulator.fem.energy import potential_energy, volume_ratio
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
-from emulator.fem.system import relative_residual
 
 Starts = Callable[[int], Sequence[Any]]
 """Displacements (n, 3) mm that the solve of that number may start from; none for rest."""

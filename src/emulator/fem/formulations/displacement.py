@@ -8,7 +8,6 @@ r"""Newton's method for the displacement alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,6 @@ class Displacement:
     """The displacement is all that is iterated: see :class:`Formulation`."""
 
     system: System
-    saddle: ClassVar[bool] = False
 
     @staticmethod
     def serves(scene: Scene) -> bool:
@@ -49,15 +47,9 @@ class Displacement:
         return Linearised(tangent, solvable, state.residual, pull, None)
 
     def nearer(
-        self,
-        state: NewtonState,
-        theta: jax.Array,
-        equations: Linearised,
-        move: jax.Array,
-        fraction: jax.Array,
-    ) -> jax.Array:
-        """Never asked: the potential energy judges."""
-        raise NotImplementedError
+        self, state: NewtonState, theta: jax.Array, equations: Linearised, move: jax.Array
+    ) -> None:
+        """The potential energy judges."""
 
     def advance(
         self, iterates: None, eliminated: None, move: jax.Array, fraction: jax.Array

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ from emulator.fem.condensation import (
     consistent,
     linearise,
 )
-from emulator.fem.formulations.protocol import Linearised
+from emulator.fem.formulations.protocol import Linearised, Nearer
 from emulator.fem.loop import compiled
 from emulator.fem.state import NewtonState
 from emulator.fem.system import System
@@ -44,7 +44,6 @@ class MeanDilatation:
     """Volumes and pressures of the blocks are iterates, too: see :class:`Formulation`."""
 
     system: System
-    saddle: ClassVar[bool] = True
 
     @staticmethod
     def serves(scene: Scene) -> bool:
@@ -76,15 +75,10 @@ class MeanDilatation:
         return Linearised(tangent, solvable, system.restrict(residual), pull, condensed)
 
     def nearer(
-        self,
-        state: NewtonState,
-        theta: jax.Array,
-        equations: Linearised,
-        move: jax.Array,
-        fraction: jax.Array,
-    ) -> jax.Array:
-        """Whether ``fraction`` of the step passes the test of natural monotonicity, shape ()."""
-        return self._nearer(state.u, state.iterates, state.level, theta, equations, move, fraction)
+        self, state: NewtonState, theta: jax.Array, equations: Linearised, move: jax.Array
+    ) -> Nearer:
+        """Whether a fraction of the step passes the test of natural monotonicity."""
+        return partial(self._nearer, state.u, state.iterates, state.level, theta, equations, move)
 
     @compiled
     def _nearer(

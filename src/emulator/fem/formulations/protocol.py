@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import jax
 
@@ -26,14 +27,16 @@ class Linearised(NamedTuple):
     eliminated: Any
 
 
+Nearer = Callable[[jax.Array], jax.Array]
+"""Of a fraction of a step: whether it leads nearer to the saddle, shape ()."""
+
+
 class Formulation(Protocol):
     """How Newton's method solves for the displacement, and what else it iterates on.
 
-    ``iterates`` are a tree of arrays besides the displacement, or None. saddle : whether the point
-    sought is one: :meth:`nearer` judges a step, where else the potential energy does.
+    ``iterates`` are a tree of arrays besides the displacement, or None. With them the point sought
+    is a saddle, and :meth:`nearer` judges a step; without, the potential energy does.
     """
-
-    saddle: ClassVar[bool]
 
     @staticmethod
     def serves(scene: Scene) -> bool:
@@ -50,14 +53,9 @@ class Formulation(Protocol):
         """The equations at ``state``."""
 
     def nearer(
-        self,
-        state: NewtonState,
-        theta: jax.Array,
-        equations: Linearised,
-        move: jax.Array,
-        fraction: jax.Array,
-    ) -> jax.Array:
-        """Whether ``fraction`` of the step ``move`` (n, 3) leads nearer to the saddle, shape ()."""
+        self, state: NewtonState, theta: jax.Array, equations: Linearised, move: jax.Array
+    ) -> Nearer | None:
+        """What judges the step ``move`` (n, 3); None without iterates."""
 
     def advance(self, iterates: Any, eliminated: Any, move: jax.Array, fraction: jax.Array) -> Any:
         """``iterates`` after ``fraction`` of a step by ``move`` (n, 3) mm."""

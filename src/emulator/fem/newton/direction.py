@@ -51,19 +51,20 @@ def newton_direction(
 
     any_tangent : whether a tangent that is not positive definite will do.
     """
-    settled, formulation = system.supports_met(state.u, state.level), formulation_of(system)
-    equations = formulation.linearise(state, theta)
+    settled = system.supports_met(state.u, state.level)
+    equations = formulation_of(system).linearise(state, theta)
     force = equations.residual + equations.pull
     full, outcome = system.attempt(equations.tangent, -force)
     indefinite = outcome == Outcome.INDEFINITE
     again = indefinite & any_tangent
     full = cond(again, lambda: system.solve(equations.tangent, -force), lambda: full)
-    turns = settled & (not formulation.saddle)
+    saddle = state.iterates is not None
+    turns = settled & (not saddle)
     move, slope, singular = _full_step(
         system, state.u, state.level, equations._replace(eliminated=None), turns, full
     )
     refused = indefinite & ~again
-    descends = ~settled | (slope <= 0.0) | formulation.saddle
+    descends = ~settled | (slope <= 0.0) | saddle
     return Direction(move, equations, slope, settled, singular, ~indefinite, refused, descends)
 
 

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.fem.balance import forces_at, level_balance
 from emulator.fem.formulations import formulation_of
 from emulator.fem.loop import cond
 from emulator.fem.newton.direction import Direction, newton_direction
@@ -32,7 +33,7 @@ from emulator.fem.newton.step_length import Outcome, take_step
 from emulator.fem.options import NewtonOptions
 from emulator.fem.solution import Status
 from emulator.fem.state import Negligible, NewtonState
-from emulator.fem.system import System, forces_at
+from emulator.fem.system import System
 
 _ROUND_OFF = 1e-15  # strain that floating point cannot tell from none
 _STILL = 1e-12  # of the body's size: a correction that may be round-off
@@ -54,7 +55,7 @@ class Newton:
         """
         system, theta = self.system, self.theta
         negligible = self.negligible() if negligible is None else negligible
-        residual, error = system.level_balance(start, theta, jnp.ones(()))
+        residual, error = level_balance(system, start, theta, jnp.ones(()))
         least_J = system.least_volume_ratio(start)
         state = _first(
             theta,
@@ -91,7 +92,7 @@ class Newton:
         system, theta = self.system, self.theta
         residual, error = cond(
             state.at_level == 0,
-            lambda: system.level_balance(state.u, theta, state.level),
+            lambda: level_balance(system, state.u, theta, state.level),
             lambda: (state.residual, state.error),
         )
         state = state._replace(residual=residual, error=error)

@@ -17,10 +17,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from emulator.fem.balance import balance
 from emulator.fem.halving import Judge, largest_good
 from emulator.fem.loop import while_loop
 from emulator.fem.newton.direction import Direction
-from emulator.fem.system import System, balance
+from emulator.fem.system import System
 
 _LEAST_FRACTION = 2.0**-19
 # Natural monotonicity fails early: a lower load is cheaper than many short steps

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from emulator.fem.balance import level_balance
 from emulator.fem.formulations import formulation_of
 from emulator.fem.loop import compiled, cond, while_loop
 from emulator.fem.newton.direction import Direction
@@ -52,7 +52,7 @@ def take_step(
     A kept tangent is worth a full step or nothing: its direction is not searched along.
     """
     none = Outcome(state.u, state.residual, state.error, jnp.zeros(()), jnp.array(False))
-    near = _near(direction.settled, state.error) & (not formulation_of(system).saddle)
+    near = _near(direction.settled, state.error) & (state.iterates is None)
 
     def attempt(before: _Tried) -> _Tried:
         search = before.searched | ~near
@@ -62,7 +62,7 @@ def take_step(
             lambda: (jnp.ones(()), jnp.array(False)),
         )
         u = _moved(system, state.u, direction.move, fraction, state.level)
-        residual, error = system.level_balance(u, theta, state.level)
+        residual, error = level_balance(system, u, theta, state.level)
         J, now = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
         good = search | _good(error, state.error, J, options.shrink, now)
         outcome = Outcome(u, residual, error, fraction, crushed)
@@ -94,12 +94,11 @@ def _searched(
     options: NewtonOptions,
 ) -> tuple[jax.Array, jax.Array]:
     """The part of the step that makes most progress, and whether elements forbade twice as much."""
+    judge = formulation_of(system).nearer(state, theta, direction.equations, direction.move)
     nearer = None
-    formulation = formulation_of(system)
-    if formulation.saddle:
+    if judge is not None:
         # Where round-off is all that is left, it cannot be told from progress.
         unclear = state.error <= options.round_off
-        judge = partial(formulation.nearer, state, theta, direction.equations, direction.move)
         nearer = lambda fraction: unclear | judge(fraction)  # noqa: E731
     return choose_fraction(system, state.u, state.level, theta, direction, options.shrink, nearer)
 

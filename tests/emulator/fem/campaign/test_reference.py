@@ -7,9 +7,9 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
+from emulator.fem.balance import relative_residual
 from emulator.fem.campaign.reference import fem_reference, outside_reference, sample_outside
 from emulator.fem.solution import Status
-from emulator.fem.system import relative_residual
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support

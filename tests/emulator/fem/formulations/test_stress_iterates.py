@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.fem.balance import relative_residual
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.formulations.stress_iterates import StressIterates, applies
 from emulator.fem.linear import Outcome
 from emulator.fem.material_point import MaterialPoint, fraction_at_stress
 from emulator.fem.options import NewtonOptions
-from emulator.fem.system import System, relative_residual
+from emulator.fem.system import System
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Law
