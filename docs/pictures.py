@@ -20,10 +20,10 @@ from typing import Any
 
 from PIL import Image
 
-from calibrate.demo import DEMOS, run_demo
 from calibrate.explorer import Explorer, serve
 from calibrate.report import write_report
 from calibrate.workflow import infer
+from calibrate.workflow.demo import DEMOS, run_demo
 from emulator.store import write_atomically
 from emulator.surrogates import load
 

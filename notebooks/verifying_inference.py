@@ -23,7 +23,7 @@ import numpy as np
 import calibrate as cal
 import emulator as em
 from calibrate.observations import spread_landmarks
-from calibrate.simulation_based import LEVELS, sbc
+from calibrate.posterior.simulation_based import LEVELS, sbc
 from calibrate.workflow import by_fem
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "0.85"

@@ -1,8 +1,5 @@
-from .campaigns import campaign
 from .certificate import Certificate, certify, reweight
-from .comparison import compare
 from .identifiability import identify
-from .joint_prior import Dependence, JointPrior
 from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from .observations import (
     CavityVolume,
@@ -14,14 +11,25 @@ from .observations import (
     strains,
     surface_points,
 )
-from .population import Population, population_of_fits
 from .posterior import Posterior, sample
-from .priors import box_prior, log_normal, truncated, truncated_normal
+from .posterior.comparison import compare
+from .posterior.simulation_based import sbc
+from .priors import (
+    Dependence,
+    JointPrior,
+    Population,
+    box_prior,
+    log_normal,
+    population_of_fits,
+    truncated,
+    truncated_normal,
+)
 from .samplers import Density, NUTSOptions, density_of
 from .sensitivity_analysis import sensitivity
-from .simulation_based import sbc
-from .statistical_model import Model, model
+from .statistical_model import Model
+from .statistical_model.build import model
 from .workflow import load
+from .workflow.campaigns import campaign
 
 __version__: str
 

@@ -19,7 +19,7 @@ from studies.effects.scenes import SCENES, observed, other_choices, points, publ
 
 import calibrate as cal
 import emulator as em
-from calibrate.effects import Comparison, Measured, recommend
+from calibrate.evaluation.effects import Comparison, Measured, recommend
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE, GREEN, VERMILION
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks

@@ -11,12 +11,12 @@ from arviz_stats.base import array_stats
 from studies.fem_posterior.problems import Problem
 
 import calibrate as cal
-from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.posterior import Posterior
 from calibrate.samplers import density_of, named_draws, transport
 from calibrate.samplers.delayed_acceptance import DelayedAcceptanceOptions
 from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.run import compile_chains
+from calibrate.statistical_model import FEMLikelihood
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 PLAIN, TUNED, LATE, CHEAP = (

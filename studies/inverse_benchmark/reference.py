@@ -20,7 +20,7 @@ from studies.inverse_benchmark import tables
 from studies.inverse_benchmark.problems import Problem, data_of, model
 
 import calibrate as cal
-from calibrate.fem_likelihood import FEMLikelihood
+from calibrate.statistical_model import FEMLikelihood
 from emulator.fem import Simulator
 from emulator.surrogates.protocol import ForwardMap
 

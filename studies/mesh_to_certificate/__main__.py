@@ -21,8 +21,7 @@ from studies.common.output import save
 from calibrate.data import write_data
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from calibrate.run import Run
-from calibrate.workflow import make_data
+from calibrate.workflow import Run, make_data
 from emulator.catalogue import find_scene
 from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.io import write_mesh

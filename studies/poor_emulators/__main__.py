@@ -22,12 +22,11 @@ import numpy as np
 from studies.common.output import save
 
 import calibrate as cal
-from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.figures.drawing import pyplot
-from calibrate.learned_error import with_error
 from calibrate.observations import parse_observation
 from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
+from calibrate.statistical_model import FEMLikelihood, with_error
 from emulator.fem import Simulator, design, run_campaign, sobol
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.scene import Scene

@@ -55,9 +55,9 @@ from calibrate.certificate.pool import (
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, Solver, correction_from, joined
 from calibrate.certificate.verdict import Certificate, judge
-from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.posterior import Posterior
 from calibrate.samplers.registry import SAMPLERS
+from calibrate.statistical_model import FEMLikelihood
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import executor

@@ -11,7 +11,7 @@ from calibrate.certificate.check import Check, examine, resampled
 from calibrate.certificate.pool import effective
 from calibrate.certificate.verdict import Certificate
 from calibrate.posterior import Posterior
-from calibrate.tree import make_tree
+from calibrate.posterior.tree import make_tree
 from emulator.errors import InputError
 from emulator.fem import Simulator
 

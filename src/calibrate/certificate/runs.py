@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from calibrate.certificate.correction import Correction, fit, nothing
 from calibrate.certificate.predictive import Predictive
-from calibrate.fem_likelihood import FEMLikelihood, Likelihoods
+from calibrate.statistical_model.fem_likelihood import FEMLikelihood, Likelihoods
 
 
 class Runs(NamedTuple):

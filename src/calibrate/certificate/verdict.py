@@ -14,7 +14,7 @@ import numpy as np
 
 from calibrate.certificate.evidence import Evidence, Figure, MeshChange, Physics, Sampling
 from calibrate.certificate.misfit import Misfit
-from calibrate.fit import SMALLEST_P
+from calibrate.posterior.fit import SMALLEST_P
 from emulator.shown import Row, Shown
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]

@@ -77,7 +77,7 @@ def add_model(parser: argparse.ArgumentParser) -> None:
 
 
 def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What :func:`add_model` read, as fields of :class:`~calibrate.run.Run`."""
+    """What :func:`add_model` read, as fields of :class:`~calibrate.workflow.Run`."""
     scene, root = scene_words(arguments)
     measured = arguments.data != "synthetic"
     for option in ("truth", "observe") if measured else ():
@@ -142,7 +142,7 @@ def _add_noise(parser: argparse.ArgumentParser) -> None:
 
 def prior_word(word: str) -> str | dict[str, Any]:
     """A name as it is; a file's content, because a kept run must not change with the file."""
-    from calibrate.population import read_population
+    from calibrate.priors.population import read_population
 
     return asdict(read_population(word)) if word.endswith(".json") else word
 

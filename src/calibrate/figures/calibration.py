@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.figures.drawing import pyplot, save
 from calibrate.figures.palette import BLUE, VERMILION
-from calibrate.simulation_based import LEVELS, Calibration
+from calibrate.posterior.simulation_based import LEVELS, Calibration
 
 _INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ for all readers
 

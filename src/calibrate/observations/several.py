@@ -21,7 +21,7 @@ class Observations:
     """Observations by name; one forward map serves them all.
 
     In a body with several load states each name says which one is meant, as in ``volume@diastole``
-    (:mod:`calibrate.load_states`).
+    (:mod:`calibrate.statistical_model.load_states`).
     """
 
     parts: Mapping[str, Observation]

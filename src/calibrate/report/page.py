@@ -17,9 +17,9 @@ from calibrate.identifiability.combinations import identify, in_words
 from calibrate.posterior import Posterior
 from calibrate.report import charts
 from calibrate.report.body import body_figure
-from calibrate.run import Run
 from calibrate.state_names import split
-from calibrate.workflow import CERTIFICATE, read_posterior, simulator_of
+from calibrate.workflow import Run, read_posterior, simulator_of
+from calibrate.workflow.workflow import CERTIFICATE
 from emulator.store import read_json, replacing
 
 REPORT = "report.html"

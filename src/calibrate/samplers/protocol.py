@@ -13,10 +13,9 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
-from calibrate.fem_likelihood import FEMLikelihood
 from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.density import Density
-from calibrate.statistical_model import Data
+from calibrate.statistical_model import Data, FEMLikelihood
 
 Statistics = Mapping[str, Any]
 """Statistics by ArviZ's names: ``diverging``, ``acceptance_rate``, ``n_steps``, ``lp``, ..."""

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 
-from calibrate.joint_prior import dependence_of
-from calibrate.priors import Prior, bisect, bounds
+from calibrate.priors import Prior, bisect, bounds, dependence_of
 from emulator.errors import InputError
 
 _EDGE = 1e-9  # of the unit interval; beyond, a distribution without ends has infinite quantiles

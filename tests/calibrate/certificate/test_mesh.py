@@ -12,7 +12,7 @@ from calibrate.certificate import examine
 from calibrate.certificate.evidence import Figure, MeshChange
 from calibrate.certificate.mesh import changed, points_for
 from calibrate.certificate.verdict import judge
-from calibrate.learned_error import with_error
+from calibrate.statistical_model import with_error
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
 from emulator.surrogates.taylor import expand
 from linear_support import LinearSimulator, linear_forward

@@ -9,7 +9,7 @@ from calibrate.cli import main
 from calibrate.cli.commands.infer import sampler_options
 from calibrate.posterior import read_tree
 from calibrate.samplers.checkpoint import Checkpoint
-from calibrate.workflow import SAMPLING
+from calibrate.workflow.workflow import SAMPLING
 
 
 class Killed(Exception):

@@ -5,7 +5,7 @@ import pytest
 from calibrate.cli.commands import compare, evaluate
 from calibrate.cli.common import table
 from calibrate.cli.posterior_table import summary
-from calibrate.comparison import Compared, Comparison
+from calibrate.posterior.comparison import Compared, Comparison
 
 PARAMETERS = {
     name: {"truth": 1.2345e-5, "mean": -1.2345e-5, "sd": 1.5e-6, "low": -2e-5, "high": 2e-5,

@@ -6,8 +6,7 @@ import pytest
 
 from calibrate.cli import main
 from calibrate.report import charts
-from calibrate.run import Run
-from calibrate.workflow import infer
+from calibrate.workflow import Run, infer
 
 
 @pytest.mark.slow

@@ -13,8 +13,8 @@ from calibrate.observations import CavityVolume, Observations, landmarks, spread
 from calibrate.report import charts
 from calibrate.report.body import body_figure
 from calibrate.report.page import html_of
-from calibrate.run import Run
 from calibrate.samplers.laplace import LaplaceOptions
+from calibrate.workflow import Run
 
 pytestmark = pytest.mark.slow  # compiling for a ventricle; test_command.py is quick
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpyro.distributions import Normal
 
-from calibrate.diagnosis import diagnose
+from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers.density import Density
 from calibrate.samplers.modes import MISSED_AT, MISSED_BY, find_modes, missed_mode
 

@@ -14,7 +14,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.cli import main
 from calibrate.observations import parse_observation
-from calibrate.population import Population
+from calibrate.priors import Population
 from calibrate.sensitivity_analysis import FIELD
 from emulator.errors import InputError
 from emulator.surrogates.fem import fem_forward
@@ -79,7 +79,7 @@ def test_what_has_no_indices(forward: ForwardMap) -> None:
     )
     from dataclasses import asdict
 
-    from calibrate.population import prior_of
+    from calibrate.priors import prior_of
 
     prior = prior_of(asdict(population), forward.scene)
     with pytest.raises(InputError, match="the prior correlates mu, lam"):

@@ -55,7 +55,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve what the store lacks, and count."""
-    from calibrate.campaigns import fill, question
+    from calibrate.workflow.campaigns import fill, question
     from emulator.catalogue import find_scene
     from emulator.errors import InputError
     from emulator.fem import NewtonOptions

@@ -81,7 +81,7 @@ def run_mesh(arguments: argparse.Namespace) -> int:
     """The error of the mesh at one theta: displacements, observations, and a picture."""
     import numpy as np
 
-    from calibrate.mesh_error import errors_of
+    from calibrate.observations.mesh_error import errors_of
     from emulator.catalogue import find_scene
     from emulator.error.mesh_error import mesh_error
     from emulator.store import check_folder, write_json
@@ -130,10 +130,9 @@ def run_mesh(arguments: argparse.Namespace) -> int:
 def run_sbc(arguments: argparse.Namespace) -> int:
     """Simulation-based calibration of the model."""
     from calibrate.figures.calibration import draw
-    from calibrate.run import Run
+    from calibrate.posterior.simulation_based import sbc
     from calibrate.samplers import NUTSOptions
-    from calibrate.simulation_based import sbc
-    from calibrate.workflow import by_fem, model_before_data
+    from calibrate.workflow import Run, by_fem, model_before_data
     from emulator.store import check_folder, write_json
 
     folder, progress = check_folder(arguments.out), show_progress(arguments)
@@ -177,9 +176,8 @@ def run_prior(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from calibrate.figures.calibration import draw_prior_predictive
-    from calibrate.predictions import prior_replicates
-    from calibrate.run import Run
-    from calibrate.workflow import model_before_data
+    from calibrate.posterior.predictions import prior_replicates
+    from calibrate.workflow import Run, model_before_data
     from emulator.store import check_folder, save_arrays
 
     folder: Path = check_folder(arguments.out)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from calibrate.cli.common import DONE, add_json, emit, table
 
 if TYPE_CHECKING:
-    from calibrate.comparison import Comparison
+    from calibrate.posterior.comparison import Comparison
 
 
 def register(commands: Any) -> None:
@@ -25,9 +25,9 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare the posteriors in several folders."""
-    from calibrate.comparison import compare
     from calibrate.posterior import read_tree
-    from calibrate.workflow import POSTERIOR
+    from calibrate.posterior.comparison import compare
+    from calibrate.workflow.workflow import POSTERIOR
     from emulator.errors import InputError
 
     if len(set(arguments.folders)) < len(arguments.folders):

@@ -8,7 +8,7 @@ from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress
 from calibrate.cli.posterior_table import summary
-from calibrate.demo import DEMOS, run_demo
+from calibrate.workflow.demo import DEMOS, run_demo
 
 
 def register(commands: Any) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from calibrate.cli.common import DONE, add_json, add_scene, emit, scene_words, table
 
 if TYPE_CHECKING:
-    from calibrate.effects import Measured, Recommendation
+    from calibrate.evaluation.effects import Measured, Recommendation
 
 
 def register(commands: Any) -> None:
@@ -44,7 +44,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, and recommend."""
-    from calibrate.effects import recommend, tolerances
+    from calibrate.evaluation.effects import recommend, tolerances
     from calibrate.observations import observations, parse_observation
     from emulator.catalogue import find_scene
     from emulator.errors import check_seed

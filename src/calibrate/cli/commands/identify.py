@@ -37,8 +37,7 @@ def run_before(arguments: argparse.Namespace) -> int:
     """What the observations would determine."""
     from calibrate.identifiability import expected_precision
     from calibrate.identifiability.combinations import products_in_words
-    from calibrate.run import Run
-    from calibrate.workflow import model_before_data
+    from calibrate.workflow import Run, model_before_data
 
     model = model_before_data(Run(**model_of(arguments), seed=arguments.seed))
     found = expected_precision(model)

@@ -65,8 +65,7 @@ def warmup(sampler: str, given: int | None) -> int:
 
 def run(arguments: argparse.Namespace) -> int:
     """Sample and keep a posterior."""
-    from calibrate.run import Run
-    from calibrate.workflow import certify_and_keep, report
+    from calibrate.workflow import Run, certify_and_keep, report
     from calibrate.workflow import infer as run_inference
     from emulator.store import check_folder
 

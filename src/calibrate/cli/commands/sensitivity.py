@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Analyse a scene's forward map."""
     from calibrate.cli.model_words import emulator_word, prior_word
     from calibrate.observations import parse_observation
-    from calibrate.population import prior_of
+    from calibrate.priors import prior_of
     from calibrate.sensitivity_analysis import sensitivity
     from emulator import Simulator
     from emulator.catalogue import find_scene

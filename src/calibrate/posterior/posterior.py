@@ -1,0 +1,253 @@
+"""A posterior: draws as an ArviZ DataTree, with the model and data they came from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import numpyro.distributions as dist
+import xarray as xr
+
+from calibrate.arviz import stats
+from calibrate.observations.present import missing_values
+from calibrate.posterior.diagnosis import diagnose
+from calibrate.posterior.fit import misfits
+from calibrate.posterior.tree import make_tree
+from calibrate.provenance import versions
+from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws, r_hat
+from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.samplers.modes import MISSED_BY, find_modes, missed_mode
+from calibrate.samplers.protocol import Context
+from calibrate.statistical_model import Data, FEMLikelihood, Model
+from emulator.errors import InputError
+from emulator.fem import Simulator
+from emulator.shown import Row, Shown
+from emulator.store import replacing
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Posterior(Shown):
+    """Draws, with the model and the data they came from.
+
+    tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; with
+        predictions also log_likelihood (of each datum at each draw), posterior_predictive, prior
+        and prior_predictive (at about 500 draws). Variables have units; attributes hold the
+        provenance.
+    model, data : what the posterior was conditioned on; data by the observation's name.
+    """
+
+    tree: xr.DataTree
+    model: Model
+    data: Data
+
+    def shown(self) -> tuple[str, list[Row]]:
+        """Mean and sd of every unknown, draws, and what is wrong with them."""
+        table, sizes = self.summary(), self.tree["posterior"].sizes
+        rows = [(name, f"{row['mean']:.4g} +- {row['sd']:.2g}") for name, row in table.items()]
+        worst = max(row["r_hat"] for row in table.values())
+        rows.append(("draws", f"{sizes['chain']} x {sizes['draw']}, R-hat at most {worst:.3f}"))
+        rows += [("warning", sentence) for sentence in self.warnings()]
+        return f"Posterior of '{self.model.forward.scene.name}'", rows
+
+    def draws(self) -> dict[str, np.ndarray]:
+        """All draws by name, chains joined, each (s,)."""
+        return {n: np.asarray(self.tree["posterior"][n]).reshape(-1) for n in self.model.names}
+
+    def thetas(self, state: str | None = None) -> jax.Array:
+        """All draws of theta, (s, p), in load state ``state``, or in the only one.
+
+        Raises
+        ------
+        InputError
+            No such state, or several and none is named.
+        """
+        states = self.model.states.states
+        if state is None and len(states) > 1:
+            raise InputError(f"the posterior has several load states: {', '.join(states)}")
+        if state is not None and state not in states:
+            raise InputError(f"load state '{state}' is unknown; known: {', '.join(states)}")
+        return self.model.states.thetas(self.draws())[:, states.index(state or states[0])]
+
+    def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
+        """Per parameter: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
+        draws = self.tree["posterior"].to_dataset()
+        bulk, tail = stats.ess(draws, method="bulk"), stats.ess(draws, method="tail")
+        edge = 0.5 * (1.0 - probability)
+        table = {}
+        for name, values in self.draws().items():
+            low, high = np.quantile(values, [edge, 1.0 - edge])
+            table[name] = {
+                "mean": float(values.mean()),
+                "sd": float(values.std(ddof=1)),
+                "low": float(low),
+                "high": float(high),
+                "r_hat": r_hat(np.asarray(draws[name])),
+                "ess_bulk": float(bulk[name]),
+                "ess_tail": float(tail[name]),
+            }
+        return table
+
+    @property
+    def divergences(self) -> int:
+        """Number of divergent transitions; 0 for samplers that have none."""
+        statistics = self.tree["sample_stats"]
+        return int(statistics["diverging"].sum()) if "diverging" in statistics else 0
+
+    def warnings(self) -> list[str]:
+        """What is wrong with run or data and what to do, a sentence each; empty if nothing is."""
+        groups = [self.tree[name].to_dataset() for name in ("posterior", "sample_stats")]
+        draws, statistics = (
+            {str(name): np.asarray(values) for name, values in group.data_vars.items()}
+            for group in groups
+        )
+        attributes = {str(name): value for name, value in self.tree.attrs.items()}
+        return diagnose(draws, statistics, self.summary(), attributes) + misfits(self.tree)
+
+    def save(self, path: str | Path) -> None:
+        """Write the DataTree as netCDF, whole or not at all."""
+        with replacing(path) as temporary:
+            self.tree.to_netcdf(temporary, engine="h5netcdf")
+
+
+def read_tree(path: str | Path) -> xr.DataTree:
+    """The DataTree in a netCDF file, in memory; :class:`InputError` when it is not one."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"posterior file {path} does not exist")
+    try:
+        with xr.open_datatree(path, engine="h5netcdf") as tree:
+            return tree.load()
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"posterior file {path} is truncated or not netCDF") from error
+
+
+def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str, Any]:
+    """Everything needed to repeat how a posterior was made; plain JSON values."""
+    scene = model.forward.scene
+    return {
+        "scene": dict(scene.origin),
+        "scene_name": scene.name,
+        "scene_fingerprint": scene.fingerprint,
+        "forward": model.forward.kind,
+        "forward_fingerprint": model.full.fingerprint,
+        "forward_error": None if model.error is None else model.error.fingerprint,
+        "observe": model.observe.to_json(),
+        "missing": missing_values(model.observe),
+        "noise": {name: noise.to_json() for name, noise in model.noise.items()},
+        "prior": {name: describe_distribution(d) for name, d in model.prior.items()},
+        "prior_dependence": None if model.dependence is None else model.dependence.to_json(),
+        "prior_cut": dict(model.prior_cut),
+        "load_states": model.states.to_json(),
+        "sampler": sampler,
+        "sampler_options": asdict(options),
+        "seed": seed,
+        "versions": versions(),
+    }
+
+
+def describe_distribution(distribution: dist.Distribution) -> str:
+    """A distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
+    parts = {name: getattr(distribution, name, None) for name in distribution.arg_constraints}
+    base = getattr(distribution, "base_dist", None)
+    # The arguments of a named transform such as LogUniform describe it fully.
+    named = isinstance(distribution, dist.TransformedDistribution) and parts
+    if isinstance(base, dist.Distribution) and not named:
+        parts["base"] = base
+    words = [
+        f"{name}={describe_distribution(v) if isinstance(v, dist.Distribution) else _plain(v)}"
+        for name, v in parts.items()
+    ]
+    return f"{type(distribution).__name__}({', '.join(words)})"
+
+
+def _plain(value: Any) -> str:
+    return repr(np.asarray(value).tolist())
+
+
+def sample(
+    model: Model,
+    data: np.ndarray | Mapping[str, np.ndarray],
+    *,
+    sampler: str = "nuts",
+    options: Any | None = None,
+    seed: int = 0,
+    progress: bool = False,
+    predictions: bool = True,
+    simulator: Simulator | None = None,
+    checkpoint: str | Path | None = None,
+) -> Posterior:
+    """Draw from the posterior of ``model`` given ``data``.
+
+    With several observations, ``data`` maps their names to values: displacements (d, 3) in mm, a
+    volume in mL. Missing values are NaN and left out. ``sampler`` is a name of
+    :data:`calibrate.samplers.SAMPLERS`; ``options`` is an instance of that sampler's options,
+    ``None`` for its defaults.
+
+    Parameters
+    ----------
+    predictions : whether the DataTree gets log likelihoods and replicated data.
+    simulator : FEM, for samplers that solve it in a second stage.
+    checkpoint : a file that the run's state is kept in every few seconds. If the run is killed, the
+        same call goes on from there to the same draws; the file is removed when they are complete.
+
+    Raises
+    ------
+    InputError
+        Unknown sampler, options of another sampler, data of the wrong shape, with infinite values
+        or of which all values are missing, a sampler that needs a simulator and has none, a
+        checkpoint of another run.
+    """
+    chosen = find_sampler(sampler)
+    options = check_options(chosen, options)
+    model, checked = model.given(data)
+    fem = _fem_likelihood(chosen, model, simulator)
+    made = provenance(model, seed, sampler, options)
+    kept = Checkpoint(checkpoint, _identity(made, checked))
+    context = Context(progress, kept, fem)
+    density = density_of(model)
+    found = chosen.sample(density, checked, options, seed, context)
+    attributes = dict(found.attributes)
+    if MISSED_BY not in attributes:
+        z = np.asarray(found.z).reshape(-1, density.dimension)
+        key = jax.random.fold_in(jax.random.key(seed), _MODES)
+        modes = find_modes(density, checked, key, draws=z)
+        attributes |= missed_mode(density, checked, z, modes)
+    rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
+    draws = named_draws(model, found.z)
+    tree = make_tree(model, checked, draws, found.statistics, rng_key)
+    for name, value in {**made, **attributes}.items():
+        tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
+    kept.remove()
+    return Posterior(tree, model, checked)
+
+
+# Keep the keys of replicated data and of the search for modes apart from the sampler's.
+_PREDICTIONS, _MODES = 0x9E3779B9, 0x85EBCA6B
+
+
+def _fem_likelihood(
+    sampler: Sampler, model: Model, simulator: Simulator | None
+) -> FEMLikelihood | None:
+    if simulator is None and sampler.solves_fem:
+        raise InputError(
+            f"sampler '{sampler.name}' solves FEM in its second stage: give simulator=..., of the "
+            "posterior's scene"
+        )
+    return None if simulator is None else FEMLikelihood(model, simulator)
+
+
+def _identity(made: Mapping[str, Any], data: Data) -> dict[str, str]:
+    """What a run is of, by name: provenance without places, and a hash of the data."""
+    digest = hashlib.sha256()
+    for name in sorted(data):
+        digest.update(name.encode() + np.asarray(data[name]).tobytes())
+    described = {name: json.dumps(value) for name, value in made.items() if name != "scene"}
+    # What a user changes most comes first: the first difference is named.
+    first = {name: described.pop(name) for name in ("sampler", "seed", "sampler_options")}
+    return {**first, **described, "data": digest.hexdigest()[:16]}

@@ -1,0 +1,157 @@
+"""FEM's log likelihood at a draw of a posterior, beside the cheap map's.
+
+Whatever compares a posterior with FEM asks here: certificates, and samplers with FEM in a second
+stage. It is the only place that solves FEM for a draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.statistical_model.model import Data, Model
+from emulator.errors import InputError
+from emulator.fem import Simulator
+from emulator.fem.campaign import Executor, Solver, in_process, solve_rows
+from emulator.fem.energy import volume_ratio
+
+
+class Likelihoods(NamedTuple):
+    """Log likelihoods of the data at one draw.
+
+    fem : with FEM's displacement, and the error of its mesh where the model allows for that;
+        ``-inf`` where FEM did not converge in a load state.
+    cheap : with the model's forward map and its error, where the model allows for one; ``-inf``
+        where the map has no answer.
+    converged : whether FEM did, in every load state.
+    smallest_J : smallest volume ratio det F in the body, by FEM; NaN where it did not converge.
+    means : FEM's data without noise, by the observation's name; empty where it did not converge.
+    stable : whether FEM's equilibrium is a minimum of the energy; ``None`` where that was not asked
+        for, FEM did not converge or the scene has no energy.
+    """
+
+    fem: float
+    cheap: float
+    converged: bool
+    smallest_J: float
+    means: Mapping[str, jax.Array] = MappingProxyType({})
+    stable: bool | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FEMLikelihood:
+    """FEM's log likelihood under ``model``; solves start from the cheap map's prediction.
+
+    execute : solves, in this process by default.
+
+    Raises
+    ------
+    InputError
+        The simulator is for another scene.
+    """
+
+    model: Model
+    simulator: Simulator
+    execute: Executor = in_process
+
+    def __post_init__(self) -> None:
+        if self.simulator.scene.fingerprint != self.model.forward.scene.fingerprint:
+            raise InputError("the simulator's scene is not the posterior's")
+
+    def __call__(
+        self, draw: Mapping[str, Any], data: Data, *, stability: bool = False
+    ) -> Likelihoods:
+        """Log likelihoods at ``draw``: a number for each of the model's ``names``.
+
+        ``stability`` asks for ``stable`` as well, at the cost of one more factorisation a state.
+        """
+        return next(self.many([draw], data, stability=(0,) if stability else ()))[1]
+
+    def many(
+        self, draws: Sequence[Mapping[str, Any]], data: Data, *, stability: Collection[int] = ()
+    ) -> Iterator[tuple[int, Likelihoods]]:
+        """Numbers of ``draws`` and their log likelihoods, as they are finished.
+
+        ``stability`` : numbers of the draws of which ``stable`` is asked, too.
+        """
+        thetas = [self.model.states.thetas(draw) for draw in draws]
+        states = len(self.model.states.states)
+        each = jnp.concatenate(thetas)
+        solved: dict[int, dict[int, jax.Array]] = {number: {} for number in range(len(draws))}
+        # A draw that fails in one load state is done: its other states are not begun.
+        numbers = (k for k in range(len(each)) if k // states in solved)
+        # Not under jit: there the solver cannot use CHOLMOD, which is faster.
+        for row in solve_rows(
+            self._solver,
+            each,
+            numbers=numbers,
+            starts=lambda k: (self._start(each[k]),),
+            execute=self.execute,
+        ):
+            number, state = divmod(row.number, states)
+            if number not in solved:
+                continue
+            if not row.converged:
+                del solved[number]
+                cheap = float(self._cheap(dict(draws[number]), data))
+                yield number, Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
+                continue
+            solved[number][state] = row.solution.displacement
+            if len(solved[number]) == states:
+                fields = [jnp.asarray(solved[number][k]) for k in range(states)]
+                del solved[number]
+                yield (
+                    number,
+                    self._told(draws[number], thetas[number], fields, data, number in stability),
+                )
+
+    def _told(
+        self,
+        draw: Mapping[str, Any],
+        thetas: jax.Array,
+        fields: list[jax.Array],
+        data: Data,
+        stability: bool,
+    ) -> Likelihoods:
+        """Log likelihoods from FEM's displacements (n, 3) mm, one a load state."""
+        cheap = float(self._cheap(dict(draw), data))
+        fem, means, smallest = self._fem(jnp.stack(fields), thetas, dict(draw), data)
+        stable = self._stable(fields, thetas) if stability else None
+        return Likelihoods(float(fem), cheap, True, float(smallest), means, stable)
+
+    def _stable(self, solved: list[jax.Array], thetas: jax.Array) -> bool | None:
+        """Whether every load state's equilibrium is a minimum of the energy, where there is one."""
+        if self.simulator.system.forces:
+            return None
+        return all(
+            self.simulator.is_stable(u, theta) for u, theta in zip(solved, thetas, strict=True)
+        )
+
+    @cached_property
+    def _solver(self) -> Solver:
+        return Solver(self.simulator, from_rest_again=False)
+
+    @cached_property
+    def _start(self):  # noqa: ANN202 - a compiled program, private
+        return jax.jit(self.model.full)
+
+    @cached_property
+    def _cheap(self):  # noqa: ANN202
+        return jax.jit(self.model.map_log_likelihood)
+
+    @cached_property
+    def _fem(self):  # noqa: ANN202
+        def fem(displacement, thetas, draw, data):  # noqa: ANN001, ANN202
+            means = self.model.observe(displacement[:, self.model.observe.nodes], thetas)
+            value = self.model.fem_log_likelihood(draw, means, data)
+            ratios = [volume_ratio(self.simulator.scene, u) for u in displacement]
+            return value, means, jnp.min(jnp.stack(ratios))
+
+        return jax.jit(fem)

@@ -1,0 +1,297 @@
+r"""The statistical model around a forward map.
+
+.. math:: y_{sj} = \mathcal{O}_j\,u(\theta_s) + \varepsilon_{sj}
+
+for each observation j in each load state s, with the unknowns of :math:`\theta_s` from their priors
+(``load_states``). The noise :math:`\varepsilon_{sj}` of each observation has a distribution of its
+own (:mod:`calibrate.noise`), whose unknown numbers have priors too. The model does not know whether
+the forward map is the emulator, the emulator with a correction, a reduced model or FEM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+
+from calibrate.data.magnitude import PRIOR_DRAWS, check_magnitudes
+from calibrate.noise import Noise
+from calibrate.observations import Observations
+from calibrate.observations.present import leave_out_missing, missing_values
+from calibrate.priors import Prior
+from calibrate.priors.joint_prior import Conditional, Dependence
+from calibrate.state_names import split
+from calibrate.statistical_model.approximation_error import ApproximationError
+from calibrate.statistical_model.load_states import LoadStates
+from calibrate.statistical_model.prior_range import standardised
+from emulator.errors import InputError
+from emulator.surrogates.protocol import ForwardMap, Prediction
+
+Data = Mapping[str, jax.Array]
+"""Data by the observation's name; each of the observation's shape and unit."""
+
+_GROUP = "observed_data"  # of a posterior's DataTree
+
+NoiseValues = Mapping[str, Mapping[str, jax.Array]]
+"""Inferred numbers of each observation's noise: observation to number's name to value."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A NumPyro model: call it with the data. :func:`model` makes it.
+
+    Parameters
+    ----------
+    forward : map restricted to the observed nodes.
+    full : the same map over all nodes.
+    observe : what was measured, by name.
+    noise : noise of each observation.
+    noise_names : the name each observation's noise was given under; observations with one name
+        share its unknown numbers.
+    states : where theta comes from in each load state.
+    prior : one distribution an unknown of theta.
+    error : the forward map's own error, where the likelihood allows for it.
+    prior_cut : unknown to the mass of its prior that was cut off (``prior_range``).
+    check_scale : whether :meth:`check_data` refuses data far from every prediction.
+    dependence : of the prior of some unknowns of theta, in theta's order.
+    """
+
+    forward: ForwardMap
+    full: ForwardMap
+    observe: Observations
+    noise: Mapping[str, Noise]
+    noise_names: Mapping[str, str]
+    states: LoadStates
+    prior: Prior
+    error: ApproximationError | None = None
+    prior_cut: Mapping[str, float] = field(default_factory=dict)
+    check_scale: bool = True
+    dependence: Dependence | None = None
+
+    @cached_property
+    def noise_sites(self) -> dict[str, dict[str, str]]:
+        """Observation to the unknown numbers of its noise, each with its name in the posterior.
+
+        ``noise_sd`` when one thing is observed, ``noise_sd_<observation>`` when several are.
+        """
+        alone = len(set(self.noise_names.values())) == 1
+        return {
+            name: {
+                number: number if alone else f"{number}_{self.noise_names[name]}"
+                for number in noise.priors
+            }
+            for name, noise in self.noise.items()
+        }
+
+    @cached_property
+    def noise_priors(self) -> dict[str, dist.Distribution]:
+        """Prior of every unknown number of the noises, by its name in the posterior."""
+        return {
+            site: self.noise[name].priors[number]
+            for name, sites in self.noise_sites.items()
+            for number, site in sites.items()
+        }
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is inferred: the unknowns of theta, then those of the noises."""
+        return (*self.states.unknowns, *self.noise_priors)
+
+    @property
+    def on_log_scale(self) -> tuple[bool, ...]:
+        """Whether each unknown of theta has a logarithmic scale in its scene."""
+        scales = {parameter.name: parameter.scale for parameter in self.forward.scene.parameters}
+        return tuple(scales[split(name)[0]] == "log" for name in self.states.unknowns)
+
+    @cached_property
+    def sampled_priors(self) -> dict[str, dist.Distribution]:
+        """Prior of all that is inferred, as NumPyro samples it, but for the dependence."""
+        theta = {name: standardised(self.prior[name]) for name in self.states.unknowns}
+        return {**theta, **self.noise_priors}
+
+    def __call__(self, data: jax.Array | Data | None = None) -> None:
+        """The NumPyro program; ``data`` by name, or as it is when one thing is observed."""
+        draw: dict[str, jax.Array] = {}
+        for name, prior in self.sampled_priors.items():
+            draw[name] = numpyro.sample(name, self._given_earlier(name, prior, draw))
+        thetas = self.states.thetas(draw)
+        prediction = self.evaluate(thetas)
+        # Where the forward map has no answer, the density is zero, not NaN.
+        numpyro.factor("valid", jnp.where(prediction.valid, 0.0, -jnp.inf))
+        means = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0), thetas)
+        observed = None if data is None else self.observe.name(data, "data")
+        if self.error is not None:
+            if observed is None:
+                means = self.error.draw(numpyro.prng_key(), self._stacked(draw), means)
+            else:
+                numpyro.factor("approximation_error", self._error_ratio(draw, means, observed))
+        for name, distribution in self.distributions(means, self.noise_values(draw)).items():
+            obs = None if observed is None else observed[name]
+            numpyro.sample(f"observed_{name}", distribution, obs=obs)
+
+    def _given_earlier(
+        self, name: str, prior: dist.Distribution, draw: Mapping[str, jax.Array]
+    ) -> dist.Distribution:
+        """``prior`` of ``name``, given the unknowns before it that it depends on."""
+        if self.dependence is None or name not in self.dependence.names:
+            return prior
+        mean, sd = self.dependence.given_earlier(name, self.prior, draw)
+        return Conditional(self.prior[name], mean, sd, prior.support)
+
+    def evaluate(self, thetas: jax.Array) -> Prediction:
+        """Displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p), in one call.
+
+        It is valid where the forward map is valid in every state.
+        """
+        if len(thetas) == 1:
+            displacement, valid = self.forward.evaluate(thetas[0])
+            return Prediction(displacement[None], valid)
+        displacement, valid = jax.vmap(self.forward.evaluate)(thetas)
+        return Prediction(displacement, jnp.all(valid))
+
+    def predict(self, values: Mapping[str, Any]) -> tuple[dict[str, jax.Array], jax.Array]:
+        """Data without noise by observation, and its validity, from a value of each unknown."""
+        thetas = self.states.thetas(values)
+        prediction = self.evaluate(thetas)
+        return self.observe(prediction.displacement, thetas), prediction.valid
+
+    def noise_values(self, draw: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
+        """The inferred numbers of each observation's noise, from ``draw`` by the names there."""
+        return {
+            name: {number: jnp.asarray(draw[site]) for number, site in sites.items()}
+            for name, sites in self.noise_sites.items()
+        }
+
+    def distributions(self, means: Data, values: NoiseValues) -> dict[str, dist.Distribution]:
+        """Distribution of each observation's data around its mean, by name.
+
+        ``values`` of the inferred numbers of the noises (:meth:`noise_values`).
+        """
+        return {n: self.noise[n].distribution(mean, values[n]) for n, mean in means.items()}
+
+    def log_density(self, means: Data, values: NoiseValues, data: Data) -> jax.Array:
+        """Log density of ``data`` around ``means``, shape ()."""
+        parts = self.distributions(means, values)
+        return sum((d.log_prob(data[name]) for name, d in parts.items()), jnp.zeros(()))
+
+    def fem_log_likelihood(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
+        """Log density of ``data``, (), around FEM's ``means`` at ``draw``.
+
+        Where the likelihood allows for the error of the mesh, FEM on the mesh has it, too.
+        """
+        found = self.log_density(means, self.noise_values(draw), data)
+        if self.error is not None and self.error.of_mesh:
+            found += self._error_ratio(draw, means, data)
+        return found
+
+    def fem_means(self, rng_key: jax.Array, draw: Mapping[str, Any], means: Data) -> Data:
+        """FEM's ``means`` at ``draw``, with a draw of the mesh's error where it is allowed for."""
+        if self.error is None or not self.error.of_mesh:
+            return means
+        return self.error.draw(rng_key, self._stacked(draw), means)
+
+    def map_log_likelihood(self, draw: Mapping[str, Any], data: Data) -> jax.Array:
+        """Log density of ``data``, (), with the forward map and what is allowed for its error.
+
+        ``-inf`` where the map has no answer. ``draw`` has a number for each of ``names``.
+        """
+        thetas = self.states.thetas(draw)
+        displacement, valid = self.evaluate(thetas)
+        means = self.observe(jnp.where(valid, displacement, 0.0), thetas)
+        found = self.log_density(means, self.noise_values(draw), data)
+        if self.error is not None:
+            found += self._error_ratio(draw, means, data)
+        return jnp.where(valid, found, -jnp.inf)
+
+    def _error_ratio(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
+        assert self.error is not None
+        residual = {name: data[name] - mean for name, mean in means.items()}
+        return self.error.log_ratio(self._stacked(draw), residual)
+
+    def _stacked(self, draw: Mapping[str, Any]) -> jax.Array:
+        return jnp.stack([jnp.asarray(draw[name], float) for name in self.states.unknowns])
+
+    def prior_draws(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
+        """Draws (count,) from the prior of each unknown of theta."""
+        keys = jax.random.split(key, len(self.states.unknowns))
+        found: dict[str, jax.Array] = {}
+        for name, k in zip(self.states.unknowns, keys, strict=True):
+            prior = self._given_earlier(name, self.prior[name], found)
+            found[name] = prior.sample(k, (count,))
+        return found
+
+    def given(
+        self, data: np.ndarray | Mapping[str, np.ndarray]
+    ) -> tuple[Model, dict[str, jax.Array]]:
+        """The model of the values that are not missing, and these, checked.
+
+        Missing values are NaN (:mod:`calibrate.observations.present`).
+
+        Raises
+        ------
+        InputError
+            As :meth:`check_data`, or every value of an observation is missing.
+        """
+        observe, kept = leave_out_missing(self.observe, self._fitting(data))
+        if not missing_values(observe):
+            return self, self.check_data(kept)
+        if self.error is not None:
+            raise InputError(
+                "the forward map's error was learned for data without missing values; learn it for "
+                "Model.given's model"
+            )
+        reduced = replace(self, observe=observe, noise=at_sites(self.noise, observe))
+        return reduced, reduced.check_data(kept)
+
+    def check_data(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
+        """``data`` in float64 by name; :class:`InputError` on data that cannot be the model's."""
+        named = self._fitting(data)
+        for name, values in named.items():
+            if np.isnan(values).any():
+                raise InputError(
+                    f"data: {int(np.isnan(values).sum())} of {values.size} values of {name} are "
+                    "missing (NaN); Model.given leaves them out"
+                )
+        if self.check_scale:
+            draws = jax.jit(lambda key: self.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))
+            stacked = np.stack([np.asarray(draws[n]) for n in self.states.unknowns], axis=1)
+            check_magnitudes(self._predict_stacked, self.observe, self.noise, stacked, named)
+        return {name: jnp.asarray(values) for name, values in named.items()}
+
+    def _fitting(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """``data`` in float64 by name, of the right shapes; NaN where missing.
+
+        A number may be an array of one, and ``data`` a DataTree with what was observed in a group.
+        """
+        if isinstance(data, Mapping) and _GROUP in data and _GROUP not in self.observe.parts:
+            data = data[_GROUP]
+        named = {
+            name: np.asarray(values, dtype=float)
+            for name, values in self.observe.name(data, "data").items()
+        }
+        for name in [n for n, shape in self.observe.shapes.items() if shape == ()]:
+            named[name] = named[name].reshape(()) if named[name].shape == (1,) else named[name]
+        for name, values in named.items():
+            self.observe.parts[name].check(name, values)
+        return named
+
+    def _predict_stacked(self, values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        return self.predict(dict(zip(self.states.unknowns, values, strict=True)))
+
+
+def at_sites(noise: Mapping[str, Noise], observe: Observations) -> dict[str, Noise]:
+    """Each noise at the sites of its observation; :class:`InputError` names the observation."""
+    found = {}
+    for name, part in observe.parts.items():
+        try:
+            found[name] = noise[name].at(part.sites)
+        except InputError as error:
+            raise InputError(f"noise of {name}: {error}") from error
+    return found

@@ -1,0 +1,29 @@
+"""From a scene to a report: what is run is a :class:`Run`, and kept beside its results."""
+
+from calibrate.workflow.run import Run
+from calibrate.workflow.workflow import (
+    by_fem,
+    certify_and_keep,
+    infer,
+    load,
+    make_data,
+    model_before_data,
+    observed,
+    read_posterior,
+    report,
+    simulator_of,
+)
+
+__all__ = [
+    "Run",
+    "by_fem",
+    "certify_and_keep",
+    "infer",
+    "load",
+    "make_data",
+    "model_before_data",
+    "observed",
+    "read_posterior",
+    "report",
+    "simulator_of",
+]

@@ -1,0 +1,78 @@
+"""Whether a kept posterior still belongs to the run and the forward map beside it.
+
+``posterior.nc`` carries the run it was sampled for and the fingerprint of its forward map. A
+certificate speaks about that run and that map, so any difference is refused.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from calibrate.statistical_model.approximation_error import ApproximationError
+from emulator.errors import InputError
+from emulator.store import read_arrays
+from emulator.surrogates.protocol import ForwardMap
+
+# Paths of scene and emulator may change when a folder moves; their fingerprints may not.
+_PLACES = ("scene", "root", "emulator")
+
+
+def check_run(path: Path, tree: xr.DataTree, run: Mapping[str, Any]) -> None:
+    """:class:`InputError` names the first entry of ``run`` that the posterior was not made with.
+
+    Parameters
+    ----------
+    path, tree : the posterior's file and its content.
+    run : entries of run.json, by name, as they are there.
+    """
+    try:
+        sampled: dict[str, Any] = json.loads(tree.attrs["run"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} does not name the run it was sampled for; infer again") from error
+    now = json.loads(json.dumps(run))
+    for name in sorted({*sampled, *now} - set(_PLACES)):
+        if name not in now:
+            raise InputError(
+                f"{path} was sampled with {name} = {json.dumps(sampled[name])}, which run.json "
+                "lacks; restore it, or infer again"
+            )
+        if sampled.get(name) != now.get(name):
+            raise InputError(
+                f"{path} was sampled with {name} = {json.dumps(sampled.get(name))}, but run.json "
+                f"says {json.dumps(now.get(name))}; infer again"
+            )
+
+
+def check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
+    """:class:`InputError` unless the posterior was made with ``forward``."""
+    made_with = tree.attrs.get("forward_fingerprint")
+    if made_with != forward.fingerprint:
+        raise InputError(
+            f"{path} was made with another {forward.kind} map (fingerprint {made_with}; it is "
+            f"{forward.fingerprint} now); infer again"
+        )
+
+
+def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ApproximationError:
+    """The forward map's error kept in ``file``, with which the posterior was sampled.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged or of another posterior.
+    """
+    if not file.is_file():
+        raise InputError(f"{file}, the forward map's error of the posterior beside it, is missing")
+    arrays, _ = read_arrays(file)
+    try:
+        error = ApproximationError.restore(arrays)
+    except KeyError as missing:
+        raise InputError(f"{file}: array {missing} is missing; infer again") from missing
+    if tree.attrs.get("forward_error") != error.fingerprint:
+        raise InputError(f"{path} was sampled with another error than {file} holds; infer again")
+    return error

@@ -1,0 +1,289 @@
+"""One calibration from start to end: data, forward map, posterior, certificate, files.
+
+The :class:`~calibrate.workflow.run.Run` is kept as ``run.json`` beside its results: they can be
+certified again, or repeated.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
+from shutil import copyfile
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.certificate import Certificate, examine
+from calibrate.certificate.reweight import keeps, reweighted
+from calibrate.data import read_data, write_data
+from calibrate.observations import Observations, observations_from_json, parse_observation
+from calibrate.observations.present import missing_values
+from calibrate.posterior import Posterior, read_tree, sample
+from calibrate.priors import prior_of
+from calibrate.samplers import find_sampler, options_from
+from calibrate.state_names import split
+from calibrate.statistical_model import Model, with_error
+from calibrate.statistical_model.build import model
+from calibrate.statistical_model.load_states import known_thetas
+from calibrate.workflow.kept import check_forward, check_run, restore_error
+from calibrate.workflow.run import Run
+from emulator import schema
+from emulator.catalogue import find_scene
+from emulator.errors import InputError
+from emulator.fem import NewtonOptions, Simulator
+from emulator.scenes.scene import Scene
+from emulator.store import read_json, save_arrays, write_json
+from emulator.surrogates import registry
+from emulator.surrogates.fem import fem_forward
+from emulator.surrogates.kind import Ingredients
+from emulator.surrogates.protocol import ForwardMap
+
+RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
+FORWARD, ERROR = "forward.safetensors", "error.safetensors"
+SAMPLING = "sampling.safetensors"  # of a run under way, or killed
+
+
+@lru_cache(maxsize=2)
+def simulator_of(scene: Scene, load_steps: int = 1) -> Simulator:
+    """The simulator of a scene, compiled once for data, campaign and certificate."""
+    return Simulator(scene, NewtonOptions.load_steps(load_steps))
+
+
+def ingredients_of(run: Run, scene: Scene, *, progress: bool = False) -> Ingredients:
+    """What the forward map of a run is built from."""
+    simulator = simulator_of(scene, run.load_steps)
+    return Ingredients(scene, simulator, run.emulator, run.seed, progress=progress)
+
+
+def build_forward(run: Run, scene: Scene, *, progress: bool = False) -> ForwardMap:
+    """The forward map a run asks for, over all nodes."""
+    made_of = ingredients_of(run, scene, progress=progress)
+    return registry.build_forward(run.forward, made_of, run.forward_options)
+
+
+def restore_forward(run: Run, scene: Scene, folder: Path) -> ForwardMap:
+    """The forward map of the run kept in ``folder``."""
+    made_of = ingredients_of(run, scene)
+    return registry.restore_forward(run.forward, made_of, run.forward_options, folder / FORWARD)
+
+
+def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarray]]:
+    """Observations and data of a run by name, read from a file or made by FEM."""
+    if run.data != "synthetic":
+        return read_data(scene, run.data)
+    observe = observed(run, scene)
+    thetas = known_thetas(scene, observe.states, {**run.known, **run.truth})
+    noises = run.synthetic_noise(observe)
+    simulator = simulator_of(scene, run.load_steps)
+    fields = [simulator(theta)[observe.nodes] for theta in thetas]
+    exact = jax.jit(observe)(jnp.stack(fields), thetas)
+    rng = np.random.default_rng([run.seed, 1])
+    return observe, {
+        name: np.asarray(exact[name]) + noises[name].simulate(rng, part.shape)
+        for name, part in observe.parts.items()
+    }
+
+
+def observed(run: Run, scene: Scene) -> Observations:
+    """What a run observes, without making or reading its data if it is synthetic."""
+    if run.data != "synthetic":
+        return read_data(scene, run.data)[0]
+    states = dict.fromkeys(state for _, state in map(split, {**run.known, **run.truth}) if state)
+    return parse_observation(scene, run.observe, run.seed, tuple(states) or ("",))
+
+
+def build_model(run: Run, scene: Scene, observe: Observations, *, progress: bool = False) -> Model:
+    """The statistical model of a run, before its data."""
+    forward = build_forward(run, scene, progress=progress)
+    noises = run.noises(observe)
+    prior = prior_of(run.prior, scene)
+    return model(forward, observe, noises, prior, known=run.known, check_scale=run.check_scale)
+
+
+def model_before_data(run: Run, *, progress: bool = False) -> Model:
+    """The statistical model of a run that has no data yet."""
+    scene = find_scene(run.scene, run.root)
+    observe = observed(run, scene)
+    return build_model(run.named(observe), scene, observe, progress=progress)
+
+
+def by_fem(model: Model) -> Model:
+    """``model`` with FEM as its forward map, to make the data it is checked with."""
+    whole = fem_forward(simulator_of(model.forward.scene), model.full)
+    return replace(model, full=whole, forward=whole.at(model.observe.nodes), error=None)
+
+
+def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
+    """Sample the posterior of a run; with ``folder``, keep run, data and posterior there.
+
+    A run into ``folder`` that was killed while sampling goes on where it was.
+    """
+    sampler = find_sampler(run.sampler)
+    length = {"warmup": run.warmup, "draws": run.draws, "chains": run.chains}
+    options = options_from(sampler, run.sampler_options, **length)
+    scene = find_scene(run.scene, run.root)
+    observe, data = make_data(run, scene)
+    run = run.named(observe)
+    built = build_model(run, scene, observe, progress=progress)
+    kept: Mapping[str, Any] = data
+    if runs := run.error_runs or run.mesh_error_runs:
+        built, kept = built.given(data)
+        # Now that the data is checked, sampling need not check it again.
+        built = with_error(
+            replace(built, check_scale=False),
+            simulator_of(scene, run.load_steps),
+            runs,
+            of_mesh=bool(run.mesh_error_runs),
+            seed=run.seed,
+            progress=progress,
+        )
+    posterior = sample(
+        built,
+        kept,
+        sampler=run.sampler,
+        options=options,
+        seed=run.seed,
+        progress=progress,
+        simulator=simulator_of(scene, run.load_steps) if sampler.solves_fem else None,
+        checkpoint=None if folder is None else Path(folder) / SAMPLING,
+    )
+    if folder is not None:
+        folder = Path(folder)
+        # An earlier result is removed first and the posterior is written last: a run that is killed
+        # leaves no posterior, rather than one beside the certificate of another.
+        for name in (CERTIFICATE, POSTERIOR, FORWARD, ERROR):
+            (folder / name).unlink(missing_ok=True)
+        write_data(folder / DATA, observe, data)
+        write_json(folder / RUN, asdict(run))
+        registry.keep_forward(posterior.model.full, folder / FORWARD)
+        if posterior.model.error is not None:
+            save_arrays(folder / ERROR, posterior.model.error.arrays(), {})
+        posterior.tree.attrs["run"] = json.dumps(asdict(run))
+        posterior.save(folder / POSTERIOR)
+    return posterior
+
+
+def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
+    """The run kept in ``folder`` and its posterior, ready to be certified.
+
+    Raises
+    ------
+    InputError
+        A file is missing or damaged, or the posterior was not made with this run, its scene or its
+        forward map.
+    """
+    folder = Path(folder)
+    path = folder / POSTERIOR
+    run = schema.read_json_as(Run, folder / RUN)
+    scene = find_scene(run.scene, run.root)
+    tree = read_tree(path)
+    if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
+        raise InputError(f"{path} was made for another scene than '{run.scene}'")
+    check_run(path, tree, read_json(folder / RUN))
+    forward = restore_forward(run, scene, folder)
+    check_forward(path, tree, forward)
+    observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
+    noises = run.noises(observe)
+    # Its data was checked when it was sampled, or the check was overruled.
+    prior = prior_of(run.prior, scene)
+    built: Model = model(forward, observe, noises, prior, known=run.known, check_scale=False)
+    if run.error_runs or run.mesh_error_runs:
+        error = restore_error(path, tree, folder / ERROR)
+        built = replace(built, error=error)
+    kept = tree["observed_data"]
+    data = built.check_data(
+        {n: np.asarray(kept[n]).reshape(part.shape) for n, part in observe.parts.items()}
+    )
+    return run, Posterior(tree, built, data)
+
+
+def load(folder: str | Path) -> Posterior:
+    """The posterior kept in ``folder`` by :func:`infer` or ``calibrate infer``.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_posterior`.
+    """
+    return read_posterior(folder)[1]
+
+
+def certify_and_keep(
+    posterior: Posterior,
+    folder: str | Path,
+    *,
+    draws: int | None = None,
+    mesh: int | None = None,
+    load_steps: int = 1,
+    reweight_to: str | Path | None = None,
+    scheduler: str | None = None,
+    progress: bool = False,
+) -> Certificate:
+    """Check a posterior against FEM and write certificate.json.
+
+    ``mesh`` is the number of solves on a finer mesh, 0 for none. ``load_steps`` are those of every
+    solve. ``scheduler`` is the address of a
+    Dask scheduler whose workers solve. With ``reweight_to``, the
+    reweighted posterior is kept in that folder, ready to be certified in its turn, where the
+    verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
+
+    Raises
+    ------
+    InputError
+        FEM has decided on the draws already.
+    """
+    simulator = simulator_of(posterior.model.forward.scene, load_steps)
+    check = examine(
+        posterior, simulator, draws=draws, mesh=mesh, scheduler=scheduler, progress=progress
+    )
+    write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
+    if reweight_to is not None and keeps(check.certificate):
+        _keep_reweighted(reweighted(check), Path(folder), Path(reweight_to))
+    return check.certificate
+
+
+def _keep_reweighted(posterior: Posterior, source: Path, target: Path) -> None:
+    """``posterior`` beside copies of the run, data and map it is from."""
+    target.mkdir(parents=True, exist_ok=True)
+    for name in (CERTIFICATE, POSTERIOR, FORWARD, ERROR):
+        (target / name).unlink(missing_ok=True)
+    for name in (RUN, DATA, FORWARD, ERROR):
+        if (source / name).exists():
+            copyfile(source / name, target / name)
+    posterior.save(target / POSTERIOR)
+
+
+def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> dict[str, Any]:
+    """The result as plain JSON: parameter table, diagnostics, verdict."""
+    table = posterior.summary()
+    for name, row in table.items() if run.data == "synthetic" else ():
+        if (value := run.truth.get(name, run.truth.get(split(name)[0]))) is not None:
+            row["truth"] = value
+    result: dict[str, Any] = {
+        "scene": run.scene,
+        "forward": run.forward,
+        "parameters": table,
+        "divergences": posterior.divergences,
+        "verdict": "not certified",
+        "k_hat": None,
+        "prior_cut": dict(posterior.model.prior_cut),
+        "missing": missing_values(posterior.model.observe),
+        "draws": int(posterior.tree["posterior"].sizes["draw"]),
+        "chains": int(posterior.tree["posterior"].sizes["chain"]),
+        "warnings": posterior.warnings(),
+    }
+    if "fem_solves" in posterior.tree.attrs:
+        result["fem_solves"] = int(posterior.tree.attrs["fem_solves"])
+        result["verdict"] = "decided by FEM"
+    if "log_evidence" in posterior.tree.attrs:
+        result["log_evidence"] = posterior.tree.attrs["log_evidence"]
+        result["log_evidence_error"] = posterior.tree.attrs.get("log_evidence_error")
+    if certificate is not None:
+        result.update(verdict=certificate.verdict, k_hat=certificate.k_hat)
+        result["certificate"] = certificate.to_json()
+    return result

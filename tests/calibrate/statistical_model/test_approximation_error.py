@@ -1,0 +1,181 @@
+"""The forward map's own error in the likelihood, against densities written by hand."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from numpyro.infer.util import log_density
+from scipy.stats import multivariate_normal
+
+import calibrate as cal
+from calibrate.posterior import sample
+from calibrate.statistical_model import with_error
+from calibrate.statistical_model.approximation_error import ApproximationError, fit
+from emulator.errors import InputError
+from linear_support import LinearSimulator, closed_form, linear_forward
+
+NODES = np.array([3, 11, 20, 30])
+NOISE = 0.02
+TRUTH = jnp.array([72.0, 68.0])
+MEAN, SD = np.array([75.0, 75.0]), np.array([8.0, 8.0])
+
+
+@pytest.fixture(scope="module")
+def truth(beam):
+    return linear_forward(beam)
+
+
+@pytest.fixture(scope="module")
+def poor(truth):
+    """A map that is wrong by some five noise sd, in a way that changes with theta."""
+    other = linear_forward(truth.scene, seed=9)
+    return replace(truth, matrix=truth.matrix + 0.15 * other.matrix, shift=truth.shift)
+
+
+def model_of(forward, noise=NOISE):
+    prior = {n: dist.Normal(m, s) for n, m, s in zip(("mu", "lam"), MEAN, SD, strict=True)}
+    observe = cal.nodal_displacements(forward.scene, NODES)
+    return cal.model(forward, observe, cal.GaussianNoise(sd=noise), prior, check_scale=False)
+
+
+@pytest.fixture(scope="module")
+def aware(truth, poor):
+    return with_error(model_of(poor), LinearSimulator(truth), 40)
+
+
+def test_the_density_is_that_of_the_sum_of_noise_and_error(aware, truth):
+    """Against SciPy's multivariate normal with the whole covariance."""
+    data = aware.check_data(np.asarray(truth.at(NODES)(TRUTH)))
+    draw = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}
+    size = float(aware.error.size(jnp.array([70.0, 81.0])))
+    spread = size**2 * aware.error.modes.T @ aware.error.modes
+    covariance = NOISE**2 * np.eye(spread.shape[0]) + spread
+    mean = np.asarray(aware.forward(jnp.array([70.0, 81.0]))).ravel()
+    wanted = multivariate_normal(mean, covariance).logpdf(np.ravel(data["displacement"]))
+    assert float(aware.map_log_likelihood(draw, data)) == pytest.approx(wanted, rel=1e-9)
+    found, _ = log_density(aware, (data,), {}, draw)
+    prior = sum(float(aware.prior[n].log_prob(v)) for n, v in draw.items())
+    assert float(found) == pytest.approx(wanted + prior, rel=1e-9)
+
+
+def test_fem_on_the_mesh_shares_the_error_of_the_mesh_only(aware, truth):
+    """Against SciPy's normal; the error of the map alone leaves FEM's likelihood as it is."""
+    data = aware.check_data(np.asarray(truth.at(NODES)(TRUTH)))
+    draw = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}
+    means = aware.predict(draw)[0]
+    size = float(aware.error.size(jnp.array([70.0, 81.0])))
+    of_noise = NOISE**2 * np.eye(aware.error.modes.shape[1])
+    of_mesh = size**2 * aware.error.modes.T @ aware.error.modes
+    whole = replace(aware, error=replace(aware.error, of_mesh=True))
+    mean, y = (np.ravel(d["displacement"]) for d in (means, data))
+    for model, covariance in ((aware, of_noise), (whole, of_noise + of_mesh)):
+        found = float(model.fem_log_likelihood(draw, means, data))
+        assert found == pytest.approx(multivariate_normal(mean, covariance).logpdf(y), rel=1e-9)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    moved = jax.vmap(lambda key: whole.fem_means(key, draw, means)["displacement"])(keys)
+    spread = np.cov(np.asarray(moved).reshape(len(keys), -1).T)
+    np.testing.assert_allclose(spread, of_mesh, atol=0.1 * np.abs(of_mesh).max())
+    again = ApproximationError.restore(whole.error.arrays())
+    assert again.of_mesh
+    assert again.fingerprint == whole.error.fingerprint != aware.error.fingerprint
+
+
+def test_the_covariance_is_that_of_the_errors():
+    """Errors of one size everywhere: their second moment."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(4, 4))
+    errors = rng.normal(size=(600, 2)) @ root[:2]
+    noise = np.diag([0.1, 0.2, 0.3, 0.4]) ** 2
+    found = fit(rng.random((600, 2)), errors, np.linalg.inv(noise))
+    assert found.modes.shape == (2, 4)
+    size = np.array([float(found.size(jnp.array(x))) for x in rng.random((20, 2))])
+    middle = np.median(size) ** 2 * found.modes.T @ found.modes
+    np.testing.assert_allclose(middle, root[:2].T @ root[:2], atol=0.6 * np.abs(middle).max())
+    # G is diagonal: V^T W V.
+    G = found.modes @ np.linalg.inv(noise) @ found.modes.T
+    np.testing.assert_allclose(G, np.diag(found.strength), atol=1e-9 * G.max())
+
+
+def test_its_size_follows_the_unknowns():
+    """Errors ten times larger at one end than at the other."""
+    rng = np.random.default_rng(1)
+    x = rng.random((60, 1))
+    errors = 10.0**x * rng.normal(size=(60, 5))
+    found = fit(x, errors, np.eye(5))
+    low, high = (float(found.size(jnp.array([v]))) for v in (0.05, 0.95))
+    assert 4.0 < high / low < 15.0
+    # Far outside the runs it stays between the sizes they have.
+    assert float(found.size(jnp.array([50.0]))) <= np.exp(found.log_sizes.max()) * (1 + 1e-12)
+
+
+def test_a_poor_map_widens_the_posterior_instead_of_moving_it(truth, poor, aware):
+    """Shift from the true map's posterior in sd of its own: 20 data sets, many sd against one."""
+    rng = np.random.default_rng(2)
+    A, B = truth.matrix[NODES].reshape(-1, 2), poor.matrix[NODES].reshape(-1, 2)
+    shifts = {"blind": [], "aware": []}
+    for theta in rng.normal(MEAN, SD, (20, 2)):
+        y = A @ theta + NOISE * rng.normal(size=len(A))
+        right, _ = closed_form(truth, NODES, y.reshape(-1, 3), NOISE, MEAN, SD)
+        # The posterior of the aware model is Gaussian but for the size: taken at the truth.
+        size = float(aware.error.size(jnp.asarray(theta)))
+        error = size**2 * aware.error.modes.T @ aware.error.modes
+        for name, spread in (("blind", 0.0 * error), ("aware", error)):
+            precision = np.linalg.inv(NOISE**2 * np.eye(len(A)) + spread)
+            C = np.linalg.inv(B.T @ precision @ B + np.diag(SD**-2.0))
+            mean = C @ (B.T @ precision @ y + MEAN / SD**2)
+            shifts[name].append((mean - right) / np.sqrt(np.diagonal(C)))
+    rms = {name: float(np.sqrt(np.mean(np.square(v)))) for name, v in shifts.items()}
+    assert rms["blind"] > 5.0
+    assert 0.3 < rms["aware"] < 1.5
+
+
+@pytest.mark.slow
+def test_nuts_and_replicated_data_know_of_it(truth, aware):
+    data = np.asarray(truth.at(NODES)(TRUTH))
+    options = cal.NUTSOptions(warmup=200, draws=300, chains=2, rounds=1)
+    posterior = sample(aware, data, options=options)
+    table = posterior.summary()
+    for name, value in zip(("mu", "lam"), TRUTH, strict=True):
+        assert abs(table[name]["mean"] - float(value)) < 3.0 * table[name]["sd"]
+    # The replicates spread as the error and the noise together, far more than the noise.
+    replicated = np.asarray(posterior.tree["posterior_predictive"]["displacement"])
+    assert replicated.std(axis=(0, 1)).mean() > 3.0 * NOISE
+
+
+def test_an_exact_map_changes_nothing(truth):
+    model = with_error(model_of(truth), LinearSimulator(truth), 10)
+    data = model.check_data(np.asarray(truth.at(NODES)(TRUTH)))
+    draw = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}
+    plain = replace(model, error=None).map_log_likelihood(draw, data)
+    assert float(model.map_log_likelihood(draw, data)) == pytest.approx(float(plain), rel=1e-9)
+
+
+def test_it_is_kept_and_restored(aware):
+    back = ApproximationError.restore(aware.error.arrays())
+    x = jnp.array([71.0, 66.0])
+    assert float(back.size(x)) == float(aware.error.size(x))
+    key = jax.random.key(0)
+    means = {"displacement": jnp.zeros((4, 3))}
+    np.testing.assert_array_equal(
+        back.draw(key, x, means)["displacement"], aware.error.draw(key, x, means)["displacement"]
+    )
+
+
+def test_what_is_refused(truth, poor, cube):
+    model = model_of(poor)
+    with pytest.raises(InputError, match="5 FEM runs; give 8 or more"):
+        with_error(model, LinearSimulator(truth), 5)
+    with pytest.raises(InputError, match="the simulator is for another scene"):
+        with_error(model, LinearSimulator(linear_forward(cube)), 10)
+    observe = cal.nodal_displacements(poor.scene, NODES)
+    unknown = cal.model(poor, observe, cal.GaussianNoise(sd_scale=0.1))
+    with pytest.raises(InputError, match="the noise of displacement must be Gaussian and of known"):
+        with_error(unknown, LinearSimulator(truth), 10)
+    nowhere = cal.model(
+        replace(poor, limit=10.0), observe, cal.GaussianNoise(sd=0.1), check_scale=False
+    )
+    with pytest.raises(InputError, match="answered at 0 of 10 draws of the prior; 8 are needed"):
+        with_error(nowhere, LinearSimulator(truth), 10)
