@@ -10,7 +10,6 @@ program, so they follow any observation and noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -21,7 +20,6 @@ import numpyro.distributions as dist
 from numpyro import handlers
 
 from calibrate.noise.spatial import SpatialNormal
-from calibrate.samplers.density import sum_log_likelihood, trace_of
 from calibrate.statistical_model import Data, Model
 from emulator.surrogates.protocol import Prediction, evaluate_all, solves_itself
 
@@ -79,50 +77,34 @@ def spread(draws: Draws, count: int = REPLICATES) -> tuple[np.ndarray, Draws]:
     return rows, {name: np.asarray(values)[:, rows] for name, values in draws.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class _Told(Model):
-    """A model that is told its predictions. ``told`` : displacement (S, k, 3) mm and validity."""
-
-    told: Prediction | None = None
-
-    def evaluate(self, thetas: jax.Array) -> Prediction:  # noqa: ARG002 - it knows their answers
-        """What it was told."""
-        assert self.told is not None
-        return self.told
-
-
 def _solved_prior(model: Model, keys: jax.Array) -> Any:
     """What the program ``prior`` gives, by solves that are driven from Python.
 
     The theta of all draws first, then every solve, then the data: keys decide on all of them alike.
     """
-    parts = {each.name: getattr(model, each.name) for each in fields(Model)}
     states = model.states
-
-    def given(told: Prediction, rng_key: jax.Array) -> Any:
-        return _prior(_Told(**parts, told=told), rng_key)
-
-    nowhere = Prediction(
+    given = partial(_prior, model)
+    at_rest = Prediction(
         jnp.zeros((len(states.states), len(model.observe.nodes), 3)), jnp.array(True)
     )
-    draws = jax.jit(jax.vmap(lambda key: given(nowhere, key)[0]))(keys)
+    draws = jax.jit(jax.vmap(lambda key: given(key, at_rest)[0]))(keys)
     thetas = jax.jit(jax.vmap(states.thetas))({name: draws[name] for name in states.unknowns})
     solved = evaluate_all(model.forward, thetas.reshape(-1, thetas.shape[-1]))
     shape = thetas.shape[:2]
-    told = Prediction(
+    known = Prediction(
         solved.displacement.reshape(*shape, *solved.displacement.shape[1:]),
         jnp.all(solved.valid.reshape(shape), axis=1),
     )
-    return jax.jit(jax.vmap(given))(told, keys)
+    return jax.jit(jax.vmap(given))(keys, known)
 
 
-def _prior(model: Model, rng_key: jax.Array) -> Any:
+def _prior(model: Model, rng_key: jax.Array, prediction: Prediction | None = None) -> Any:
     """A draw of the prior, data replicated there, and whether the forward map has an answer."""
-    trace = handlers.trace(handlers.seed(model, rng_key)).get_trace()
+    trace = handlers.trace(handlers.seed(model, rng_key)).get_trace(None, prediction)
     draw = {name: trace[name]["value"] for name in model.names}
     data = {name: trace[_site(name)]["value"] for name in model.observe.parts}
-    # Without data, the only thing observed is that the forward map has an answer.
-    return draw, data, jnp.isfinite(sum_log_likelihood(trace))
+    valid = trace["valid"]
+    return draw, data, jnp.isfinite(valid["fn"].log_prob(valid["value"]))
 
 
 class _Programs(NamedTuple):
@@ -134,7 +116,7 @@ class _Programs(NamedTuple):
 @lru_cache(maxsize=4)
 def _programs(model: Model) -> _Programs:
     def log_likelihood(draw: dict[str, jax.Array], data: Data) -> dict[str, jax.Array]:
-        trace = trace_of(model, draw, data)
+        trace = model.trace(draw, data)
         return {name: _pointwise(trace[_site(name)]) for name in model.observe.parts}
 
     def replicate(draw: dict[str, jax.Array], rng_key: jax.Array) -> dict[str, jax.Array]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ def density_of(model: Model) -> Density:
         return -potential_energy(unobserved, (example,), {}, coordinates(z))
 
     def log_likelihood(z: jax.Array, data: Data) -> jax.Array:
-        return sum_log_likelihood(trace_of(model, draw(z), data))
+        return model.map_log_likelihood(draw(z), data)
 
     def draw(z: jax.Array) -> dict[str, jax.Array]:
         return {name: transforms[name](value) for name, value in coordinates(z).items()}
@@ -102,33 +102,16 @@ def tempered(density: Density, power: float) -> Density:
     return density._replace(log_density=log_density)
 
 
-def trace_of(model: Model, draw: dict[str, jax.Array], data: Data) -> dict[str, Any]:
-    """The model's sites at ``draw`` (a number by name) and ``data``, as NumPyro traces them."""
-    return handlers.trace(handlers.substitute(model, data=draw)).get_trace(data)
-
-
 def _observed_sites(model: Model, data: dict[str, np.ndarray]) -> list[str]:
     """Names of what is observed, and of the factors; nothing is computed."""
     found: list[str] = []
 
     def trace() -> None:
         sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(data)
-        found.extend(name for name, site in sites.items() if _observed(site))
+        found.extend(name for name, site in sites.items() if site.get("is_observed", False))
 
     jax.eval_shape(trace)
     return found
-
-
-def _observed(site: dict[str, Any]) -> bool:
-    return bool(site.get("is_observed", False))
-
-
-def sum_log_likelihood(trace: dict[str, Any]) -> jax.Array:
-    """Log density of all that is observed, whether the forward map is valid included."""
-    terms = [
-        jnp.sum(site["fn"].log_prob(site["value"])) for site in trace.values() if _observed(site)
-    ]
-    return sum(terms, jnp.zeros(()))
 
 
 def named_draws(model: Model, z: np.ndarray) -> dict[str, np.ndarray]:

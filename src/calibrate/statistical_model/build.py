@@ -54,7 +54,16 @@ def model(
     dependence = dependence_of(prior)
     joint = None if dependence is None else dependence.ordered(states.unknowns)
     return Model(
-        restricted, forward, several, noises, names, states, fitting, None, cut, check_scale, joint
+        restricted,
+        forward,
+        several,
+        noises,
+        names,
+        states,
+        fitting,
+        prior_cut=cut,
+        check_scale=check_scale,
+        dependence=joint,
     )
 
 

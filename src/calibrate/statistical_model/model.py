@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from numpyro import handlers
 
 from calibrate.data.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.noise import Noise
@@ -116,13 +117,18 @@ class Model:
         theta = {name: standardised(self.prior[name]) for name in self.states.unknowns}
         return {**theta, **self.noise_priors}
 
-    def __call__(self, data: jax.Array | Data | None = None) -> None:
-        """The NumPyro program; ``data`` by name, or as it is when one thing is observed."""
+    def __call__(
+        self, data: jax.Array | Data | None = None, prediction: Prediction | None = None
+    ) -> None:
+        """The NumPyro program; ``data`` by name, or as it is when one thing is observed.
+
+        ``prediction`` of :meth:`evaluate` at the drawn theta, where it is known already.
+        """
         draw: dict[str, jax.Array] = {}
         for name, prior in self.sampled_priors.items():
             draw[name] = numpyro.sample(name, self._given_earlier(name, prior, draw))
         thetas = self.states.thetas(draw)
-        prediction = self.evaluate(thetas)
+        prediction = self.evaluate(thetas) if prediction is None else prediction
         # Where the forward map has no answer, the density is zero, not NaN.
         numpyro.factor("valid", jnp.where(prediction.valid, 0.0, -jnp.inf))
         means = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0), thetas)
@@ -202,13 +208,12 @@ class Model:
 
         ``-inf`` where the map has no answer. ``draw`` has a number for each of ``names``.
         """
-        thetas = self.states.thetas(draw)
-        displacement, valid = self.evaluate(thetas)
-        means = self.observe(jnp.where(valid, displacement, 0.0), thetas)
-        found = self.log_density(means, self.noise_values(draw), data)
-        if self.error is not None:
-            found += self._error_ratio(draw, means, data)
-        return jnp.where(valid, found, -jnp.inf)
+        observed = [site for site in self.trace(draw, data).values() if site.get("is_observed")]
+        return sum((jnp.sum(s["fn"].log_prob(s["value"])) for s in observed), jnp.zeros(()))
+
+    def trace(self, draw: Mapping[str, Any], data: Data) -> dict[str, dict[str, Any]]:
+        """The program's sites at ``draw`` (a number by name) and ``data``, as NumPyro has them."""
+        return handlers.trace(handlers.substitute(self, data=dict(draw))).get_trace(data)
 
     def _error_ratio(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
         assert self.error is not None
