@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibrate.certificate.misfit import Misfit
+from calibrate.posterior.fit import Misfit
 
 # At a shift of 0.25 sd a 90 % interval still covers 88.9 %.
 LARGEST_SHIFT = 0.25

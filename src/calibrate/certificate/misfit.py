@@ -17,7 +17,6 @@ wrong sd where the sd is inferred.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -27,22 +26,9 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.certificate.correction import Correction
 from calibrate.certificate.predictive import Predictive
+from calibrate.posterior.fit import Misfit, places_of
 
 DRAWS = 1000
-OUTLYING = 4.0  # noise sd; of 100 Gaussian data 0.6 % have one beyond
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """Discrepancies of one observation.
-
-    p, p_worst : posterior predictive p of the whole (T_1) and of its worst datum (T_2).
-    outlying : data beyond 4 noise sd by FEM's posterior, each with its mean distance in noise sd.
-    """
-
-    p: float
-    p_worst: float
-    outlying: dict[str, float]
 
 
 def misfits(
@@ -70,7 +56,11 @@ def misfits(
         }
 
     found = jax.jit(jax.vmap(one))(flat, draws, jax.random.split(rng_key, len(z)))
-    return {name: _misfit(name, *map(np.asarray, parts)) for name, parts in found.items()}
+    misfit = {}
+    for name, (whole, *distances) in found.items():
+        simulated, distance = (np.asarray(x).reshape(len(z), -1) for x in distances)
+        misfit[name] = Misfit.of(places_of(name, shapes[name]), whole, simulated, distance)
+    return misfit
 
 
 def _compared(
@@ -79,18 +69,3 @@ def _compared(
     """At one draw: whether simulated data is as unlikely as y, and both their distances."""
     simulated = d.sample(rng_key) + error
     return d.log_prob(simulated) <= d.log_prob(y), jnp.abs(simulated - mean), jnp.abs(y - mean)
-
-
-def _misfit(name: str, whole: np.ndarray, simulated: np.ndarray, distance: np.ndarray) -> Misfit:
-    # The sd is the simulated data's: not every distribution knows its own.
-    sd = np.sqrt(np.mean(simulated**2, axis=0))
-    simulated, distance = (x.reshape(len(x), -1) / sd.ravel() for x in (simulated, distance))
-    mean = distance.mean(axis=0)
-    order = [k for k in np.argsort(-mean) if mean[k] > OUTLYING]
-    places = [np.unravel_index(k, sd.shape) for k in order]
-    names = [f"{name}[{', '.join(map(str, place))}]" if place else name for place in places]
-    return Misfit(
-        float(whole.mean()),
-        float(np.mean(simulated.max(axis=1) >= distance.max(axis=1))),
-        {label: float(mean[k]) for label, k in zip(names, order, strict=True)},
-    )

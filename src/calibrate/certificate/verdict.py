@@ -8,20 +8,17 @@ but do not turn one verdict into the other.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from calibrate.certificate.evidence import Evidence, Figure, MeshChange, Physics, Sampling
-from calibrate.certificate.misfit import Misfit
-from calibrate.posterior.fit import SMALLEST_P
+from calibrate.posterior.fit import SMALLEST_P, Misfit
+from calibrate.samplers.stopping import REFUSE_ABOVE_R_HAT, REFUSE_BELOW_ESS
 from emulator.shown import Row, Shown
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
 
-# Largest R-hat at which the chains count as draws of one posterior; samplers aim at 1.008.
-LARGEST_R_HAT = 1.05
-SMALLEST_ESS = 100.0
 LARGEST_DIVERGENT = 0.002
 LARGEST_FAILED = 0.02
 SMALLEST_P_WORST = 0.001
@@ -34,13 +31,24 @@ _QUADRATIC = f"make the elements quadratic (order = 2), {_WIDEN}"
 _REFINE = f"emulate the finer mesh (calibrate train finer:SCENE --recipe two_meshes), {_WIDEN}"
 
 
+class Finding(NamedTuple):
+    """What was found, and what to do about it where something is to be done."""
+
+    what: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        """Both, as they are told."""
+        return f"{self.what}: {self.remedy}" if self.remedy else self.what
+
+
 @dataclass(frozen=True, repr=False)
 class Certificate(Shown):
     """Outcome of a check against FEM.
 
     verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use the reweighted one),
         ``undecided`` (give more FEM runs), or ``not certified``.
-    reason : the finding that decides, in words. findings : all of them, each with what to do.
+    reason : what decides, in words. findings : all that was found, each with what to do.
     evidence : the figures.
     """
 
@@ -113,116 +121,144 @@ def judge(evidence: Evidence) -> Certificate:
     elif fine is None and verdict in ("accepted", "reweight"):
         verdict = "undecided"
     if evidence.mesh.why and verdict == "accepted":
-        words[0] += " on this mesh"
-    findings = (*wrong, *words, *mesh) if fine else (*wrong, *mesh, *words)
-    return Certificate(verdict, findings[0].split(":")[0], findings, evidence)
+        words = [Finding(f"{words[0].what} on this mesh")]
+    findings = [*wrong, *words, *mesh] if fine else [*wrong, *mesh, *words]
+    return Certificate(verdict, findings[0].what, tuple(map(str, findings)), evidence)
 
 
-def _mesh(mesh: MeshChange) -> tuple[bool | None, list[str]]:
-    """Whether a finer mesh leaves the posterior as it is, ``None`` where that is open, in words."""
+def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
+    """Whether a finer mesh leaves the posterior as it is, ``None`` where that is open; findings."""
     if mesh.why:
-        return True, [f"no finer mesh was asked: {mesh.why}"]
+        return True, [Finding(f"no finer mesh was asked: {mesh.why}")]
     finer = f"on a finer mesh ({mesh.nodes} nodes)"
     if not mesh.shift:
-        return None, [f"FEM failed at {mesh.failed} of {mesh.runs} points {finer}: refine the mesh"]
+        failed = f"FEM failed at {mesh.failed} of {mesh.runs} points {finer}"
+        return None, [Finding(failed, "refine the mesh")]
     within = mesh.within()
     if within:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
         told = f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"
-        return True, [f"{told}, which is widened for it" if mesh.widened else told]
+        return True, [Finding(f"{told}, which is widened for it" if mesh.widened else told)]
     words = [w for w, figure, limit in mesh.judged() if figure.within(limit) is within]
     if within is None:
-        more = "give more runs on the finer mesh (--mesh-runs)"
-        return None, [f"{finer} the {words[0]}, too close to the limit for its error: {more}"]
+        near = f"{finer} the {words[0]}, too close to the limit for its error"
+        return None, [Finding(near, "give more runs on the finer mesh (--mesh-runs)")]
     remedy = _QUADRATIC if mesh.linear else _REFINE
     if mesh.widened:
         remedy = "learn the error of the mesh from more runs, or emulate the finer mesh"
-    return False, [f"{finer} the {each}: {remedy}" for each in words]
+    return False, [Finding(f"{finer} the {each}", remedy) for each in words]
 
 
-def _agreement(evidence: Evidence) -> tuple[Verdict, list[str]]:
-    """Verdict and words on draws against FEM."""
+def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
+    """Verdict and findings on draws against FEM."""
     tail, draws, corrected = evidence.tail, evidence.draws, evidence.corrected
     if tail.ess == 0.0:
-        return "not certified", ["no FEM run supports the posterior: check map and FEM options"]
+        return "not certified", [
+            Finding("no FEM run supports the posterior", "check map and FEM options")
+        ]
     if tail.spread > LARGEST_SPREAD:
         return "not certified", [
-            f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}: "
-            "train a better map, or put FEM into the likelihood"
+            Finding(
+                f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}",
+                "train a better map, or put FEM into the likelihood",
+            )
         ]
     if tail.heavy or not tail.pool >= SMALLEST_POOL:
-        return "undecided", ["the weights' tail is too heavy to trust their errors: more FEM runs"]
+        heavy = "the weights' tail is too heavy to trust their errors"
+        return "undecided", [Finding(heavy, "more FEM runs")]
     if tail.missed:
         return "undecided", [
-            f"{tail.missed} FEM runs are likely where the corrected map says they are not, so the "
-            "map may hide a part of the posterior: train a better map, or more FEM runs"
+            Finding(
+                f"{tail.missed} FEM runs are likely where the corrected map says they are not, so "
+                "the map may hide a part of the posterior",
+                "train a better map, or more FEM runs",
+            )
         ]
     agree = draws.within()
     beyond = [words for words, f, limit in draws.judged() if f.within(limit) is False]
     if agree:
         worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
-        return "accepted", [f"no mean moves by more than {worst:.2f} posterior sd"]
+        return "accepted", [Finding(f"no mean moves by more than {worst:.2f} posterior sd")]
     if agree is None:
         near = [words for words, f, limit in draws.judged() if f.within(limit) is None]
-        return "undecided", [f"{near[0]}, too close to the limit for its error: more FEM runs"]
+        close = f"{near[0]}, too close to the limit for its error"
+        return "undecided", [Finding(close, "more FEM runs")]
     repaired = corrected.within()
     if repaired:
-        return "reweight", [f"{words}: use the reweighted posterior" for words in beyond]
+        return "reweight", [Finding(words, "use the reweighted posterior") for words in beyond]
     verdict: Verdict = "undecided" if repaired is None else "not certified"
-    what = "more FEM runs" if repaired is None else "train a better map"
-    return verdict, [f"{words}, and reweighting does not repair it: {what}" for words in beyond]
+    remedy = "more FEM runs" if repaired is None else "train a better map"
+    still = "and reweighting does not repair it"
+    return verdict, [Finding(f"{words}, {still}", remedy) for words in beyond]
 
 
-def _sampling(s: Sampling) -> list[str]:
+def _sampling(s: Sampling) -> list[Finding]:
     found = []
     if not s.vary:
-        found.append("the draws of a parameter do not vary: the sampler is stuck")
+        found.append(Finding("the draws of a parameter do not vary", "the sampler is stuck"))
     elif not np.isfinite(s.r_hat):
-        found.append("R-hat is not a number: draw more")
-    elif not s.r_hat <= LARGEST_R_HAT:
-        found.append(f"the chains disagree, R-hat {s.r_hat:.3f}: draw more, or find their modes")
+        found.append(Finding("R-hat is not a number", "draw more"))
+    elif not s.r_hat <= REFUSE_ABOVE_R_HAT:
+        disagree = f"the chains disagree, R-hat {s.r_hat:.3f}"
+        found.append(Finding(disagree, "draw more, or find their modes"))
     if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
         found.append(
-            f"{s.divergences} of {s.transitions} transitions diverged: the sampler cannot follow "
-            "the posterior everywhere; raise target_accept, or narrow a prior the data leaves open"
+            Finding(
+                f"{s.divergences} of {s.transitions} transitions diverged",
+                "the sampler cannot follow the posterior everywhere; raise target_accept, or "
+                "narrow a prior the data leaves open",
+            )
         )
-    if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= SMALLEST_ESS:
+    if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= REFUSE_BELOW_ESS:
         found.append(
-            f"too few effective draws, {s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the "
-            f"tails: draw until both reach {SMALLEST_ESS:.0f}"
+            Finding(
+                f"too few effective draws, {s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in "
+                "the tails",
+                f"draw until both reach {REFUSE_BELOW_ESS:.0f}",
+            )
         )
     return found
 
 
-def _physics(p: Physics) -> list[str]:
+def _physics(p: Physics) -> list[Finding]:
     found = []
     if not p.failed_mass <= LARGEST_FAILED:
         found.append(
-            f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior: raise "
-            "--load-steps (NewtonOptions.load_steps), or narrow the prior to states that exist"
+            Finding(
+                f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior",
+                "raise --load-steps (NewtonOptions.load_steps), or narrow the prior to states that "
+                "exist",
+            )
         )
     if p.unstable:
         found.append(
-            f"FEM is at a saddle at {p.unstable} of {p.asked} draws: the body would leave that "
-            "state; follow the loading path with --load-steps 10 (NewtonOptions.load_steps)"
+            Finding(
+                f"FEM is at a saddle at {p.unstable} of {p.asked} draws",
+                "the body would leave that state; follow the loading path with --load-steps 10 "
+                "(NewtonOptions.load_steps)",
+            )
         )
     return found
 
 
-def _misfit(observations: dict[str, Misfit]) -> list[str]:
+def _misfit(observations: dict[str, Misfit]) -> list[Finding]:
     found = []
     for name, m in observations.items():
         if not (m.p >= SMALLEST_P and m.p_worst >= SMALLEST_P_WORST):
             named = ", ".join(f"{k} by {d:.1f} sd" for k, d in list(m.outlying.items())[:4])
+            outlying = f"outlying data ({named}), " if named else ""
             found.append(
-                f"{name} does not fit, posterior predictive p {min(m.p, m.p_worst):.3f}: check "
-                + (f"outlying data ({named}), " if named else "")
-                + "registration, units, law and noise sd"
+                Finding(
+                    f"{name} does not fit, posterior predictive p {min(m.p, m.p_worst):.3f}",
+                    f"check {outlying}registration, units, law and noise sd",
+                )
             )
         elif not m.p <= 1.0 - SMALLEST_P:
             found.append(
-                f"{name} fits closer than its noise allows, posterior predictive p {m.p:.3f}: "
-                "its noise sd is too large"
+                Finding(
+                    f"{name} fits closer than its noise allows, posterior predictive p {m.p:.3f}",
+                    "its noise sd is too large",
+                )
             )
     return found
 

@@ -53,5 +53,5 @@ def summary(report: dict[str, Any]) -> str:
             f"at most {c['k_threshold']:.2f}; {c['draws']} FEM runs, {c['failed']} failed): "
             f"{c['reason']}"
         )
-        lines += [f"- {finding}" for finding in c["findings"] if ":" in finding]
+        lines += [f"- {finding}" for finding in c["findings"] if finding != c["reason"]]
     return "\n".join(lines)

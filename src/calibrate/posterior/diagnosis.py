@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from calibrate.samplers.modes import MISSED_AT, MISSED_BY
+from calibrate.samplers.stopping import ENOUGH_ESS, WARN_ABOVE_R_HAT
 
-_LARGEST_R_HAT = 1.01  # Vehtari et al. (2021)
-_SMALLEST_ESS = 400.0
 _LARGEST_K = 0.7  # Vehtari et al. (2024)
 _LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
@@ -71,7 +70,7 @@ def _where(name: str, values: np.ndarray, diverging: np.ndarray) -> str:
 def _disagreement(summary: Mapping[str, Mapping[str, float]]) -> str:
     name = max(summary, key=lambda n: _worse(summary[n]["r_hat"]))
     worst = summary[name]["r_hat"]
-    if worst <= _LARGEST_R_HAT:
+    if worst <= WARN_ABOVE_R_HAT:
         return ""
     if not np.isfinite(worst):
         return f"R-hat of {name} is not a number: too few draws, or draws that do not vary"
@@ -88,10 +87,10 @@ def _worse(r_hat: float) -> float:
 def _too_few(summary: Mapping[str, Mapping[str, float]]) -> str:
     sizes = {n: min(row["ess_bulk"], row["ess_tail"]) for n, row in summary.items()}
     name = min(sizes, key=lambda n: sizes[n])
-    if sizes[name] >= _SMALLEST_ESS:
+    if sizes[name] >= ENOUGH_ESS:
         return ""
     return (
-        f"{sizes[name]:.0f} effective draws of {name}, fewer than {_SMALLEST_ESS:.0f}: quantiles "
+        f"{sizes[name]:.0f} effective draws of {name}, fewer than {ENOUGH_ESS:.0f}: quantiles "
         "are uncertain; take more draws"
     )
 

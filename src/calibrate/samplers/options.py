@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+from calibrate.samplers.stopping import ENOUGH_ESS, RUN_UNTIL_R_HAT
 from emulator.errors import InputError
 
 RANDOM, PATHFINDER = "random", "pathfinder"
@@ -27,8 +28,8 @@ class ChainOptions:
     draws: int = 1000
     chains: int = 4
     rounds: int = 8
-    r_hat: float = 1.008
-    ess: float = 400.0
+    r_hat: float = RUN_UNTIL_R_HAT
+    ess: float = ENOUGH_ESS
     start: str = RANDOM
 
     label: ClassVar[str] = "chains"

@@ -1,10 +1,22 @@
-"""The rule that ends a run: R-hat and effective sample size of every coordinate."""
+"""When draws are enough: R-hat and effective sample size, for each use of them.
+
+A run goes on until it meets the first limits, a posterior that misses the second carries a warning,
+and one that misses the third gets no certificate. The first is stricter than the second, so that a
+run that ended by its own rule has no warning; the third only refuses draws that a check against FEM
+could not be about.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from calibrate.arviz import array_stats
+
+RUN_UNTIL_R_HAT = 1.008
+WARN_ABOVE_R_HAT = 1.01  # Vehtari et al. (2021)
+REFUSE_ABOVE_R_HAT = 1.05  # the chains are draws of different posteriors
+ENOUGH_ESS = 400.0  # Vehtari et al. (2021); a run goes on until it has them
+REFUSE_BELOW_ESS = 100.0
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
 _FEWEST = 8  # draws of a single chain: two in each quarter

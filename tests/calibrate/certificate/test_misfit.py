@@ -6,6 +6,7 @@ import calibrate as cal
 from calibrate.certificate.correction import nothing
 from calibrate.certificate.misfit import misfits
 from calibrate.certificate.predictive import Predictive
+from calibrate.posterior.fit import Misfit
 from certificate_support import exact_data, grid_of, linear_model, quadrature
 from linear_support import linear_forward
 
@@ -74,11 +75,10 @@ def test_an_inferred_noise_and_a_single_number(beam):
 
 
 def test_a_single_number_is_compared_too():
-    from calibrate.certificate.misfit import _misfit
-
     rng = np.random.default_rng(0)
-    simulated = np.abs(rng.normal(size=500))
-    assert _misfit("volume", np.ones(500), simulated, np.full(500, 0.5)).p_worst > 0.5
-    far = _misfit("volume", np.zeros(500), simulated, np.full(500, 6.0))
+    simulated = np.abs(rng.normal(size=(500, 1)))
+    near = Misfit.of(["volume"], np.ones(500), simulated, np.full((500, 1), 0.5))
+    assert near.p_worst > 0.5
+    far = Misfit.of(["volume"], np.zeros(500), simulated, np.full((500, 1), 6.0))
     assert list(far.outlying) == ["volume"]
     assert far.p_worst == 0.0

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from calibrate.certificate.evidence import Changes, Evidence, Figure, Physics, Sampling, Tail
-from calibrate.certificate.misfit import Misfit
 from calibrate.certificate.verdict import judge
+from calibrate.posterior.fit import Misfit
 
 
 def changes(shift=0.0, error=0.01, log_sd=0.0, correlation=0.0):

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from scipy.stats import chi2
 
-from calibrate.posterior.fit import SMALLEST_P, misfits, tail_probabilities
+from calibrate.posterior.fit import SMALLEST_P, misfit_of, misfits
 
 
 def tree(data, sd=1.0, correlated=False):
@@ -71,7 +71,7 @@ def test_p_of_the_sum_is_chi_squareds():
     rng = np.random.default_rng(3)
     replicates, y = rng.normal(size=(4, 5000, 30)), rng.normal(size=30)
     for scale in (0.7, 1.0, 1.25):
-        p, _ = tail_probabilities(replicates, scale * y)
+        p = misfit_of("u", replicates, scale * y).p
         assert p == pytest.approx(chi2.sf(scale**2 * (y @ y), 30), abs=0.015)
 
 
@@ -80,7 +80,7 @@ def test_one_outlier_among_many_is_told_by_the_largest():
     y = np.random.default_rng(4).normal(size=(2000, 1))
     y[1234] = 6.0
     replicates = tree(y)["posterior_predictive"]["u"].values
-    p, p_worst = tail_probabilities(replicates, y)
-    assert p > SMALLEST_P
-    assert p_worst == 0.0
+    found = misfit_of("u", replicates, y)
+    assert found.p > SMALLEST_P
+    assert found.p_worst == 0.0
     assert "u[1234, 0] is 6" in misfits(tree(y))[0]
