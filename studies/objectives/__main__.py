@@ -23,9 +23,9 @@ from studies.common.processes import command, environment
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
-from calibrate.figures.evaluation import LABELS, log_density
+from calibrate.figures.evaluation import LABELS
 from calibrate.provenance import study_header
-from emulator.error.comparison import Errors, case_errors, quantiles
+from emulator.error.comparison import Errors, case_errors, log_density, quantiles
 from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.store import write_json

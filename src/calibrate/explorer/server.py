@@ -16,16 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from plotly.offline import get_plotlyjs
 
-from calibrate.figures.evaluation import surface_mesh
+from calibrate.observations.pressure_volume import PressureVolume, pressure_volume
 from emulator.error.estimate import error_bar
 from emulator.errors import InputError
 from emulator.fem import Simulator, Status
 from emulator.geometry.cavity import Cavity
-from emulator.scenes.cavities import cavity_sets, inflated_cavity
+from emulator.geometry.facets import surface_mesh
+from emulator.scenes.cavities import cavity_sets
 from emulator.surrogates.additive import Emulator
 
 LOOPBACK = "127.0.0.1"
-_PRESSURES = 12  # of a pressure-volume curve
 
 
 class Explorer:
@@ -37,7 +37,7 @@ class Explorer:
     def __init__(self, emulator: Emulator) -> None:
         self.scene = emulator.scene
         self._forward = emulator.cache()
-        self._nodes, self._triangles = surface_mesh(self.scene.mesh)
+        self._nodes, self._triangles = surface_mesh(self.scene.mesh.surface)
         self._cavities = {name: Cavity(self.scene.mesh, name) for name in cavity_sets(self.scene)}
         self._slow = threading.Lock()
 
@@ -59,7 +59,7 @@ class Explorer:
             "nodes": np.round(self.scene.mesh.nodes[self._nodes], 4).tolist(),
             "triangles": self._triangles.tolist(),
             "cavities": list(self._cavities),
-            "pressure": None if self._inflated is None else self._inflated[1],
+            "pressure": None if self._curve is None else self._curve.parameter.name,
         }
 
     def theta(self, position: Mapping[str, str]) -> jax.Array:
@@ -95,11 +95,10 @@ class Explorer:
 
     def curve(self, position: Mapping[str, str]) -> dict[str, Any]:
         """Volume of a cavity over the range of its pressure, all else at ``position``."""
-        if self._inflated is None:
+        if self._curve is None:
             raise InputError(f"scene '{self.scene.name}' has no cavity whose pressure varies")
         volumes = self._volumes(self.theta(position))
-        pressures = self._pressures()
-        return {"pressure": pressures.tolist(), "volume": np.asarray(volumes).tolist()}
+        return {"pressure": self._curve.pressures.tolist(), "volume": np.asarray(volumes).tolist()}
 
     def error(self, position: Mapping[str, str]) -> dict[str, Any]:
         """The guard's verdict, and the estimated error in mm and mL."""
@@ -155,26 +154,13 @@ class Explorer:
         return jax.jit(both)
 
     @cached_property
-    def _inflated(self) -> tuple[str, str] | None:
-        return inflated_cavity(self.scene)
-
-    def _pressures(self) -> np.ndarray:
-        assert self._inflated is not None, "asked for a curve only"
-        column = self.scene.parameter_names.index(self._inflated[1])
-        parameter = self.scene.parameters[column]
-        return np.linspace(parameter.low, parameter.high, _PRESSURES)
+    def _curve(self) -> PressureVolume | None:
+        return pressure_volume(self._forward)
 
     @cached_property
     def _volumes(self) -> Any:
-        assert self._inflated is not None, "asked for a curve only"
-        name, pressure = self._inflated
-        cavity, column = self._cavities[name], self.scene.parameter_names.index(pressure)
-        wall, pressures = self._forward.at(cavity.nodes), jnp.asarray(self._pressures())
-
-        def along(theta: jax.Array) -> jax.Array:
-            return jax.lax.map(lambda p: cavity(wall(theta.at[column].set(p))), pressures)
-
-        return jax.jit(along)
+        assert self._curve is not None, "asked for a curve only"
+        return jax.jit(self._curve.volumes)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import gaussian_kde
 
 from calibrate.figures.drawing import pyplot, save
-from emulator.error.comparison import UNITS, Errors, quantiles
-from emulator.geometry.mesh import Mesh
+from emulator.error.comparison import UNITS, Errors, log_density, quantiles
+from emulator.geometry.facets import flat_triangles
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 
@@ -27,9 +26,6 @@ LABELS = {
     "err_V": "error in cavity volume (%)",
 }
 _INSIDE, _OUTSIDE = "tab:blue", "tab:orange"
-_MOST = 20_000  # values that a density is estimated from; more do not change the curve visibly
-# Nodes of a quadratic facet (corners, then middles of edges 01, 12, 20) as four flat triangles.
-_QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 
 
 def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
@@ -89,19 +85,6 @@ def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> No
     at, density = curve
     axes.plot(at, density, color=colour, lw=1.5)
     axes.fill_between(at, density, color=colour, alpha=0.2, lw=0)
-
-
-def log_density(values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Errors (300,) and the density of ``log10(values)`` there; ``None`` where all are alike."""
-    positive = values[values > 0.0]  # held nodes have zero error, without a logarithm
-    logs = np.log10(positive[:: max(1, len(positive) // _MOST)])
-    if len(logs) < 2 or np.ptp(logs) < 1e-6:
-        return None
-    estimate = gaussian_kde(logs)
-    width = 3.0 * float(np.sqrt(estimate.covariance[0, 0]))
-    low, high = np.quantile(logs, [0.001, 0.999])
-    at = np.linspace(low - width, high + width, 300)
-    return 10.0**at, estimate(at)
 
 
 # ---- over the parameters ----------------------------------------------------------------------
@@ -205,19 +188,6 @@ def _plain(axis: Any, digits: tuple[float, ...]) -> None:
 
 
 # ---- on the body ------------------------------------------------------------------------------
-def surface_triangles(mesh: Mesh) -> np.ndarray:
-    """The surface as flat triangles (k, 3), four for each quadratic facet."""
-    facets = mesh.surface
-    return facets if facets.shape[1] == 3 else facets[:, _QUARTERS].reshape(-1, 3)
-
-
-def surface_mesh(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (s,) of the surface, and its flat triangles (k, 3) by their place among these."""
-    triangles = surface_triangles(mesh)
-    nodes, places = np.unique(triangles, return_inverse=True)
-    return nodes, places.reshape(triangles.shape)
-
-
 def surface_figure(
     scene: Scene,
     error: np.ndarray,
@@ -231,7 +201,7 @@ def surface_figure(
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     plt = pyplot()
-    nodes, triangles = scene.mesh.nodes, surface_triangles(scene.mesh)
+    nodes, triangles = scene.mesh.nodes, flat_triangles(scene.mesh.surface)
     values = error[triangles].mean(axis=1)
     colour = ScalarMappable(Normalize(0.0, max(float(values.max()), 1e-17)), "viridis")
     extent = np.ptp(nodes, axis=0)

@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 
 from calibrate.figures.drawing import pyplot, save
-from calibrate.figures.evaluation import surface_triangles
 from calibrate.figures.palette import BLUE, VERMILION
 from calibrate.sensitivity_analysis import FIELD
+from emulator.geometry.facets import flat_triangles
 from emulator.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def body_figure(found: xr.DataTree, scene: Scene) -> Any:
     name = _MAPPED[found.attrs["method"]]
     values = found[FIELD].to_dataset()[name]
     labels = [str(label) for label in values[values.dims[0]].values][:_MOST_MAPS]
-    nodes, triangles = scene.mesh.nodes, surface_triangles(scene.mesh)
+    nodes, triangles = scene.mesh.nodes, flat_triangles(scene.mesh.surface)
     known = np.asarray(values)[:, triangles]
     # A node that is held does not vary; a facet takes the mean of the others, or is grey.
     counted = np.isfinite(known)

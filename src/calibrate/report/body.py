@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import plotly.graph_objects as go
 
-from calibrate.figures.evaluation import surface_mesh
 from calibrate.posterior import Posterior
 from emulator.fem import Simulator
 from emulator.fem.fields import element_fields
+from emulator.geometry.facets import surface_mesh
 from emulator.scenes.scene import Scene
 
 _DRAWS = 20
@@ -38,7 +38,7 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     if simulator is not None:
         colours |= _error(posterior, centre, simulator)
     shown = fields[np.linspace(0, len(fields) - 1, min(_DRAWS, len(fields))).astype(int)]
-    nodes, triangles = surface_mesh(scene.mesh)
+    nodes, triangles = surface_mesh(scene.mesh.surface)
     i, j, k = triangles.T.tolist()
     first = next(iter(colours))
     figure = go.Figure(

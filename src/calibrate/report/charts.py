@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
@@ -14,17 +13,16 @@ from scipy.stats import rankdata
 
 from calibrate.figures.palette import BLUE, COLOURS, VERMILION
 from calibrate.identifiability.stress import stress_band
-from calibrate.observations import CavityVolume, Observation
+from calibrate.observations import Observation
+from calibrate.observations.pressure_volume import pressure_volume
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
-from emulator.scenes.cavities import inflated_cavity
 
 _CHAINS = COLOURS[:6]
 _BAND = "rgba(0, 114, 178, 0.22)"
 _MOST_TRACED = 500  # draws of a chain in a trace
 _MOST_PAIRED = 800  # draws in a pair plot
 _CURVES = 60  # draws of a pressure-volume band
-_PRESSURES = 12
 
 
 def names_with_units(posterior: Posterior) -> dict[str, str]:
@@ -171,27 +169,17 @@ def stress(posterior: Posterior) -> go.Figure:
     return figure
 
 
-def pressure_volume(posterior: Posterior) -> go.Figure | None:
+def volume_band(posterior: Posterior) -> go.Figure | None:
     """Cavity volume over the range of its pressure; None without such a parameter or cavity."""
     model = posterior.model
-    scene = model.forward.scene
-    found = inflated_cavity(scene)
-    if found is None:
+    curve = pressure_volume(model.full)
+    if curve is None:
         return None
-    wall_set, name = found
-    volume = CavityVolume(scene, wall_set)
-    column = scene.parameter_names.index(name)
-    parameter = scene.parameters[column]
-    pressures = jnp.linspace(parameter.low, parameter.high, _PRESSURES)
-    state = model.states.states[-1]
-    thetas = posterior.thetas(state)
+    thetas = posterior.thetas(model.states.states[-1])
     rows = np.linspace(0, len(thetas) - 1, min(_CURVES, len(thetas))).astype(int)
-    every = jnp.repeat(thetas[rows][:, None], _PRESSURES, axis=1).at[:, :, column].set(pressures)
-    wall = model.full.at(volume.nodes)
-    curve = jax.jit(lambda t: jax.lax.map(lambda theta: volume(wall(theta), theta), t))
-    volumes = np.asarray(curve(every.reshape(-1, every.shape[-1]))).reshape(len(rows), -1)
-    low, middle, high = np.nanquantile(volumes, [0.05, 0.5, 0.95], axis=0)
-    p = np.asarray(pressures)
+    volumes = jax.jit(lambda t: jax.lax.map(curve.volumes, t))(thetas[rows])
+    low, middle, high = np.nanquantile(np.asarray(volumes), [0.05, 0.5, 0.95], axis=0)
+    p, name = curve.pressures, curve.parameter.name
     figure = go.Figure()
     figure.add_scatter(
         x=[*low, *high[::-1]], y=[*p, *p[::-1]], fill="toself", fillcolor=_BAND, line_width=0,
@@ -199,9 +187,11 @@ def pressure_volume(posterior: Posterior) -> go.Figure | None:
     )  # fmt: skip
     figure.add_scatter(x=middle, y=p, line_color=BLUE, name="median")
     for seen, part in model.observe.parts.items():
-        if part.to_json() == volume.to_json():
+        if part.to_json() == curve.volume.to_json():
             _add_measured(figure, posterior, seen, name)
-    figure.update_layout(xaxis_title="cavity volume (mL)", yaxis_title=f"{name} ({parameter.unit})")
+    figure.update_layout(
+        xaxis_title="cavity volume (mL)", yaxis_title=f"{name} ({curve.parameter.unit})"
+    )
     return figure
 
 

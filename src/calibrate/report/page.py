@@ -145,7 +145,7 @@ def _body(posterior: Posterior, simulator: Any) -> str:
 def _known(posterior: Posterior) -> str:
     words = escape(in_words(identify(posterior))).replace("\n", "<br>")
     found = f"<p>{words}</p>{_chart(charts.stress(posterior))}"
-    curve = charts.pressure_volume(posterior)
+    curve = charts.volume_band(posterior)
     return found + (_chart(curve) if curve is not None else "")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import gaussian_kde
 
 from emulator.errors import InputError, SolverError
 from emulator.fem.energy import displacement_gradient, potential_energy
@@ -26,6 +27,7 @@ UNITS = {
     "max_u": "mm",
     "mean_u": "mm",
 }
+_MOST = 20_000  # values that a density is estimated from; more do not change the curve visibly
 
 
 def quantiles(errors: jax.Array | np.ndarray) -> dict[str, float]:
@@ -37,6 +39,19 @@ def quantiles(errors: jax.Array | np.ndarray) -> dict[str, float]:
         "q97_5": float(np.quantile(values, 0.975)),
         "max": float(np.max(values)),
     }
+
+
+def log_density(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Errors (300,) and the density of ``log10(errors)`` there; ``None`` where all are alike."""
+    positive = errors[errors > 0.0]  # held nodes have zero error, without a logarithm
+    logs = np.log10(positive[:: max(1, len(positive) // _MOST)])
+    if len(logs) < 2 or np.ptp(logs) < 1e-6:
+        return None
+    estimate = gaussian_kde(logs)
+    width = 3.0 * float(np.sqrt(estimate.covariance[0, 0]))
+    low, high = np.quantile(logs, [0.001, 0.999])
+    at = np.linspace(low - width, high + width, 300)
+    return 10.0**at, estimate(at)
 
 
 def field_errors(

@@ -18,6 +18,9 @@ from scipy.sparse.csgraph import connected_components
 
 from emulator.geometry.discretisation import FacetRule, facet_rule
 
+# Nodes of a quadratic facet (corners, then middles of edges 01, 12, 20) as four flat triangles.
+_QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+
 
 def area_vectors[A: (jax.Array, np.ndarray)](x: A, rule: FacetRule) -> A:
     """``n`` at each quadrature point of facets ``x`` (..., a, 3) mm, shape (..., q, 3) in mm2."""
@@ -45,6 +48,17 @@ def cone_volume[A: (jax.Array, np.ndarray)](x: A) -> A:
     rule = facet_rule(2, 4)  # x quadratic, n quadratic
     height = xp.sum((rule.values @ x) * area_vectors(x, rule), axis=-1)
     return height @ rule.weights / 3.0
+
+
+def flat_triangles(facets: np.ndarray) -> np.ndarray:
+    """Facets (k, 3 or 6) as flat triangles (k', 3), four for each quadratic one."""
+    return facets if facets.shape[1] == 3 else facets[:, _QUARTERS].reshape(-1, 3)
+
+
+def surface_mesh(facets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (s,) of ``facets``, and flat triangles (k, 3) by their places among these."""
+    nodes, places = np.unique(flat_triangles(facets), return_inverse=True)
+    return nodes, places.reshape(-1, 3)
 
 
 def rim(facets: np.ndarray) -> np.ndarray:

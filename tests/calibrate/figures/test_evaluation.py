@@ -7,9 +7,9 @@ from calibrate.figures.evaluation import (
     density_figure,
     parameter_figure,
     surface_figure,
-    surface_triangles,
 )
 from emulator.error.comparison import Errors
+from emulator.geometry.facets import flat_triangles
 from emulator.geometry.quadratic import to_quadratic
 from scene_support import block
 
@@ -86,7 +86,7 @@ def test_the_surface_is_whole_and_coloured_by_its_nodes(order):
             "fine", to_quadratic(scene.mesh), scene.law, scene.parameters, (), scene.supports
         )
     X = scene.mesh.nodes
-    corners = X[surface_triangles(scene.mesh)]
+    corners = X[flat_triangles(scene.mesh.surface)]
     edges = corners[:, 1:] - corners[:, :1]
     area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()
     assert area == pytest.approx(2.0 * (2.0 * 3.0 + 3.0 * 4.0 + 4.0 * 2.0))

@@ -17,7 +17,7 @@ def test_a_law_without_fibres_and_a_body_without_cavity(tmp_path, capsys):
         sampler="laplace",
     )  # fmt: skip
     posterior = infer(run, tmp_path / "run")
-    assert charts.pressure_volume(posterior) is None
+    assert charts.volume_band(posterior) is None
     assert len(charts.stress(posterior).data) == 2
     assert main(["report", str(tmp_path / "run"), "--no-fem", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

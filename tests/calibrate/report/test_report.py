@@ -102,7 +102,7 @@ def test_charts_say_what_was_drawn(ventricle_posterior):
     named = dict(charts.against_data(ventricle_posterior))
     assert set(named) == {"displacement", "volume"}
     assert len(named["displacement"].data[1].x) == 18
-    curve = charts.pressure_volume(ventricle_posterior)
+    curve = charts.volume_band(ventricle_posterior)
     median = curve.data[1]
     assert (np.diff(median.x) > 0.0).all()  # a stiffer pressure, a larger cavity
     assert curve.data[2].x[0] == pytest.approx(float(ventricle_posterior.data["volume"]))
