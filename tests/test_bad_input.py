@@ -154,7 +154,7 @@ def emulators(folder):
 
 
 def posteriors(folder):
-    """Kept ones whose run.json was edited; tests/calibrate/workflow/test_kept.py has sampled ones."""
+    """Kept ones whose run.json was edited; tests/calibrate/workflow/test_restore.py has sampled ones."""
     scene = em.scenes.once_clamped_beam()
     truth = {"mu": 73.0, "lam": 61.0}
     run = asdict(Run(scene.name, truth=truth, noise={"displacement": 0.2}))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibrate.observations.registry import KINDS
+from calibrate.observations.registry import OBSERVATIONS
 from calibrate.samplers.registry import SAMPLERS
 from emulator.fem import Status
 from emulator.mechanics.kinematics import Strain
@@ -21,7 +21,7 @@ GUIDE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 def written():
     """What the guide's code defines, run from top to bottom; the registries are then as before."""
     names = {}
-    kept = [(registry, dict(registry)) for registry in (KINDS, SAMPLERS)]
+    kept = [(registry, dict(registry)) for registry in (OBSERVATIONS, SAMPLERS)]
     try:
         for k, code in enumerate(
             re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)

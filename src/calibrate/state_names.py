@@ -19,7 +19,7 @@ def split(name: str) -> tuple[str, str]:
     return base, state
 
 
-def at(name: str, state: str) -> str:
+def in_state(name: str, state: str) -> str:
     """``name@state``, or ``name`` itself in the only state."""
     return f"{name}{_AT}{state}" if state else name
 

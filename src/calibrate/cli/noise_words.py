@@ -16,10 +16,10 @@ def noise_words(words: Sequence[str]) -> dict[str, NoiseWord] | float:
     A single bare number is returned as it is: which observation it belongs to depends on the data.
     Beside named values, a bare number is the displacements'.
     """
-    from calibrate.noise import KINDS, parse_noise
+    from calibrate.noise import NOISES, parse_noise
 
     for word in words:
-        if word.partition(":")[0] in KINDS:
+        if word.partition(":")[0] in NOISES:
             raise InputError(f"--noise: '{word}' needs a name, as in displacement={word}")
     if len(words) == 1 and "=" not in words[0]:
         return _number(words[0], "--noise")

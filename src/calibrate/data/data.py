@@ -12,7 +12,8 @@ A netCDF file has a variable ``displacement`` with one row a point, and beside i
 Of a body in several load states, a CSV file has a column ``state`` with the state's name in every
 row, and a netCDF file variables such as ``volume@diastole``.
 
-Each kind of observation (:data:`calibrate.observations.KINDS`) names its own columns and variables.
+Each kind of observation (``calibrate.observations.OBSERVATIONS``) names its own columns and
+variables.
 """
 
 from __future__ import annotations
@@ -23,9 +24,16 @@ from pathlib import Path
 import numpy as np
 
 from calibrate.data.files import Block, DataFile, open_data, write_csv, write_netcdf
-from calibrate.observations import KINDS, Field, Kind, Observation, Observations, observations
+from calibrate.observations import (
+    OBSERVATIONS,
+    Field,
+    Kind,
+    Observation,
+    Observations,
+    observations,
+)
 from calibrate.observations.present import check_some
-from calibrate.state_names import at, split
+from calibrate.state_names import in_state, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
@@ -47,7 +55,7 @@ def read_data(scene: Scene, path: str | Path) -> tuple[Observations, dict[str, n
         layouts = _found(path, rows)
         for base, (kind, fields) in layouts.items():
             others = _others_there(fields, [f for _, f in layouts.values()])
-            name, arrays = at(base, state), rows.arrays(fields, others)
+            name, arrays = in_state(base, state), rows.arrays(fields, others)
             try:
                 parts[name], data[name] = kind.from_arrays(scene, base, arrays)
                 parts[name].check(name, data[name])
@@ -76,7 +84,7 @@ def _found(path: Path, file: DataFile) -> dict[str, tuple[type[Kind], tuple[Fiel
     found: dict[str, tuple[type[Kind], tuple[Field, ...]]] = {}
     partly: list[list[str]] = []
     used: set[str] = set()
-    for kind in KINDS.values():
+    for kind in OBSERVATIONS.values():
         for name, fields in kind.layouts(file.words).items():
             words = [word for field in fields for word in file.needs(field)]
             if not set(words) <= set(file.words):
@@ -97,7 +105,7 @@ def _expected(file: DataFile) -> str:
     """The columns or variables of every kind, for error messages."""
     every = [
         ",".join(word for field in fields for word in file.needs(field))
-        for name, kind in KINDS.items()
+        for name, kind in OBSERVATIONS.items()
         for fields in kind.layouts((name,)).values()
     ]
     return f"{file.what}s {' or '.join(every)}"
@@ -126,7 +134,7 @@ def write_data(
                 f"there it would be called {' or '.join(part.names)}"
             )
         arrays = part.to_arrays(base, np.asarray(data[name]))
-        fields = KINDS[part.to_json()["kind"]].layouts((base, *arrays))[base]
+        fields = OBSERVATIONS[part.to_json()["kind"]].layouts((base, *arrays))[base]
         states[state].append([(field, arrays[field.variable]) for field in fields])
     write = write_netcdf if Path(path).suffix.lower() == ".nc" else write_csv
     write(path, states)

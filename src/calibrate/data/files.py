@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 
 from calibrate.observations import Field
-from calibrate.state_names import at, split, states_of
+from calibrate.state_names import in_state, split, states_of
 from emulator.errors import InputError
 from emulator.store import replacing, write_atomically
 
@@ -226,7 +226,7 @@ class NetCDFFile(DataFile):
         found = {}
         for name in (field.variable for field in fields):
             try:
-                found[name] = np.asarray(self.data[at(name, self.state)], dtype=float)
+                found[name] = np.asarray(self.data[in_state(name, self.state)], dtype=float)
             except (TypeError, ValueError) as error:
                 raise InputError(
                     f"data file {self.path}: variable '{name}' does not hold numbers"
@@ -289,6 +289,6 @@ def write_netcdf(path: str | Path, states: Mapping[str, Sequence[Block]]) -> Non
     for k, (state, block) in enumerate(every):
         for field, array in block:
             dims = [f"point_{k}", *(f"component_{n}" for n in np.shape(array)[1:])]
-            variables[at(field.variable, state)] = (dims[: np.ndim(array)], np.asarray(array))
+            variables[in_state(field.variable, state)] = (dims[: np.ndim(array)], np.asarray(array))
     with replacing(path) as temporary:
         xr.Dataset(variables).to_netcdf(temporary, engine="h5netcdf")

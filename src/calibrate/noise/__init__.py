@@ -1,14 +1,14 @@
-"""Measurement noise, one kind a file; the kinds are listed in :data:`KINDS`."""
+"""Measurement noise, one kind a file; the kinds are listed in :data:`NOISES`."""
 
 from calibrate.noise.correlated import CorrelatedNoise
 from calibrate.noise.discrepancy import DiscrepancyNoise, with_discrepancy
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise, Sites
-from calibrate.noise.registry import KINDS, noise_from_json, noise_of, parse_noise
+from calibrate.noise.registry import NOISES, noise_from_json, noise_of, parse_noise
 from calibrate.noise.student_t import StudentTNoise
 
 __all__ = [
-    "KINDS",
+    "NOISES",
     "CorrelatedNoise",
     "DiscrepancyNoise",
     "GaussianNoise",

@@ -12,7 +12,7 @@ from calibrate.noise.protocol import Noise
 from calibrate.noise.student_t import StudentTNoise
 from emulator.errors import InputError
 
-KINDS: dict[str, type[Noise]] = {
+NOISES: dict[str, type[Noise]] = {
     kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise, DiscrepancyNoise)
 }
 
@@ -20,9 +20,9 @@ KINDS: dict[str, type[Noise]] = {
 def noise_from_json(description: Mapping[str, Any]) -> Noise:
     """The noise that :meth:`Noise.to_json` described."""
     kind = description.get("kind")
-    if kind not in KINDS:
-        raise InputError(f"noise kind '{kind}' is unknown; known: {', '.join(KINDS)}")
-    return KINDS[kind].from_json(description)
+    if kind not in NOISES:
+        raise InputError(f"noise kind '{kind}' is unknown; known: {', '.join(NOISES)}")
+    return NOISES[kind].from_json(description)
 
 
 def noise_of(given: float | Mapping[str, Any]) -> Noise:
@@ -39,17 +39,17 @@ def parse_noise(text: str) -> float | dict[str, Any]:
         Neither a number nor a kind with options that it takes.
     """
     kind, _, options = text.partition(":")
-    if kind not in KINDS:
+    if kind not in NOISES:
         try:
             return float(text)
         except ValueError as error:
-            usage = ", ".join(kind.usage for kind in KINDS.values())
+            usage = ", ".join(kind.usage for kind in NOISES.values())
             raise InputError(f"'{text}' is neither a number nor a noise; give {usage}") from error
     description: dict[str, Any] = {"kind": kind}
     for option in options.split(",") if options else ():
         name, equals, value = option.partition("=")
         if not equals:
-            raise InputError(f"'{text}': '{option}' is not option=value; give {KINDS[kind].usage}")
+            raise InputError(f"'{text}': '{option}' is not option=value; give {NOISES[kind].usage}")
         description[name] = _number(value)
     noise_of(description)  # refuses what the kind does not take
     return description

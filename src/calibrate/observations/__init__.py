@@ -1,7 +1,7 @@
 """Observation operators: what of a displacement field was measured, one kind a file.
 
 Each stands for one measurement; :class:`Observations` holds those made at once, by name. The kinds
-are listed in :data:`KINDS`.
+are listed in :data:`OBSERVATIONS`.
 """
 
 from calibrate.observations.landmarks import Landmarks, landmarks, spread_landmarks
@@ -11,7 +11,7 @@ from calibrate.observations.parameter import MeasuredParameter
 from calibrate.observations.points import DISPLACEMENT
 from calibrate.observations.protocol import Field, Kind, Labels, Observation
 from calibrate.observations.registry import (
-    KINDS,
+    OBSERVATIONS,
     observation_from_json,
     observations_from_json,
     parse_observation,
@@ -30,7 +30,7 @@ from calibrate.observations.volume import CavityVolume
 
 __all__ = [
     "DISPLACEMENT",
-    "KINDS",
+    "OBSERVATIONS",
     "CavityVolume",
     "Field",
     "Kind",

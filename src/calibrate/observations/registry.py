@@ -18,12 +18,12 @@ from calibrate.observations.several import Observations
 from calibrate.observations.strain import Strain
 from calibrate.observations.surface import SurfacePoints
 from calibrate.observations.volume import CavityVolume
-from calibrate.state_names import at, split
+from calibrate.state_names import in_state, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
 # In this order they look for their columns in a file: `node` decides before `x,y,z`.
-KINDS: dict[str, type[Kind]] = {
+OBSERVATIONS: dict[str, type[Kind]] = {
     kind.kind: kind
     for kind in (
         NodalDisplacements,
@@ -55,7 +55,7 @@ def parse_observation(
         bare, own = split(word)
         base, part = _parse_word(scene, bare, seed)
         for state in (own,) if own else states:
-            if (name := at(base, state)) in parts:
+            if (name := in_state(base, state)) in parts:
                 raise InputError(f"observe '{text}': {name} is given twice; once is enough")
             parts[name] = part
     return Observations(parts)
@@ -63,13 +63,13 @@ def parse_observation(
 
 def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
     """Name and observation; the word before a colon names the kind, others are tried in turn."""
-    named = KINDS.get(word.partition(":")[0])
-    for kind in (named,) if named else KINDS.values():
+    named = OBSERVATIONS.get(word.partition(":")[0])
+    for kind in (named,) if named else OBSERVATIONS.values():
         found = kind.parse(scene, word, seed)
         if found is not None:
             return found
     raise InputError(
-        f"observe '{word}': give {', '.join(kind.usage for kind in KINDS.values())}; "
+        f"observe '{word}': give {', '.join(kind.usage for kind in OBSERVATIONS.values())}; "
         f"node sets: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
     )
 
@@ -77,9 +77,9 @@ def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
 def observation_from_json(scene: Scene, description: Mapping[str, Any]) -> Observation:
     """The observation that :meth:`Observation.to_json` described."""
     kind = description.get("kind")
-    if kind not in KINDS:
-        raise InputError(f"observation kind '{kind}' is unknown; known: {', '.join(KINDS)}")
-    whole = KINDS[kind].from_json(scene, description)
+    if kind not in OBSERVATIONS:
+        raise InputError(f"observation kind '{kind}' is unknown; known: {', '.join(OBSERVATIONS)}")
+    whole = OBSERVATIONS[kind].from_json(scene, description)
     return Present(whole, np.asarray(description[ENTRIES])) if ENTRIES in description else whole
 
 

@@ -208,8 +208,8 @@ def sample(
     model, checked = model.given(data)
     fem = _fem_likelihood(chosen, model, simulator)
     made = provenance(model, seed, sampler, options)
-    kept = Checkpoint(checkpoint, _identity(made, checked))
-    context = Context(progress, kept, fem)
+    state = Checkpoint(checkpoint, _identity(made, checked))
+    context = Context(progress, state, fem)
     density = density_of(model)
     found = chosen.sample(density, checked, options, seed, context)
     attributes = dict(found.attributes)
@@ -223,7 +223,7 @@ def sample(
     tree = make_tree(model, checked, draws, found.statistics, rng_key)
     for name, value in {**made, **attributes}.items():
         tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
-    kept.remove()
+    state.remove()
     return Posterior(tree, model, checked)
 
 

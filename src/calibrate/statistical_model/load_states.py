@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpyro.distributions as dist
 
 from calibrate.priors import box_prior, dependence_of
-from calibrate.state_names import at, split
+from calibrate.state_names import in_state, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
@@ -90,7 +90,7 @@ def load_states(
     for state in states:
         row: list[str | float] = []
         for parameter in scene.parameter_names:
-            name = at(parameter, state) if parameter in by_state else parameter
+            name = in_state(parameter, state) if parameter in by_state else parameter
             value = known.get(name, known.get(parameter))
             distribution = given.get(name, given.get(parameter))
             if value is not None and distribution is not None:
@@ -123,7 +123,7 @@ def known_thetas(scene: Scene, states: tuple[str, ...], values: Mapping[str, flo
     for state in states:
         row = {}
         for parameter in scene.parameter_names:
-            name = at(parameter, state) if parameter in by_state else parameter
+            name = in_state(parameter, state) if parameter in by_state else parameter
             if (value := values.get(name, values.get(parameter))) is not None:
                 row[parameter] = value
             elif name != parameter:

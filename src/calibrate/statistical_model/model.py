@@ -244,16 +244,16 @@ class Model:
         InputError
             As :meth:`check_data`, or every value of an observation is missing.
         """
-        observe, kept = leave_out_missing(self.observe, self._fitting(data))
+        observe, present = leave_out_missing(self.observe, self._fitting(data))
         if not missing_values(observe):
-            return self, self.check_data(kept)
+            return self, self.check_data(present)
         if self.error is not None:
             raise InputError(
                 "the forward map's error was learned for data without missing values; learn it for "
                 "Model.given's model"
             )
         reduced = replace(self, observe=observe, noise=at_sites(self.noise, observe))
-        return reduced, reduced.check_data(kept)
+        return reduced, reduced.check_data(present)
 
     def check_data(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
         """``data`` in float64 by name; :class:`InputError` on data that cannot be the model's."""

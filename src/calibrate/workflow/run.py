@@ -25,12 +25,12 @@ class Run:
     known : parameters that are not inferred, by the same names. They are those of synthetic data
         too, unless ``truth`` says otherwise.
     observe : observations of synthetic data, joined by ``+``, e.g. ``landmarks:24+volume``; each
-        kind of :data:`calibrate.observations.KINDS` says which words ask for it. They are made in
-        every load state that ``truth`` and ``known`` name; ``volume@diastole`` in one.
+        kind of ``calibrate.observations.OBSERVATIONS`` says which words ask for it. They are made
+        in every load state that ``truth`` and ``known`` name; ``volume@diastole`` in one.
     prior : ``box``, the name of a population of ``calibrate.priors.population.POPULATIONS``, or the
         fields of a :class:`calibrate.priors.Population`.
     noise : standard deviation by the observation's name, in its unit, or a kind of
-        :data:`calibrate.noise.KINDS` with its options, ``{"kind": "student_t", "dof": 4, "scale":
+        :data:`calibrate.noise.NOISES` with its options, ``{"kind": "student_t", "dof": 4, "scale":
         0.2}``. A bare number belongs to a single observation, or to the displacements. What is not
         named has its kind's default.
     noise_scale : the same for the scale of the prior of a standard deviation that is to be

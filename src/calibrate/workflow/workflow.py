@@ -30,7 +30,7 @@ from calibrate.state_names import split
 from calibrate.statistical_model import Model, with_error
 from calibrate.statistical_model.build import model
 from calibrate.statistical_model.load_states import known_thetas
-from calibrate.workflow.kept import check_forward, check_run, restore_error
+from calibrate.workflow.restore import check_forward, check_run, restore_error
 from calibrate.workflow.run import Run
 from emulator import schema
 from emulator.catalogue import find_scene
@@ -130,9 +130,9 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
     observe, data = make_data(run, scene)
     run = run.named(observe)
     built = build_model(run, scene, observe, progress=progress)
-    kept: Mapping[str, Any] = data
+    present: Mapping[str, Any] = data
     if runs := run.error_runs or run.mesh_error_runs:
-        built, kept = built.given(data)
+        built, present = built.given(data)
         # Now that the data is checked, sampling need not check it again.
         built = with_error(
             replace(built, check_scale=False),
@@ -144,7 +144,7 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         )
     posterior = sample(
         built,
-        kept,
+        present,
         sampler=run.sampler,
         options=options,
         seed=run.seed,
@@ -195,9 +195,9 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     if run.error_runs or run.mesh_error_runs:
         error = restore_error(path, tree, folder / ERROR)
         built = replace(built, error=error)
-    kept = tree["observed_data"]
+    observed = tree["observed_data"]
     data = built.check_data(
-        {n: np.asarray(kept[n]).reshape(part.shape) for n, part in observe.parts.items()}
+        {n: np.asarray(observed[n]).reshape(part.shape) for n, part in observe.parts.items()}
     )
     return run, Posterior(tree, built, data)
 

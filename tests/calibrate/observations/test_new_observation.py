@@ -10,7 +10,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.data import read_data, write_data
-from calibrate.observations import KINDS, Scalar, observations_from_json, parse_observation
+from calibrate.observations import OBSERVATIONS, Scalar, observations_from_json, parse_observation
 from calibrate.posterior.tree import labels_of
 from calibrate.workflow import Run, make_data
 from emulator.errors import InputError
@@ -51,7 +51,7 @@ class Area(Scalar):
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
-    monkeypatch.setitem(KINDS, "area", Area)  # the one line
+    monkeypatch.setitem(OBSERVATIONS, "area", Area)  # the one line
 
 
 def test_from_the_command_line_through_model_and_file_and_back(beam, tmp_path):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.noise import KINDS as NOISES
+from calibrate.noise import NOISES
 from calibrate.observations import (
-    KINDS,
+    OBSERVATIONS,
     observation_from_json,
     observations,
     observations_from_json,
@@ -189,7 +189,7 @@ def test_names_of_observations_are_checked(ventricle):
 
 def test_the_guide_names_every_kind():
     text = (Path(__file__).parents[3] / "docs" / "observations.md").read_text(encoding="utf-8")
-    for kind in (*KINDS.values(), *NOISES.values()):
+    for kind in (*OBSERVATIONS.values(), *NOISES.values()):
         assert f"`{kind.kind}" in text, kind.kind
         for option in re.findall(r"(\w+)=", kind.usage):
             assert f"`{option}`" in text, option

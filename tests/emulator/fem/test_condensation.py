@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate.verify.consistency import block
 from emulator.errors import InputError
 from emulator.fem.condensation import advance, consistent, linearise
 from emulator.fem.energy import pair_products, strain_energy
+from emulator.verify.consistency import block
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import emulator as em
-from calibrate.verify.cook import deflection, membrane
 from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.fem.energy import (
@@ -33,6 +32,7 @@ from emulator.scenes.effects import effects_of
 from emulator.scenes.finer import finer
 from emulator.scenes.loads import Gravity
 from emulator.scenes.supports import Support
+from emulator.verify.cook import deflection, membrane
 from scene_support import block
 
 

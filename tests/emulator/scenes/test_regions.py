@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate.verify.consistency import block as quadratic_block
 from emulator.errors import InputError
 from emulator.fem.condensation import consistent, linearise
 from emulator.fem.energy import strain_energy
@@ -15,6 +14,7 @@ from emulator.fem.system import System
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter
 from emulator.scenes.loads import Gravity
+from emulator.verify.consistency import block as quadratic_block
 from scene_support import block, slope
 
 COARSE = {"rings": 5, "around": 12, "layers": 1}

@@ -7,12 +7,12 @@ import pytest
 import sparsax
 
 import emulator as em
-from calibrate.verify.consistency import block as heavy_block
 from emulator.errors import InputError, SolverError
 from emulator.scenes import Parameter
 from emulator.scenes.loads import FollowerPressure, Gravity
 from emulator.surrogates import taylor
 from emulator.surrogates.taylor import Expansion, constant, expand, expand_at, monomials
+from emulator.verify.consistency import block as heavy_block
 from scene_support import block, slope
 
 

@@ -11,7 +11,7 @@ from calibrate.cli.common import DONE, FAILED, add_json, emit, table
 from emulator.errors import InputError
 
 if TYPE_CHECKING:
-    from calibrate.verify import Row
+    from emulator.verify import Benchmark
 
 # Listed here too, so that --help needs no imports; a test compares them with verify.CASES.
 CASE_NAMES = (
@@ -54,13 +54,13 @@ def run(arguments: argparse.Namespace) -> int:
     return FAILED if failed else DONE
 
 
-def _rows(names: list[str]) -> list[Row]:
+def _rows(names: list[str]) -> list[Benchmark]:
     if names and names[0] == "published":
         if len(names) != 2:
             raise InputError("verify published: give the folder of the released data, and only it")
-        from calibrate.verify import verify_published
         from emulator.released.files import models_in
         from emulator.released.scenes import MODELS
+        from emulator.verify import verify_published
 
         rows = verify_published(names[1])
         absent = sorted(set(MODELS) - set(models_in(names[1])))
@@ -72,7 +72,7 @@ def _rows(names: list[str]) -> list[Row]:
             raise InputError(
                 f"verify: case '{name}' is unknown; known: {', '.join(CASE_NAMES)}, published DIR"
             )
-    from calibrate.verify import CASES
+    from emulator.verify import CASES
 
     rows = []
     for name in names or CASE_NAMES:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate.verify.consistency import block as nearly_incompressible
 from emulator.errors import InputError
 from emulator.fem.linear import SOLVERS, Outcome, mumps
 from emulator.fem.linear.pattern import Pattern
@@ -20,6 +19,7 @@ from emulator.fem.linear.solve import attempt
 from emulator.fem.linear.solve import solve as solve_any
 from emulator.fem.system import System
 from emulator.scenes.loads import FollowerPressure
+from emulator.verify.consistency import block as nearly_incompressible
 from scene_support import block
 
 

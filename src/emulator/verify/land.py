@@ -9,7 +9,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.verify.row import Row
 from emulator.fem import Simulator
 from emulator.geometry.bodies.box import box
 from emulator.geometry.bodies.ellipsoid import land_ventricle
@@ -18,6 +17,7 @@ from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import CavityPressure, FollowerPressure
+from emulator.verify.benchmark import Benchmark
 
 _BEAM = "Land et al. (2015), problem 1: 4.17 in the reproduction by fenicsx-pulse"
 _VENTRICLE = (
@@ -85,22 +85,24 @@ def apexes(rings: int, around: int, layers: int) -> tuple[float, float]:
     return float(z[inside[0]]), float(z[outside[0]])
 
 
-def verify_beam() -> list[Row]:
+def verify_beam() -> list[Benchmark]:
     """Problem 1.
 
     The cells and the tolerance are from docs/experiments.md, "Land's beam and the pressure through
     its height".
     """
     return [
-        Row("Land 1: deformed z of (10, 0.5, 1) in mm", beam_tip((40, 2, 10)), 4.17, 0.02, _BEAM)
+        Benchmark(
+            "Land 1: deformed z of (10, 0.5, 1) in mm", beam_tip((40, 2, 10)), 4.17, 0.02, _BEAM
+        )
     ]
 
 
-def verify_ventricle() -> list[Row]:
+def verify_ventricle() -> list[Benchmark]:
     """Problem 2: both apexes."""
     inside, outside = apexes(10, 20, 3)
     return [
-        Row(f"Land 2: apex of the {where} in mm", z, value, 0.005 * abs(value), source)
+        Benchmark(f"Land 2: apex of the {where} in mm", z, value, 0.005 * abs(value), source)
         for where, z, value, source in (
             ("endocardium", inside, -26.61, _VENTRICLE.format(value="-26.611")),
             ("epicardium", outside, -28.28, _VENTRICLE.format(value="-28.278")),

@@ -3,15 +3,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibrate.verify.homogeneous import (
+from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.laws import LAWS
+from emulator.verify.homogeneous import (
     PARAMETERS,
     PRINCIPAL_STRESS,
     equibiaxial,
     uniaxial,
     verify_homogeneous,
 )
-from emulator.mechanics.kinematics import Strain
-from emulator.mechanics.laws import LAWS
 
 
 def test_every_law_has_a_solution():

@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.verify.homogeneous import PARAMETERS
-from calibrate.verify.row import Row
 from emulator.fem import Simulator
 from emulator.fem.energy import strain_energy
 from emulator.geometry.bodies.box import box
@@ -22,6 +20,8 @@ from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import FollowerPressure, Gravity
+from emulator.verify.benchmark import Benchmark
+from emulator.verify.homogeneous import PARAMETERS
 
 _FACES = ("left", "right", "front", "back", "bottom", "top")
 _EXACT = "holds exactly; the tolerance is round-off"
@@ -43,7 +43,7 @@ def block(form: str) -> Scene:
     )
 
 
-def verify_patch() -> list[Row]:
+def verify_patch() -> list[Benchmark]:
     """With an affine displacement prescribed on the surface, the whole field is affine."""
     H = 0.2 * np.random.default_rng(0).normal(size=(3, 3))
     rows = []
@@ -54,11 +54,11 @@ def verify_patch() -> list[Row]:
         scene = replace(scene, supports=faces, loads=())
         u = Simulator(scene)(scene.centre)
         error = float(jnp.max(jnp.abs(u - nodes @ H.T)) / np.abs(nodes @ H.T).max())
-        rows.append(Row(f"patch test, {form}: relative error", error, 0.0, 1e-12, _EXACT))
+        rows.append(Benchmark(f"patch test, {form}: relative error", error, 0.0, 1e-12, _EXACT))
     return rows
 
 
-def verify_invariance() -> list[Row]:
+def verify_invariance() -> list[Benchmark]:
     """Rigid rotations store no energy; laws do not depend on the frame; closed surfaces balance."""
     return [*_rotated_blocks(), *_rotated_points(), *_closed_surfaces()]
 
@@ -70,7 +70,7 @@ def _rotation() -> np.ndarray:
     return q if np.linalg.det(q) > 0 else -q
 
 
-def _rotated_blocks() -> list[Row]:
+def _rotated_blocks() -> list[Benchmark]:
     rows = []
     for form in FORMS:
         scene = block(form)
@@ -80,14 +80,14 @@ def _rotated_blocks() -> list[Row]:
         mu, volume = float(scene.centre[0]), float(scene.discretisation.weights.sum())
         name = f"rigid rotation, {form}"
         rows.append(
-            Row(f"{name}: energy / mu V", float(energy) / (mu * volume), 0.0, 1e-12, _EXACT)
+            Benchmark(f"{name}: energy / mu V", float(energy) / (mu * volume), 0.0, 1e-12, _EXACT)
         )
         largest = float(jnp.max(jnp.abs(force))) / (mu * volume ** (2 / 3))
-        rows.append(Row(f"{name}: largest force / mu V^(2/3)", largest, 0.0, 1e-12, _EXACT))
+        rows.append(Benchmark(f"{name}: largest force / mu V^(2/3)", largest, 0.0, 1e-12, _EXACT))
     return rows
 
 
-def _rotated_points() -> list[Row]:
+def _rotated_points() -> list[Benchmark]:
     """Frame indifference of every law but those of small strains, which have none."""
     F = np.eye(3) + 0.2 * np.random.default_rng(3).normal(size=(3, 3))
     directions = jnp.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0]]) / 3.0  # fibre, sheet
@@ -102,11 +102,11 @@ def _rotated_points() -> list[Row]:
             return float(law.energy(strain, *map(jnp.asarray, values.values())))
 
         change = energy(_rotation() @ F) / energy(F) - 1.0
-        rows.append(Row(f"frame indifference, {name}", change, 0.0, 1e-12, _EXACT))
+        rows.append(Benchmark(f"frame indifference, {name}", change, 0.0, 1e-12, _EXACT))
     return rows
 
 
-def _closed_surfaces() -> list[Row]:
+def _closed_surfaces() -> list[Benchmark]:
     """Net force of a pressure on the whole, badly deformed surface of a block."""
     rows = []
     for form in ("P1", "P2"):
@@ -117,16 +117,18 @@ def _closed_surfaces() -> list[Row]:
         u = 0.2 * np.random.default_rng(1).normal(size=mesh.nodes.shape)
         force = np.asarray(forces.total(jnp.asarray(u), {}))
         net = float(np.linalg.norm(force.sum(axis=0)) / np.abs(force).sum())
-        rows.append(Row(f"closed surface, {form}: net pressure force", net, 0.0, 1e-12, _EXACT))
+        rows.append(
+            Benchmark(f"closed surface, {form}: net pressure force", net, 0.0, 1e-12, _EXACT)
+        )
     return rows
 
 
-def verify_derivatives() -> list[Row]:
+def verify_derivatives() -> list[Benchmark]:
     """Taylor: the remainder after the first derivative falls with the square of the step."""
     return [row for form in FORMS for row in _taylor(form)]
 
 
-def _taylor(form: str) -> list[Row]:
+def _taylor(form: str) -> list[Benchmark]:
     scene = block(form)
     simulator = Simulator(scene)
     system, theta = simulator.system, scene.centre
@@ -148,7 +150,7 @@ def _taylor(form: str) -> list[Row]:
         ("du/dtheta", lambda h: moved(theta + h * direction) - solution - h * sensitivity, 2.0),
     )
     return [
-        Row(f"Taylor, {form}: order of {name}", _order(left, first), 2.0, 0.1, "theory")
+        Benchmark(f"Taylor, {form}: order of {name}", _order(left, first), 2.0, 0.1, "theory")
         for name, left, first in checks
     ]
 
@@ -160,7 +162,7 @@ def _order(left: Callable, first: float) -> float:
     return float(np.polyfit(np.log(steps), np.log(sizes), 1)[0])
 
 
-def verify_barriers() -> list[Row]:
+def verify_barriers() -> list[Benchmark]:
     """The published barriers, by the formulas and constants of the paper (Eq. 21-23)."""
     barriers = Barriers()
     # beta_1 = 1 / (0.05 - 0.001) and beta_2 = ln(0.05 - 0.001) - 0.05 beta_1.
@@ -175,7 +177,7 @@ def verify_barriers() -> list[Row]:
     ]
     source = "Dalton et al. (2023), Eq. 21-23"
     return [
-        Row(
+        Benchmark(
             f"barrier {limit.__name__.removeprefix('limit_')} at {value:g}",
             float(limit(jnp.asarray(value))),
             float(expected),

@@ -7,7 +7,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Row:
+class Benchmark:
     """A measured value against its reference.
 
     tolerance : largest allowed |measured - reference|.

@@ -7,12 +7,12 @@ from scipy.integrate import quad
 
 import emulator as em
 from calibrate.cli.commands.verify import CASE_NAMES
-from calibrate.verify import CASES, Row
-from calibrate.verify.consistency import verify_barriers, verify_invariance, verify_patch
-from calibrate.verify.cook import deflection, membrane
-from calibrate.verify.land import beam
-from calibrate.verify.sphere import INNER, OUTER, inner_stretch, pressure_at
-from calibrate.verify.sphere import MU as SHEAR
+from emulator.verify import CASES, Benchmark
+from emulator.verify.consistency import verify_barriers, verify_invariance, verify_patch
+from emulator.verify.cook import deflection, membrane
+from emulator.verify.land import beam
+from emulator.verify.sphere import INNER, OUTER, inner_stretch, pressure_at
+from emulator.verify.sphere import MU as SHEAR
 
 
 def test_the_command_line_knows_every_case():
@@ -32,9 +32,9 @@ def test_what_holds_exactly(case):
 
 
 def test_a_row_outside_its_tolerance_has_not_passed():
-    assert not Row("x", 1.2, 1.0, 0.1, "").passed
-    assert not Row("x", float("nan"), 1.0, 0.1, "").passed
-    assert Row("x", 0.95, 1.0, 0.1, "").passed
+    assert not Benchmark("x", 1.2, 1.0, 0.1, "").passed
+    assert not Benchmark("x", float("nan"), 1.0, 0.1, "").passed
+    assert Benchmark("x", 0.95, 1.0, 0.1, "").passed
 
 
 @pytest.mark.parametrize("stretch", [1.1, 1.5])

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from calibrate.verify import Row, verify_published
 from emulator.errors import InputError
+from emulator.verify import Benchmark, verify_published
 
 
 def test_rows_pass_inside_their_tolerance_and_never_on_nan():
-    assert Row("a", 1.05, 1.0, 0.1, "").passed
-    assert not Row("a", 1.2, 1.0, 0.1, "").passed
-    assert not Row("a", float("nan"), 1.0, 0.1, "").passed
-    assert Row("a", 1.0, 1.0, 0.1, "s").to_json()["passed"]
+    assert Benchmark("a", 1.05, 1.0, 0.1, "").passed
+    assert not Benchmark("a", 1.2, 1.0, 0.1, "").passed
+    assert not Benchmark("a", float("nan"), 1.0, 0.1, "").passed
+    assert Benchmark("a", 1.0, 1.0, 0.1, "s").to_json()["passed"]
 
 
 @pytest.mark.slow  # the fast suite compares the two beams, below
@@ -29,7 +29,7 @@ def test_fem_reproduces_the_released_solutions(published, most):
 def test_a_wrong_reference_is_noticed(published, tmp_path, monkeypatch):
     import shutil
 
-    monkeypatch.setattr("calibrate.verify.released.MODELS", ("OnceClampedBeam", "TwistingBeam"))
+    monkeypatch.setattr("emulator.verify.released.MODELS", ("OnceClampedBeam", "TwistingBeam"))
     for model in ("OnceClampedBeam", "TwistingBeam"):
         shutil.copytree(published / model, tmp_path / model)
     path = tmp_path / "TwistingBeam/simulationData/test/displacement.npy"

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from calibrate.verify.consistency import (
+from emulator.verify.benchmark import Benchmark
+from emulator.verify.consistency import (
     verify_barriers,
     verify_derivatives,
     verify_invariance,
     verify_patch,
 )
-from calibrate.verify.cook import verify_cook
-from calibrate.verify.homogeneous import verify_homogeneous
-from calibrate.verify.land import verify_beam, verify_ventricle
-from calibrate.verify.row import Row
-from calibrate.verify.sphere import verify_sphere
+from emulator.verify.cook import verify_cook
+from emulator.verify.homogeneous import verify_homogeneous
+from emulator.verify.land import verify_beam, verify_ventricle
+from emulator.verify.sphere import verify_sphere
 
-CASES: dict[str, Callable[[], list[Row]]] = {
+CASES: dict[str, Callable[[], list[Benchmark]]] = {
     "patch": verify_patch,
     "invariance": verify_invariance,
     "derivatives": verify_derivatives,

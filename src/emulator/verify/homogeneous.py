@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
 
-from calibrate.verify.row import Row
 from emulator.fem import Simulator
 from emulator.fem.energy import strain_energy
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
+from emulator.verify.benchmark import Benchmark
 
 Values = Mapping[str, float]
 
@@ -263,10 +263,10 @@ PARAMETERS: dict[str, dict[str, float]] = {
 
 STRETCHES = (0.85, 1.2)
 _TOLERANCE = 1e-8  # relative to the closed form; the solver leaves 1e-10
-_SOURCE = "closed form in principal stretches, written out in calibrate.verify.homogeneous"
+_SOURCE = "closed form in principal stretches, written out in emulator.verify.homogeneous"
 
 
-def verify_homogeneous(laws: Sequence[str] = tuple(PARAMETERS)) -> list[Row]:
+def verify_homogeneous(laws: Sequence[str] = tuple(PARAMETERS)) -> list[Benchmark]:
     """FEM cubes against :func:`uniaxial` and :func:`equibiaxial`: stress in kPa, free stretch."""
     rows = []
     for law in laws:
@@ -280,7 +280,7 @@ def verify_homogeneous(laws: Sequence[str] = tuple(PARAMETERS)) -> list[Row]:
                 ):
                     name = f"{law}: {kind}, stretch {stretch:g}: {what}"
                     tolerance = _TOLERANCE * abs(reference[k])
-                    rows.append(Row(name, measured[k], reference[k], tolerance, _SOURCE))
+                    rows.append(Benchmark(name, measured[k], reference[k], tolerance, _SOURCE))
     return rows
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from calibrate.verify.row import Row
 from emulator.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign, solve_together
 from emulator.fem.balance import relative_residual
@@ -15,6 +14,7 @@ from emulator.fem.energy import potential_energy
 from emulator.released.files import models_in, units
 from emulator.released.scenes import MODELS, published_scene, published_tests
 from emulator.scenes.scene import Scene
+from emulator.verify.benchmark import Benchmark
 
 _SOURCE = (
     "FEniCS, Dalton et al. (2023), released test set; both stopped at 1e-8 of the first residual"
@@ -28,7 +28,7 @@ VENTRICLE_ENERGY_TOLERANCE = 1e-6
 BALANCE_TOLERANCE = 1e-6
 
 
-def verify_published(root: str | Path, *, most: int | None = None) -> list[Row]:
+def verify_published(root: str | Path, *, most: int | None = None) -> list[Benchmark]:
     """Largest relative errors over all test cases of every released model in ``root``.
 
     The released solutions end where FEniCS stopped, some with a visible force out of balance. The
@@ -71,7 +71,7 @@ def fenics_tolerance(scene: Scene, model: str) -> float:
     return 1e-8 * float(jnp.sqrt(jnp.sum(free**2) + jnp.sum(held**2))) * force
 
 
-def _verify_model(root: str | Path, model: str, most: int | None) -> list[Row]:
+def _verify_model(root: str | Path, model: str, most: int | None) -> list[Benchmark]:
     scene = published_scene(model, root)
     thetas, tests = published_tests(model, root)
     thetas, energies = thetas[:most], tests.energy[:most]
@@ -79,7 +79,7 @@ def _verify_model(root: str | Path, model: str, most: int | None) -> list[Row]:
 
     def add(what: str, measured: jax.Array, tolerance: float) -> None:
         name = f"{model}: {what}, largest of {len(thetas)} cases"
-        rows.append(Row(name, float(measured.max()), 0.0, tolerance, _SOURCE))
+        rows.append(Benchmark(name, float(measured.max()), 0.0, tolerance, _SOURCE))
 
     if tests.displacement is None:
         runs = run_campaign(Simulator(scene), thetas)

@@ -18,13 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.verify.row import Row
 from emulator.fem import Simulator
 from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import CavityPressure, PublishedPressure
+from emulator.verify.benchmark import Benchmark
 
 INNER, OUTER, MU = 10.0, 15.0, 10.0
 NU = 0.4999
@@ -65,32 +65,34 @@ def inner_stretch(cells: tuple[int, int], pressure: float) -> float:
     return float(np.linalg.norm(place, axis=1).mean()) / INNER
 
 
-def verify_sphere() -> list[Row]:
+def verify_sphere() -> list[Benchmark]:
     """Stretch against pressure, its order of convergence, and the work of the pressure."""
     rows = []
     for stretch in (1.1, 1.2, 1.3):
         found = inner_stretch((6, 4), pressure_at(stretch))
         name = f"thick sphere, {pressure_at(stretch):.4f} kPa: inner stretch"
-        rows.append(Row(name, found, stretch, 0.005 * stretch, _SOURCE))
+        rows.append(Benchmark(name, found, stretch, 0.005 * stretch, _SOURCE))
     errors = [abs(inner_stretch((n, n), pressure_at(1.2)) - 1.2) for n in (2, 4, 8)]
     order = float(np.polyfit(np.log([1 / 2, 1 / 4, 1 / 8]), np.log(errors), 1)[0])
     rows.append(
-        Row("thick sphere: order of convergence", order, 2.5, 1.0, "2 for a pressure an element")
+        Benchmark(
+            "thick sphere: order of convergence", order, 2.5, 1.0, "2 for a pressure an element"
+        )
     )
     return rows + verify_pressure_work()
 
 
-def verify_pressure_work() -> list[Row]:
+def verify_pressure_work() -> list[Benchmark]:
     """Work of a pressure in a uniform swelling, exact and as released, over ``p dV``."""
     rows = []
     for stretch in (1.1, 1.5, 2.0):
         exact = _work_ratio(CavityPressure("inner", 1.0), stretch)
         published = _work_ratio(PublishedPressure("inner", 1.0), stretch)
         name = f"pressure work, swollen by {stretch:g}"
-        rows.append(Row(f"{name}: exact / p dV", exact, 1.0, 1e-10, _WORK))
+        rows.append(Benchmark(f"{name}: exact / p dV", exact, 1.0, 1e-10, _WORK))
         excess = 3.0 - 2.0 / stretch
         source = "3 - 2/lambda: the released work is differentiated through cof(F) too"
-        rows.append(Row(f"{name}: published / p dV", published, excess, 1e-10, source))
+        rows.append(Benchmark(f"{name}: published / p dV", published, excess, 1e-10, source))
     return rows
 
 

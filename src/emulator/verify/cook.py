@@ -8,7 +8,6 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.verify.row import Row
 from emulator.fem import Simulator
 from emulator.geometry.bodies.box import box
 from emulator.geometry.bodies.slab import cooks_membrane
@@ -17,6 +16,7 @@ from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import Traction
+from emulator.verify.benchmark import Benchmark
 
 MU, TRACTION = 422.5, 62.5  # kPa
 POINT = (48.0, 52.0)  # mm, middle of the loaded edge
@@ -70,23 +70,25 @@ def deflection(scene: Scene) -> float:
     return float(solution.displacement[np.argmin(distance), 1])
 
 
-def verify_cook() -> list[Row]:
+def verify_cook() -> list[Benchmark]:
     """Deflections of the forms that do not lock, and of P1, which does."""
     quadratic, mixed = deflection(membrane(8, 0.3, "P2")), deflection(membrane(8, 0.3, "mean"))
     near, nearer = (deflection(membrane(16, nu, "mean")) for nu in (0.4999, 0.49999))
     locked = deflection(membrane(16, 0.4999, "P1"))
     return [
-        Row("Cook, nu 0.3, P2: deflection in mm", quadratic, 14.73, 0.05, _COMPRESSIBLE),
-        Row("Cook, nu 0.3, mean dilatation: deflection in mm", mixed, 14.73, 0.05, _COMPRESSIBLE),
-        Row("Cook, nu 0.4999, mean dilatation: in mm", near, 12.0, 0.12, _INCOMPRESSIBLE),
-        Row(
+        Benchmark("Cook, nu 0.3, P2: deflection in mm", quadratic, 14.73, 0.05, _COMPRESSIBLE),
+        Benchmark(
+            "Cook, nu 0.3, mean dilatation: deflection in mm", mixed, 14.73, 0.05, _COMPRESSIBLE
+        ),
+        Benchmark("Cook, nu 0.4999, mean dilatation: in mm", near, 12.0, 0.12, _INCOMPRESSIBLE),
+        Benchmark(
             "Cook, mean dilatation: nu 0.49999 over nu 0.4999",
             nearer / near,
             1.0,
             1e-3,
             "does not lock: ten times the bulk modulus changes nothing",
         ),
-        Row(
+        Benchmark(
             "Cook, nu 0.4999, P1 with parallel diagonals: share of the deflection",
             locked / near,
             0.36,
