@@ -66,6 +66,12 @@ def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]
     return kernel @ c.weights, variance
 
 
+@jax.jit
+def corrections(correction: Correction, x: jax.Array) -> jax.Array:
+    """The correction (s, m) at features ``x`` (s, q)."""
+    return jax.vmap(lambda one: correct(correction, one)[0])(x)
+
+
 def fit(x: np.ndarray, errors: np.ndarray, scales: np.ndarray, rows: int) -> Correction:
     """The process fitted to ``errors`` (n, m) at features ``x`` (n, q).
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from calibrate.certificate.correction import Correction, correct, fit, nothing
+from calibrate.certificate.correction import Correction, corrections, fit, nothing
 from calibrate.certificate.evidence import Figure, MeshChange
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.pool import ENOUGH, Pool, corrected_again, effective, normalised, step
@@ -175,16 +175,10 @@ class _Corrected:
         errors = runs.means - means
         if len(z):
             mesh = fit(predictive.features(z), D, predictive.scales, len(z))
-            errors = errors + np.asarray(_values(mesh, x))
+            errors = errors + np.asarray(corrections(mesh, x))
         if fine.sum() < x.shape[1] + 2:
             return nothing(len(runs.z), x.shape[1], means.shape[1])
         return fit(x[fine], errors[fine], predictive.scales, len(runs.z))
-
-
-@jax.jit
-def _values(correction: Correction, features: jax.Array) -> jax.Array:
-    """The correction (s, m) at ``features`` (s, q)."""
-    return jax.vmap(lambda x: correct(correction, x)[0])(features)
 
 
 def _solved(

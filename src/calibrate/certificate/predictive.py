@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from calibrate.certificate.correction import Correction, correct
+from calibrate.certificate.correction import Correction, correct, corrections
 from calibrate.samplers.density import Density, density_of
 from calibrate.statistical_model import Data, Model
 
@@ -87,7 +87,7 @@ class Predictive:
     def corrected_means(self, z: np.ndarray, correction: Correction) -> np.ndarray:
         """The corrected map's data without noise, flat (s, m)."""
         features, means = self.features(z), self.means(z)[0]
-        return means + np.asarray(_corrections(correction, features))
+        return means + np.asarray(corrections(correction, features))
 
     def features(self, z: np.ndarray) -> np.ndarray:
         """Unknowns of theta (s, q) on their parameters' scales, standardised by the prior."""
@@ -103,7 +103,6 @@ class Predictive:
         }
         return np.asarray(ravel_pytree(levels)[0])
 
-    # ---- programs -----------------------------------------------------------------------------
     @cached_property
     def _scale_of_features(self) -> tuple[np.ndarray, np.ndarray]:
         with jax.ensure_compile_time_eval():
@@ -178,12 +177,6 @@ class Predictive:
             for k in range(0, len(padded), _BLOCK)
         ]
         return jax.tree.map(lambda *arrays: np.concatenate(arrays)[: len(z)], *parts)
-
-
-@jax.jit
-def _corrections(correction: Correction, features: jax.Array) -> jax.Array:
-    """Corrections (s, m) at ``features`` (s, q)."""
-    return jax.vmap(lambda x: correct(correction, x)[0])(features)
 
 
 def _inside(z: jax.Array) -> np.ndarray:

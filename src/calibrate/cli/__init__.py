@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from calibrate.cli import commands
-from calibrate.cli.common import BAD_INPUT, FAILED, Parser
+from calibrate.cli.common import BAD_INPUT, FAILED, Parser, answer
 from calibrate.cli.compiled import VARIABLE, keep_programs
 from emulator import __version__
 from emulator.errors import InputError, SolverError
@@ -33,7 +33,10 @@ def build_parser(only: str | None = None) -> Parser:
         dest="command", required=True, metavar="COMMAND", parser_class=Parser
     )
     for name in command_names() if only is None else [only]:
-        importlib.import_module(f"{commands.__name__}.{name}").register(chosen)
+        command = importlib.import_module(f"{commands.__name__}.{name}")
+        command.register(chosen)
+        if hasattr(command, "run"):  # those of several kinds answer each by itself
+            answer(chosen.choices[name], command.run)
     return parser
 
 

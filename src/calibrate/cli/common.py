@@ -6,7 +6,7 @@ import argparse
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -24,9 +24,10 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``, which every command has."""
+def answer(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], int]) -> None:
+    """Have ``run`` answer a command, with ``--json``, which every command has."""
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    parser.set_defaults(run=run)
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
@@ -51,6 +52,13 @@ def scene_words(arguments: argparse.Namespace) -> tuple[str, str | None]:
 
 def _published(scene: str) -> bool:
     return scene.removeprefix("finer:").startswith("published:")
+
+
+def add_theta(parser: argparse.ArgumentParser) -> None:
+    """Add one theta."""
+    parser.add_argument(
+        "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
+    )
 
 
 def add_scheduler(parser: argparse.ArgumentParser, which: str) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 from calibrate.cli.common import (
     DONE,
     FAILED,
-    add_json,
     add_scene,
     add_scheduler,
     emit,
@@ -49,8 +48,6 @@ def register(commands: Any) -> None:
     )
     add_scheduler(parser, "solve")
     parser.add_argument("--out", required=True, metavar="STORE.zarr")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -9,7 +9,6 @@ from typing import Any
 from calibrate.cli.common import (
     DONE,
     FAILED,
-    add_json,
     add_scheduler,
     emit,
     scheduler_word,
@@ -39,8 +38,6 @@ def register(commands: Any) -> None:
         "--reweight", metavar="DIR2", help="write FEM's posterior, reweighted from the check, there"
     )
     add_scheduler(parser, "the FEM runs")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -10,9 +10,10 @@ from typing import Any
 from calibrate.cli.common import (
     DONE,
     FAILED,
-    add_json,
     add_scene,
     add_scheduler,
+    add_theta,
+    answer,
     assignments,
     emit,
     scene_words,
@@ -37,8 +38,7 @@ def register(commands: Any) -> None:
         add_model(kind)
         kind.add_argument("--seed", type=int, default=0)
         kind.add_argument("--out", required=True, metavar="DIR")
-        add_json(kind)
-        kind.set_defaults(run=run)
+        answer(kind, run)
     sbc.add_argument("--replicates", type=int, default=200, metavar="N", help="data sets")
     sbc.add_argument(
         "--fem-data",
@@ -62,9 +62,7 @@ def register(commands: Any) -> None:
 def _add_mesh(kinds: Any) -> None:
     mesh = kinds.add_parser("mesh", help="how far a scene's mesh is from a finer one of its body")
     add_scene(mesh)
-    mesh.add_argument(
-        "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
-    )
+    add_theta(mesh)
     mesh.add_argument(
         "--observe",
         metavar="WHAT",
@@ -73,8 +71,7 @@ def _add_mesh(kinds: Any) -> None:
     )
     mesh.add_argument("--seed", type=int, default=0, help="of random landmarks")
     mesh.add_argument("--out", metavar="DIR", help="write mesh_error.json and a picture")
-    add_json(mesh)
-    mesh.set_defaults(run=run_mesh)
+    answer(mesh, run_mesh)
 
 
 def run_mesh(arguments: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import DONE, add_json, emit, table
+from calibrate.cli.common import DONE, emit, table
 
 if TYPE_CHECKING:
     from calibrate.posterior.comparison import Comparison
@@ -19,8 +19,6 @@ def register(commands: Any) -> None:
         "compare", help="which of several models predicts the same data better"
     )
     parser.add_argument("folders", metavar="DIR", nargs="+", help="of calibrate infer")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

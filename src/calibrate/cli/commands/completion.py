@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from calibrate.cli.common import DONE, add_json, emit
+from calibrate.cli.common import DONE, emit
 
 _SHELLS = ("bash", "zsh", "fish")
 
@@ -23,8 +23,6 @@ def register(commands: Any) -> None:
         "~/.config/fish/completions/calibrate.fish",
     )
     parser.add_argument("shell", choices=_SHELLS)
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ import argparse
 import time
 from typing import Any
 
-from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress
+from calibrate.cli.common import DONE, FAILED, emit, show_progress
 from calibrate.cli.posterior_table import summary
 from calibrate.workflow.demo import DEMOS, run_demo
 
@@ -23,8 +23,6 @@ def register(commands: Any) -> None:
         help="the beam (default), or the left ventricle from a volume and 24 landmarks, in minutes",
     )
     parser.add_argument("--out", default="demo-output", metavar="DIR")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

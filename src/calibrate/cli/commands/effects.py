@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import DONE, add_json, add_scene, emit, scene_words, table
+from calibrate.cli.common import DONE, add_scene, emit, scene_words, table
 
 if TYPE_CHECKING:
     from calibrate.evaluation.effects import Measured, Recommendation
@@ -38,8 +38,6 @@ def register(commands: Any) -> None:
         "--samples", type=int, default=6, metavar="N", help="theta to solve at (default 6)"
     )
     parser.add_argument("--seed", type=int, default=0)
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

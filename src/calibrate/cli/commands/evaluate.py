@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import DONE, add_json, emit, show_progress, table
+from calibrate.cli.common import DONE, emit, show_progress, table
 from calibrate.cli.forward import add_forward, forward_options
 
 if TYPE_CHECKING:
@@ -30,8 +30,6 @@ def register(commands: Any) -> None:
     )
     add_forward(parser)
     parser.add_argument("--out", metavar="DIR", help="write evaluation.json and figures")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import sys
 import webbrowser
 from typing import Any
 
-from calibrate.cli.common import DONE, add_json, emit
+from calibrate.cli.common import DONE, emit
 from emulator.errors import InputError
 
 
@@ -24,8 +24,6 @@ def register(commands: Any) -> None:
     parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
     parser.add_argument("--port", type=int, default=0, help="default: a free one")
     parser.add_argument("--no-browser", action="store_true", help="print the address alone")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

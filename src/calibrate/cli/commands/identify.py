@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from calibrate.cli.common import DONE, add_json, emit, table
+from calibrate.cli.common import DONE, answer, emit, table
 from calibrate.cli.model_words import add_model, model_of
 
 
@@ -29,8 +29,7 @@ def register(commands: Any) -> None:
         "--profile", nargs="+", default=[], metavar="NAME", help="profile likelihoods"
     )
     for kind, run in ((before, run_before), (after, run_after)):
-        add_json(kind)
-        kind.set_defaults(run=run)
+        answer(kind, run)
 
 
 def run_before(arguments: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import fields
 from typing import Any
 
-from calibrate.cli.common import DONE, FAILED, add_json, emit, show_progress
+from calibrate.cli.common import DONE, FAILED, emit, show_progress
 from calibrate.cli.model_words import add_model, model_of
 from calibrate.cli.posterior_table import summary
 from calibrate.samplers import SAMPLERS, find_sampler
@@ -34,8 +34,6 @@ def register(commands: Any) -> None:
         "--no-certify", action="store_true", help="leave the check against FEM for later"
     )
     parser.add_argument("--out", required=True, metavar="DIR")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def sampler_options(words: list[str]) -> dict[str, Any]:

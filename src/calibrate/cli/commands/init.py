@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from calibrate.cli.common import DONE, add_json, emit
+from calibrate.cli.common import DONE, emit
 
 
 def register(commands: Any) -> None:
@@ -26,8 +26,6 @@ def register(commands: Any) -> None:
         "--unit", metavar="mm|cm|m", help="of the mesh's coordinates (default: guessed, and said)"
     )
     parser.add_argument("--law", metavar="NAME", help="default: by whether there are fibres")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import DONE, FAILED, add_json, assignments, check_vtu, emit
+from calibrate.cli.common import DONE, FAILED, add_theta, assignments, check_vtu, emit
 from emulator.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,15 +25,11 @@ def register(commands: Any) -> None:
         "theta outside the box, an inverted element, no equilibrium near the prediction.",
     )
     parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
-    parser.add_argument(
-        "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
-    )
+    add_theta(parser)
     parser.add_argument(
         "--error-bar", action="store_true", help="estimate the error from the residual forces"
     )
     parser.add_argument("--out", metavar="FILE.vtu", help="write displacement, stress and strain")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from calibrate.cli.common import DONE, add_json, emit
+from calibrate.cli.common import DONE, emit
 
 
 def register(commands: Any) -> None:
@@ -21,8 +21,6 @@ def register(commands: Any) -> None:
         "--root", required=True, metavar="DIR", help="a clone of the release, or its folder data"
     )
     parser.add_argument("--out", required=True, metavar="DIR")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from calibrate.cli.common import DONE, add_json, emit
+from calibrate.cli.common import DONE, emit
 from emulator.errors import InputError
 
 
@@ -26,8 +26,6 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--no-fem", action="store_true", help="without the FEM solve that shows the map's error"
     )
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

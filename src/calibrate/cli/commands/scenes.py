@@ -6,16 +6,14 @@ import argparse
 import textwrap
 from typing import Any
 
-from calibrate.cli.common import DONE, add_json, emit, table
+from calibrate.cli.common import DONE, emit, table
 
 _WIDTH = 79
 
 
 def register(commands: Any) -> None:
     """Add the command."""
-    parser = commands.add_parser("scenes", help="what is built in")
-    add_json(parser)
-    parser.set_defaults(run=run)
+    commands.add_parser("scenes", help="what is built in")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from calibrate.cli.common import DONE, add_json, emit
+from calibrate.cli.common import DONE, emit
 
 
 def register(commands: Any) -> None:
     """Add the command."""
-    parser = commands.add_parser(
+    commands.add_parser(
         "schema",
         help="JSON Schema of scene files, for editors",
         description="Prints the JSON Schema of scene files: their keys, kinds of laws, loads and "
@@ -18,8 +18,6 @@ def register(commands: Any) -> None:
         "with the line '#:schema ./scene.schema.json'.",
         epilog="example: calibrate schema > scene.schema.json",
     )
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

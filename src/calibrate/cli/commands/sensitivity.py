@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import (
     DONE,
-    add_json,
     add_scene,
     add_scheduler,
     emit,
@@ -90,8 +89,6 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--out", metavar="DIR", help="write sensitivity.nc, figures, and the map as VTU"
     )
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

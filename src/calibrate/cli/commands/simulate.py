@@ -9,8 +9,8 @@ from typing import Any
 from calibrate.cli.common import (
     DONE,
     FAILED,
-    add_json,
     add_scene,
+    add_theta,
     assignments,
     check_vtu,
     emit,
@@ -22,9 +22,7 @@ def register(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser("simulate", help="solve a scene by finite elements")
     add_scene(parser)
-    parser.add_argument(
-        "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
-    )
+    add_theta(parser)
     parser.add_argument(
         "--load-steps",
         type=int,
@@ -35,8 +33,6 @@ def register(commands: Any) -> None:
     parser.add_argument(
         "--out", metavar="FILE.vtu", help="write displacement, stress, strain and fibres"
     )
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

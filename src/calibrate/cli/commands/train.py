@@ -9,7 +9,6 @@ from typing import Any
 
 from calibrate.cli.common import (
     DONE,
-    add_json,
     add_scene,
     emit,
     scene_words,
@@ -64,8 +63,6 @@ def register(commands: Any) -> None:
         "--resume", action="store_true", help="continue from the checkpoint in --out"
     )
     parser.add_argument("--out", required=True, metavar="DIR")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import DONE, FAILED, add_json, emit, table
+from calibrate.cli.common import DONE, FAILED, emit, table
 from emulator.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,8 +37,6 @@ def register(commands: Any) -> None:
         "against the released FEniCS solutions in DIR.",
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases; 'published DIR'")
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
