@@ -7,6 +7,7 @@ but do not turn one verdict into the other.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -157,23 +158,17 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
             Finding("no FEM run supports the posterior", "check map and FEM options")
         ]
     if tail.spread > LARGEST_SPREAD:
+        apart = f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}"
         return "not certified", [
-            Finding(
-                f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}",
-                "train a better map, or put FEM into the likelihood",
-            )
+            Finding(apart, "train a better map, or put FEM into the likelihood")
         ]
     if tail.heavy or not tail.pool >= SMALLEST_POOL:
         heavy = "the weights' tail is too heavy to trust their errors"
         return "undecided", [Finding(heavy, "more FEM runs")]
     if tail.missed:
-        return "undecided", [
-            Finding(
-                f"{tail.missed} FEM runs are likely where the corrected map says they are not, so "
-                "the map may hide a part of the posterior",
-                "train a better map, or more FEM runs",
-            )
-        ]
+        missed = f"{tail.missed} FEM runs are likely where the corrected map says they are not"
+        hidden = f"{missed}, so the map may hide a part of the posterior"
+        return "undecided", [Finding(hidden, "train a better map, or more FEM runs")]
     agree = draws.within()
     beyond = [words for words, f, limit in draws.judged() if f.within(limit) is False]
     if agree:
@@ -192,75 +187,53 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
     return verdict, [Finding(f"{words}, {still}", remedy) for words in beyond]
 
 
-def _sampling(s: Sampling) -> list[Finding]:
-    found = []
+def _sampling(s: Sampling) -> Iterator[Finding]:
     if not s.vary:
-        found.append(Finding("the draws of a parameter do not vary", "the sampler is stuck"))
+        yield Finding("the draws of a parameter do not vary", "the sampler is stuck")
     elif not np.isfinite(s.r_hat):
-        found.append(Finding("R-hat is not a number", "draw more"))
+        yield Finding("R-hat is not a number", "draw more")
     elif not s.r_hat <= REFUSE_ABOVE_R_HAT:
         disagree = f"the chains disagree, R-hat {s.r_hat:.3f}"
-        found.append(Finding(disagree, "draw more, or find their modes"))
+        yield Finding(disagree, "draw more, or find their modes")
     if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
-        found.append(
-            Finding(
-                f"{s.divergences} of {s.transitions} transitions diverged",
-                "the sampler cannot follow the posterior everywhere; raise target_accept, or "
-                "narrow a prior the data leaves open",
-            )
+        yield Finding(
+            f"{s.divergences} of {s.transitions} transitions diverged",
+            "the sampler cannot follow the posterior everywhere; raise target_accept, or narrow a "
+            "prior the data leaves open",
         )
     if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= REFUSE_BELOW_ESS:
-        found.append(
-            Finding(
-                f"too few effective draws, {s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in "
-                "the tails",
-                f"draw until both reach {REFUSE_BELOW_ESS:.0f}",
-            )
-        )
-    return found
+        few = f"{s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the tails"
+        remedy = f"draw until both reach {REFUSE_BELOW_ESS:.0f}"
+        yield Finding(f"too few effective draws, {few}", remedy)
 
 
-def _physics(p: Physics) -> list[Finding]:
-    found = []
+def _physics(p: Physics) -> Iterator[Finding]:
     if not p.failed_mass <= LARGEST_FAILED:
-        found.append(
-            Finding(
-                f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior",
-                "raise --load-steps (NewtonOptions.load_steps), or narrow the prior to states that "
-                "exist",
-            )
+        yield Finding(
+            f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior",
+            "raise --load-steps (NewtonOptions.load_steps), or narrow the prior to states that "
+            "exist",
         )
     if p.unstable:
-        found.append(
-            Finding(
-                f"FEM is at a saddle at {p.unstable} of {p.asked} draws",
-                "the body would leave that state; follow the loading path with --load-steps 10 "
-                "(NewtonOptions.load_steps)",
-            )
+        yield Finding(
+            f"FEM is at a saddle at {p.unstable} of {p.asked} draws",
+            "the body would leave that state; follow the loading path with --load-steps 10 "
+            "(NewtonOptions.load_steps)",
         )
-    return found
 
 
-def _misfit(observations: dict[str, Misfit]) -> list[Finding]:
-    found = []
+def _misfit(observations: dict[str, Misfit]) -> Iterator[Finding]:
     for name, m in observations.items():
         if not (m.p >= SMALLEST_P and m.p_worst >= SMALLEST_P_WORST):
             named = ", ".join(f"{k} by {d:.1f} sd" for k, d in list(m.outlying.items())[:4])
             outlying = f"outlying data ({named}), " if named else ""
-            found.append(
-                Finding(
-                    f"{name} does not fit, posterior predictive p {min(m.p, m.p_worst):.3f}",
-                    f"check {outlying}registration, units, law and noise sd",
-                )
+            yield Finding(
+                f"{name} does not fit, posterior predictive p {min(m.p, m.p_worst):.3f}",
+                f"check {outlying}registration, units, law and noise sd",
             )
         elif not m.p <= 1.0 - SMALLEST_P:
-            found.append(
-                Finding(
-                    f"{name} fits closer than its noise allows, posterior predictive p {m.p:.3f}",
-                    "its noise sd is too large",
-                )
-            )
-    return found
+            close = f"{name} fits closer than its noise allows, posterior predictive p {m.p:.3f}"
+            yield Finding(close, "its noise sd is too large")
 
 
 def _columns(name: str, figures: dict[str, Figure]) -> dict[str, dict[str, float]]:

@@ -135,7 +135,6 @@ class Explorer:
             "volumes": volumes,
         }
 
-    # ---- compiled once ------------------------------------------------------------------------
     @cached_property
     def _simulator(self) -> Simulator:
         return Simulator(self.scene)

@@ -46,7 +46,6 @@ def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
     return [folder / name for name in figures]
 
 
-# ---- densities --------------------------------------------------------------------------------
 def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
     """Density of each error on a logarithmic axis, its median and 97.5 % quantile marked."""
     names = [name for name in LABELS if name in inside.fields]
@@ -87,7 +86,6 @@ def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> No
     axes.fill_between(at, density, color=colour, alpha=0.2, lw=0)
 
 
-# ---- over the parameters ----------------------------------------------------------------------
 def parameter_figure(scene: Scene, inside: Errors, outside: Errors | None, title: str) -> Any:
     """Median err_u of each case over theta: a map of two parameters, else a panel for each."""
     groups = [(inside, "o", "inside the box")]
@@ -187,7 +185,6 @@ def _plain(axis: Any, digits: tuple[float, ...]) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-# ---- on the body ------------------------------------------------------------------------------
 def surface_figure(
     scene: Scene,
     error: np.ndarray,

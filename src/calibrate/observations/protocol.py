@@ -45,7 +45,6 @@ class Labels(NamedTuple):
 class Observation(Protocol):
     """A function of the displacement of a few nodes, and of theta."""
 
-    # ---- the measurement --------------------------------------------------------------------
     @property
     def quantity(self) -> str:
         """What is measured, such as ``displacement``."""
@@ -98,7 +97,6 @@ class Observation(Protocol):
         """
         ...
 
-    # ---- its names, labels and JSON ---------------------------------------------------------
     @property
     def names(self) -> tuple[str, ...]:
         """Names it may have in a data file; the first is its name where it is observed alone."""

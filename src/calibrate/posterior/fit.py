@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 import xarray as xr
@@ -81,9 +82,7 @@ def misfit_of(name: str, replicates: np.ndarray, data: np.ndarray) -> Misfit:
     y = replicates.reshape(-1, data.size)[:, present]
     simulated, distance = np.abs(y - y.mean(axis=0)), np.abs(data.ravel()[present] - y.mean(axis=0))
     sums = [((x / y.std(axis=0)) ** 2).sum(axis=-1) for x in (simulated, distance)]
-    places = [
-        place for place, here in zip(places_of(name, data.shape), present, strict=True) if here
-    ]
+    places = list(compress(places_of(name, data.shape), present))
     return Misfit.of(places, sums[0] >= sums[1], simulated, distance[None])
 
 

@@ -108,7 +108,6 @@ def _answers(forward: ForwardMap, k: int, value: float) -> bool:
     return bool(forward.evaluate(theta).valid)
 
 
-# ---- where samplers start ---------------------------------------------------------------------
 class _Around(constraints.Constraint):
     """``base`` with unconstrained coordinates of centre 0 and width 1 for the prior at hand."""
 
