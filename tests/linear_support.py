@@ -38,11 +38,11 @@ class LinearForward:
         return replace(self, nodes=nodes, matrix=self.matrix[nodes], shift=self.shift[nodes])
 
 
-def linear_forward(scene, seed=0, size=0.01, bias=0.0) -> LinearForward:
+def linear_forward(scene, seed=0, size=0.01, bias=0.0, of=LinearForward, **more) -> LinearForward:
     rng = np.random.default_rng(seed)
     count = len(scene.mesh.nodes)
     matrix = size * rng.normal(size=(count, 3, len(scene.parameters)))
-    return LinearForward(scene, all_nodes(scene), matrix, np.full((count, 3), bias))
+    return of(scene, all_nodes(scene), matrix, np.full((count, 3), bias), **more)
 
 
 class Step:

@@ -6,7 +6,8 @@ import argparse
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -108,6 +109,17 @@ def seconds(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise InputError(f"duration '{text}' must be above 0")
     return value
+
+
+@contextmanager
+def needing_plotly(what: str) -> Iterator[None]:
+    """Have a missing Plotly told in one line, that ``what`` needs it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != "plotly":
+            raise
+        raise InputError(f"{what} plotly: pip install 'soft-tissue-calibrate[plot]'") from error
 
 
 def check_vtu(path: str) -> None:

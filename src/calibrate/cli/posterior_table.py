@@ -9,23 +9,20 @@ from calibrate.cli.common import table
 
 def summary(report: dict[str, Any]) -> str:
     """The parameter table and the verdict as text."""
+    from calibrate.certificate.verdict import shifts
+
     parameters = report["parameters"]
     columns = ["mean", "sd", "low", "high", "r_hat", "ess_bulk"]
     titles = ["mean", "sd", "5 %", "95 %", "R-hat", "ESS"]
     if any("truth" in row for row in parameters.values()):
         columns, titles = ["truth", *columns], ["truth", *titles]
-    certificate = report.get("certificate", {})
-    shifts = {
-        "FEM/sd": certificate.get("shift"),
-        "mesh/sd": certificate.get("mesh", {}).get("shift"),
-    }
-    shifts = {title: shift for title, shift in shifts.items() if shift}
+    moved = shifts(report.get("certificate", {}))
     rows = []
     for name, row in parameters.items():
         cells: list[object] = [row.get(column) for column in columns]
-        rows.append((name, *cells, *(shift.get(name) for shift in shifts.values())))
-    lines = [table(("parameter", *titles, *shifts), rows)]
-    if shifts:
+        rows.append((name, *cells, *(shift.get(name) for shift in moved.values())))
+    lines = [table(("parameter", *titles, *(f"{what}/sd" for what in moved)), rows)]
+    if moved:
         lines.append("FEM, mesh: how far FEM, and a finer mesh, would move each mean, in sd")
     lines.append(
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"

@@ -18,6 +18,7 @@ import numpy as np
 
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.observations.location import locate
+from calibrate.observations.protocol import LENGTH_UNITS
 from calibrate.observations.scalar import Scalar
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -45,7 +46,7 @@ class Length(Scalar):
     usage: ClassVar[str] = "length:A:B (each a node, a node set or x,y,z)"
     quantity: ClassVar[str] = "length"
     unit: ClassVar[str] = "mm"
-    other_units: ClassVar[Mapping[str, float]] = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
+    other_units: ClassVar[Mapping[str, float]] = LENGTH_UNITS
     default_noise: ClassVar[GaussianNoise] = GaussianNoise(sd=0.5)
 
     @property

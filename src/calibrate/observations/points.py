@@ -9,7 +9,7 @@ import numpy as np
 
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Sites
-from calibrate.observations.protocol import Field, Labels
+from calibrate.observations.protocol import LENGTH_UNITS, Field, Labels
 from emulator.errors import InputError
 
 DISPLACEMENT = "displacement"
@@ -26,7 +26,7 @@ class DisplacementPoints:
 
     quantity: ClassVar[str] = DISPLACEMENT
     unit: ClassVar[str] = "mm"
-    other_units: ClassVar[Mapping[str, float]] = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
+    other_units: ClassVar[Mapping[str, float]] = LENGTH_UNITS
     names: ClassVar[tuple[str, ...]] = (DISPLACEMENT,)
     default_noise: ClassVar[GaussianNoise] = GaussianNoise(sd=0.2)
 

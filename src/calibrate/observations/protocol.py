@@ -29,6 +29,10 @@ class Field(NamedTuple):
     where: bool = False
 
 
+LENGTH_UNITS: Mapping[str, float] = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
+"""Units that lengths in mm may come in by mistake, each in mm."""
+
+
 class Labels(NamedTuple):
     """How an observation's data is labelled in the DataTree.
 

@@ -26,7 +26,7 @@ import numpy as np
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Sites
 from calibrate.observations.points import check_table, check_values, count_of
-from calibrate.observations.protocol import Field, Labels
+from calibrate.observations.protocol import LENGTH_UNITS, Field, Labels
 from calibrate.observations.surface_location import facet_shapes, foot_on
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -57,7 +57,7 @@ class SurfacePoints:
     usage: ClassVar[str] = "surface:FACETSET:N"
     quantity: ClassVar[str] = "normal displacement"
     unit: ClassVar[str] = "mm"
-    other_units: ClassVar[Mapping[str, float]] = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
+    other_units: ClassVar[Mapping[str, float]] = LENGTH_UNITS
     default_noise: ClassVar[GaussianNoise] = GaussianNoise(sd=0.5)
 
     @property

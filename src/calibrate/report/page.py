@@ -13,6 +13,7 @@ import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
 
+from calibrate.certificate.verdict import shifts
 from calibrate.identifiability.combinations import identify, in_words
 from calibrate.posterior import Posterior
 from calibrate.report import charts
@@ -25,6 +26,7 @@ from emulator.store import read_json, replacing
 REPORT = "report.html"
 _COLOURS = {"accepted": "#00684a", "reweight": "#8a5a00", "undecided": "#8a5a00"}
 _NOT = "#9c2a00"
+_MOVED = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1c1c1c; margin: 0 auto; max-width: 1060px;
   padding: 0 20px 60px; }
@@ -109,15 +111,15 @@ def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | No
     truth = run.truth if run.data == "synthetic" else {}
     priors = json.loads(posterior.tree.attrs.get("prior", "{}"))
     head += ["truth"] if truth else []
-    shifts = _shifts(certificate or {})
-    head += list(shifts)
+    moved = shifts(certificate or {})
+    head += [_MOVED[what] for what in moved]
     rows = []
     for name, row in posterior.summary().items():
         numbers = [f"{row[key]:.4g}" for key in ("mean", "sd", "low", "high")]
         numbers += [f"{row['r_hat']:.4f}", f"{row['ess_bulk']:.0f}", f"{row['ess_tail']:.0f}"]
         numbers.append(priors.get(name, priors.get(split(name)[0], "")))
         numbers += [f"{truth[name]:.4g}" if name in truth else ""] if truth else []
-        numbers += [f"{shift[name]:+.2f}" if name in shift else "" for shift in shifts.values()]
+        numbers += [f"{shift[name]:+.2f}" if name in shift else "" for shift in moved.values()]
         rows.append((labels[name], *numbers))
     lost = "".join(
         f'<p class="note">{escape(n)}: {100 * share:.2g} % of the prior lies where the map has no '
@@ -125,13 +127,6 @@ def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | No
         for n, share in cut.items() if share
     )  # fmt: skip
     return _table(head, rows) + lost
-
-
-def _shifts(certificate: dict[str, Any]) -> dict[str, dict[str, float]]:
-    """How far a certificate says that each mean would move, in posterior sd, by what moves it."""
-    found = {"by FEM / sd": certificate.get("shift", {})}
-    found["on a finer mesh / sd"] = certificate.get("mesh", {}).get("shift", {})
-    return {title: shift for title, shift in found.items() if shift}
 
 
 def _body(posterior: Posterior, simulator: Any) -> str:

@@ -227,10 +227,9 @@ def certify_and_keep(
     """Check a posterior against FEM and write certificate.json.
 
     ``mesh`` is the number of solves on a finer mesh, 0 for none. ``load_steps`` are those of every
-    solve. ``scheduler`` is the address of a
-    Dask scheduler whose workers solve. With ``reweight_to``, the
-    reweighted posterior is kept in that folder, ready to be certified in its turn, where the
-    verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
+    solve. ``scheduler`` is the address of a Dask scheduler whose workers solve. With
+    ``reweight_to``, the reweighted posterior is kept in that folder, ready to be certified in its
+    turn, where the verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
 
     Raises
     ------

@@ -31,7 +31,7 @@ class BoxForward(LinearForward):
 
 @pytest.fixture(scope="module")
 def bounded(beam):
-    return BoxForward(**vars(linear_forward(beam)))
+    return linear_forward(beam, of=BoxForward)
 
 
 def model_with(forward, beam, mu):
@@ -87,12 +87,12 @@ def test_a_prior_cut_by_request_is_sampled(bounded, beam):
 def test_a_map_without_a_box_takes_any_prior_and_chains_start(beam):
     """Before, NumPyro looked for starting points near 0 and gave up."""
 
-    class Positive(type(linear_forward(beam))):
+    class Positive(LinearForward):
         def evaluate(self, theta):
             found = super().evaluate(theta)
             return found._replace(valid=jnp.all((theta > 5.0) & (theta < 500.0)))
 
-    forward = Positive(**vars(linear_forward(beam)))
+    forward = linear_forward(beam, of=Positive)
     prior = {"mu": dist.Normal(120.0, 20.0), "lam": dist.Gamma(100.0, 1.4)}
     model = cal.model(forward, cal.nodal_displacements(beam, [3, 11]), NOISE, prior)
     assert model.prior_cut == {}

@@ -24,7 +24,7 @@ class Bent(LinearForward):
 
 
 def bent(beam):
-    forward = Bent(**vars(linear_forward(beam)))
+    forward = linear_forward(beam, of=Bent)
     prior = {name: dist.Normal(75.0, 10.0) for name in beam.parameter_names}
     observe = cal.nodal_displacements(beam, [3])
     model = cal.model(forward, observe, cal.GaussianNoise(sd=0.05), prior, check_scale=False)
@@ -92,7 +92,7 @@ class Even(LinearForward):
 @pytest.mark.parametrize(("slope", "told"), [(0.0, True), (0.02, True), (0.5, False)])
 def test_a_second_mode_nearly_as_high_is_told(beam, slope, told):
     """At x = -1 the log density is (2 slope / 0.1)^2 / 2 below that at x = 1: 0.08 and 50 nats."""
-    forward = Even(**vars(linear_forward(beam)), slope=slope)
+    forward = linear_forward(beam, of=Even, slope=slope)
     prior = {name: dist.Normal(75.0, 10.0) for name in beam.parameter_names}
     observe = cal.nodal_displacements(beam, [3])
     model = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), prior, check_scale=False)

@@ -27,7 +27,7 @@ class Even(LinearForward):
 @pytest.fixture(scope="module")
 def two_modes(beam):
     """Modes at mu = 65 and 85, each 0.3 wide; the prior favours the lower one."""
-    forward = Even(**vars(linear_forward(beam)))
+    forward = linear_forward(beam, of=Even)
     prior = {"mu": dist.Normal(73.0, 9.0), "lam": dist.Normal(75.0, 8.0)}
     observe = cal.nodal_displacements(beam, [3])
     model = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), prior, check_scale=False)

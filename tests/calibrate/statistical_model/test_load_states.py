@@ -1,5 +1,7 @@
 """Several load states of one body, against densities and files written by hand."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
@@ -131,9 +133,9 @@ def test_one_call_of_the_forward_map_serves_all_states(ventricle, curve):
             calls.append(theta.shape)
             return super().__call__(theta)
 
-    forward, observe = curve
+    _, observe = curve
     noise = dict.fromkeys(("volume", "displacement"), cal.GaussianNoise(sd=1.0))
-    model = cal.model(Counted(**vars(forward)), observe, noise)
+    model = cal.model(linear_forward(ventricle, size=1.0, of=Counted), observe, noise)
     calls.clear()
     thetas = jnp.stack([ventricle.centre, ventricle.centre])
     assert model.evaluate(thetas).displacement.shape == (2, len(observe.nodes), 3)
@@ -142,7 +144,7 @@ def test_one_call_of_the_forward_map_serves_all_states(ventricle, curve):
 
 def test_known_values_outside_the_range_of_the_map_are_refused(ventricle, curve):
     forward, observe = curve
-    limited = LinearForward(**{**vars(forward), "limit": 60.0})
+    limited = replace(forward, limit=60.0)
     noise = dict.fromkeys(("volume", "displacement"), cal.GaussianNoise(sd=1.0))
     with pytest.raises(InputError, match=r"'pressure' is known to be 90 kPa; forward map 'linear'"):
         cal.model(limited, observe, noise, known={"pressure@low": 90.0})

@@ -10,7 +10,7 @@ from numpyro.infer.util import log_density
 import calibrate as cal
 from calibrate.observations import spread_landmarks
 from emulator.errors import InputError
-from linear_support import linear_forward
+from linear_support import LinearForward, linear_forward
 
 THETA = {"a": 0.3, "b": 2.0, "a_f": 5.0, "b_f": 1.7, "pressure": 1.1}
 
@@ -102,7 +102,7 @@ def test_each_noise_may_be_known_or_inferred(ventricle, parts, data):
 def test_only_the_observed_nodes_are_asked_for(ventricle, parts, data):
     asked = []
 
-    class Watched(type(linear_forward(ventricle))):
+    class Watched(LinearForward):
         def at(self, nodes):
             asked.append(np.asarray(nodes))
             return super().at(nodes)
@@ -111,7 +111,7 @@ def test_only_the_observed_nodes_are_asked_for(ventricle, parts, data):
             assert len(self.nodes) < len(ventricle.mesh.nodes), "the whole field was decoded"
             return super().__call__(theta)
 
-    forward = Watched(**vars(linear_forward(ventricle, size=1.0)))
+    forward = linear_forward(ventricle, size=1.0, of=Watched)
     noise = {"displacement": cal.GaussianNoise(sd=0.5), "volume": cal.GaussianNoise(sd=4.0)}
     model = cal.model(forward, {"displacement": parts["displacement"]}, noise["displacement"])
     np.testing.assert_array_equal(asked[-1], parts["displacement"].nodes)

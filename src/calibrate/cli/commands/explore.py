@@ -7,8 +7,7 @@ import sys
 import webbrowser
 from typing import Any
 
-from calibrate.cli.common import DONE, emit
-from emulator.errors import InputError
+from calibrate.cli.common import DONE, emit, needing_plotly
 
 
 def register(commands: Any) -> None:
@@ -28,14 +27,8 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until interrupted."""
-    try:
+    with needing_plotly("exploring needs"):
         from calibrate.explorer import LOOPBACK, Explorer, serve
-    except ModuleNotFoundError as error:
-        if error.name != "plotly":
-            raise
-        raise InputError(
-            "exploring needs plotly: pip install 'soft-tissue-calibrate[plot]'"
-        ) from error
     from emulator.surrogates import load
 
     explorer = Explorer(load(arguments.emulator))

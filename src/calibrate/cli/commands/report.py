@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from calibrate.cli.common import DONE, emit
+from calibrate.cli.common import DONE, emit, needing_plotly
 from emulator.errors import InputError
 
 
@@ -32,14 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the page."""
     if arguments.out and not arguments.out.endswith(".html"):
         raise InputError(f"--out {arguments.out}: the file name must end in .html")
-    try:
+    with needing_plotly("a report needs"):
         from calibrate.report import write_report
-    except ModuleNotFoundError as error:
-        if error.name != "plotly":
-            raise
-        raise InputError(
-            "a report needs plotly: pip install 'soft-tissue-calibrate[plot]'"
-        ) from error
     path = write_report(arguments.folder, arguments.out, fem=not arguments.no_fem)
     emit({"out": str(path)}, as_json=arguments.json, text=f"written to {path}")
     return DONE
