@@ -80,7 +80,7 @@ def scheduler_word(arguments: argparse.Namespace) -> str | None:
     return arguments.scheduler
 
 
-def assignments(words: Sequence[str], example: str = "mu=73") -> dict[str, float]:
+def assignments(words: Sequence[str]) -> dict[str, float]:
     """``name=number`` words as a dict; :class:`InputError` for other words or a repeated name."""
     values: dict[str, float] = {}
     for word in words:
@@ -90,7 +90,7 @@ def assignments(words: Sequence[str], example: str = "mu=73") -> dict[str, float
         try:
             values[name] = float(text)
         except ValueError as error:
-            raise InputError(f"'{word}' is not name=number, e.g. {example}") from error
+            raise InputError(f"'{word}' is not name=number, e.g. mu=73") from error
     return values
 
 

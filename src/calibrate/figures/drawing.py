@@ -38,10 +38,10 @@ def pyplot() -> Any:
     return plt
 
 
-def displacement_draws(posterior: Posterior, count: int = 200) -> np.ndarray:
-    """Full displacement fields (count, n, 3) mm at evenly spaced draws, from the forward map."""
+def displacement_draws(posterior: Posterior) -> np.ndarray:
+    """Full displacement fields (200, n, 3) mm at evenly spaced draws, from the forward map."""
     thetas = posterior.thetas()
-    rows = np.linspace(0, len(thetas) - 1, count).astype(int)
+    rows = np.linspace(0, len(thetas) - 1, 200).astype(int)
     chosen = np.asarray(thetas)[rows]
     return np.asarray(jax.jit(lambda t: jax.lax.map(posterior.model.full, t))(chosen))
 

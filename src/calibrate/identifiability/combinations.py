@@ -23,6 +23,8 @@ from calibrate.statistical_model import Model
 _PRIOR_DRAWS = 4096
 # Exponents are rounded to be readable; those that round to zero are left out.
 _DIGITS = 1
+_TOGETHER = 0.7  # least absolute correlation of pairs that are told
+_BEST = 2  # combinations that are told
 
 
 def identify(posterior: Posterior) -> dict[str, Any]:
@@ -58,9 +60,9 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     }
 
 
-def prior_table(model: Model, count: int = _PRIOR_DRAWS) -> np.ndarray:
-    """Draws (count, q) of the unknowns of theta from their prior."""
-    draws = model.prior_draws(jax.random.key(0), count)
+def prior_table(model: Model) -> np.ndarray:
+    """Draws (s, q) of the unknowns of theta from their prior."""
+    draws = model.prior_draws(jax.random.key(0), _PRIOR_DRAWS)
     return np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
 
 
@@ -90,14 +92,8 @@ def combinations(
     return sorted(found, key=lambda entry: entry["known_to"] / entry["prior"])
 
 
-def in_words(found: dict[str, Any], *, pairs: float = 0.7, best: int = 2) -> str:
-    """The result in words: contractions, correlated pairs, the best combinations.
-
-    Parameters
-    ----------
-    pairs : least absolute correlation of the pairs that are named.
-    best : number of combinations that are named.
-    """
+def in_words(found: dict[str, Any]) -> str:
+    """The result in words: contractions, correlated pairs, the best combinations."""
     learned = ", ".join(f"{name} {100 * c:.0f} %" for name, c in found["contraction"].items())
     lines = [f"learned from the data (1 - sd / prior sd): {learned}"]
     names = list(found["correlation"])
@@ -105,10 +101,10 @@ def in_words(found: dict[str, Any], *, pairs: float = 0.7, best: int = 2) -> str
         f"{first} and {second} ({found['correlation'][first][second]:+.2f})"
         for k, first in enumerate(names)
         for second in names[k + 1 :]
-        if abs(found["correlation"][first][second]) >= pairs
+        if abs(found["correlation"][first][second]) >= _TOGETHER
     ]
     lines.append(f"only known together: {', '.join(together) or 'none'}")
-    return "\n".join([*lines, *products_in_words(found["combinations"], best)])
+    return "\n".join([*lines, *products_in_words(found["combinations"], _BEST)])
 
 
 def products_in_words(combinations: list[dict[str, Any]], best: int) -> list[str]:
