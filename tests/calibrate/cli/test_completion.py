@@ -38,7 +38,7 @@ def ask(tmp_path_factory):
 def test_commands(ask):
     assert ask("") == set(command_names())
     assert ask("si") == {"simulate"}
-    assert ask("check", "") == {"sbc", "prior"}
+    assert ask("check", "") == {"sbc", "prior", "mesh"}
 
 
 def test_scenes_and_scene_files(ask):
