@@ -20,8 +20,8 @@ from calibrate.noise.gaussian import GaussianNoise
 from calibrate.observations.location import locate
 from calibrate.observations.scalar import Scalar
 from emulator.errors import InputError
+from emulator.scenes.nodes import check_nodes
 from emulator.scenes.scene import Scene
-from emulator.surrogates.protocol import check_nodes
 
 _SHORTEST = 1e-6  # of the body's size; the direction of a shorter length is round-off
 

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.scenes.nodes import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
 from emulator.shown import Row, Shown
 from emulator.surrogates.coarse import Coarse
@@ -32,14 +33,7 @@ from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.part import Network
 from emulator.surrogates.part import CachedPart, Part
-from emulator.surrogates.protocol import (
-    Prediction,
-    all_nodes,
-    check_nodes,
-    fingerprint_of,
-    inside_only,
-    rows_of,
-)
+from emulator.surrogates.protocol import Prediction, fingerprint_of, inside_only, rows_of
 from emulator.surrogates.taylor import Expansion
 
 KINDS: dict[str, type[Part]] = {

@@ -15,12 +15,12 @@ from emulator.fem import Simulator
 from emulator.fem.campaign import Runs, StoredRuns, run_campaign
 from emulator.fem.campaign.designs import design, sobol
 from emulator.fem.campaign.starts import Predictor
+from emulator.scenes.nodes import all_nodes
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.graph import augment
 from emulator.surrogates.network.part import Network, fresh
 from emulator.surrogates.network.pignn import Architecture
-from emulator.surrogates.protocol import all_nodes
 from emulator.surrogates.taylor import Expansion, constant, expand
 from emulator.training.basis import mechanical_modes
 from emulator.training.budget import Budget
