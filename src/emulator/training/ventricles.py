@@ -13,7 +13,6 @@ since a message's sign on a mesh unknown follows from the numbering of its nodes
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,8 +39,8 @@ from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import standardised
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.network.ventricle_graph import Described, describe
-from emulator.training.checkpoint import CHECKPOINT, State, Writer, read_checkpoint
-from emulator.training.loop import Bar, Keep, optimise, require_finite
+from emulator.training.checkpoint import State, open_session
+from emulator.training.loop import require_finite, run
 from emulator.training.plan import Plan
 from emulator.training.step import clipped_adam, make_step
 
@@ -122,11 +121,10 @@ def train_family(
     plan : its steps, learning rate, schedule, seed and checkpoints.
     folder : where checkpoints go.
     """
-    path, began = Path(folder) / CHECKPOINT, time.perf_counter()
-    fingerprint = _check(runs)
-    saved = read_checkpoint(path, fingerprint, f"{len(runs)} bodies") if resume else None
-    if saved is not None:
-        plan, architecture = saved.plan, saved.architecture or architecture
+    session = open_session(
+        folder, _check(runs), f"{len(runs)} bodies", plan, architecture, resume=resume
+    )
+    plan, architecture = session.plan, session.architecture or architecture
     described = [describe(r.scene) for r in tqdm(runs, "describe", disable=not progress)]
     standard = _standard(described)
     sizes = _sizes(runs, described)
@@ -157,18 +155,13 @@ def train_family(
         )
         return State(weights, moments, state.done + 1, loss)
 
-    spent = saved.seconds if saved is not None else 0.0
-    clock = lambda: spent + time.perf_counter() - began  # noqa: E731
     state = State(weights, optimiser.init(weights))
-    state = state if saved is None else saved.restore(*state[:2])
-    keep = Keep(Writer(path, fingerprint, architecture), plan, clock)
-    with Bar("train", state, plan.steps, shown=progress) as bar:
-        state = optimise(state, plan.steps, advance, [bar, keep])
+    state = run(session, state, plan.steps, advance, progress=progress)
     record: dict[str, Any] = {
         "plan": asdict(plan),
         "final_loss": require_finite(state),
         "bodies": len(runs),
-        "seconds": round(clock(), 1),
+        "seconds": round(session.seconds, 1),
     }
     part = on_body(learned._replace(weights=state.weights), home)
     return Emulator(home, family=part, record=record)
