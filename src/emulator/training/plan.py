@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from emulator.errors import InputError, check_seed
+from emulator.errors import InputError, check_seed, look_up
 
 Objective = Literal["energy", "simulations", "gradients", "both", "modes"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
@@ -192,6 +192,4 @@ Dalton et al. (2023)."""
 
 def recipe(name: str) -> Plan:
     """The plan of that name; :class:`InputError` lists the names."""
-    if name not in RECIPES:
-        raise InputError(f"recipe '{name}' is unknown; known: {', '.join(RECIPES)}")
-    return RECIPES[name]
+    return look_up(RECIPES, name, "recipe")

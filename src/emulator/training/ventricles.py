@@ -146,10 +146,9 @@ def train_family(
     optimiser = clipped_adam()
     descend = _descent(definition, scale, _gradient_scale(bodies), sizes.real)
     step = make_step(plan, descend, optimiser, moves=lambda updates, _: updates)
-    order = _Order(len(bodies), plan.seed)
 
     def advance(state: State, total: int) -> State:
-        body = bodies[order(state.done)]
+        body = bodies[_taken(state.done, len(bodies), plan.seed)]
         weights, moments, loss = step(
             state.weights, state.optimiser, jnp.asarray(state.done), jnp.asarray(total), body
         )
@@ -167,15 +166,10 @@ def train_family(
     return Emulator(home, family=part, record=record)
 
 
-class _Order:
-    """Which body a step takes: all of them in an order of its own, epoch after epoch."""
-
-    def __init__(self, count: int, seed: int) -> None:
-        self._count, self._seed = count, seed
-
-    def __call__(self, done: int) -> int:
-        epoch, place = divmod(done, self._count)
-        return int(np.random.default_rng((self._seed, epoch)).permutation(self._count)[place])
+def _taken(done: int, count: int, seed: int) -> int:
+    """Which of ``count`` bodies a step takes: all of them, in an order of its own each epoch."""
+    epoch, place = divmod(done, count)
+    return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
 
 
 def _check(runs: Sequence[BodyRuns]) -> str:
@@ -231,7 +225,7 @@ def _padded(
     sizes: _Sizes,
     generator: np.random.Generator,
 ) -> _Body:
-    """``runs`` with what its network is told, padded. The last virtual node belongs to no body."""
+    """``runs`` and the network's features, padded. The last virtual node belongs to no body."""
     scene, graph = runs.scene, standard.graph(body)
     size = body.shape["size"]
     total, real = sizes.real + sizes.virtual, body.real

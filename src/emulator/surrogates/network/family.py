@@ -254,10 +254,9 @@ def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNet
 
 def physics_of(scene: Scene) -> dict[str, Any]:
     """What a network can only know one of: law, constants, kinds of loads and supports."""
-    told = dict(scene.identity.description)
-    told["loads"] = sorted(load.to_json()[0] for load in scene.loads)
-    told["regions"] = scene.regions is not None
-    return told
+    loads = sorted(load.to_json()[0] for load in scene.loads)
+    regions = scene.regions is not None
+    return {**scene.identity.description, "loads": loads, "regions": regions}
 
 
 def _check_physics(learned: Learned, scene: Scene) -> None:
