@@ -52,8 +52,9 @@ def train(
         less so, and ``plan.simulations`` by as many as were done in its first third. Where a
         discrepancy model follows, which soon outdoes the network, neither is made larger.
     resume : continue from the checkpoint in ``folder``, under the plan it was written with and with
-        the network it holds. For a plan in steps the result equals that of a run never
-        interrupted; one on a budget keeps the number of steps it was aiming at.
+        the network it holds; where no network is trained, ``start`` is needed again. For a plan in
+        steps the result equals that of a run never interrupted; one on a budget keeps the number of
+        steps it was aiming at.
     """
     if campaign is not None and not (plan.runs or resume):
         raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
@@ -66,8 +67,7 @@ def train(
     digest = "" if campaign is None else campaign.digest
     if resume:
         _check_same(session, digest, source)
-        # The checkpoint has the budget, and the weights of a network to start from.
-        budget, start = None, start if session.plan.on_coarse else None
+        budget = None  # it is in the checkpoint
     else:
         session = replace(session, plan=replace(plan, campaign=digest), start=source)
     limit = None if budget is None else Budget(budget, session.began)
@@ -99,13 +99,16 @@ def _coarse(scene: Scene, folder: Path, *, known: bool, progress: bool) -> Emula
 
 
 def _check_same(session: Session, digest: str, start: Mapping[str, Any]) -> None:
-    """Refuse to resume with other FEM runs, or with another emulator on the coarser mesh."""
+    """Refuse to resume with other FEM runs, or on another emulator."""
     if session.plan.campaign != digest:
         what = "FEM runs of a campaign" if session.plan.campaign else "FEM runs of its own"
         raise InputError(f"the checkpoint was trained on {what}; resume it with the same")
-    if session.plan.on_coarse and session.start != start:
+    if session.plan.steps and start:
+        raise InputError("the checkpoint has its network's weights; resume it without a start")
+    if not session.plan.steps and session.start != start:
         raise InputError(
-            "the checkpoint stands on another emulator on the coarser mesh; resume it with the same"
+            "the checkpoint stands on another emulator than is given as the start; resume it with "
+            "the same"
         )
 
 

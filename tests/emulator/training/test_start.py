@@ -106,6 +106,8 @@ def test_a_started_run_killed_resumes_without_its_start(
         kill_after(writes, patch)
         with pytest.raises(KeyboardInterrupt):
             train(other, PLAN, tmp_path, start=start)
+    with pytest.raises(InputError, match="has its network's weights; resume it without a start"):
+        train(other, Plan(), tmp_path, start=start, resume=True)
     # Neither the start nor its architecture is said again.
     resumed = train(other, Plan(), tmp_path, resume=True)
     same(resumed.network.weights, whole.network.weights)

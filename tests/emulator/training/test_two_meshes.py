@@ -89,5 +89,5 @@ def test_it_resumes_on_the_emulator_it_stands_on(body, coarse, fine, tmp_path):
     train(body.scene, PLAN, tmp_path, start=coarse)
     assert train(body.scene, Plan(), tmp_path, resume=True).fingerprint == fine.fingerprint
     other = replace(coarse, discrepancy=None)
-    with pytest.raises(InputError, match="stands on another emulator on the coarser mesh"):
+    with pytest.raises(InputError, match="stands on another emulator than is given"):
         train(body.scene, Plan(), tmp_path, resume=True, start=other)
