@@ -9,7 +9,8 @@ import numpyro.distributions as dist
 
 import calibrate as cal
 from emulator.fem.solution import Solution, Status
-from emulator.surrogates.protocol import Prediction, all_nodes, fingerprint_of
+from emulator.scenes.nodes import all_nodes
+from emulator.surrogates.protocol import Prediction, fingerprint_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,14 +5,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from html import escape
 
-Row = tuple[str, str]
-
 
 class Shown:
     """An object that says what it is in a title and a few rows."""
 
     @abstractmethod
-    def shown(self) -> tuple[str, list[Row]]:
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """A title, and what there is to know, by name."""
 
     def __repr__(self) -> str:

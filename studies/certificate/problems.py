@@ -18,7 +18,8 @@ import numpy as np
 import emulator as em
 from calibrate.observations import spread_nodes
 from emulator.fem.solution import Solution, Status
-from emulator.surrogates.protocol import Prediction, all_nodes, fingerprint_of
+from emulator.scenes.nodes import all_nodes
+from emulator.surrogates.protocol import Prediction, fingerprint_of
 
 
 @dataclass(frozen=True, eq=False)

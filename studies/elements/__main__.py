@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results, parser, save
@@ -134,6 +135,8 @@ def effectivity(
     except em.SolverError as reason:
         return {"effectivity": {"failed": str(reason)}}
     there = measured(error.finer.scene, np.asarray(told.fine)[None], points)
+    error.forget()
+    jax.clear_caches()  # programs keep the systems they were compiled for, gigabytes in all
     estimated, wrong = (
         np.nanmedian(np.linalg.norm(found.landmarks[0] - other.landmarks[0], axis=1))
         for other in (there, true)

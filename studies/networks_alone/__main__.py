@@ -36,7 +36,8 @@ from emulator.training import Plan, recipe
 from emulator.training.checkpoint import State
 from emulator.training.loop import Steps, optimise
 from emulator.training.modal import ARCHITECTURE, Modal
-from emulator.training.problem import Problem, prepare
+from emulator.training.network import NetworkTraining
+from emulator.training.problem import prepare
 from emulator.training.start import with_weights
 from emulator.training.step import make_step
 
@@ -130,18 +131,19 @@ def trained(idea: Idea, scene: Any, seed: int, arguments: argparse.Namespace) ->
     sizes = SMALL if arguments.quick else ARCHITECTURE
     if plan.decoder == "pointwise":
         sizes = Architecture(2, 8, (16, 16)) if arguments.quick else Architecture()
-    problem = _with(idea, prepare(scene, plan, sizes))
-    state = optimise(State(*problem.initial()), plan.steps, Steps([problem]), [])
-    return with_weights(problem.emulator, problem.finish(state.weights))
+    problem = prepare(scene, plan, sizes)
+    assert problem.training is not None, "every idea has a network"
+    training = _with(idea, problem.training)
+    state = optimise(State(*training.initial()), plan.steps, Steps([training]), [])
+    return with_weights(problem.emulator, training.finish(state.weights))
 
 
-def _with(idea: Idea, problem: Problem) -> Problem:
-    if problem.modal is None:
-        return problem
-    modal, optimiser = idea.modal(problem.modal), idea.optimiser or problem.optimiser
-    assert optimiser is not None
-    step = make_step(problem.plan, modal.descend, optimiser)
-    return replace(problem, modal=modal, optimiser=optimiser, step=step)
+def _with(idea: Idea, training: NetworkTraining) -> NetworkTraining:
+    if training.modal is None:
+        return training
+    modal, optimiser = idea.modal(training.modal), idea.optimiser or training.optimiser
+    step = make_step(training.plan, modal.descend, optimiser)
+    return replace(training, modal=modal, optimiser=optimiser, step=step)
 
 
 def errors_of(emulator: Emulator, known: Any) -> dict[str, Any]:

@@ -80,10 +80,11 @@ def judge(problem: Problem, known: Runs) -> Callable[[Any], dict[str, Any]]:
 def steps_from(problem: Problem, start: Emulator, total: int) -> tuple[Any, float]:
     """Weights after a whole training of ``total`` steps, and the seconds of one step."""
     weights = with_network_of(problem.emulator, start).network.weights
-    state = problem.optimiser.init(weights)
+    training = problem.training
+    state = training.optimiser.init(weights)
     began = time.perf_counter()
     for number in range(total):
-        weights, state, _ = problem.step(weights, state, jnp.asarray(number), jnp.asarray(total))
+        weights, state, _ = training.step(weights, state, jnp.asarray(number), jnp.asarray(total))
     jax.block_until_ready(weights)
     return weights, (time.perf_counter() - began) / max(total, 1)
 

@@ -12,9 +12,10 @@ from calibrate.cli import main
 from calibrate.posterior import read_tree
 from calibrate.workflow import simulator_of
 from emulator.scenes import registry
+from emulator.scenes.nodes import all_nodes
 from emulator.surrogates import save_emulator
 from emulator.surrogates.kind import ForwardKind, Option
-from emulator.surrogates.protocol import all_nodes, fingerprint_of, inside_only
+from emulator.surrogates.protocol import fingerprint_of, inside_only
 from emulator.surrogates.registry import FORWARD_MAPS
 from network_support import untrained
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.posterior import Posterior
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 from emulator.fem.energy import point_energy
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
@@ -61,9 +61,7 @@ def stress_band(
     InputError
         Another direction, or a stretch that is not above 0.
     """
-    axes = {"fibre": _FIBRE, "cross-fibre": _CROSS}
-    if direction not in axes:
-        raise InputError(f"stress: direction '{direction}' is unknown; known: {', '.join(axes)}")
+    axis = look_up({"fibre": _FIBRE, "cross-fibre": _CROSS}, direction, "stress: direction")
     stretch = np.asarray(stretches, dtype=float)
     if not (stretch > 0.0).all():
         raise InputError("stress: stretches must be above 0; 1 is no stretch")
@@ -71,7 +69,7 @@ def stress_band(
     state = model.states.states[0]  # the material is the same in every load state
     thetas = posterior.thetas(state)
     rows = np.linspace(0, len(thetas) - 1, min(_DRAWS, len(thetas))).astype(int)
-    curve = jax.jit(jax.vmap(lambda t: stresses(model.forward.scene, t, axes[direction], stretch)))
+    curve = jax.jit(jax.vmap(lambda t: stresses(model.forward.scene, t, axis, stretch)))
     edge = 0.5 * (1.0 - probability)
     found = np.quantile(np.asarray(curve(thetas[rows])), [edge, 0.5, 1.0 - edge], axis=0)
     return StressBand(direction, stretch, *found)

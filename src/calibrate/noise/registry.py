@@ -10,7 +10,7 @@ from calibrate.noise.discrepancy import DiscrepancyNoise
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise
 from calibrate.noise.student_t import StudentTNoise
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 
 NOISES: dict[str, type[Noise]] = {
     kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise, DiscrepancyNoise)
@@ -19,10 +19,7 @@ NOISES: dict[str, type[Noise]] = {
 
 def noise_from_json(description: Mapping[str, Any]) -> Noise:
     """The noise that :meth:`Noise.to_json` described."""
-    kind = description.get("kind")
-    if kind not in NOISES:
-        raise InputError(f"noise kind '{kind}' is unknown; known: {', '.join(NOISES)}")
-    return NOISES[kind].from_json(description)
+    return look_up(NOISES, description.get("kind"), "noise kind").from_json(description)
 
 
 def noise_of(given: float | Mapping[str, Any]) -> Noise:

@@ -42,7 +42,7 @@ from scipy.spatial.distance import cdist
 
 from calibrate.noise.protocol import Sites
 from calibrate.noise.scale import check_positive
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 
 KERNELS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "matern32": lambda s: (1.0 + np.sqrt(3.0) * s) * np.exp(-np.sqrt(3.0) * s),
@@ -114,8 +114,7 @@ def spatial_modes(sites: Sites | None, length: float, kernel: str) -> SpatialMod
 def check_kernel(length: float, kernel: str) -> None:
     """Raise :class:`InputError` on a length that is not above 0, or an unknown kernel."""
     check_positive("correlation length (mm)", length)
-    if kernel not in KERNELS:
-        raise InputError(f"noise: kernel '{kernel}' is unknown; known: {', '.join(KERNELS)}")
+    look_up(KERNELS, kernel, "noise: kernel")
 
 
 def spatial_distribution(

@@ -21,8 +21,8 @@ from calibrate.observations.location import locate
 from calibrate.observations.protocol import LENGTH_UNITS
 from calibrate.observations.scalar import Scalar
 from emulator.errors import InputError
+from emulator.scenes.nodes import check_nodes
 from emulator.scenes.scene import Scene
-from emulator.surrogates.protocol import check_nodes
 
 _SHORTEST = 1e-6  # of the body's size; the direction of a shorter length is round-off
 

@@ -18,8 +18,8 @@ from calibrate.observations.points import (
 )
 from calibrate.observations.protocol import Field
 from emulator.errors import InputError
+from emulator.scenes.nodes import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
-from emulator.surrogates.protocol import all_nodes, check_nodes
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from calibrate.observations.strain import Strain
 from calibrate.observations.surface import SurfacePoints
 from calibrate.observations.volume import CavityVolume
 from calibrate.state_names import in_state, split
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 from emulator.scenes.scene import Scene
 
 # In this order they look for their columns in a file: `node` decides before `x,y,z`.
@@ -76,10 +76,8 @@ def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
 
 def observation_from_json(scene: Scene, description: Mapping[str, Any]) -> Observation:
     """The observation that :meth:`Observation.to_json` described."""
-    kind = description.get("kind")
-    if kind not in OBSERVATIONS:
-        raise InputError(f"observation kind '{kind}' is unknown; known: {', '.join(OBSERVATIONS)}")
-    whole = OBSERVATIONS[kind].from_json(scene, description)
+    kind = look_up(OBSERVATIONS, description.get("kind"), "observation kind")
+    whole = kind.from_json(scene, description)
     return Present(whole, np.asarray(description[ENTRIES])) if ENTRIES in description else whole
 
 

@@ -27,7 +27,7 @@ from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, FEMLikelihood, Model
 from emulator.errors import InputError
 from emulator.fem import Simulator
-from emulator.shown import Row, Shown
+from emulator.shown import Shown
 from emulator.store import replacing
 
 
@@ -46,7 +46,7 @@ class Posterior(Shown):
     model: Model
     data: Data
 
-    def shown(self) -> tuple[str, list[Row]]:
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """Mean and sd of every unknown, draws, and what is wrong with them."""
         table, sizes = self.summary(), self.tree["posterior"].sizes
         rows = [(name, f"{row['mean']:.4g} +- {row['sd']:.2g}") for name, row in table.items()]

@@ -21,7 +21,7 @@ from numpyro import handlers
 
 from calibrate.noise.spatial import SpatialNormal
 from calibrate.statistical_model import Data, Model
-from emulator.surrogates.protocol import Prediction, evaluate_all, solves_itself
+from emulator.surrogates.protocol import Prediction, SolvingMap, evaluate_all
 
 REPLICATES = 500  # draws of the posterior, and of the prior, that data is replicated at
 
@@ -62,8 +62,10 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
     A tenth more is drawn; draws where the forward map has no answer are left out.
     """
     keys = jax.random.split(rng_key, count + count // 10)
-    made = _solved_prior(model, keys) if solves_itself(model.forward) else None
-    made = _programs(model).prior(keys) if made is None else made
+    if isinstance(model.forward, SolvingMap):
+        made = _solved_prior(model, keys)
+    else:
+        made = _programs(model).prior(keys)
     draws, data, valid = jax.tree.map(np.asarray, made)
     rows = np.flatnonzero(valid)[:count]
     return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))

@@ -13,7 +13,7 @@ from calibrate.samplers.mclmc import MCLMC
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Sampler
 from calibrate.samplers.smc import SMC
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 
 _ALL: tuple[Sampler, ...] = (
     NUTS,
@@ -28,9 +28,7 @@ SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
 def find_sampler(name: str) -> Sampler:
     """The sampler of that name; :class:`InputError` names the known ones."""
-    if name not in SAMPLERS:
-        raise InputError(f"sampler '{name}' is unknown; known: {', '.join(SAMPLERS)}")
-    return SAMPLERS[name]
+    return look_up(SAMPLERS, name, "sampler")
 
 
 def check_options(sampler: Sampler, options: Any | None) -> Any:

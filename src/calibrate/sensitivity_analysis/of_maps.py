@@ -20,8 +20,8 @@ from emulator.fem.campaign import executor, in_process
 from emulator.surrogates.protocol import (
     ForwardMap,
     Prediction,
+    SolvingMap,
     evaluate_all,
-    slopes_of,
     solved_by,
 )
 
@@ -158,11 +158,10 @@ class _Outputs:
 
     def slopes(self, thetas: jax.Array) -> np.ndarray:
         """Derivatives (n, m, p) at ``thetas`` (n, p)."""
-        solved = slopes_of(self._map, thetas)
-        if solved is None:
+        if not isinstance(self._map, SolvingMap):
             slope = jax.jacfwd(lambda theta: self.of(self._map(theta), theta))
             return np.asarray(jax.jit(lambda t: jax.lax.map(slope, t))(thetas))
-        predicted, moved = solved
+        predicted, moved = self._map.slopes_all(thetas)
         self._require(predicted)
         return np.asarray(jax.jit(jax.vmap(self._along))(predicted.displacement, moved, thetas))
 

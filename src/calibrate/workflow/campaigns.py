@@ -13,7 +13,7 @@ import zarr
 from tqdm import tqdm
 
 from calibrate.provenance import versions
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.campaign import Executor, Neighbours, Solver, executor, solve_rows
 from emulator.fem.campaign.designs import DESIGNS
@@ -88,9 +88,7 @@ def question(
     about: dict[str, Any] = {"design": "given"}
     if thetas is None:
         assert samples is not None
-        if design not in DESIGNS:
-            raise InputError(f"campaign: design '{design}' is unknown; known: {', '.join(DESIGNS)}")
-        thetas = DESIGNS[design](scene, samples, seed)
+        thetas = look_up(DESIGNS, design, "campaign: design")(scene, samples, seed)
         about = {"design": design, "seed": seed}
     chosen = np.asarray(thetas, dtype=float)
     if chosen.ndim != 2 or chosen.shape[1] != len(scene.parameters) or not len(chosen):

@@ -91,42 +91,42 @@ class MaterialPoint:
         """Measures (k,) of a point where the law has the stress that its step promises."""
         phi = self.energy(at)
         xi, along = jax.jvp(lambda H: self.measures.of(H, at.directions), (H,), (change,))
-        step = xi + along - own
-
-        def one(block: jax.Array) -> jax.Array:
-            return fraction_at_stress(lambda beta: phi(own + beta * block * step))
-
-        fractions = jax.vmap(one)(jnp.asarray(self.measures.blocks))
-        return own + (fractions @ self.measures.blocks) * step
+        step, blocks = xi + along - own, jnp.asarray(self.measures.blocks)
+        parts = fractions_at_stress(len(blocks), lambda beta: phi(own + (beta @ blocks) * step))
+        return own + (parts @ blocks) * step
 
 
-def fraction_at_stress(energy: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    r"""The part of a step, in [0, 1], that takes a law to the stress its tangent promises.
+def fractions_at_stress(count: int, energy: Callable[[jax.Array], jax.Array]) -> jax.Array:
+    r"""The parts of a step, (count,) in [0, 1], that take a law to the stresses that are promised.
 
-    That is :math:`\beta` with :math:`e'(\beta) = e'(0) + e''(0)` for ``energy`` e along the step;
-    1 where the whole step does not stiffen the law, and short of where the energy is not finite.
-    Where the law begins without stiffness it promises nothing: a fibre that pulls taut on the way
-    is taken just past that point, for its stiffness to be met there by the next iteration.
+    ``energy`` e is a function of the parts. They have
+    :math:`e_{,i}(\beta) = e_{,i}(0) + \sum_j e_{,ij}(0)`; 1 where the whole step does not stiffen
+    the law, and short of where the energy is not finite. All are sought at the same time, each by
+    its own equation: most laws are sums of functions of one measure each, and there they do not
+    know of each other. Where the law begins without stiffness it promises nothing: a fibre that
+    pulls taut on the way is taken just past that point, for its stiffness to be met there by the
+    next iteration.
     """
 
-    def slope(beta: jax.Array) -> jax.Array:
-        value, along = jax.jvp(energy, (beta,), (jnp.ones(()),))
+    def slopes(beta: jax.Array) -> jax.Array:
+        value, along = jax.value_and_grad(energy)(beta)
+        finite = jnp.isfinite(along)
         # The slope of a logarithm is finite where the logarithm itself is not.
-        return jnp.where(jnp.isfinite(value), along, jnp.inf)
+        return jnp.where(finite & (jnp.isfinite(value) | ~finite.all()), along, jnp.inf)
 
     def both(beta: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return jax.jvp(slope, (beta,), (jnp.ones(()),))
+        return jax.jvp(slopes, (beta,), (jnp.ones(count),))
 
-    start, stiffness = both(jnp.zeros(()))
+    start, stiffness = both(jnp.zeros(count))
     wanted = start + stiffness
 
     def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        below = slope(middle) <= wanted
+        below = slopes(middle) <= wanted
         return jnp.where(below, middle, low), jnp.where(below, high, middle)
 
-    low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (jnp.zeros(()), jnp.ones(())))
+    low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (jnp.zeros(count), jnp.ones(count)))
 
     def refine(_: int, beta: jax.Array) -> jax.Array:
         value, rise = both(beta)
@@ -135,4 +135,4 @@ def fraction_at_stress(energy: Callable[[jax.Array], jax.Array]) -> jax.Array:
 
     beta = jax.lax.fori_loop(0, _REFINEMENTS, refine, 0.5 * (low + high))
     beta = jnp.where(stiffness > 0.0, beta, high)
-    return jnp.where(slope(jnp.ones(())) <= wanted, 1.0, beta)
+    return jnp.where(slopes(jnp.ones(count)) <= wanted, 1.0, beta)

@@ -27,7 +27,7 @@ from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
 from emulator.fem.system import System
 from emulator.scenes.scene import Scene
-from emulator.shown import Row, Shown
+from emulator.shown import Shown
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,7 +54,7 @@ class Simulator(Shown):
     def __post_init__(self) -> None:
         find_solver(self.factorisation)
 
-    def shown(self) -> tuple[str, list[Row]]:
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """What it simulates and how."""
         unknowns = int((~self.scene.held).sum())
         _, rows = self.scene.shown()

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy.sparse import csc_matrix
 from skfem import ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2
 from skfem.quadrature import get_quadrature
 
@@ -42,6 +43,13 @@ class Discretisation(Blocks):
 
     mesh: Mesh
     values: np.ndarray
+
+    def laplacian(self) -> csc_matrix:
+        """Products of the shape functions' gradients, integrated over the body, (n, n) in mm."""
+        nodes, count = self.connectivity, len(self.mesh.nodes)
+        local = np.einsum("mq,mqai,mqbi->mab", self.weights, self.gradients, self.gradients)
+        rows, columns = np.broadcast_arrays(nodes[:, :, None], nodes[:, None])
+        return csc_matrix((local.ravel(), (rows.ravel(), columns.ravel())), (count, count))
 
 
 @dataclass(frozen=True, eq=False)

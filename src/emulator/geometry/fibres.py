@@ -21,7 +21,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import spsolve
 
 from emulator.errors import InputError
@@ -41,9 +40,9 @@ class Directions(NamedTuple):
 
 
 class Depth(NamedTuple):
-    """Depth in a wall at the quadrature points.
+    """Depth in a wall at the quadrature points, (m,) or (m, q), or at the nodes, (n,).
 
-    value : (m,) or (m, q), from 0 to 1. normal : (m, 3) or (m, q, 3) of length 1.
+    value : from 0 to 1. normal : of length 1, with a last axis of 3.
     """
 
     value: np.ndarray
@@ -121,14 +120,7 @@ def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Dept
     return Depth(value, unit(np.einsum("mqai,ma->mqi", grid.gradients, at_nodes)))
 
 
-class NodalDepth(NamedTuple):
-    """Depth in a wall at the nodes: ``value`` (n,) from 0 to 1, ``normal`` (n, 3) of length 1."""
-
-    value: np.ndarray
-    normal: np.ndarray
-
-
-def nodal_depth(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> NodalDepth:
+def nodal_depth(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Depth:
     """The harmonic function of a linear mesh that is 0 at the nodes ``low`` and 1 at ``high``.
 
     Gradients are averaged at the nodes: an element's own is one order less accurate.
@@ -139,15 +131,12 @@ def nodal_depth(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> NodalDepth:
     slope = np.einsum("mai,ma->mi", grid.gradients[:, 0], value[mesh.elements])
     at_nodes = np.zeros((len(mesh.nodes), 3))
     np.add.at(at_nodes, mesh.elements, (grid.weights * slope)[:, None])
-    return NodalDepth(value, unit(at_nodes))
+    return Depth(value, unit(at_nodes))
 
 
 def _harmonic(grid: Discretisation, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The harmonic function (n,) that is 0 at the nodes ``low`` and 1 at ``high``."""
-    nodes, count = grid.connectivity, len(grid.mesh.nodes)
-    blocks = np.einsum("mq,mqai,mqbi->mab", grid.weights, grid.gradients, grid.gradients)
-    rows, columns = (np.broadcast_to(n, blocks.shape) for n in (nodes[:, :, None], nodes[:, None]))
-    stiffness = csc_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (count, count))
+    stiffness, count = grid.laplacian(), len(grid.mesh.nodes)
     value = np.zeros(count)
     value[high] = 1.0
     free = np.setdiff1d(np.arange(count), np.union1d(low, high))

@@ -22,8 +22,8 @@ from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.tetrahedra import orient
 from emulator.store import replacing
 
-# Cells by their number of nodes: (tetrahedron, triangle).
-_KINDS = {4: ("tetra", "triangle"), 10: ("tetra10", "triangle6")}
+# meshio's cells by the elements' order: (tetrahedron, triangle).
+_CELLS = {1: ("tetra", "triangle"), 2: ("tetra10", "triangle6")}
 _LOWER = {"triangle", "triangle6", "line", "line3", "vertex"}
 # A direction whose length differs from 1 by more is refused; single precision stays far below.
 _UNIT = 1e-3
@@ -144,10 +144,7 @@ def write_mesh(
 
 def write_nodal(path: str | Path, mesh: Mesh, fields: Mapping[str, np.ndarray]) -> None:
     """Write values at the nodes, (n,) by name, as VTU."""
-    cells = [(_KINDS[mesh.elements.shape[1]][0], mesh.elements)]
-    output = meshio.Mesh(mesh.nodes, cells, point_data=dict(fields))
-    with replacing(path) as temporary:
-        meshio.write(temporary, output, file_format="vtu")
+    _write_vtu(path, mesh, point_data=dict(fields))
 
 
 def write_solution(
@@ -166,17 +163,15 @@ def write_solution(
     for name, values in fields.items():
         array = np.asarray(values)
         cells[name] = [array.reshape(len(array), -1) if array.ndim == 3 else array]
-    output = meshio.Mesh(
-        mesh.nodes,
-        [(_KINDS[mesh.elements.shape[1]][0], mesh.elements)],
-        point_data={"displacement": np.asarray(displacement)},
-        cell_data=cells,
-    )
+    _write_vtu(path, mesh, point_data={"displacement": np.asarray(displacement)}, cell_data=cells)
+
+
+def _write_vtu(path: str | Path, mesh: Mesh, **data: Any) -> None:
+    output = meshio.Mesh(mesh.nodes, [(_CELLS[mesh.order][0], mesh.elements)], **data)
     with replacing(path) as temporary:
         meshio.write(temporary, output, file_format="vtu")
 
 
-# ---- reading -------------------------------------------------------------------------------------
 def _load(path: Path) -> meshio.Mesh:
     if not path.is_file():
         raise InputError(f"mesh file {path} does not exist")
@@ -250,7 +245,7 @@ def _directions(
     found: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str, order: int
 ) -> np.ndarray | None:
     """Unit vectors at the points of elements of ``order`` from cell or point data ``name``."""
-    kind = _KINDS[mesh.elements.shape[1]][0]
+    kind = _CELLS[mesh.order][0]
     if name in found.cell_data:
         blocks = zip(found.cells, found.cell_data[name], strict=True)
         values = np.concatenate([data for block, data in blocks if block.type == kind])
@@ -282,13 +277,12 @@ def _checked(values: np.ndarray, name: str, where: str) -> np.ndarray:
     return values / length
 
 
-# ---- writing -------------------------------------------------------------------------------------
 def _check_format(path: str | Path, mesh: Mesh, directions: Mapping[str, np.ndarray]) -> None:
     """Refuse data that the format cannot hold or meshio cannot read back."""
     suffix = Path(path).suffix
     if suffix not in (".msh", ".vtu", ".xdmf"):
         raise InputError(f"mesh file {path}: cannot write '{suffix}'; use .msh, .vtu or .xdmf")
-    if suffix == ".xdmf" and mesh.elements.shape[1] == 10 and mesh.facet_sets:
+    if suffix == ".xdmf" and mesh.order == 2 and mesh.facet_sets:
         raise InputError(f"mesh file {path}: .xdmf cannot hold quadratic facet sets; use .vtu")
     if suffix != ".msh":
         return
@@ -304,7 +298,7 @@ def _check_format(path: str | Path, mesh: Mesh, directions: Mapping[str, np.ndar
 
 def _with_tags(mesh: Mesh) -> meshio.Mesh:
     """Sets as gmsh's physical groups; a facet or node in two sets is written twice."""
-    solid, triangle = _KINDS[mesh.elements.shape[1]]
+    solid, triangle = _CELLS[mesh.order]
     groups = [(2, triangle, name, rows) for name, rows in mesh.facet_sets.items()]
     groups += [(0, "vertex", name, n[:, None]) for name, n in own_node_sets(mesh).items()]
     blocks = [(solid, mesh.elements), *((kind, rows) for _, kind, _, rows in groups)]
@@ -322,7 +316,7 @@ def _with_tags(mesh: Mesh) -> meshio.Mesh:
 
 def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh:
     """Sets as data of 0 and 1 on triangles and points."""
-    solid, triangle = _KINDS[mesh.elements.shape[1]]
+    solid, triangle = _CELLS[mesh.order]
     blocks = [(solid, mesh.elements)]
     marks: dict[str, np.ndarray] = {}
     if mesh.facet_sets:

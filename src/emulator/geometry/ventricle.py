@@ -19,7 +19,7 @@ from emulator.errors import InputError
 from emulator.geometry.cavity import MM3_PER_ML, Cavity
 from emulator.geometry.fibres import nodal_depth
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import boundary_facets, signed_volumes
+from emulator.geometry.tetrahedra import signed_volumes
 
 _SMALL = 0.02  # offset of a centroid, relative to L, that makes a direction of its own
 
@@ -80,7 +80,7 @@ def ventricle(mesh: Mesh, endocardium: str, held: np.ndarray) -> Ventricle:
     """
     if mesh.order != 1:
         raise InputError("its elements are quadratic; expected linear tetrahedra")
-    surface = boundary_facets(mesh.elements)
+    surface = mesh.surface
     base = held[surface].all(axis=1)
     inside = mesh.facet_set(endocardium)
     inner = np.zeros(len(mesh.nodes), dtype=bool)

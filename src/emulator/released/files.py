@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import boundary_facets, orient
 
@@ -120,9 +120,7 @@ def models_in(root: str | Path) -> tuple[str, ...]:
 
 def units(model: str) -> PublishedUnits:
     """Units of ``model``; :class:`InputError` lists the known models."""
-    if model not in UNITS:
-        raise InputError(f"published model '{model}' is unknown; known: {', '.join(UNITS)}")
-    return UNITS[model]
+    return look_up(UNITS, model, "published model")
 
 
 def read_geometry(root: str | Path, model: str) -> PublishedGeometry:

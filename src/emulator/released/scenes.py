@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 from emulator.mechanics.laws import find_law
 from emulator.released.files import (
     PRESSURE_SURFACE,
@@ -87,9 +87,7 @@ def published_scene(model: str, root: str | Path) -> Scene:
 
 
 def _find(model: str) -> _Model:
-    if model not in _MODELS:
-        raise InputError(f"published model '{model}' is unknown; known: {', '.join(MODELS)}")
-    return _MODELS[model]
+    return look_up(_MODELS, model, "published model")
 
 
 def published_tests(model: str, root: str | Path) -> tuple[jax.Array, PublishedTests]:

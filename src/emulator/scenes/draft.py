@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 from emulator.geometry.io import Body, read_body, write_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import EDGES
@@ -83,8 +83,8 @@ def draft(
         raise InputError(f"--out {out}: the file name must end in .toml")
     if out.exists():
         raise InputError(f"{out} is there already; remove it or give --out another name")
-    if unit is not None and unit not in UNITS:
-        raise InputError(f"unit '{unit}' is unknown; known: {', '.join(UNITS)}")
+    if unit is not None:
+        look_up(UNITS, unit, "unit")
     body = read_body(mesh_path)
     notes: list[str] = []
     unit = unit or _guessed_unit(body.mesh, notes)

@@ -196,7 +196,6 @@ def _quantity_in(message: str, file: SceneFile) -> tuple[str, ...]:
     return ()
 
 
-# ---- geometry ------------------------------------------------------------------------------------
 def _body(mesh_path: Path, file: SceneFile, law: Law, source: Source) -> Parts:
     """The mesh with the sets the file adds, and directions if the law or the file wants any."""
     with source.at("mesh"):

@@ -31,7 +31,7 @@ from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.regions import Tissue, checked_regions, region_quantities
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
 from emulator.scenes.supports.dirichlet import free_motions, prescribe
-from emulator.shown import Row, Shown
+from emulator.shown import Shown
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -221,7 +221,6 @@ class Scene(Shown):
                 takers.setdefault(quantity.name, (quantity, f"load {type(load).__name__}"))
         return takers
 
-    # ---- parameters -------------------------------------------------------------------------
     @cached_property
     def space(self) -> ParameterSpace:
         """The box that theta lies in."""
@@ -253,10 +252,6 @@ class Scene(Shown):
         """
         return self.space.theta(values, f"scene '{self.name}'")
 
-    def check_theta(self, theta: jax.Array) -> None:
-        """Raise :class:`InputError` unless every row of ``theta`` (..., p) is inside the box."""
-        self.space.check(theta, f"scene '{self.name}'")
-
     def to_unit(self, theta: jax.Array) -> jax.Array:
         """Theta (..., p) as positions in its box, 0 to 1 inside."""
         return self.space.to_unit(theta)
@@ -271,7 +266,6 @@ class Scene(Shown):
         values.update({name: theta[k] for k, name in enumerate(self.parameter_names)})
         return values
 
-    # ---- discretisation and supports ----------------------------------------------------------
     @cached_property
     def discretisation(self) -> Discretisation:
         """Shape functions and quadrature of the mesh."""
@@ -330,7 +324,7 @@ class Scene(Shown):
         """Known displacement in mm, zero elsewhere, (n, 3)."""
         return self.prescribed[1]
 
-    def shown(self) -> tuple[str, list[Row]]:
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """Name, mesh, law, loads, supports, theta."""
         mesh = self.mesh
         order = "linear" if mesh.order == 1 else "quadratic"
@@ -347,7 +341,6 @@ class Scene(Shown):
             ("theta", ", ".join(ranges)),
         ]
 
-    # ---- identity ------------------------------------------------------------------------------
     @cached_property
     def identity(self) -> Identity:
         """Everything the solutions depend on; see :mod:`emulator.scenes.identity`."""

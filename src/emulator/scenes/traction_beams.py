@@ -89,11 +89,8 @@ def traction_beam_guccione(
 
     Parameters
     ----------
-    cells : along x, y, z; by default what the elements' order needs.
-    traction : along z on the free end, per reference area, kPa.
-    fibre_angle : degrees from the beam's axis x towards y; any but 0 and 90 makes it twist.
-    kappa : resistance to volume change, kPa.
-    order, grading : of the elements, as in :func:`~emulator.scenes.beams.once_clamped_beam`.
+    cells, traction, fibre_angle, kappa, order, grading : as in
+        :func:`traction_beam_holzapfel_ogden`.
     """
     parameters = (
         Parameter("C", "kPa", 1.0, 4.0, "log"),

@@ -25,24 +25,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.scenes.nodes import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
-from emulator.shown import Row, Shown
+from emulator.shown import Shown
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.part import Network
 from emulator.surrogates.part import CachedPart, Part
-from emulator.surrogates.protocol import (
-    Prediction,
-    all_nodes,
-    check_nodes,
-    fingerprint_of,
-    inside_only,
-    rows_of,
-)
+from emulator.surrogates.protocol import Prediction, fingerprint_of, inside_only, rows_of
 from emulator.surrogates.taylor import Expansion
 
-KINDS: dict[str, type[Part]] = {
+PARTS: dict[str, type[Part]] = {
     "coarse": Coarse,
     "taylor": Expansion,
     "network": Network,
@@ -76,7 +70,7 @@ class Emulator(Shown):
     discrepancy: Discrepancy | None = None
     record: Mapping[str, Any] = field(default_factory=dict)
 
-    def shown(self) -> tuple[str, list[Row]]:
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """What it emulates, what it is made of, how it was trained."""
         _, rows = self.scene.shown()
         plan = self.record.get("plan", {})
@@ -88,7 +82,7 @@ class Emulator(Shown):
     @property
     def parts(self) -> dict[str, Part]:
         """The parts that are present, in the order they are summed."""
-        named = {name: getattr(self, name) for name in KINDS}
+        named = {name: getattr(self, name) for name in PARTS}
         return {name: part for name, part in named.items() if part is not None}
 
     @cached_property

@@ -28,7 +28,7 @@ from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.part import CachedPart, Part, widened
 from emulator.surrogates.taylor import Expansion
 
-_KINDS: dict[str, type[Part]] = {"taylor": Expansion, "discrepancy": Discrepancy}
+_PARTS: dict[str, type[Part]] = {"taylor": Expansion, "discrepancy": Discrepancy}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +71,8 @@ class Coarse:
 
     def to_json(self) -> dict[str, Any]:
         """Nodes of the coarse mesh, and what the parts say."""
-        told = {name: part.to_json() for name, part in self.parts.items()}
-        return {"nodes": self.prolongation.shape[1], "parts": told}
+        parts = {name: part.to_json() for name, part in self.parts.items()}
+        return {"nodes": self.prolongation.shape[1], "parts": parts}
 
     @classmethod
     def restore(
@@ -83,8 +83,8 @@ class Coarse:
         shape = len(scene.mesh.nodes), description["nodes"]
         rows = csr_matrix((widened(places["data"]), places["indices"], places["indptr"]), shape)
         parts = {
-            name: _KINDS[name].restore(scene, told, inside(arrays, name))
-            for name, told in description["parts"].items()
+            name: _PARTS[name].restore(scene, part, inside(arrays, name))
+            for name, part in description["parts"].items()
         }
         return cls(parts, rows)
 
@@ -97,7 +97,7 @@ def carried(parts: Mapping[str, Part], body: Finer) -> Coarse:
     InputError
         No parts, or one that is not a sum of a series and discrepancies.
     """
-    if not parts or not set(parts) <= set(_KINDS):
+    if not parts or not set(parts) <= set(_PARTS):
         raise InputError(
             f"two_meshes: the emulator on the coarser mesh is {' + '.join(parts) or 'empty'}; give "
             "one of a series and a discrepancy, as recipe mechanics makes"

@@ -22,16 +22,11 @@ from emulator.errors import InputError
 from emulator.fem.energy import volume_ratio
 from emulator.fem.simulator import Simulator
 from emulator.fem.system import System
+from emulator.scenes.nodes import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
 from emulator.surrogates.files import EMULATOR
 from emulator.surrogates.kind import ForwardKind, Ingredients, Option, Options
-from emulator.surrogates.protocol import (
-    ForwardMap,
-    Prediction,
-    all_nodes,
-    check_nodes,
-    fingerprint_of,
-)
+from emulator.surrogates.protocol import ForwardMap, Prediction, fingerprint_of
 
 
 def newton_step(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:

@@ -11,20 +11,15 @@ import numpy as np
 
 from emulator.fem.campaign import Executor, Row, Solver, in_process, solve_rows
 from emulator.fem.simulator import Simulator
+from emulator.scenes.nodes import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
 from emulator.store import to_json
 from emulator.surrogates.kind import ForwardKind
-from emulator.surrogates.protocol import (
-    ForwardMap,
-    Prediction,
-    all_nodes,
-    check_nodes,
-    fingerprint_of,
-)
+from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, fingerprint_of
 
 
 @dataclass(frozen=True, eq=False)
-class FEMForward:
+class FEMForward(SolvingMap):
     """The simulator as a forward map; Newton begins at ``start(theta)``, or at rest if ``None``.
 
     execute : solves many theta, in this process by default.

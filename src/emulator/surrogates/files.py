@@ -13,7 +13,7 @@ from emulator.catalogue import scene_from_origin
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.store import inside, read_arrays, read_json, save_arrays, write_json
-from emulator.surrogates.additive import KINDS, Emulator
+from emulator.surrogates.additive import PARTS, Emulator
 from emulator.surrogates.kind import ForwardKind, Ingredients, Options
 from emulator.surrogates.protocol import ForwardMap
 
@@ -99,8 +99,8 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
     except (KeyError, TypeError) as error:
         raise InputError(f"{folder}/emulator.json lacks or garbles {error}") from error
     parts = {
-        part: _restore(folder, part, scene, told, inside(arrays, part))
-        for part, told in description["parts"].items()
+        name: _restore(folder, name, scene, part, inside(arrays, name))
+        for name, part in description["parts"].items()
     }
     return Emulator(scene, **parts, record=description.get("record", {}))
 
@@ -114,7 +114,7 @@ def _restore(
 ) -> Any:
     """The part ``name``; errors name the folder and the part."""
     try:
-        return KINDS[name].restore(scene, description, arrays)
+        return PARTS[name].restore(scene, description, arrays)
     except (KeyError, TypeError) as error:
         raise InputError(f"{folder}: its part '{name}' lacks or garbles {error}") from error
     except InputError as error:
@@ -127,10 +127,10 @@ def _check_description(folder: Path, description: Mapping[str, Any]) -> None:
             f"{folder}/emulator.json has format {description['format']}; this version reads "
             f"{FORMAT}: train the emulator again"
         )
-    unknown = [name for name in description["parts"] if name not in KINDS]
+    unknown = [name for name in description["parts"] if name not in PARTS]
     if unknown:
         raise InputError(
-            f"{folder}/emulator.json: part '{unknown[0]}' is unknown; known: {', '.join(KINDS)}"
+            f"{folder}/emulator.json: part '{unknown[0]}' is unknown; known: {', '.join(PARTS)}"
         )
 
 

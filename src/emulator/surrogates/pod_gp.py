@@ -24,12 +24,12 @@ from emulator._precision import require_float64
 from emulator.errors import InputError
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import sobol
+from emulator.scenes.nodes import all_nodes
 from emulator.scenes.scene import Scene
 from emulator.surrogates.kind import Arrays, ForwardKind, Ingredients, Option, Options
 from emulator.surrogates.protocol import (
     ForwardMap,
     Prediction,
-    all_nodes,
     fingerprint_of,
     inside_only,
     rows_of,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.fem.campaign import Executor
+from emulator.scenes.nodes import check_nodes
 from emulator.scenes.scene import Scene
 
 
@@ -63,31 +65,32 @@ class ForwardMap(Protocol):
         ...
 
 
+class SolvingMap(ABC):
+    """A forward map whose predictions are FEM solves, driven from Python or done by a cluster.
+
+    All other maps are compiled and differentiated by JAX.
+    """
+
+    @abstractmethod
+    def evaluate_all(self, thetas: jax.Array) -> Prediction:
+        """Predictions at many theta (c, p); fields gain a leading axis."""
+
+    @abstractmethod
+    def slopes_all(self, thetas: jax.Array) -> tuple[Prediction, jax.Array]:
+        """Predictions at many theta (c, p), and du/dtheta (c, p, k, 3)."""
+
+    @abstractmethod
+    def solved_by(self, execute: Executor) -> ForwardMap:
+        """The same map with its solves at many theta done by ``execute``."""
+
+
 _AT_ONCE = 64  # theta evaluated side by side
 
 
-def solves_itself(forward: ForwardMap) -> bool:
-    """Whether the map has its own way to many theta: FEM, which is faster driven from Python."""
-    return getattr(forward, "evaluate_all", None) is not None
-
-
-def slopes_of(forward: ForwardMap, thetas: jax.Array) -> tuple[Prediction, jax.Array] | None:
-    """Predictions at many theta (c, p) and du/dtheta (c, p, k, 3), from a map that has its own way.
-
-    Others are differentiated by JAX; for them None.
-    """
-    own = getattr(forward, "slopes_all", None)
-    return None if own is None else own(thetas)
-
-
 def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
-    """Predictions at many theta (c, p); fields gain a leading axis.
-
-    Compiled; FEM, which is faster driven from Python, has its own way.
-    """
-    own = getattr(forward, "evaluate_all", None)
-    if own is not None:
-        return own(thetas)
+    """Predictions at many theta (c, p); fields gain a leading axis."""
+    if isinstance(forward, SolvingMap):
+        return forward.evaluate_all(thetas)
     return jax.jit(lambda t: jax.lax.map(forward.evaluate, t, batch_size=_AT_ONCE))(thetas)
 
 
@@ -99,13 +102,12 @@ def solved_by(forward: ForwardMap, execute: Executor) -> ForwardMap:
     InputError
         A map that solves nothing.
     """
-    own = getattr(forward, "solved_by", None)
-    if own is None:
+    if not isinstance(forward, SolvingMap):
         raise InputError(
             f"a {forward.kind} map solves no FEM, so a scheduler has no effect; take fem_forward, "
             "or leave the scheduler out"
         )
-    return own(execute)
+    return forward.solved_by(execute)
 
 
 def fingerprint_of(*parts: str | np.ndarray | jax.Array) -> str:
@@ -118,25 +120,6 @@ def fingerprint_of(*parts: str | np.ndarray | jax.Array) -> str:
             array = np.ascontiguousarray(part)
             digest.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
     return digest.hexdigest()[:16]
-
-
-def all_nodes(scene: Scene) -> np.ndarray:
-    """Indices of every node of the scene, (n,)."""
-    return np.arange(len(scene.mesh.nodes))
-
-
-def check_nodes(scene: Scene, nodes: np.ndarray) -> np.ndarray:
-    """``nodes`` as integers; :class:`InputError` unless each is a node of the scene."""
-    nodes = np.atleast_1d(np.asarray(nodes))
-    if nodes.size == 0 or not np.issubdtype(nodes.dtype, np.integer):
-        raise InputError("observed nodes must be a list of whole numbers, not empty")
-    unknown = nodes[(nodes < 0) | (nodes >= len(scene.mesh.nodes))]
-    if unknown.size:
-        raise InputError(
-            f"node {unknown[0]} is unknown; scene '{scene.name}' has nodes 0 to "
-            f"{len(scene.mesh.nodes) - 1}"
-        )
-    return nodes
 
 
 def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:

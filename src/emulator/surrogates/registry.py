@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 from emulator.store import read_arrays, save_arrays
 from emulator.surrogates.corrected import CORRECTED
 from emulator.surrogates.fem import FEM
@@ -26,9 +26,7 @@ FORWARD_MAPS: dict[str, ForwardKind] = {
 
 def forward_kind(name: str) -> ForwardKind:
     """The kind called ``name``; :class:`InputError` lists the known ones."""
-    if name not in FORWARD_MAPS:
-        raise InputError(f"forward map '{name}' is unknown; known: {', '.join(FORWARD_MAPS)}")
-    return FORWARD_MAPS[name]
+    return look_up(FORWARD_MAPS, name, "forward map")
 
 
 def known_options() -> dict[str, tuple[Option, tuple[str, ...]]]:

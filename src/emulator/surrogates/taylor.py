@@ -211,7 +211,7 @@ def _forces(
     """
     degree = len(terms[0])
     # The path holds one term for every proper subset of the multi-index.
-    parts = [s for size in range(1, degree) for s in _subsets(degree, size)]
+    parts = [s for size in range(1, degree) for s in combinations(range(degree), size)]
     places = {term: k for k, term in enumerate(found)}
     paths = [[places[tuple(term[k] for k in part)] for part in parts] for term in terms]
     known = jnp.stack(list(found.values())) if found else jnp.zeros((0, *u.shape))
@@ -243,7 +243,3 @@ def _mixed(function: Callable[..., jax.Array], degree: int) -> Callable[[], jax.
         lambda last: function(*rest, last), (jnp.zeros(()),), (jnp.ones(()),)
     )[1]
     return _mixed(derivative, degree - 1)
-
-
-def _subsets(count: int, size: int) -> list[tuple[int, ...]]:
-    return list(combinations(range(count), size))

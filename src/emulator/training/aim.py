@@ -10,8 +10,8 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.training.checkpoint import State
+from emulator.training.network import NetworkTraining
 from emulator.training.plan import Plan
-from emulator.training.problem import Problem
 from emulator.training.step import WARMUP
 
 _AIM_EVERY = 200  # steps
@@ -32,9 +32,9 @@ class Aim:
         self._restart = plan.freeze + 1 if plan.decoder == "separable" else -1
         self._began, self._first = time.perf_counter(), 0
 
-    def first_total(self, problem: Problem) -> int:
+    def first_total(self, training: NetworkTraining) -> int:
         """The number of steps to begin with, from a few that are timed and thrown away."""
-        fitting = steps_within(self._deadline - time.perf_counter(), problem)
+        fitting = steps_within(self._deadline - time.perf_counter(), training)
         self._began = time.perf_counter()
         return min(fitting, self._most)
 
@@ -50,7 +50,7 @@ class Aim:
         return total
 
 
-def steps_within(seconds: float, problem: Problem) -> int:
+def steps_within(seconds: float, training: NetworkTraining) -> int:
     """How many steps fit into ``seconds``.
 
     Raises
@@ -58,11 +58,11 @@ def steps_within(seconds: float, problem: Problem) -> int:
     InputError
         Fewer than a warm-up.
     """
-    plan = problem.plan
+    plan = training.plan
     started = time.perf_counter()
-    one = late = _seconds_a_step(problem)
+    one = late = _seconds_a_step(training)
     if plan.decoder == "separable":
-        late = _seconds_a_step(problem, *problem.keep(problem.initial()[0]))
+        late = _seconds_a_step(training, *training.keep(training.initial()[0]))
     left = 0.98 * seconds - (time.perf_counter() - started)
     early = min(left / one, plan.freeze) if late < one else left / one
     steps = int(early + max(left - early * one, 0.0) / late)
@@ -74,15 +74,14 @@ def steps_within(seconds: float, problem: Problem) -> int:
     return steps
 
 
-def _seconds_a_step(problem: Problem, *kept: jax.Array) -> float:
+def _seconds_a_step(training: NetworkTraining, *kept: jax.Array) -> float:
     """Median seconds of a step, compilation excluded."""
-    assert problem.step is not None, "only a network has steps"
-    weights, optimiser = problem.initial()
-    total = jnp.asarray(problem.plan.steps)
+    weights, optimiser = training.initial()
+    total = jnp.asarray(training.plan.steps)
     durations = []
     for number in range(_CLOCKED):
         begin = time.perf_counter()
-        weights, optimiser, value = problem.step(
+        weights, optimiser, value = training.step(
             weights, optimiser, jnp.asarray(number), total, *kept
         )
         value.block_until_ready()

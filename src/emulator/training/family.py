@@ -7,7 +7,6 @@ with ``train(scene, ..., start=pretrained[0])``.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,8 +17,9 @@ from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.checkpoint import CHECKPOINT, State, Writer, read_checkpoint
-from emulator.training.loop import Bar, Keep, Steps, optimise, require_finite
+from emulator.training.checkpoint import State, open_session
+from emulator.training.loop import Steps, require_finite, run
+from emulator.training.network import NetworkTraining
 from emulator.training.plan import Plan
 from emulator.training.problem import Problem, prepare
 from emulator.training.start import with_weights
@@ -45,33 +45,31 @@ def pretrain(
     folder : where checkpoints go, as in :func:`~emulator.training.train`.
     resume : continue from the checkpoint in ``folder``, under the plan it was written with.
     """
-    path, began = Path(folder) / CHECKPOINT, time.perf_counter()
     if not scenes:
         raise InputError("pretraining: no scene is given")
-    fingerprint = "+".join(scene.fingerprint for scene in scenes)
-    saved = None
-    if resume:
-        saved = read_checkpoint(path, fingerprint, ", ".join(scene.name for scene in scenes))
-    if saved is not None:
-        plan, architecture = saved.plan, saved.architecture or architecture
-    problems = _problems(scenes, plan, architecture, progress)
-    spent = saved.seconds if saved is not None else 0.0
-    clock = lambda: spent + time.perf_counter() - began  # noqa: E731
-    keep = Keep(Writer(path, fingerprint, problems[0].architecture), plan, clock)
-    state = State(*problems[0].initial())
-    state = state if saved is None else saved.restore(*state[:2])
-    with Bar("pretrain", state, plan.steps, shown=progress) as bar:
-        state = optimise(state, plan.steps, Steps(problems), [bar, keep])
+    session = open_session(
+        folder,
+        "+".join(scene.fingerprint for scene in scenes),
+        ", ".join(scene.name for scene in scenes),
+        plan,
+        architecture,
+        resume=resume,
+    )
+    plan = session.plan
+    problems, trainings = _problems(scenes, plan, session.architecture, progress)
+    session = replace(session, architecture=problems[0].architecture)
+    state = State(*trainings[0].initial())
+    state = run(session, state, plan.steps, Steps(trainings), progress=progress, name="pretrain")
     family = [scene.fingerprint for scene in scenes]
     record = {"plan": asdict(plan), "final_loss": require_finite(state), "family": family}
-    record["seconds"] = round(clock(), 1)
+    record["seconds"] = round(session.seconds, 1)
     return [replace(with_weights(p.emulator, state.weights), record=record) for p in problems]
 
 
 def _problems(
     scenes: Sequence[Scene], plan: Plan, architecture: Architecture | None, progress: bool
-) -> list[Problem]:
-    """A problem for each scene, all with the first one's untrained weights."""
+) -> tuple[list[Problem], list[NetworkTraining]]:
+    """A problem for each scene, all with the first one's untrained weights, and its network's."""
     if plan.discrepancy:
         raise InputError(
             f"pretraining: recipe '{plan.recipe}' fits a discrepancy model, which belongs to one "
@@ -85,4 +83,5 @@ def _problems(
     first = prepare(scenes[0], plan, architecture)
     others = tqdm(scenes[1:], "prepare", disable=not progress)
     # Starting from the first one's network also checks that each scene can have its weights.
-    return [first, *(prepare(s, plan, architecture, start=first.emulator) for s in others)]
+    problems = [first, *(prepare(s, plan, architecture, start=first.emulator) for s in others)]
+    return problems, [p.training for p in problems if p.training is not None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Self
 
 import jax
@@ -12,9 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from emulator.errors import SolverError
-from emulator.training.checkpoint import State, Writer
-from emulator.training.plan import Plan
-from emulator.training.problem import Problem
+from emulator.training.checkpoint import Session, State
+from emulator.training.network import NetworkTraining
 
 Advance = Callable[[State, int], State]
 """One step: state and total number of steps to the next state."""
@@ -33,34 +31,49 @@ def optimise(state: State, total: int, advance: Advance, hooks: Sequence[Hook]) 
     return state
 
 
+def run(
+    session: Session,
+    state: State,
+    total: int,
+    advance: Advance,
+    hooks: Sequence[Hook] = (),
+    *,
+    progress: bool,
+    name: str = "train",
+) -> State:
+    """All steps of a training, from ``state`` or from its checkpoint, and checkpoints of them."""
+    state = session.first(state, total)
+    with Bar(name, state, total, shown=progress) as bar:
+        return optimise(state, total, advance, [*hooks, bar, session])
+
+
 class Steps:
-    """One step after another of several problems in turn, their weights in common.
+    """One step after another of several networks in turn, their weights in common.
 
     After ``freeze`` steps of a separable decoder, what these have learned is computed once and
     kept.
     """
 
-    def __init__(self, problems: Sequence[Problem]) -> None:
-        self._problems = problems
+    def __init__(self, trainings: Sequence[NetworkTraining]) -> None:
+        self._trainings = trainings
         self._kept: dict[int, tuple[jax.Array, ...]] = {}
 
     def __call__(self, state: State, total: int) -> State:
         """The next step."""
-        turn = state.done % len(self._problems)
-        problem = self._problems[turn]
-        assert problem.step is not None, "only a network has steps"
-        plan = problem.plan
+        turn = state.done % len(self._trainings)
+        training = self._trainings[turn]
+        plan = training.plan
         kept: tuple[jax.Array, ...] = ()
         if plan.decoder == "separable" and state.done >= plan.freeze:
             kept = self._keep(turn, state)
         done, of = jnp.asarray(state.done), jnp.asarray(total)
-        weights, optimiser, loss = problem.step(state.weights, state.optimiser, done, of, *kept)
+        weights, optimiser, loss = training.step(state.weights, state.optimiser, done, of, *kept)
         return State(weights, optimiser, state.done + 1, loss)
 
     def _keep(self, turn: int, state: State) -> tuple[jax.Array, ...]:
-        """What problem ``turn`` keeps; no later step changes it."""
+        """What network ``turn`` keeps; no later step changes it."""
         if turn not in self._kept:
-            self._kept[turn] = self._problems[turn].keep(state.weights)
+            self._kept[turn] = self._trainings[turn].keep(state.weights)
         return self._kept[turn]
 
 
@@ -83,23 +96,6 @@ class Bar:
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
-
-
-class Keep:
-    """Writes checkpoints as often as the plan says, and after the last step; a hook."""
-
-    def __init__(self, writer: Writer, plan: Plan, clock: Callable[[], float]) -> None:
-        self._writer, self._plan, self._clock = writer, plan, clock
-
-    def __call__(self, state: State, total: int) -> int:
-        """A checkpoint, if one is due."""
-        if state.done % self._plan.checkpoint_every == 0 or state.done == total:
-            self.write(state, total)
-        return total
-
-    def write(self, state: State, total: int) -> None:
-        """A checkpoint with the number of steps aimed at."""
-        self._writer.write(state, replace(self._plan, steps=total), self._clock())
 
 
 def require_finite(state: State) -> float:

@@ -52,6 +52,7 @@ from emulator.scenes.scene import Scene
 from emulator.surrogates.network.part import Network
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.objectives import Scales
+from emulator.training.step import in_branch
 
 ARCHITECTURE = Architecture(
     steps=3,
@@ -63,7 +64,7 @@ ARCHITECTURE = Architecture(
     branch=(128, 128, 128),
 )
 """Smaller messages than the paper's, a wide last layer of the trunk, which costs a least-squares
-solve, and a branch that can bend (docs/experiments.md, "A network alone")."""
+solve, and a deep branch (docs/experiments.md, "A network alone")."""
 
 _SLOPES = 0.1  # gamma: positions have a variance of 1/12 in the unit box
 _RIDGE = 1e-9  # of the mean square of the hidden layer; weights beyond are noise in float32
@@ -109,12 +110,8 @@ class Modal:
     def _product(self) -> tuple[jax.Array, jax.Array]:
         """K by rows, its largest number of entries for each: columns (n, e) and values (n, e)."""
         n, rule = len(self.scene.mesh.nodes), self.scene.discretisation
-        local = np.einsum("mq,mqai,mqbi->mab", rule.weights, rule.gradients, rule.gradients)
-        nodes = np.broadcast_to(rule.connectivity[:, :, None], local.shape)
-        pairs = (nodes.ravel(), np.swapaxes(nodes, 1, 2).ravel())
-        stiffness = sp.csr_matrix((local.ravel(), pairs), shape=(n, n))
-        stiffness *= (self.scales.displacement / self.scales.gradient) ** 2 / rule.weights.sum()
-        matrix = sp.csr_matrix(stiffness + sp.identity(n) / n)
+        weight = (self.scales.displacement / self.scales.gradient) ** 2 / rule.weights.sum()
+        matrix = sp.csr_matrix(weight * rule.laplacian() + sp.identity(n) / n)
         entries = np.diff(matrix.indptr)
         place = np.arange(entries.max())[None] < entries[:, None]
         columns, values = np.zeros(place.shape, dtype=np.int32), np.zeros(place.shape)
@@ -291,7 +288,7 @@ class Modal:
 def _split(weights: Weights) -> tuple[list[jax.Array], Callable[[list[jax.Array]], Weights]]:
     """Weights of the branch, and what puts them back among the others."""
     leaves, structure = jax.tree_util.tree_flatten_with_path(weights)
-    mine = ["'branch'" in jax.tree_util.keystr(path) for path, _ in leaves]
+    mine = [in_branch(path) for path, _ in leaves]
 
     def joined(branch: list[jax.Array]) -> Weights:
         new = iter(branch)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from emulator.errors import InputError, check_seed
+from emulator.errors import InputError, check_seed, look_up
 
 Objective = Literal["energy", "simulations", "gradients", "both", "modes"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
@@ -14,31 +15,32 @@ OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
 @dataclass(frozen=True)
 class Plan:
-    """How to train.
+    """How to train. Settings that change nothing under a plan are :attr:`idle`.
 
     recipe : the name in :data:`RECIPES` it came from, for the record.
+    seed : of the weights, the FEM runs' theta, and the batches.
+    simulations : FEM runs to train the network on (not used by ``energy``) and to fit the
+        discrepancy model to.
+    campaign : digest of the campaign whose first ``simulations`` rows are the FEM runs; empty where
+        training makes them.
+    centred : add the network to a Taylor series about the centre of the box, not to zero.
+    order : of that series; 0 is the FEM solution at the centre alone.
+    discrepancy : fit a discrepancy model to the FEM runs and their sensitivities.
+    steps : of the network's optimiser; without any, which a discrepancy model allows, there is no
+        network, and all that follows is idle.
     objective : of the network: ``energy`` (no FEM run but the centre), ``simulations``,
         ``gradients`` (simulations and their deformation gradients), ``both`` (simulations and
         energy), or ``modes`` (simulations, their deformation gradients and slopes in theta, all at
         every step: :mod:`~emulator.training.modal`).
-    steps : optimiser steps; without any, which a discrepancy model allows, there is no network.
-    simulations : FEM runs to train the network on (not used by ``energy``) and to fit the
-        discrepancy model to.
     batch : theta a step.
     learning_rate : of Adam at its peak.
     schedule : ``cosine`` to zero after a warm-up, or ``halves``: the peak, then a tenth of it.
     energy_weight : weight of the energy gap in ``both``.
-    centred : add the network to a Taylor series about the centre of the box, not to zero.
-    order : of that series; 0 is the FEM solution at the centre alone.
     decoder : ``pointwise`` or ``separable``.
     modes : mechanical modes given to a separable decoder, at most.
     freeze : step after which a separable decoder keeps its modes and trains its branch alone.
     polish : iterations of L-BFGS on the branch after the steps, for ``modes``.
-    discrepancy : fit a discrepancy model to the FEM runs and their sensitivities.
     checkpoint_every : steps between checkpoints.
-    seed : of the weights, the FEM runs' theta, and the batches.
-    campaign : digest of the campaign whose first ``simulations`` rows are the FEM runs; empty where
-        training makes them.
     """
 
     recipe: str = "network"
@@ -64,38 +66,31 @@ class Plan:
         if self.objective not in OBJECTIVES:
             *others, last = OBJECTIVES
             raise InputError(f"objective '{self.objective}': use {', '.join(others)} or {last}")
-        trains = not (self.discrepancy or self.as_learned)
-        least = {"steps": int(trains), "batch": 1, "checkpoint_every": 1}
-        for name, value in least.items():
-            if getattr(self, name) < value:
-                raise InputError(
-                    f"training: {name} is {getattr(self, name)}; it must be {value} or more"
-                )
-        if not 0.0 < self.learning_rate < math.inf:
-            raise InputError(
-                f"training: learning_rate is {self.learning_rate}; it must be positive and finite"
-            )
         check_seed(self.seed, "training")
-        if self.simulations < (1 if self.discrepancy else 0):
-            raise InputError(
-                f"training: {self.simulations} simulations; a discrepancy model needs 1 or more"
-            )
-        if self.objective == "modes" and self.simulations < 1:
-            raise InputError(f"training: {self.simulations} simulations; modes need 1 or more")
-        if self.objective not in ("energy", "modes") and self.simulations < self.batch:
-            raise InputError(
-                f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"
-            )
-        if not 0 <= self.order <= 4 or (self.order and not self.centred):
-            raise InputError(
-                f"training: a series of order {self.order}"
-                f"{'' if self.centred else ' without a centre'}; give 0 to 4, 0 without a centre"
-            )
+        for fault in self._faults():
+            raise InputError(f"training: {fault}")
 
+    def _faults(self) -> Iterator[str]:
+        """What cannot work."""
+        trains = not (self.discrepancy or self.as_learned)
+        for name, least in {"steps": int(trains), "batch": 1, "checkpoint_every": 1}.items():
+            if getattr(self, name) < least:
+                yield f"{name} is {getattr(self, name)}; it must be {least} or more"
+        if not 0.0 < self.learning_rate < math.inf:
+            yield f"learning_rate is {self.learning_rate}; it must be positive and finite"
+        if self.simulations < (1 if self.discrepancy else 0):
+            yield f"{self.simulations} simulations; a discrepancy model needs 1 or more"
+        if self.objective == "modes" and self.simulations < 1:
+            yield f"{self.simulations} simulations; modes need 1 or more"
+        if self.objective not in ("energy", "modes") and self.simulations < self.batch:
+            yield f"{self.simulations} simulations are fewer than a batch of {self.batch}"
+        if not 0 <= self.order <= 4 or (self.order and not self.centred):
+            about = "" if self.centred else " without a centre"
+            yield f"a series of order {self.order}{about}; give 0 to 4, 0 without a centre"
         alone = self.decoder == "separable" and self.centred and not self.order
         if self.objective == "modes" and (not alone or self.discrepancy or self.modes):
-            raise InputError(
-                f"training: recipe '{self.recipe}' cannot have the objective 'modes', which is for "
+            yield (
+                f"recipe '{self.recipe}' cannot have the objective 'modes', which is for "
                 "a separable network alone about the centre's solution; use recipe modal"
             )
 
@@ -192,6 +187,4 @@ Dalton et al. (2023)."""
 
 def recipe(name: str) -> Plan:
     """The plan of that name; :class:`InputError` lists the names."""
-    if name not in RECIPES:
-        raise InputError(f"recipe '{name}' is unknown; known: {', '.join(RECIPES)}")
-    return RECIPES[name]
+    return look_up(RECIPES, name, "recipe")

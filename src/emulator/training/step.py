@@ -72,7 +72,11 @@ def branch_alone(updates: Weights, *kept: jax.Array) -> Weights:
 
     Adam's momentum would otherwise move the weights behind that part.
     """
-    return jax.tree_util.tree_map_with_path(_branch_only, updates) if kept else updates
+
+    def own(path: Any, update: jax.Array) -> jax.Array:
+        return update if in_branch(path) else jnp.zeros_like(update)
+
+    return jax.tree_util.tree_map_with_path(own, updates) if kept else updates
 
 
 def make_step(
@@ -118,9 +122,9 @@ def _batches(emulator: Emulator, plan: Plan, runs: Runs) -> Callable[[jax.Array]
     return draw
 
 
-def _branch_only(path: Any, update: jax.Array) -> jax.Array:
-    """``update`` of a weight of the decoder's branch, zero of any other."""
-    return update if "'branch'" in jax.tree_util.keystr(path) else jnp.zeros_like(update)
+def in_branch(path: Any) -> bool:
+    """Whether a weight at this path belongs to the decoder's branch."""
+    return "'branch'" in jax.tree_util.keystr(path)
 
 
 def learning_rate(plan: Plan, number: jax.Array, total: jax.Array) -> jax.Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from emulator.surrogates.files import load, save_emulator
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.aim import Aim
 from emulator.training.budget import Budget
-from emulator.training.checkpoint import CHECKPOINT, Checkpoint, State, Writer, read_checkpoint
+from emulator.training.checkpoint import Session, State, open_session, remove_checkpoint
 from emulator.training.discrepancy_stage import add_discrepancy
-from emulator.training.loop import Bar, Hook, Keep, Steps, optimise, require_finite
+from emulator.training.loop import Hook, Steps, require_finite, run
 from emulator.training.plan import Plan, recipe
 from emulator.training.problem import Problem, prepare
 from emulator.training.start import family_on, start_record, with_weights
@@ -51,47 +52,45 @@ def train(
         less so, and ``plan.simulations`` by as many as were done in its first third. Where a
         discrepancy model follows, which soon outdoes the network, neither is made larger.
     resume : continue from the checkpoint in ``folder``, under the plan it was written with and with
-        the network it holds. For a plan in steps the result equals that of a run never
-        interrupted; one on a budget keeps the number of steps it was aiming at.
+        the network it holds; where no network is trained, ``start`` is needed again. For a plan in
+        steps the result equals that of a run never interrupted; one on a budget keeps the number of
+        steps it was aiming at.
     """
     if campaign is not None and not (plan.runs or resume):
         raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
-    path, began = Path(folder) / CHECKPOINT, time.perf_counter()
     if plan.as_learned:
-        return _as_learned(scene, plan, start, began)
-    saved = read_checkpoint(path, scene.fingerprint, scene.name) if resume else None
-    if plan.on_coarse and start is None:
-        start = _coarse(scene, Path(folder) / "coarse", progress=progress, resume=resume)
+        return _as_learned(scene, plan, start)
+    session = open_session(folder, scene.fingerprint, scene.name, plan, architecture, resume=resume)
+    if session.plan.on_coarse and start is None:
+        start = _coarse(scene, Path(folder) / "coarse", known=resume, progress=progress)
     source = {} if start is None else start_record(start)
-    plan = replace(plan, campaign="" if campaign is None else campaign.digest)
-    if saved is not None:
-        _check_campaign(saved.plan, plan)
-        plan, architecture, source = saved.plan, saved.architecture or architecture, saved.start
-        budget = None  # it is in the checkpoint, and so is a network to start from
-        start = start if plan.on_coarse else None
-    limit = None if budget is None else Budget(budget, began)
+    digest = "" if campaign is None else campaign.digest
+    if resume:
+        _check_same(session, digest, source)
+        budget = None  # it is in the checkpoint
+    else:
+        session = replace(session, plan=replace(plan, campaign=digest), start=source)
+    limit = None if budget is None else Budget(budget, session.began)
     problem = prepare(
         scene,
-        plan,
-        architecture,
+        session.plan,
+        session.architecture,
         start=start,
         campaign=campaign,
         budget=limit,
         progress=progress,
     )
-    writer = Writer(path, scene.fingerprint, problem.architecture, source)
-    spent = saved.seconds if saved is not None else 0.0
-    clock = lambda: spent + time.perf_counter() - began  # noqa: E731
-    state = _optimise(problem, saved, limit, Keep(writer, problem.plan, clock), progress)
+    session = replace(session, plan=problem.plan, architecture=problem.architecture)
+    state = _optimise(problem, session, limit, progress)
     emulator, record = _finish(problem, state, progress=progress)
-    record |= {"start": source} if source else {}
-    return replace(emulator, record={**record, "seconds": round(clock(), 1)})
+    record |= {"start": session.start} if session.start else {}
+    return replace(emulator, record={**record, "seconds": round(session.seconds, 1)})
 
 
-def _coarse(scene: Scene, folder: Path, *, progress: bool, resume: bool) -> Emulator:
+def _coarse(scene: Scene, folder: Path, *, known: bool, progress: bool) -> Emulator:
     """An emulator on the mesh that the scene's is finer than, kept in ``folder``."""
     coarse = finer_of(scene).coarse
-    if resume and (folder / "emulator.json").is_file():
+    if known:
         return load(folder, coarse)
     found = train(coarse, recipe("mechanics"), folder, progress=progress)
     save_emulator(found, folder)
@@ -99,15 +98,23 @@ def _coarse(scene: Scene, folder: Path, *, progress: bool, resume: bool) -> Emul
     return found
 
 
-def _check_campaign(saved: Plan, given: Plan) -> None:
-    """Refuse to resume with other FEM runs."""
-    if saved.campaign != given.campaign:
-        what = "FEM runs of a campaign" if saved.campaign else "FEM runs of its own"
+def _check_same(session: Session, digest: str, start: Mapping[str, Any]) -> None:
+    """Refuse to resume with other FEM runs, or on another emulator."""
+    if session.plan.campaign != digest:
+        what = "FEM runs of a campaign" if session.plan.campaign else "FEM runs of its own"
         raise InputError(f"the checkpoint was trained on {what}; resume it with the same")
+    if session.plan.steps and start:
+        raise InputError("the checkpoint has its network's weights; resume it without a start")
+    if not session.plan.steps and session.start != start:
+        raise InputError(
+            "the checkpoint stands on another emulator than is given as the start; resume it with "
+            "the same"
+        )
 
 
-def _as_learned(scene: Scene, plan: Plan, start: Emulator | None, began: float) -> Emulator:
+def _as_learned(scene: Scene, plan: Plan, start: Emulator | None) -> Emulator:
     """The network of a family on ``scene``, as it is."""
+    began = time.perf_counter()
     if start is None or start.family is None:
         raise InputError(
             "recipe 'family' takes a network that has learned a family of bodies to a new one; "
@@ -123,36 +130,27 @@ def _as_learned(scene: Scene, plan: Plan, start: Emulator | None, began: float) 
     return Emulator(scene, family=part, record=record)
 
 
-def _optimise(
-    problem: Problem, saved: Checkpoint | None, limit: Budget | None, keep: Keep, progress: bool
-) -> State:
+def _optimise(problem: Problem, session: Session, limit: Budget | None, progress: bool) -> State:
     """The state after all steps."""
-    plan, hooks = problem.plan, list[Hook]()
-    state, total = State(*problem.initial()), plan.steps
-    if saved is not None:
-        state = saved.restore(*state[:2])
-    elif limit is not None and total:
+    training, plan = problem.training, problem.plan
+    if training is None:
+        return session.first(State({}, ()), 0)
+    hooks, total = list[Hook](), plan.steps
+    if limit is not None:
         aim = Aim(limit.network_deadline(plan), plan)
-        total = aim.first_total(problem)
+        total = aim.first_total(training)
         hooks.append(aim)
-    if saved is None:
-        keep.write(state, total)
-    with Bar("train", state, total, shown=progress) as bar:
-        return optimise(state, total, Steps([problem]), [*hooks, bar, keep])
+    state = State(*training.initial())
+    return run(session, state, total, Steps([training]), hooks, progress=progress)
 
 
 def _finish(problem: Problem, state: State, *, progress: bool) -> tuple[Emulator, dict[str, Any]]:
     """The trained emulator with its discrepancy model, if the plan has one, and the record."""
     plan, emulator, loss = replace(problem.plan, steps=state.done), problem.emulator, None
-    if emulator.network is not None:
+    if problem.training is not None:
         loss = require_finite(state)
-        emulator = with_weights(emulator, problem.finish(state.weights, progress=progress))
+        emulator = with_weights(emulator, problem.training.finish(state.weights, progress=progress))
     record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
     if plan.discrepancy:
         emulator, record["discrepancy"] = add_discrepancy(emulator, problem.runs, problem.series)
     return emulator, record
-
-
-def remove_checkpoint(folder: str | Path) -> None:
-    """Remove the checkpoint in ``folder``, if there is one."""
-    (Path(folder) / CHECKPOINT).unlink(missing_ok=True)

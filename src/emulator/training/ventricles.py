@@ -13,7 +13,6 @@ since a message's sign on a mesh unknown follows from the numbering of its nodes
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,8 +39,8 @@ from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import standardised
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.network.ventricle_graph import Described, describe
-from emulator.training.checkpoint import CHECKPOINT, State, Writer, read_checkpoint
-from emulator.training.loop import Bar, Keep, optimise, require_finite
+from emulator.training.checkpoint import State, open_session
+from emulator.training.loop import require_finite, run
 from emulator.training.plan import Plan
 from emulator.training.step import clipped_adam, make_step
 
@@ -122,11 +121,10 @@ def train_family(
     plan : its steps, learning rate, schedule, seed and checkpoints.
     folder : where checkpoints go.
     """
-    path, began = Path(folder) / CHECKPOINT, time.perf_counter()
-    fingerprint = _check(runs)
-    saved = read_checkpoint(path, fingerprint, f"{len(runs)} bodies") if resume else None
-    if saved is not None:
-        plan, architecture = saved.plan, saved.architecture or architecture
+    session = open_session(
+        folder, _check(runs), f"{len(runs)} bodies", plan, architecture, resume=resume
+    )
+    plan, architecture = session.plan, session.architecture or architecture
     described = [describe(r.scene) for r in tqdm(runs, "describe", disable=not progress)]
     standard = _standard(described)
     sizes = _sizes(runs, described)
@@ -148,41 +146,30 @@ def train_family(
     optimiser = clipped_adam()
     descend = _descent(definition, scale, _gradient_scale(bodies), sizes.real)
     step = make_step(plan, descend, optimiser, moves=lambda updates, _: updates)
-    order = _Order(len(bodies), plan.seed)
 
     def advance(state: State, total: int) -> State:
-        body = bodies[order(state.done)]
+        body = bodies[_taken(state.done, len(bodies), plan.seed)]
         weights, moments, loss = step(
             state.weights, state.optimiser, jnp.asarray(state.done), jnp.asarray(total), body
         )
         return State(weights, moments, state.done + 1, loss)
 
-    spent = saved.seconds if saved is not None else 0.0
-    clock = lambda: spent + time.perf_counter() - began  # noqa: E731
     state = State(weights, optimiser.init(weights))
-    state = state if saved is None else saved.restore(*state[:2])
-    keep = Keep(Writer(path, fingerprint, architecture), plan, clock)
-    with Bar("train", state, plan.steps, shown=progress) as bar:
-        state = optimise(state, plan.steps, advance, [bar, keep])
+    state = run(session, state, plan.steps, advance, progress=progress)
     record: dict[str, Any] = {
         "plan": asdict(plan),
         "final_loss": require_finite(state),
         "bodies": len(runs),
-        "seconds": round(clock(), 1),
+        "seconds": round(session.seconds, 1),
     }
     part = on_body(learned._replace(weights=state.weights), home)
     return Emulator(home, family=part, record=record)
 
 
-class _Order:
-    """Which body a step takes: all of them in an order of its own, epoch after epoch."""
-
-    def __init__(self, count: int, seed: int) -> None:
-        self._count, self._seed = count, seed
-
-    def __call__(self, done: int) -> int:
-        epoch, place = divmod(done, self._count)
-        return int(np.random.default_rng((self._seed, epoch)).permutation(self._count)[place])
+def _taken(done: int, count: int, seed: int) -> int:
+    """Which of ``count`` bodies a step takes: all of them, in an order of its own each epoch."""
+    epoch, place = divmod(done, count)
+    return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
 
 
 def _check(runs: Sequence[BodyRuns]) -> str:
@@ -238,7 +225,7 @@ def _padded(
     sizes: _Sizes,
     generator: np.random.Generator,
 ) -> _Body:
-    """``runs`` with what its network is told, padded. The last virtual node belongs to no body."""
+    """``runs`` and the network's features, padded. The last virtual node belongs to no body."""
     scene, graph = runs.scene, standard.graph(body)
     size = body.shape["size"]
     total, real = sizes.real + sizes.virtual, body.real

@@ -20,7 +20,8 @@ import calibrate as cal
 import emulator as em
 from calibrate.samplers import find_sampler
 from emulator.scenes import Scene
-from emulator.surrogates.protocol import Prediction, all_nodes, fingerprint_of
+from emulator.scenes.nodes import all_nodes
+from emulator.surrogates.protocol import Prediction, fingerprint_of
 
 SAMPLERS = ("nuts", "blackjax_nuts", "mclmc", "smc", "laplace")
 SHIFT, LOG_SD = 0.25, np.log(1.25)  # of moments, in posterior sd

@@ -7,9 +7,10 @@ import sparsax
 import emulator as em
 from emulator.error.estimate import error_bar
 from emulator.errors import InputError
+from emulator.scenes.nodes import all_nodes
 from emulator.surrogates.corrected import newton_step
 from emulator.surrogates.fem import fem_forward
-from emulator.surrogates.protocol import Prediction, all_nodes
+from emulator.surrogates.protocol import Prediction
 
 
 class Off:

@@ -13,7 +13,7 @@ from emulator.fem import design
 from emulator.fem.campaign import run_campaign
 from emulator.store import read_arrays
 from emulator.surrogates import Architecture, Emulator, augment, load, save_emulator
-from emulator.surrogates.additive import KINDS
+from emulator.surrogates.additive import PARTS
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import fresh
@@ -24,7 +24,7 @@ from network_support import drawn
 SMALL = Architecture(steps=1, latent=8, hidden=(16, 16), decoder="separable", modes=3)
 # A family's network cannot be on a beam; tests/emulator/surrogates/test_family.py has it, and
 # tests/emulator/training/test_two_meshes.py the part from a coarser mesh.
-NAMES = tuple(name for name in KINDS if name not in ("family", "coarse"))
+NAMES = tuple(name for name in PARTS if name not in ("family", "coarse"))
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,11 @@ import pytest
 import emulator as em
 from emulator.errors import InputError
 from emulator.fem import run_campaign, sobol
+from emulator.scenes.nodes import all_nodes
 from emulator.surrogates.corrected import corrected
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.protocol import Prediction, all_nodes
+from emulator.surrogates.protocol import Prediction
 
 
 class Off:

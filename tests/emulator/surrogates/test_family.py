@@ -175,6 +175,11 @@ def test_a_start_for_other_recipes(family: Emulator, tmp_path: Path) -> None:
     slope = jax.jacfwd(found)(scene.centre)
     exact = jnp.moveaxis(em.Simulator(scene).sensitivities(u, scene.centre), 0, -1)
     assert np.abs(slope - exact).max() < 1e-3 * np.abs(exact).max()
+    # Resumed, it is asked for again: the checkpoint of a training without a network has no weights.
+    whole = train(scene, plan, tmp_path, start=start)
+    with pytest.raises(InputError, match="stands on another emulator than is given"):
+        train(scene, PLAN, tmp_path, resume=True)
+    assert train(scene, PLAN, tmp_path, start=start, resume=True).fingerprint == whole.fingerprint
 
 
 def test_what_it_cannot_take(family: Emulator, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def problem(beam):
 
 @pytest.fixture(scope="module")
 def modal(problem) -> Modal:
-    return problem.modal
+    return problem.training.modal
 
 
 def field(modal, seed):
@@ -66,7 +66,7 @@ def test_targets_hold_what_the_snapshots_vary_by(modal, problem):
 
 def test_the_last_layer_is_the_least_squares_solution(modal, problem):
     """Against NumPy's, component by component, in the factor of the product."""
-    H = modal._hidden(problem.initial()[0])
+    H = modal._hidden(problem.training.initial()[0])
     W, misfit, _ = modal._project(H)
     n, targets = len(H), np.asarray(modal.targets)
     K = np.asarray(jax.vmap(modal.weighted, 1, 1)(jnp.eye(n)))
@@ -87,7 +87,7 @@ def test_the_last_layer_is_the_least_squares_solution(modal, problem):
 
 def test_the_derivative_in_the_hidden_layer_needs_none_of_the_solution(modal, problem):
     """Of few features, so that the misfit is far above what the ridge costs."""
-    H = modal._hidden(problem.initial()[0])[:, :8]
+    H = modal._hidden(problem.training.initial()[0])[:, :8]
     _, _, pull = modal._project(H)
     along = jnp.asarray(np.random.default_rng(1).normal(size=H.shape))
     h = 1e-6
@@ -98,7 +98,7 @@ def test_the_derivative_in_the_hidden_layer_needs_none_of_the_solution(modal, pr
 def test_coefficients_are_of_values_and_slopes(modal, problem):
     """A branch that gives the coefficients gives displacements and their slopes in theta."""
     scene, runs = modal.scene, problem.runs
-    weights = jax.jit(modal._settled)(problem.initial()[0])
+    weights = jax.jit(modal._settled)(problem.training.initial()[0])
     taught = modal.keep(weights)
     s = modal.scales.displacement
     found = s * np.tensordot(np.asarray(taught.values), np.asarray(taught.modes, float), axes=1)
@@ -163,9 +163,9 @@ def test_more_modes_than_snapshots_leave_zeros(beam):
     plan = replace(PLAN, simulations=4, batch=2)
     runs = run_campaign(em.Simulator(beam), design(beam, 2, 0), sensitivities=True)
     problem = prepare(beam, plan, replace(SMALL, modes=30))
-    few = Modal(beam, problem.emulator.network, Runs(*runs), problem.modal.scales)
+    few = Modal(beam, problem.emulator.network, Runs(*runs), problem.training.modal.scales)
     assert (np.asarray(few.targets)[..., 20:] == 0.0).all()
-    assert np.isfinite(few.keep(problem.initial()[0]).values).all()
+    assert np.isfinite(few.keep(problem.training.initial()[0]).values).all()
 
 
 def test_bad_plans_and_families(beam, tmp_path):

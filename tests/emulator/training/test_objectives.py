@@ -11,9 +11,10 @@ import emulator as em
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates import Architecture
 from emulator.training import Plan
+from emulator.training.network import scales_of
 from emulator.training.objectives import Batch, Scales, make_loss
 from emulator.training.plan import OBJECTIVES
-from emulator.training.problem import _scales, prepare
+from emulator.training.problem import prepare
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 SCALES = Scales(displacement=2.0, gradient=0.3, energy=7.0)
@@ -103,7 +104,7 @@ def test_both_terms_of_gradients_are_one_at_the_centre(beam):
     """Over the runs its scales were taken from."""
     plan = Plan(objective="gradients", steps=1, simulations=8, batch=4)
     runs = prepare(beam, plan, SMALL).runs
-    _, scales = _scales(beam, plan, runs)
+    _, scales = scales_of(beam, plan, runs)
     batch = Batch(*runs.take(slice(1, None))[:3])
     centre = jnp.broadcast_to(runs.displacement[0], batch.displacement.shape)
     simulations, gradients = (

@@ -11,7 +11,7 @@ import emulator as em
 from emulator.errors import InputError
 from emulator.surrogates import load, save_emulator
 from emulator.training import Plan, pretrain, recipe, train
-from emulator.training.checkpoint import CHECKPOINT, Writer
+from emulator.training.checkpoint import CHECKPOINT, Session
 from emulator.training.problem import prepare
 from emulator.training.start import with_network_of
 from network_support import SMALL, untrained
@@ -48,7 +48,7 @@ def whole(other, start, tmp_path_factory):
 
 def kill_after(writes, monkeypatch):
     """Stop a training after so many checkpoints."""
-    write, kept = Writer.write, []
+    write, kept = Session.write, []
 
     def killed(*arguments):
         write(*arguments)
@@ -56,7 +56,7 @@ def kill_after(writes, monkeypatch):
         if len(kept) == writes:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Writer, "write", killed)
+    monkeypatch.setattr(Session, "write", killed)
 
 
 @pytest.mark.slow
@@ -106,6 +106,8 @@ def test_a_started_run_killed_resumes_without_its_start(
         kill_after(writes, patch)
         with pytest.raises(KeyboardInterrupt):
             train(other, PLAN, tmp_path, start=start)
+    with pytest.raises(InputError, match="has its network's weights; resume it without a start"):
+        train(other, Plan(), tmp_path, start=start, resume=True)
     # Neither the start nor its architecture is said again.
     resumed = train(other, Plan(), tmp_path, resume=True)
     same(resumed.network.weights, whole.network.weights)
@@ -154,9 +156,9 @@ def test_a_family_shares_one_network(beam, other, own, pretrained):
 def test_a_family_takes_its_scenes_in_turn(beam, own, pretrained):
     problems = [prepare(beam, FAMILY, SMALL), own]
     weights = with_network_of(problems[0].emulator, problems[1].emulator).network.weights
-    state = problems[0].optimiser.init(weights)
+    state = problems[0].training.optimiser.init(weights)
     for number in range(FAMILY.steps):
-        weights, state, _ = problems[number % 2].step(
+        weights, state, _ = problems[number % 2].training.step(
             weights, state, jnp.asarray(number), jnp.asarray(FAMILY.steps)
         )
     same(weights, pretrained[0].network.weights)
@@ -166,7 +168,7 @@ def test_a_family_takes_its_scenes_in_turn(beam, own, pretrained):
 def test_a_family_killed_resumes_to_the_same(beam, other, pretrained, tmp_path, monkeypatch):
     scenes = [beam, other]
     with monkeypatch.context() as patch:
-        kill_after(1, patch)
+        kill_after(2, patch)
         with pytest.raises(KeyboardInterrupt):
             pretrain(scenes, FAMILY, tmp_path, architecture=SMALL)
     resumed = pretrain(scenes, Plan(), tmp_path, resume=True)

@@ -14,7 +14,7 @@ from emulator.fem.campaign import StoredRuns
 from emulator.geometry.quadratic import to_quadratic
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import Plan, recipe, train
-from emulator.training.checkpoint import CHECKPOINT, Writer
+from emulator.training.checkpoint import CHECKPOINT, Session
 from emulator.training.problem import prepare
 from emulator.training.step import WARMUP, learning_rate
 
@@ -50,7 +50,7 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
     plan = Plan(steps=30, simulations=8, batch=4, checkpoint_every=10)
     whole = train(beam, plan, tmp_path / "whole", architecture=SMALL)
 
-    write, kept = Writer.write, []
+    write, kept = Session.write, []
 
     def kill_after_second(*arguments):
         write(*arguments)
@@ -58,10 +58,10 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
         if len(kept) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Writer, "write", kill_after_second)
+    monkeypatch.setattr(Session, "write", kill_after_second)
     with pytest.raises(KeyboardInterrupt):
         train(beam, plan, tmp_path / "killed", architecture=SMALL)
-    monkeypatch.setattr(Writer, "write", write)
+    monkeypatch.setattr(Session, "write", write)
     # The plan comes from the checkpoint, not from the call.
     resumed = train(beam, Plan(), tmp_path / "killed", architecture=SMALL, resume=True)
     leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
@@ -91,9 +91,9 @@ def test_a_step_without_a_finite_gradient_is_not_taken(beam):
     leaves, structure = jax.tree.flatten(problem.emulator.network.weights)
     leaves[3] = jnp.full_like(leaves[3], jnp.nan)
     weights = jax.tree.unflatten(structure, leaves)
-    state = problem.optimiser.init(weights)
+    state = problem.training.optimiser.init(weights)
     before = [np.array(leaf) for leaf in leaves]
-    weights, state, _ = problem.step(weights, state, jnp.asarray(5), jnp.asarray(10))
+    weights, state, _ = problem.training.step(weights, state, jnp.asarray(5), jnp.asarray(10))
     for old, new in zip(before, jax.tree.leaves(weights), strict=True):
         np.testing.assert_array_equal(old, new)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
@@ -205,7 +205,7 @@ def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
 @pytest.mark.parametrize("writes", [3, 5])
 def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatch, hybrid, writes):
     """After its modes are frozen, and while the discrepancy model is fitted."""
-    write, kept = Writer.write, []
+    write, kept = Session.write, []
 
     def killed(*arguments):
         write(*arguments)
@@ -213,10 +213,10 @@ def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatc
         if len(kept) == writes:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Writer, "write", killed)
+    monkeypatch.setattr(Session, "write", killed)
     with pytest.raises(KeyboardInterrupt):
         train(beam, HYBRID, tmp_path, architecture=SMALL)
-    monkeypatch.setattr(Writer, "write", write)
+    monkeypatch.setattr(Session, "write", write)
     resumed = train(beam, Plan(), tmp_path, architecture=SMALL, resume=True)
     assert resumed.fingerprint == hybrid.fingerprint
     assert resumed.record["plan"] == hybrid.record["plan"]
@@ -225,13 +225,13 @@ def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatc
 @pytest.mark.slow
 def test_frozen_modes_do_not_move(beam):
     problem = prepare(beam, HYBRID, SMALL)
-    weights, state = problem.initial()
+    weights, state = problem.training.initial()
     number, total = jnp.asarray(0), jnp.asarray(30)
     for _ in range(2):  # momentum that would move them
-        weights, state, _ = problem.step(weights, state, number, total)
+        weights, state, _ = problem.training.step(weights, state, number, total)
     kept = problem.emulator.network.prepare(weights)[1]
     before = jax.tree.map(np.array, weights)
-    weights, state, _ = problem.step(weights, state, number, total, kept)
+    weights, state, _ = problem.training.step(weights, state, number, total, kept)
     moved = {
         jax.tree_util.keystr(path)
         for (path, a), b in zip(
@@ -269,7 +269,7 @@ def test_mechanics_builds_no_network(beam, tests, tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("a graph was built")
 
-    monkeypatch.setattr("emulator.training.problem.augment", never)
+    monkeypatch.setattr("emulator.training.network.augment", never)
     plan = replace(recipe("mechanics"), simulations=5, order=2)
     emulator = train(beam, plan, tmp_path)
     assert list(emulator.parts) == ["taylor", "discrepancy"]

@@ -13,7 +13,7 @@ from emulator.errors import InputError
 from emulator.fem import sobol
 from emulator.scenes.finer import finer
 from emulator.surrogates import load, save_emulator
-from emulator.training import recipe, train
+from emulator.training import Plan, recipe, train
 
 PLAN = replace(recipe("two_meshes"), simulations=5)
 MECHANICS = replace(recipe("mechanics"), simulations=12)
@@ -81,3 +81,13 @@ def test_what_it_cannot_stand_on_is_refused(body, coarse, tmp_path):
         train(other, PLAN, tmp_path, start=coarse)
     with pytest.raises(InputError, match="as recipe mechanics makes"):
         train(body.scene, PLAN, tmp_path, start=replace(coarse, taylor=None, discrepancy=None))
+
+
+def test_it_resumes_on_the_emulator_it_stands_on(body, coarse, fine, tmp_path):
+    """The one kept beside the checkpoint, or the one given; no other."""
+    save_emulator(coarse, tmp_path / "coarse")
+    train(body.scene, PLAN, tmp_path, start=coarse)
+    assert train(body.scene, Plan(), tmp_path, resume=True).fingerprint == fine.fingerprint
+    other = replace(coarse, discrepancy=None)
+    with pytest.raises(InputError, match="stands on another emulator than is given"):
+        train(body.scene, Plan(), tmp_path, resume=True, start=other)

@@ -34,7 +34,8 @@ def register(commands: Any) -> None:
         "--start",
         metavar="EMULATOR",
         help="begin from the network of this emulator (folder or ventricle_family), whatever its "
-        "mesh; the recipe then is network, or family, unless another is given",
+        "mesh; the recipe then is network, or family, unless another is given; give it again "
+        "with --resume where no network is trained",
     )
     parser.add_argument(
         "--objective",
@@ -133,7 +134,7 @@ def _given(arguments: argparse.Namespace) -> dict[str, Any]:
     names = ("objective", "steps", "simulations", "batch", "seed")
     given = {name: getattr(arguments, name) for name in names}
     given = {name: value for name, value in given.items() if value is not None}
-    others = [n for n in ("recipe", "start", "budget") if getattr(arguments, n) is not None]
+    others = [n for n in ("recipe", "budget") if getattr(arguments, n) is not None]
     if arguments.resume and (given or others):
         option = next(iter([*given, *others]))
         raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")

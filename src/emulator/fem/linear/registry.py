@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulator.errors import InputError
+from emulator.errors import look_up
 from emulator.fem.linear.petsc import PETSC
 from emulator.fem.linear.protocol import Direct
 from emulator.fem.linear.suitesparse import SUITESPARSE
@@ -12,7 +12,6 @@ SOLVERS: dict[str, Direct] = {kind.name: kind for kind in (SUITESPARSE, PETSC)}
 
 def find_solver(name: str) -> Direct:
     """The solver of that name; :class:`InputError` if unknown, or its library is missing."""
-    if name not in SOLVERS:
-        raise InputError(f"factorisation '{name}' is unknown; known: {', '.join(SOLVERS)}")
-    SOLVERS[name].check()
-    return SOLVERS[name]
+    solver = look_up(SOLVERS, name, "factorisation")
+    solver.check()
+    return solver

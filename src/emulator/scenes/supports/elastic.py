@@ -17,6 +17,7 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation, facet_rule
+from emulator.geometry.facets import area_vectors
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.local_terms import LocalTerm, Values
@@ -72,9 +73,7 @@ class ElasticSupport(BoundaryCondition):
         mesh = grid.mesh
         facets = mesh.facet_set(self.facet_set)
         rule = facet_rule(mesh.order, 2 * mesh.order)  # the degree of |u|^2
-        corners = mesh.nodes[facets]
-        along = np.einsum("qad,kai->kqdi", rule.derivatives, corners)
-        normals = np.cross(along[:, :, 0], along[:, :, 1])  # (k, q, 3), length: area
+        normals = area_vectors(mesh.nodes[facets], rule)  # (k, q, 3)
         areas = np.linalg.norm(normals, axis=-1)
         data = (rule.weights * areas, normals / areas[..., None])
 

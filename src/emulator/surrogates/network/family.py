@@ -25,9 +25,8 @@ from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.scene import Scene
 from emulator.store import inside, named_leaves
 from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.mlp import MLP
 from emulator.surrogates.network.part import filled_state, standardised
-from emulator.surrogates.network.pignn import Architecture, Processor
+from emulator.surrogates.network.pignn import Architecture, Processor, branch, trunk
 from emulator.surrogates.network.ventricle_graph import Described, describe
 from emulator.surrogates.part import CachedPart
 
@@ -49,23 +48,10 @@ class FamilyModule(nnx.Module):
         parameters: int,
         rngs: nnx.Rngs,
     ) -> None:
-        states, hidden = 2 * architecture.latent, architecture.hidden
         self.processor = Processor(architecture, node_width, edge_width, rngs)
-        self.branch = MLP(
-            (parameters, states),
-            architecture.branch or hidden,
-            architecture.modes,
-            layer_norm=False,
-            zero_last=True,
-            rngs=rngs,
-        )
-        self.trunk = MLP(
-            (states,),
-            architecture.trunk or hidden,
-            VECTORS * architecture.modes,
-            layer_norm=False,
-            rngs=rngs,
-        )
+        parts = (parameters, 2 * architecture.latent)
+        self.branch = branch(parts, architecture.modes, architecture, rngs)
+        self.trunk = trunk(VECTORS, architecture, rngs)
 
     def prepare(
         self, graph: AugmentedGraph, vectors: jax.Array, shares: jax.Array
@@ -179,10 +165,10 @@ class FamilyNetwork:
         """Run the processor and keep the modes at ``nodes`` (k,)."""
         modes, mean = jax.jit(self._prepare)()
         kept = np.asarray(modes, dtype=float)[:, nodes]
-        branch = nnx.merge(*nnx.split(self._module().branch))
+        network = nnx.merge(*nnx.split(self._module().branch))
 
         def coefficients(position: jax.Array) -> jax.Array:
-            return branch(self.normalise(position), mean).astype(jnp.float64)
+            return network(self.normalise(position), mean).astype(jnp.float64)
 
         return CachedPart(np.zeros((len(nodes), 3)), kept, coefficients)
 
@@ -254,10 +240,9 @@ def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNet
 
 def physics_of(scene: Scene) -> dict[str, Any]:
     """What a network can only know one of: law, constants, kinds of loads and supports."""
-    told = dict(scene.identity.description)
-    told["loads"] = sorted(load.to_json()[0] for load in scene.loads)
-    told["regions"] = scene.regions is not None
-    return told
+    loads = sorted(load.to_json()[0] for load in scene.loads)
+    regions = scene.regions is not None
+    return {**scene.identity.description, "loads": loads, "regions": regions}
 
 
 def _check_physics(learned: Learned, scene: Scene) -> None:

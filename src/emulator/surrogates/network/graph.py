@@ -11,7 +11,6 @@ their edge; they replace the edge between those corners.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
@@ -108,9 +107,10 @@ def hierarchy(
         joined.append(np.column_stack([offset + np.arange(len(positions)), above + parent]))
         positions = _cluster_means(positions, parent, count)
         last = count // options.cluster < options.smallest
-        joined.append(
-            above + (_all_pairs(count) if last else _nearest(positions, options.neighbours))
-        )
+        if last:
+            joined.append(above + np.column_stack(np.triu_indices(count, 1)))
+        else:
+            joined.append(above + _nearest(positions, options.neighbours))
         offset = above
     pairs = np.unique(np.sort(np.concatenate(joined), axis=1), axis=0)
     return Hierarchy(pairs, tuple(parents))
@@ -149,10 +149,6 @@ def _cluster_means(values: np.ndarray, labels: np.ndarray, count: int) -> np.nda
     if not sizes.all():
         raise InputError("graph: a cluster of nodes is empty; are there duplicate nodes?")
     return sums / sizes[:, None]
-
-
-def _all_pairs(count: int) -> np.ndarray:
-    return np.array(list(combinations(range(count), 2)))
 
 
 def _nearest(positions: np.ndarray, neighbours: int) -> np.ndarray:

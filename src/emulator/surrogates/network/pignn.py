@@ -171,6 +171,18 @@ class PointwiseDecoder(nnx.Module):
         return jnp.concatenate(parts, axis=-1)
 
 
+def branch(parts: tuple[int, ...], out: int, architecture: Architecture, rngs: nnx.Rngs) -> MLP:
+    """The network of the coefficients, zero before training."""
+    widths = architecture.branch or architecture.hidden
+    return MLP(parts, widths, out, layer_norm=False, zero_last=True, rngs=rngs)
+
+
+def trunk(vectors: int, architecture: Architecture, rngs: nnx.Rngs) -> MLP:
+    """The network of the modes: from a node's state, ``vectors`` numbers for each mode."""
+    widths, out = architecture.trunk or architecture.hidden, vectors * architecture.modes
+    return MLP((2 * architecture.latent,), widths, out, layer_norm=False, rngs=rngs)
+
+
 class SeparableDecoder(nnx.Module):
     """A sum of modes: coefficients of theta times modes of the node."""
 
@@ -179,22 +191,8 @@ class SeparableDecoder(nnx.Module):
     def __init__(
         self, architecture: Architecture, parameters: int, fixed: int, rngs: nnx.Rngs
     ) -> None:
-        M, hidden = architecture.latent, architecture.hidden
-        self.branch = MLP(
-            (parameters,),
-            architecture.branch or hidden,
-            fixed + architecture.modes,
-            layer_norm=False,
-            zero_last=True,
-            rngs=rngs,
-        )
-        self.trunk = MLP(
-            (2 * M,),
-            architecture.trunk or hidden,
-            3 * architecture.modes,
-            layer_norm=False,
-            rngs=rngs,
-        )
+        self.branch = branch((parameters,), fixed + architecture.modes, architecture, rngs)
+        self.trunk = trunk(3, architecture, rngs)
 
     def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
         """All modes (r, n, 3): ``basis`` (f, n, 3), then the learned ones."""

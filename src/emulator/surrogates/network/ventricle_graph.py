@@ -1,4 +1,4 @@
-r"""What a network is told of a ventricle, so that it can be told of any.
+r"""Features of a ventricle for a network that has learned a family of them.
 
 All features are products of vectors that turn with the body (:mod:`emulator.geometry.ventricle`),
 lengths over its size L and volumes over L^3. So a ventricle moved, turned or enlarged has the same

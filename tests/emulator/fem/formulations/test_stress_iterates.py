@@ -11,7 +11,7 @@ from emulator.fem.balance import relative_residual
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.formulations.stress_iterates import StressIterates, applies
 from emulator.fem.linear import Outcome
-from emulator.fem.material_point import MaterialPoint, fraction_at_stress
+from emulator.fem.material_point import MaterialPoint, fractions_at_stress
 from emulator.fem.options import NewtonOptions
 from emulator.fem.system import System
 from emulator.geometry.bodies.box import box
@@ -99,7 +99,7 @@ def test_it_converges_quadratically(ventricle):
 
 def test_the_fraction_undoes_an_exponential():
     """phi = exp(20 b) / 20 promises stress 1 + 20 for b = 1; the law has it at ln(21) / 20."""
-    fraction = fraction_at_stress(lambda b: jnp.exp(20.0 * b) / 20.0)
+    fraction = fractions_at_stress(1, lambda b: jnp.exp(20.0 * b[0]) / 20.0)
     np.testing.assert_allclose(fraction, np.log(21.0) / 20.0, rtol=1e-9)
 
 
@@ -113,14 +113,25 @@ def test_the_fraction_undoes_an_exponential():
     ],
 )
 def test_a_law_that_does_not_stiffen_goes_all_the_way(phi):
-    assert fraction_at_stress(phi) == 1.0
+    assert fractions_at_stress(1, lambda b: phi(b[0])) == 1.0
 
 
 def test_a_law_that_blows_up_on_the_way_is_stopped_short():
     """ln J of an element that its step would turn inside out."""
-    fraction = fraction_at_stress(lambda b: -jnp.log1p(-3.0 * b))
+    fraction = fractions_at_stress(1, lambda b: -jnp.log1p(-3.0 * b[0]))
     # 3 / (1 - 3 b) = 3 + 9
     np.testing.assert_allclose(fraction, 0.25, rtol=1e-9)
+
+
+def test_parts_that_share_an_exponential():
+    """phi = exp(3 a + 5 b) promises nine times its slopes for a = b = 1."""
+    fractions = fractions_at_stress(2, lambda b: jnp.exp(3.0 * b[0] + 5.0 * b[1]))
+    np.testing.assert_allclose(fractions, np.log(9.0) / 8.0, rtol=1e-9)
+
+
+def test_a_part_that_overflows_leaves_the_others_alone():
+    fractions = fractions_at_stress(2, lambda b: jnp.exp(1000.0 * b[0]) + 0.5 * b[1] ** 2)
+    np.testing.assert_allclose(fractions, [np.log(1001.0) / 1000.0, 1.0], rtol=1e-2)
 
 
 @pytest.mark.slow  # the ventricle's path is followed by Newton's method in test_loading_path, too
