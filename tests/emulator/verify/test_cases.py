@@ -11,7 +11,7 @@ from emulator.verify import CASES, Benchmark
 from emulator.verify.consistency import verify_barriers, verify_invariance, verify_patch
 from emulator.verify.cook import deflection, membrane
 from emulator.verify.land import beam
-from emulator.verify.sphere import INNER, OUTER, inner_stretch, pressure_at
+from emulator.verify.sphere import INNER, OUTER, inner_stretch, order_of, pressure_at, sphere_scene
 from emulator.verify.sphere import MU as SHEAR
 
 
@@ -50,16 +50,20 @@ def test_the_spheres_pressure_is_the_integral_of_radial_equilibrium(stretch):
     assert pressure_at(stretch) == pytest.approx(quad(slope, a, b)[0], rel=1e-10)
 
 
+def test_the_order_of_three_meshes():
+    assert order_of(*(1.0 + 0.3 * h**2.5 for h in (1.0, 0.5, 0.25))) == pytest.approx(2.5)
+
+
 @pytest.mark.slow
 def test_a_coarse_sphere():
-    assert inner_stretch((3, 2), pressure_at(1.2)) == pytest.approx(1.2, rel=5e-3)
+    assert inner_stretch(em.Simulator(sphere_scene((3, 2))), 1.2) == pytest.approx(1.2, rel=5e-3)
 
 
 @pytest.mark.slow
 def test_a_coarse_membrane_does_not_lock():
-    fine = deflection(membrane(4, 0.4999, "mean"))
+    fine = deflection(em.Simulator(membrane(4, "mean")), 0.4999)
     assert fine == pytest.approx(12.0, rel=0.03)
-    assert deflection(membrane(8, 0.4999, "P1")) < 0.6 * fine
+    assert deflection(em.Simulator(membrane(8, "P1")), 0.4999) < 0.6 * fine
 
 
 @pytest.mark.slow
