@@ -22,7 +22,6 @@ import numpy as np
 import calibrate as cal
 import emulator as em
 from calibrate.figures.sensitivity import body_figure, index_figure
-from emulator.surrogates.fem import fem_forward
 
 forward = em.load("left_ventricle").cache()
 scene = forward.scene
@@ -93,7 +92,7 @@ for name, weight in zip(
 # %%
 small = {"samples": 8, "seed": 3}
 by_emulator = cal.sensitivity(forward, cal.CavityVolume(scene), **small)["volume"]
-by_fem = cal.sensitivity(fem_forward(em.Simulator(scene)), cal.CavityVolume(scene), **small)[
+by_fem = cal.sensitivity(em.fem_forward(em.Simulator(scene)), cal.CavityVolume(scene), **small)[
     "volume"
 ]
 difference = np.abs(by_fem["total"] - by_emulator["total"]).max()

@@ -33,16 +33,11 @@ import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import emulator as em
-from emulator.error.comparison import evaluate
-from emulator.fem.campaign.reference import fem_reference
-from emulator.fem.energy import strain_energy
 from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.fibres import depth
-from emulator.geometry.io import write_mesh
 from emulator.geometry.tetrahedra import boundary_facets
 from emulator.scenes.draft import draft
-from emulator.training import recipe, train
 
 # %% [markdown]
 # ## 1. A mesh file
@@ -58,7 +53,7 @@ along = (z - z.max()) / (z.min() - z.max())  # 0 at the base, 1 at the apex
 bent = np.stack([x + 15.0 * along**2, y, z], axis=1)  # mm
 groups = {"LV_endo": "endocardium", "LV_epi": "epicardium", "LV_base": "base"}
 facets = {name: wall.facet_sets[ours] for name, ours in groups.items()}
-write_mesh("patient.msh", replace(wall, nodes=bent / 10.0, node_sets={}, facet_sets=facets))
+em.write_mesh("patient.msh", replace(wall, nodes=bent / 10.0, node_sets={}, facet_sets=facets))
 
 # %% [markdown]
 # What a file must hold: tetrahedra, and triangles in named groups. meshio shows both, whatever the format (`.msh`, `.vtu`,
@@ -208,7 +203,7 @@ print(f"cavity {cavity.rest:.1f} mL -> {float(cavity(u[cavity.nodes])):.1f} mL")
 # %%
 moved = scene.mesh.nodes + u
 pressure = float(theta[scene.parameter_names.index("pressure")])
-tissue = np.asarray(jax.jit(jax.grad(strain_energy(scene)))(solution.displacement, theta))  # mN
+tissue = np.asarray(jax.jit(jax.grad(em.strain_energy(scene)))(solution.displacement, theta))  # mN
 wall_facets = scene.mesh.facet_sets["LV_endo"]  # ordered so that their normals leave the tissue
 # Dunavant's six points of a triangle, exact to degree 4, barycentric; weights sum to 1.
 p = np.array(
@@ -309,11 +304,11 @@ assert abs(growth["quadratic, finer"][1] - growth["quadratic"][1]) < 5.0
 # their derivatives. Its defaults are a series of order 3 and 60 runs. Order 2 and 30 runs are quicker here.
 
 # %%
-plan = replace(recipe("mechanics"), order=2, simulations=30)
-emulator = train(scene, plan, "training")
+plan = replace(em.recipe("mechanics"), order=2, simulations=30)
+emulator = em.train(scene, plan, "training")
 print(f"trained in {emulator.record['seconds']:.0f} s")
-reference = fem_reference(simulator, 12)  # theta that it has not seen
-errors = evaluate(emulator.cache(), reference.thetas, reference.displacement)
+reference = em.fem_reference(simulator, 12)  # theta that it has not seen
+errors = em.evaluate(emulator.cache(), reference.thetas, reference.displacement)
 for name in ("max_u", "err_u", "err_V"):
     print(name, {k: float(f"{v:.2g}") for k, v in errors[name].items()}, errors["units"][name])
 assert errors["err_u"]["median"] < 0.05

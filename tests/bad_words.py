@@ -37,10 +37,6 @@ COMMANDS = [
     ("train once_clamped_beam --steps -1 --out x", "steps is -1"),
     ("train once_clamped_beam --resume --steps 9 --out x", "--steps has no effect with --resume"),
     (
-        "train once_clamped_beam --resume --start liver --out x",
-        "--start has no effect with --resume",
-    ),
-    (
         "train twice_clamped_beam --start once_clamped_beam --out x",
         "the emulator of 'once_clamped_beam' has no network to start from",
     ),

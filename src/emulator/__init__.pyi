@@ -1,12 +1,16 @@
 from . import fem, scenes
 from .catalogue import find_scene
+from .error.comparison import evaluate
 from .error.mesh_error import MeshError, mesh_error
 from .errors import InputError, SolverError
 from .fem import NewtonOptions, Simulator, Solution, Status, run_campaign
+from .fem.campaign.reference import fem_reference
 from .fem.campaign.stored_runs import read_runs
-from .fem.energy import potential_energy
-from .geometry.io import Body, read_body, read_mesh
+from .fem.energy import potential_energy, strain_energy
+from .fem.fields import element_fields
+from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
 from .geometry.mesh import Mesh
+from .mechanics.laws import find_law
 from .scenes import Parameter, Scene, Support
 from .scenes.finer import finer
 from .surrogates import Emulator, load, save_emulator, shipped
@@ -38,8 +42,12 @@ __all__ = [
     "Status",
     "Support",
     "corrected",
+    "element_fields",
+    "evaluate",
     "fem",
     "fem_forward",
+    "fem_reference",
+    "find_law",
     "find_scene",
     "finer",
     "fit_reduced",
@@ -55,5 +63,8 @@ __all__ = [
     "save_emulator",
     "scenes",
     "shipped",
+    "strain_energy",
     "train",
+    "write_mesh",
+    "write_solution",
 ]

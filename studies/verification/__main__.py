@@ -67,7 +67,7 @@ class Study:
 
 
 BEAM = Study("once_clamped_beam", 20, 0.2, truth="beam")
-LIVER = Study("liver", 20, 0.5, truth="liver")
+LIVER = Study("liver", 20, 0.5, truth="liver", sets=30)
 VENTRICLE = Study("left_ventricle", volume=1.0, sets=12, truth="ventricle")
 STUDIES = {
     "ventricle": replace(VENTRICLE, sets=60, certify="worst"),

@@ -112,7 +112,7 @@ def _work_ratio(load: CavityPressure | PublishedPressure, stretch: float) -> flo
     scene = replace(sphere_scene((4, 2), order=1), loads=(load,))
     term = load.term(scene.discretisation)
     X = jnp.asarray(scene.mesh.nodes)
-    derivative = jax.grad(lambda value: term.total((value - 1.0) * X, {"pressure": 1.0}))
+    derivative = jax.grad(lambda value: term.total((value - 1.0) * X, {"pressure": jnp.ones(())}))
     facets = scene.mesh.nodes[scene.mesh.facet_set("inner")]
     cone = -np.einsum("ki,ki->", facets[:, 0], np.cross(facets[:, 1], facets[:, 2])) / 6.0
     return float(-derivative(stretch) / (3.0 * stretch**2 * cone))
