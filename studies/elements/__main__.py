@@ -220,6 +220,7 @@ def drawn(cases: list[Case]) -> Any:
             )  # fmt: skip
         axes.set(xscale="log", yscale="log", title=name, xlabel="seconds a solve from rest")
         axes.margins(x=0.35)
+        axes.xaxis.set_minor_formatter("")  # within a decade the labels would overlap
         axes.grid(alpha=0.3)
     grid[0, 0].set_ylabel("landmarks' median distance from the limit (mm)")
     figure.suptitle("Elements: red linear, blue quadratic, black the default (nodes)")
