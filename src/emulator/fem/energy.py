@@ -113,12 +113,6 @@ def nodal_vectors(blocks: Blocks, P: jax.Array) -> jax.Array:
     return jnp.einsum("bq,bqij,bqaj->bai", blocks.weights, P, blocks.gradients)
 
 
-def nodal_matrices(blocks: Blocks, A: jax.Array) -> jax.Array:
-    """Second ones (b, a, 3, a, 3) from ``A = d2W/dH2`` (b, q, 3, 3, 3, 3)."""
-    A = A * blocks.weights[:, :, None, None, None, None]
-    return jnp.einsum("mqak,mqikjl,mqbl->maibj", blocks.gradients, A, blocks.gradients)
-
-
 _CHUNK = 128  # elements whose products of gradients stay in a processor's cache
 
 

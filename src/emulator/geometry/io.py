@@ -81,14 +81,6 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
     return _convert(source, directions=True, quadratic=quadratic)
 
 
-def read_fibres(path: str | Path) -> np.ndarray:
-    """Unit fibre directions, (m, 3) or (m, q, 3); :class:`InputError` when the file has none."""
-    fibres = read_body(path).fibres
-    if fibres is None:
-        raise InputError(f"mesh file {path}: it has no fibres; add cell data 'fibres' (m, 3)")
-    return fibres
-
-
 def read_regions(path: str | Path, name: str) -> np.ndarray:
     """Whole number (m,) of each element from cell data ``name``; :class:`InputError` if none."""
     found = _load(Path(path))

@@ -6,7 +6,6 @@ from emulator.errors import InputError
 from emulator.geometry.bodies.box import box
 from emulator.geometry.io import (
     read_body,
-    read_fibres,
     read_mesh,
     write_mesh,
     write_solution,
@@ -220,7 +219,6 @@ def test_what_is_written_reads_back(tmp_path, suffix):
         return
     np.testing.assert_allclose(body.fibres, fibres, rtol=1e-12)
     np.testing.assert_allclose(body.sheets, sheets, rtol=1e-12)
-    np.testing.assert_allclose(read_fibres(path), fibres, rtol=1e-12)
 
 
 def test_a_mesh_without_sets_or_fibres_reads_back(tmp_path):
@@ -231,8 +229,6 @@ def test_a_mesh_without_sets_or_fibres_reads_back(tmp_path):
         body = read_body(path)
         assert body.fibres is None
         assert not body.mesh.node_sets
-        with pytest.raises(InputError, match="it has no fibres; add cell data"):
-            read_fibres(path)
 
 
 def test_a_file_that_cannot_hold_the_sets_is_refused(tmp_path):
@@ -263,7 +259,7 @@ def with_data(path, **data):
 def test_fibres_at_nodes_are_averaged_whatever_their_sign(tmp_path):
     fibres = np.tile([0.6, 0.8, 0.0], (8, 1)) * np.array([1, -1, 1, 1, -1, -1, 1, 1])[:, None]
     path = with_data(tmp_path / "body.vtu", point_data={"fibres": fibres})
-    found = read_fibres(path)
+    found = read_body(path).fibres
     assert found.shape == (6, 3)
     np.testing.assert_allclose(np.abs(found @ [0.6, 0.8, 0.0]), 1.0, rtol=1e-14)
 
