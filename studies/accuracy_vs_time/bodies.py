@@ -1,13 +1,14 @@
 """The bodies: a scene, its meshes coarser and finer, and one fine enough to be the truth.
 
-A finer mesh of beam, cube or ventricle is made by the body's generator. For the liver and the
-released bodies it is made by cutting the mesh's own tetrahedra in eight, so that it is the same
-polyhedron, held at the same facets. Displacements are compared at the same material points.
+A finer mesh is made by the body's generator; for the released bodies by cutting the mesh's own
+tetrahedra in eight, so that it is the same polyhedron, held at the same facets. Displacements are
+compared at the same material points.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from studies.accuracy_vs_time.refinement import quadratic, refined
 
@@ -21,16 +22,18 @@ class Body:
     """One body.
 
     scene : makes what emulators are of. meshes : other discretisations by name. truth : the
-    finest; none where there is none. network : a shipped one of it; empty for none. model : whose
-    released network is of this body; empty for none. tests : theta. tolerances : looser ones of
-    FEM. orders : of series. runs, reduced : FEM runs of series with discrepancy and of POD + GP.
-    calls : of each timing of FEM. fenics : whether FEniCSx solves it, too.
+    finest; none where there is none. shipped : emulators by label, on whatever mesh. coarse : the
+    scene whose emulator is carried to a finer mesh, if any. model : whose released network is of
+    this body; empty for none. tests : theta. tolerances : looser ones of FEM. orders : of series.
+    runs, reduced : FEM runs of series with discrepancy and of POD + GP. calls : of each timing of
+    FEM. fenics : whether FEniCSx solves it, too.
     """
 
     scene: Callable[[], Scene]
     truth: Callable[[], Scene] | None
     meshes: dict[str, Callable[[], Scene]]
-    network: str = ""
+    shipped: dict[str, str] = field(default_factory=dict)
+    coarse: Callable[[], Scene] | None = None
     model: str = ""
     tests: int = 10
     tolerances: tuple[float, ...] = (1e-3, 1e-6)
@@ -43,91 +46,78 @@ class Body:
     def has(self, stage: str) -> bool:
         """Whether the stage has rungs on this body."""
         asked = {
-            "shipped": self.network,
+            "shipped": self.shipped,
+            "two meshes": self.coarse,
             "released": self.model,
             "meshes": self.meshes,
-            "float32": self.network or self.model,
+            "float32": self.shipped or self.model,
             "FEniCSx": self.fenics,
         }
         return bool(asked.get(stage, True))
 
 
-def beam(cells: tuple[int, int, int], order: int = 1) -> Scene:
-    """The once-clamped beam of other elements."""
-    return em.scenes.once_clamped_beam(cells, order=order)
+def of_scene(name: str) -> dict[str, str]:
+    """The emulator that is shipped of a scene, and the network of its linear mesh."""
+    return {"emulator as shipped": name, "network alone": f"{name}_pignn"}
 
 
-def cube(cells: int, order: int = 1) -> Scene:
-    """The twisting cube of other elements."""
-    return em.scenes.twisting_cube(cells, order=order)
-
-
-def ventricle(rings: int, around: int, layers: int, order: int = 1) -> Scene:
-    """The left ventricle of other elements."""
-    return em.scenes.left_ventricle(rings, around, layers, order=order, grading=1.0)
-
-
-def liver() -> Scene:
-    """The liver of linear elements, clamped at its ligament."""
-    return em.scenes.liver(order=1)
+def linear(scene: Callable[..., Scene], *sizes: Any) -> Callable[[], Scene]:
+    """``scene`` in linear elements."""
+    return lambda: scene(*sizes, order=1)
 
 
 BODIES = {
     "beam": Body(
-        lambda: beam((12, 4, 5)),
-        lambda: beam((24, 8, 10), 2),
+        em.scenes.once_clamped_beam,
+        lambda: em.scenes.once_clamped_beam((60, 6, 6)),
         {
-            "linear, coarser": lambda: beam((6, 2, 3)),
-            "linear, finer": lambda: beam((24, 8, 10)),
-            "linear, finest": lambda: beam((36, 12, 15)),
-            "quadratic, coarser": lambda: beam((6, 2, 3), 2),
-            "quadratic": lambda: beam((12, 4, 5), 2),
+            "linear": linear(em.scenes.once_clamped_beam),
+            "linear, finer": linear(em.scenes.once_clamped_beam, (24, 8, 10)),
+            "linear, finest": linear(em.scenes.once_clamped_beam, (36, 12, 15)),
+            "coarser": lambda: em.scenes.once_clamped_beam((10, 1, 1)),
+            "finer": lambda: em.scenes.once_clamped_beam((40, 4, 4)),
         },
-        "once_clamped_beam_pignn",
+        of_scene("once_clamped_beam"),
+        em.scenes.once_clamped_beam,
         fenics=True,
     ),
     "cube": Body(
-        lambda: cube(6),
-        lambda: cube(10, 2),
+        em.scenes.twisting_cube,
+        lambda: em.scenes.twisting_cube(12),
         {
-            "linear, coarser": lambda: cube(4),
-            "linear, finer": lambda: cube(12),
-            "quadratic, coarser": lambda: cube(3, 2),
-            "quadratic": lambda: cube(6, 2),
+            "linear": linear(em.scenes.twisting_cube),
+            "linear, finer": linear(em.scenes.twisting_cube, 12),
+            "coarser": lambda: em.scenes.twisting_cube(2),
+            "finer": lambda: em.scenes.twisting_cube(8),
         },
-        "twisting_cube_pignn",
+        of_scene("twisting_cube"),
+        em.scenes.twisting_cube,
         fenics=True,
     ),
     "liver": Body(
-        liver,
-        lambda: quadratic(liver()),
-        # No coarser one: of fewer shells it is another body, held at more of its surface.
-        {"linear, finer": lambda: refined(liver())},
-        "liver_pignn",
+        em.scenes.liver,
+        lambda: em.scenes.liver(10),
+        # A ligament of five shells, as the quadratic one's.
+        {
+            "linear": lambda: em.scenes.liver(
+                5, order=1, ligament=2.0, clustering=0.5, ligament_shells=5
+            )
+        },
+        of_scene("liver"),
         tests=6,
     ),
     "ventricle": Body(
-        lambda: ventricle(15, 30, 3),
-        lambda: ventricle(20, 40, 3, order=2),
+        em.scenes.left_ventricle,
+        lambda: em.scenes.left_ventricle(20, 40, 4),
         {
-            "linear, coarser": lambda: ventricle(10, 20, 2),
-            "linear, finer": lambda: ventricle(22, 44, 4),
-            "quadratic, coarser": lambda: ventricle(8, 16, 1, order=2),
-            "quadratic": lambda: ventricle(15, 30, 3, order=2),
+            "linear": linear(em.scenes.left_ventricle),
+            "linear, finer": linear(em.scenes.left_ventricle, 22, 44, 4),
+            "coarser": lambda: em.scenes.left_ventricle(8, 16, 1),
+            "finer": lambda: em.scenes.left_ventricle(15, 30, 3),
         },
-        "left_ventricle_pignn",
+        of_scene("left_ventricle"),
+        lambda: em.scenes.left_ventricle(8, 16, 1),
         fenics=True,
-    ),
-    "fine ventricle": Body(
-        lambda: ventricle(40, 80, 7),
-        lambda: ventricle(20, 40, 3, order=2),
-        {},
-        tests=4,
-        tolerances=(),
-        orders=(3,),
-        runs=(8,),
-        reduced=(8,),
-        calls=1,
     ),
 }
 _RELEASED: dict[str, tuple[str, Callable[[Scene], Scene] | None]] = {

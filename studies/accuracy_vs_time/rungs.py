@@ -6,6 +6,7 @@ Times are processor seconds: the machine may be shared, and a process keeps to o
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 from studies.accuracy_vs_time.bodies import Body
 from studies.common.maps import shipped
 from studies.common.timing import clocked
+from studies.common.two_meshes import on_two_meshes
 
 import emulator as em
 from calibrate.observations import landmarks, spread_landmarks
@@ -30,6 +32,7 @@ from emulator.training import RECIPES, train
 
 POINTS, SEED = 24, 4
 FAST_CALLS = 60
+NETWORK = "network alone"
 COMPILED = 5000  # nodes below which Newton steps are compiled into one program with the map
 Solve = Callable[[jax.Array], jax.Array]
 CLOCK = process_time
@@ -135,10 +138,21 @@ def reduced(place: Place) -> Iterator[Rung]:
 
 
 def loaded(place: Place) -> Iterator[Rung]:
-    """The shipped network alone; emulators as shipped are of quadratic elements."""
-    alone = shipped(place.body.network)
-    before = {"offline_s": alone.seconds, "fem_runs": alone.fem_runs}
-    yield of_map("network alone", "network", alone.forward, place.at, **before)
+    """What is shipped: the emulator, and the network alone, of linear elements."""
+    for label, name in place.body.shipped.items():
+        made = shipped(name)
+        kind = "network" if label == NETWORK else "emulator"
+        before = {"offline_s": made.seconds, "fem_runs": made.fem_runs}
+        yield of_map(label, kind, made.forward, place.at, **before)
+
+
+def carried(place: Place) -> Iterator[Rung]:
+    """An emulator of a coarse mesh, taken to the next finer one by a few runs there."""
+    with TemporaryDirectory() as folder:
+        seconds, pair = clocked(on_two_meshes, place.body.coarse(), Path(folder), clock=CLOCK)
+    runs = sum(each.record["plan"]["simulations"] for each in pair)
+    offline = {"offline_s": seconds, "fem_runs": runs}
+    yield of_map("emulator of two meshes", "emulator", pair.fine.cache(), place.at, **offline)
 
 
 def released(place: Place) -> Iterator[Rung]:
@@ -175,12 +189,12 @@ def float32(place: Place) -> Iterator[Rung]:
         "series of order 3": ("series", lambda: _series(place, 3)[1]),
         "POD + GP, 30 FEM runs": ("POD + GP", lambda: _reduced(place, 30)),
     }
-    if place.body.network:
+    if NETWORK in place.body.shipped:
         makes |= {
             "series + discrepancy, 20 FEM runs": (
                 "emulator", lambda: mechanics(place.scene, 20).cache()
             ),
-            "network alone": ("network", lambda: em.load(place.body.network).cache()),
+            NETWORK: ("network", lambda: em.load(place.body.shipped[NETWORK]).cache()),
         }  # fmt: skip
     if place.body.model:
         network = em.released_network
@@ -206,6 +220,7 @@ STAGES: dict[str, Callable[[Place], Iterator[Rung]]] = {
     "discrepancy": discrepancy,
     "reduced": reduced,
     "shipped": loaded,
+    "two meshes": carried,
     "released": released,
     "meshes": other_meshes,
     "float32": float32,
