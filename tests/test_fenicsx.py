@@ -22,14 +22,14 @@ def test_displacements_and_gradients_are_those_of_fenicsx(name, request, monkeyp
     if not os.environ.get("CALIBRATE_FENICS"):
         pytest.skip("CALIBRATE_FENICS names no interpreter with FEniCSx")
     monkeypatch.syspath_prepend(str(STUDIES))
-    from studies.accuracy_vs_time import fenics
+    from studies.common import fenicsx
     from studies.accuracy_vs_time.refinement import quadratic
 
     scene = request.getfixturevalue(name.split()[-1])
     scene = quadratic(scene) if name.startswith("quadratic") else scene
     thetas = uniform(scene, 2, jax.random.key(3))
     observed = np.flatnonzero(~scene.held.any(axis=1))[[0, 3, -1]]
-    _, _, cold, warm = fenics.compare(scene, observed, thetas, os.environ["CALIBRATE_FENICS"])
+    _, _, cold, warm = fenicsx.compare(scene, observed, thetas, os.environ["CALIBRATE_FENICS"])
     # Newton's method stops at a relative residual of 1e-11 in both.
     assert cold["difference"] < 1e-9
     assert cold["gradient_difference"] < 1e-9

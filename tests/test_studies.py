@@ -29,8 +29,7 @@ QUICK = {
     "elements": "--quick",
     "error_bar": "--scenes once_clamped_beam --cases 3 --outside 1",
     "fem_posterior": "--quick",
-    # No dolfin here: compiling its forms alone takes longer than all the rest.
-    "fem_speed": "--quick --fenics-python ABSENT",
+    "fem_speed": "--quick",
     "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
     "inverse_benchmark": "--quick",
     "large_meshes": "--quick",

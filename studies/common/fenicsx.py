@@ -1,0 +1,168 @@
+"""FEniCSx on our scenes, in a process and with forms of its own (``fenicsx_solver.py``).
+
+It is given mesh, law, load, supports and theta, and solves from rest and from the solution of a
+neighbouring theta, 3 % away in every entry. Our FEM solves the same, before it and on the same
+core. Displacements and gradients of both are compared at every theta.
+"""
+
+import os
+import subprocess
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from studies.common.output import Case
+from studies.common.timing import Clock, clocked
+
+from emulator.errors import InputError
+from emulator.fem import Simulator, uniform
+from emulator.fem.options import NewtonOptions
+from emulator.geometry.discretisation import quadrature_points
+from emulator.scenes import Scene
+from emulator.scenes.loads import CavityPressure, Gravity
+
+AWAY = 0.03  # relative distance of a neighbour in every entry of theta
+SPARE = 3  # theta for the choice of settings; the first is not timed
+LIMIT = 1800.0  # s
+PROGRAM = Path(__file__).with_name("fenicsx_solver.py")
+Arrays = dict[str, Any]
+
+
+def arrays(scene: Scene) -> Arrays:
+    """The scene as plain arrays: what FEniCSx is told."""
+    found: Arrays = {
+        "nodes": scene.mesh.nodes,
+        "elements": scene.mesh.elements,
+        "law": scene.law.name,
+        "names": np.array(scene.parameter_names),
+        "constant_names": np.array(list(scene.constants), dtype=str),
+        "constants": np.array(list(scene.constants.values()), dtype=float),
+        "held": np.flatnonzero(scene.held.all(axis=1)),
+        "prescribed": scene.held_displacement,
+        "body_force": np.zeros(3),
+    }
+    if scene.fibres is not None:
+        linear = scene.mesh.order == 1
+        found["fibres"] = scene.fibres if linear else scene.fibres_at_points
+        found["points"] = quadrature_points(scene.mesh.order)[:, 1:]
+    for load in scene.loads:
+        found |= _load(scene, load)
+    return found
+
+
+def _load(scene: Scene, load: object) -> Arrays:
+    if isinstance(load, Gravity):
+        return {"body_force": load.body_force}
+    if isinstance(load, CavityPressure) and "pressure" in scene.parameter_names:
+        return {"pressed": scene.mesh.facet_set(load.facet_set)}
+    raise InputError(f"scene '{scene.name}': FEniCSx is not told of {type(load).__name__}")
+
+
+def solve(python: str, problem: Arrays) -> Arrays:
+    """What ``fenicsx_solver.py`` finds, run by ``python``."""
+    with TemporaryDirectory() as folder:
+        task, answer = Path(folder) / "problem.npz", Path(folder) / "solutions.npz"
+        np.savez(task, **problem)
+        done = subprocess.run(
+            [python, PROGRAM, task, answer],
+            capture_output=True, text=True, check=False, timeout=LIMIT, env=_environment(),
+        )  # fmt: skip
+        if done.returncode:
+            raise SystemExit(f"FEniCSx by {Path(python).name}: {done.stderr[-2000:]}")
+        with np.load(answer, allow_pickle=False) as file:
+            return dict(file)
+
+
+def _environment() -> dict[str, str]:
+    """This process's environment without the variables of this Python, one thread."""
+    ours = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
+    return kept | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+# ---- the same by both ------------------------------------------------------------------------
+def neighbours(thetas: jax.Array) -> jax.Array:
+    """Each theta with every entry ``AWAY`` up or down."""
+    signs = jax.random.rademacher(jax.random.key(1), thetas.shape, float)
+    return thetas * (1.0 + AWAY * signs)
+
+
+def compare(
+    scene: Scene, observed: np.ndarray, thetas: jax.Array, python: str, clock: Clock = process_time
+) -> tuple[Case, ...]:
+    """Ours from rest and warm, then FEniCSx's: times, displacements (c, n, 3), differences.
+
+    Gradients are of ``sum |u|^2`` over the ``observed`` nodes. FEniCSx has a clock of its own,
+    processor seconds.
+    """
+    simulator = Simulator(scene)
+    starts = [simulator.solve(theta).displacement for theta in neighbours(thetas)]
+    cold = _ours(simulator, observed, thetas, [None] * len(thetas), clock)
+    warm = _ours(simulator, observed, thetas, starts, clock)
+    spare = uniform(scene, SPARE, jax.random.key(8))
+    told = {
+        **arrays(scene), "observed": observed, "theta": thetas, "starts": np.stack(starts),
+        "spare": spare, "tolerance": NewtonOptions().tolerance,
+    }  # fmt: skip
+    found = solve(python, told)
+    about = {
+        "settings": str(found["settings"]),
+        "load_steps": int(found["load_steps"]),
+        "tried": found["tried"].tolist(),
+        "compile_s": float(found["compile_s"]),
+        "version": str(found["version"]),
+        "difference": _relative(found["cold_displacement"], cold["displacement"]),
+        "gradient_difference": _relative(found["cold_gradient"], cold["gradient"]),
+    }
+    assert (found["cold_iterations"] > 0).all(), "FEniCSx gave up from rest"
+    assert (found["warm_iterations"] > 0).all(), "FEniCSx gave up from a neighbour"
+    theirs = [
+        {"displacement": found[f"{way}_displacement"], **_times(found, way), **about}
+        for way in ("cold", "warm")
+    ]
+    return cold, warm, *theirs
+
+
+def _ours(
+    simulator: Simulator,
+    observed: np.ndarray,
+    thetas: jax.Array,
+    starts: list[Any],
+    clock: Clock,
+) -> Case:
+    """Our solves; a theta solved for its value is solved anew, a hair away, for its gradient."""
+
+    def value(theta: jax.Array, start: Any) -> tuple[jax.Array, jax.Array]:
+        u = simulator.solve(theta, start).require_converged("FEM").displacement
+        return jnp.sum(u[observed] ** 2), u
+
+    both = jax.value_and_grad(value, has_aux=True)
+    pairs = list(zip(thetas, starts, strict=True))
+    value(0.99 * thetas[0], starts[0])  # compiles
+    both(0.98 * thetas[0], starts[0])
+    values = [clocked(value, *pair, clock=clock) for pair in pairs]
+    again = [clocked(both, theta * (1.0 + 1e-12), start, clock=clock) for theta, start in pairs]
+    return {
+        "displacement": np.stack([found[1][1] for found in values]),
+        "gradient": np.stack([found[1][1] for found in again]),
+        "value_s": float(np.median([found[0] for found in values])),
+        "gradient_s": float(np.median([found[0] for found in again])),
+    }
+
+
+def _times(found: Arrays, way: str) -> Case:
+    return {
+        "value_s": float(np.median(found[f"{way}_seconds"])),
+        "gradient_s": float(np.median(found[f"{way}_both_s"])),
+        "iterations": float(np.median(found[f"{way}_iterations"])),
+    }
+
+
+def _relative(theirs: np.ndarray, ours: np.ndarray) -> float:
+    """Largest difference relative to the largest entry, theta by theta; the largest of them."""
+    axes = tuple(range(1, ours.ndim))
+    return float((np.abs(theirs - ours).max(axis=axes) / np.abs(ours).max(axis=axes)).max())
