@@ -137,6 +137,10 @@ class _Arrays(pickle.Unpickler):
             return _frombuffer
         if (module, name) == ("_codecs", "encode"):
             return _latin1
+        if (module, name) == ("jax._src.array", "_reconstruct_array"):
+            return _of_jax
+        if (module, name) == ("flax.core.frozen_dict", "FrozenDict"):
+            return _dictionary
         raise InputError(f"asks for {module}.{name}; a pickle of anything but arrays is not read")
 
 
@@ -154,6 +158,22 @@ def _frombuffer(
     if not isinstance(buffer, bytes | bytearray) or np.dtype(dtype).kind not in "fiub":
         raise InputError("makes something else of an array; it is not read")
     return np.frombuffer(buffer, dtype=dtype).reshape(shape, order=order)
+
+
+def _of_jax(make: Any, arguments: tuple, state: tuple, _aval: Any) -> np.ndarray:
+    """A JAX array, which is pickled as how to make a NumPy array, and that array's state."""
+    if make is not _reconstruct:
+        raise InputError("makes something else of an array; it is not read")
+    array = make(*arguments)
+    array.__setstate__(state)
+    return array
+
+
+def _dictionary(content: Any) -> dict:
+    """Flax's frozen dictionary, which is pickled as a plain one."""
+    if not isinstance(content, dict):
+        raise InputError("makes something else of a dictionary; it is not read")
+    return content
 
 
 def _latin1(text: str, encoding: str) -> bytes:
