@@ -22,8 +22,8 @@ def test_displacements_and_gradients_are_those_of_fenicsx(name, request, monkeyp
     if not os.environ.get("CALIBRATE_FENICS"):
         pytest.skip("CALIBRATE_FENICS names no interpreter with FEniCSx")
     monkeypatch.syspath_prepend(str(STUDIES))
-    from studies.common import fenicsx
     from studies.accuracy_vs_time.refinement import quadratic
+    from studies.common import fenicsx
 
     scene = request.getfixturevalue(name.split()[-1])
     scene = quadratic(scene) if name.startswith("quadratic") else scene
