@@ -34,10 +34,20 @@ def test_what_the_readme_imports_is_there():
             id="importing turns on float64, loads JAX and does nothing else",
         ),
         pytest.param(
-            # ArviZ puts a lazy module in NumPyro's place (calibrate.arviz).
+            # ArviZ puts a lazy module in NumPyro's place (calibrate.whole_numpyro).
             "import arviz_base, calibrate; from numpyro import distributions;"
             "calibrate.sample; distributions.distribution",
             id="ArviZ may be imported first",
+        ),
+        pytest.param(
+            "import calibrate, arviz_base, numpyro.distributions as dist;"
+            "calibrate.model; dist.distribution",
+            id="ArviZ may be imported second",
+        ),
+        pytest.param(
+            "import arviz_base, numpyro.distributions as dist; import calibrate;"
+            "dist.distribution",
+            id="ArviZ and NumPyro may be imported first",
         ),
     ],
 )

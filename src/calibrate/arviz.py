@@ -1,8 +1,4 @@
-"""ArviZ as this package uses it, imported after NumPyro.
-
-ArviZ puts a lazy module in NumPyro's place, and a submodule that is imported through it first
-leaves ``numpyro.distributions.distribution`` undefined. So whoever needs ArviZ takes it from here.
-"""
+"""ArviZ as this package uses it, imported after NumPyro, see :mod:`calibrate.whole_numpyro`."""
 
 import numpyro.distributions  # isort: skip  # noqa: F401
 import arviz_base as base

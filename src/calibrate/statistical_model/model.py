@@ -32,8 +32,11 @@ from calibrate.state_names import split
 from calibrate.statistical_model.approximation_error import ApproximationError
 from calibrate.statistical_model.load_states import LoadStates
 from calibrate.statistical_model.prior_range import standardised
+from calibrate.whole_numpyro import mend_numpyro
 from emulator.errors import InputError
 from emulator.surrogates.protocol import ForwardMap, Prediction
+
+mend_numpyro()
 
 Data = Mapping[str, jax.Array]
 """Data by the observation's name; each of the observation's shape and unit."""
