@@ -45,8 +45,7 @@ def test_what_the_readme_imports_is_there():
             id="ArviZ may be imported second",
         ),
         pytest.param(
-            "import arviz_base, numpyro.distributions as dist; import calibrate;"
-            "dist.distribution",
+            "import arviz_base, numpyro.distributions as dist; import calibrate;dist.distribution",
             id="ArviZ and NumPyro may be imported first",
         ),
     ],

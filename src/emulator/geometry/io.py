@@ -166,7 +166,10 @@ def _write_vtu(path: str | Path, mesh: Mesh, **data: Any) -> None:
 
 def _load(path: Path) -> meshio.Mesh:
     if not path.is_file():
-        raise InputError(f"mesh file {path} does not exist")
+        what = "is a folder; name a file in it" if path.is_dir() else "does not exist"
+        raise InputError(f"mesh file {path} {what}")
+    if not path.stat().st_size:
+        raise InputError(f"mesh file {path} is empty")
     said = io.StringIO()
     try:
         # meshio's readers raise exceptions of many types, or print a reason and exit.

@@ -94,15 +94,17 @@ def draft(
         notes.append(_LINEAR)
     chosen = _law(body, law, notes)
     support = _support(body.mesh, notes)
-    for load in _loads(body.mesh, notes):
-        text = _text(body, mesh_name, chosen, support, load, notes)
+    for load, lines, note in _loads(body.mesh):
+        told = [*notes, note]
+        told += _unused(body.mesh, _text(body, mesh_name, chosen, support, (load, lines), []))
+        text = _text(body, mesh_name, chosen, support, (load, lines), told)
         out.write_text(text, encoding="utf-8")
         try:
-            return Draft(out, read_scene(out), tuple(notes))
+            return Draft(out, read_scene(out), tuple(told))
         except InputError as error:
             out.unlink()
             failure = error
-        notes.append(f"not the load '{load[0].kind}': {failure}")
+        notes.append(f"not the load '{load.kind}': {failure}")
     raise failure
 
 
@@ -157,18 +159,29 @@ def _helix(mesh: Mesh) -> tuple[str, str] | None:
     return (inner, outer) if inner and outer else None
 
 
-def _loads(mesh: Mesh, notes: list[str]) -> list[tuple[Load, str]]:
-    """Loads to try, each with its lines."""
-    found: list[tuple[Load, str]] = []
+def _loads(mesh: Mesh) -> list[tuple[Load, str, str]]:
+    """Loads to try, each with its lines and a note on it."""
+    found: list[tuple[Load, str, str]] = []
     wall = _named(mesh.facet_sets, _INSIDE)
     if wall is not None:
         for kind in (CavityPressure, FollowerPressure):
             lines = f'[[loads]]\nkind = "{kind.kind}"\nfacet_set = "{wall}"\n'
             lines += "# pressure = 0.8   # kPa; without it, a parameter\n"
-            found.append((kind(wall), lines))
-        notes.append(f"pressure on '{wall}'")
-    gravity = f'[[loads]]\nkind = "{Gravity.kind}"\ndensity = 1.06   # g/cm3\n'
-    return [*found, (Gravity(), gravity + "direction = [0.0, 0.0, -1.0]\n")]
+            found.append((kind(wall), lines, f"pressure on '{wall}'"))
+    gravity = f'[[loads]]   # CHANGE\nkind = "{Gravity.kind}"\ndensity = 1.06   # g/cm3\n'
+    note = "its own weight along -z is the load; change it if you know another"
+    return [*found, (Gravity(), gravity + "direction = [0.0, 0.0, -1.0]\n", note)]
+
+
+def _unused(mesh: Mesh, text: str) -> list[str]:
+    """A note on the facet sets that the scene file does not use, and what could be done there."""
+    names = [name for name in mesh.facet_sets if f'"{name}"' not in text]
+    if not names:
+        return []
+    return [
+        f'not used: {", ".join(names)}; a force on one: [[loads]] with kind = "traction", '
+        f'facet_set = "{names[0]}", traction = [0.0, 0.0, 1.0] in kPa'
+    ]
 
 
 def _support(mesh: Mesh, notes: list[str]) -> str:

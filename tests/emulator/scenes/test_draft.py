@@ -71,10 +71,21 @@ def test_a_bare_block_hangs_by_its_end(tmp_path):
     assert made.scene.law.name == "neo_hookean"
     assert isinstance(made.scene.loads[0], Gravity)
     assert any("held where x is least, 0 mm; change it" in note for note in made.notes)
+    assert any("own weight along -z is the load" in note for note in made.notes)
+    assert not any("not used" in note for note in made.notes)
     assert made.scene.held[:, 0].sum() == 25  # made quadratic
     other = draft(tmp_path / "block.vtu", tmp_path / "other.toml", law="neo_hookean_E_nu")
     nu = other.scene.parameters[1]
     assert (nu.name, nu.low < nu.high < 0.5) == ("nu", True)
+
+
+def test_sets_that_are_not_used_are_named(tmp_path):
+    write_mesh(tmp_path / "block.vtu", box((40.0, 10.0, 10.0), (4, 2, 2)))
+    made = draft(tmp_path / "block.vtu", tmp_path / "block.toml")
+    (note,) = (note for note in made.notes if "not used" in note)
+    assert "right, front, back, bottom, top; a force on one" in note
+    assert 'kind = "traction"' in note
+    assert note in (tmp_path / "block.toml").read_text()
 
 
 def test_command_and_bad_input(ventricle_file, capsys):
@@ -83,9 +94,13 @@ def test_command_and_bad_input(ventricle_file, capsys):
     assert told["parameters"] == ["a", "b", "a_f", "b_f", "pressure"]
     assert set(told["facet_sets"]) == {"endocardium", "epicardium", "base"}
     folder = ventricle_file.parent
+    (folder / "empty.msh").touch()
     for words, message in (
         ([str(ventricle_file)], "is there already"),
         ([str(folder / "none.msh")], "none.msh"),
+        ([str(folder)], "is a folder; name a file in it"),
+        (["."], "is a folder; name a file in it"),
+        ([str(folder / "empty.msh")], "is empty"),
         ([str(ventricle_file), "--out", "scene.json"], "must end in .toml"),
         ([str(ventricle_file), "--out", str(folder / "b.toml"), "--unit", "ft"], "known: mm, cm"),
         ([str(ventricle_file), "--out", str(folder / "c.toml"), "--law", "hooke"], "is unknown"),

@@ -32,7 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the scene file."""
     from emulator.scenes.draft import draft
 
-    out = arguments.out or Path(arguments.mesh).with_suffix(".toml")
+    beside = Path(arguments.mesh)
+    out = arguments.out or beside.parent / f"{beside.stem or 'scene'}.toml"
     made = draft(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
     mesh = made.scene.mesh
     sets = {name: len(nodes) for name, nodes in mesh.node_sets.items()}
