@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
@@ -80,6 +81,30 @@ def check_folder(path: str | Path) -> Path:
     if not existing.is_dir() or not os.access(existing, os.W_OK):
         raise InputError(f"cannot write to {path}: {existing} is not a folder one may write to")
     return path
+
+
+@contextmanager
+def exclusive(path: str | Path, what: str) -> Iterator[Path]:
+    """``path``, which no other process that asks the same has meanwhile; its folder is made.
+
+    Raises
+    ------
+    InputError
+        Another ``what`` is writing there.
+    """
+    path = Path(path)
+    check_folder(path.parent)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path.parent / f".{path.name}.lock")
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise InputError(f"{path}: another {what} is writing to it; wait until it ends") from None
+    try:
+        yield path
+    finally:
+        Path(lock.lock_file).unlink(missing_ok=True)
+        lock.release()
 
 
 def read_json(path: str | Path) -> Any:

@@ -20,10 +20,9 @@ from calibrate.report import charts
 from calibrate.report.body import body_figure
 from calibrate.state_names import split
 from calibrate.workflow import Run, read_posterior, simulator_of
-from calibrate.workflow.workflow import CERTIFICATE
+from calibrate.workflow.workflow import CERTIFICATE, REPORT
 from emulator.store import read_json, replacing
 
-REPORT = "report.html"
 _COLOURS = {"accepted": "#00684a", "reweight": "#8a5a00", "undecided": "#8a5a00"}
 _NOT = "#9c2a00"
 _MOVED = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}

@@ -72,7 +72,7 @@ def run_demo(
     pyplot()  # a missing plotting package is reported before the sampling
     chosen = DEMOS[scene]
     run = chosen.run
-    posterior = infer(run, folder, progress=progress)
+    posterior = infer(run, folder, force=True, progress=progress)
     certificate = certify_and_keep(posterior, folder, progress=progress)
     built = posterior.model.forward.scene
     truth = simulator_of(built)(built.theta(**run.truth))

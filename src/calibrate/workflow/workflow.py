@@ -37,7 +37,7 @@ from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.fem import NewtonOptions, Simulator
 from emulator.scenes.scene import Scene
-from emulator.store import read_json, save_arrays, write_json
+from emulator.store import exclusive, read_json, save_arrays, write_json
 from emulator.surrogates import registry
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.kind import Ingredients
@@ -45,6 +45,8 @@ from emulator.surrogates.protocol import ForwardMap
 
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
 FORWARD, ERROR = "forward.safetensors", "error.safetensors"
+REPORT = "report.html"
+_RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # of a run that has ended
 SAMPLING = "sampling.safetensors"  # of a run under way, or killed
 
 
@@ -118,11 +120,48 @@ def by_fem(model: Model) -> Model:
     return replace(model, full=whole, forward=whole.at(model.observe.nodes), error=None)
 
 
-def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False) -> Posterior:
+def infer(
+    run: Run, folder: str | Path | None = None, *, force: bool = False, progress: bool = False
+) -> Posterior:
     """Sample the posterior of a run; with ``folder``, keep run, data and posterior there.
 
-    A run into ``folder`` that was killed while sampling goes on where it was.
+    A run into ``folder`` that was killed while sampling goes on where it was. Results of an earlier
+    run are replaced with ``force`` alone.
+
+    Raises
+    ------
+    InputError
+        ``folder`` has the results of an earlier run, or another process is writing to it.
     """
+    if folder is None:
+        return _sampled(run, None, progress=progress)[0]
+    folder = Path(folder)
+    with exclusive(folder, "run"):
+        there = [name for name in _RESULTS if (folder / name).exists()]
+        if there and not force:
+            raise InputError(
+                f"{folder} has results of an earlier run ({', '.join(there)}); replace them with "
+                "--force (in Python: force=True), or name another folder"
+            )
+        posterior, run, observe, data = _sampled(run, folder / SAMPLING, progress=progress)
+        # Earlier results are removed first and the posterior is written last: a run that is killed
+        # leaves no posterior, rather than one beside the certificate of another.
+        for name in _RESULTS:
+            (folder / name).unlink(missing_ok=True)
+        write_data(folder / DATA, observe, data)
+        write_json(folder / RUN, asdict(run))
+        registry.keep_forward(posterior.model.full, folder / FORWARD)
+        if posterior.model.error is not None:
+            save_arrays(folder / ERROR, posterior.model.error.arrays(), {})
+        posterior.tree.attrs["run"] = json.dumps(asdict(run))
+        posterior.save(folder / POSTERIOR)
+    return posterior
+
+
+def _sampled(
+    run: Run, checkpoint: Path | None, *, progress: bool
+) -> tuple[Posterior, Run, Observations, dict[str, np.ndarray]]:
+    """The posterior of a run, the run with its noises by name, its observations and data."""
     sampler = find_sampler(run.sampler)
     length = {"warmup": run.warmup, "draws": run.draws, "chains": run.chains}
     options = options_from(sampler, run.sampler_options, **length)
@@ -150,22 +189,9 @@ def infer(run: Run, folder: str | Path | None = None, *, progress: bool = False)
         seed=run.seed,
         progress=progress,
         simulator=simulator_of(scene, run.load_steps) if sampler.solves_fem else None,
-        checkpoint=None if folder is None else Path(folder) / SAMPLING,
+        checkpoint=checkpoint,
     )
-    if folder is not None:
-        folder = Path(folder)
-        # An earlier result is removed first and the posterior is written last: a run that is killed
-        # leaves no posterior, rather than one beside the certificate of another.
-        for name in (CERTIFICATE, POSTERIOR, FORWARD, ERROR):
-            (folder / name).unlink(missing_ok=True)
-        write_data(folder / DATA, observe, data)
-        write_json(folder / RUN, asdict(run))
-        registry.keep_forward(posterior.model.full, folder / FORWARD)
-        if posterior.model.error is not None:
-            save_arrays(folder / ERROR, posterior.model.error.arrays(), {})
-        posterior.tree.attrs["run"] = json.dumps(asdict(run))
-        posterior.save(folder / POSTERIOR)
-    return posterior
+    return posterior, run, observe, data
 
 
 def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
@@ -241,6 +267,7 @@ def certify_and_keep(
         posterior, simulator, draws=draws, mesh=mesh, scheduler=scheduler, progress=progress
     )
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
+    (Path(folder) / REPORT).unlink(missing_ok=True)  # it tells an earlier verdict
     if reweight_to is not None and keeps(check.certificate):
         _keep_reweighted(reweighted(check), Path(folder), Path(reweight_to))
     return check.certificate
@@ -249,7 +276,7 @@ def certify_and_keep(
 def _keep_reweighted(posterior: Posterior, source: Path, target: Path) -> None:
     """``posterior`` beside copies of the run, data and map it is from."""
     target.mkdir(parents=True, exist_ok=True)
-    for name in (CERTIFICATE, POSTERIOR, FORWARD, ERROR):
+    for name in _RESULTS:
         (target / name).unlink(missing_ok=True)
     for name in (RUN, DATA, FORWARD, ERROR):
         if (source / name).exists():

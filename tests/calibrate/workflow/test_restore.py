@@ -13,7 +13,7 @@ from calibrate.posterior import read_tree
 from calibrate.workflow import Run, infer, read_posterior
 from emulator.errors import InputError
 from emulator.scenes import registry
-from emulator.store import read_arrays, save_arrays
+from emulator.store import exclusive, read_arrays, save_arrays
 
 SCENE = "once_clamped_beam"
 RUN = Run(
@@ -136,9 +136,26 @@ def test_a_new_result_takes_the_old_map_with_it(infer_once, folder, monkeypatch)
 
     monkeypatch.setattr("calibrate.workflow.workflow.sample", lambda *_, **__: infer_once[1])
     monkeypatch.setattr("calibrate.workflow.workflow.write_data", stop)
+    (folder / "report.html").touch()
     with pytest.raises(KeyboardInterrupt):
-        infer(RUN, folder)
+        infer(RUN, folder, force=True)
     assert {path.name for path in folder.iterdir()} == {"run.json", "data.csv"}
+
+
+def test_results_that_are_there_are_not_replaced(folder):
+    before = (folder / "posterior.nc").stat().st_mtime_ns
+    with pytest.raises(InputError, match=r"earlier run \(posterior.nc, .*\); .* --force"):
+        infer(RUN, folder)
+    assert (folder / "posterior.nc").stat().st_mtime_ns == before
+
+
+def test_two_runs_do_not_share_a_folder(folder):
+    with (
+        exclusive(folder, "run"),
+        pytest.raises(InputError, match="another run is writing to it; wait until it ends"),
+    ):
+        infer(RUN, folder, force=True)
+    assert not list(folder.parent.glob("*.lock"))
 
 
 @pytest.mark.slow

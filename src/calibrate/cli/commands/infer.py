@@ -34,6 +34,9 @@ def register(commands: Any) -> None:
         "--no-certify", action="store_true", help="leave the check against FEM for later"
     )
     parser.add_argument("--out", required=True, metavar="DIR")
+    parser.add_argument(
+        "--force", action="store_true", help="replace the results of an earlier run in DIR"
+    )
 
 
 def sampler_options(words: list[str]) -> dict[str, Any]:
@@ -77,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
         chains=arguments.chains,
         seed=arguments.seed,
     )
-    posterior = run_inference(plan, folder, progress=progress)
+    posterior = run_inference(plan, folder, force=arguments.force, progress=progress)
     certificate = None
     if not (arguments.no_certify or find_sampler(plan.sampler).solves_fem):
         certificate = certify_and_keep(

@@ -33,7 +33,6 @@ from typing import Any
 
 import numpy as np
 import zarr
-from filelock import FileLock, Timeout
 
 from emulator.errors import InputError
 from emulator.fem.campaign.engine import Solver
@@ -41,7 +40,7 @@ from emulator.fem.campaign.row import Row
 from emulator.fem.campaign.starts import Field
 from emulator.fem.solution import Status
 from emulator.scenes.scene import Scene
-from emulator.store import check_folder
+from emulator.store import exclusive
 
 MISSING = -1
 _FORMAT = 1
@@ -147,22 +146,12 @@ def writing(path: str | Path, question: Question) -> Iterator[ZarrRows]:
     path = Path(path)
     if path.is_symlink() or path.exists():
         require_store(path)
-    check_folder(path.parent)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(path.parent / f".{path.name}.lock")
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        raise InputError(f"{path}: another campaign is writing to it; wait until it ends") from None
-    try:
+    with exclusive(path, "campaign"):
         if not path.exists():
             _make_at(path, question)
         group = zarr.open_group(path, mode="r+", use_consolidated=False)
         _check_question(path, group, question)
         yield ZarrRows(group)
-    finally:
-        Path(lock.lock_file).unlink(missing_ok=True)
-        lock.release()
 
 
 def require_store(path: str | Path) -> zarr.Group:
