@@ -5,7 +5,7 @@ Before data: :func:`expected_precision`. After: :func:`identify`, :func:`profile
 """
 
 from calibrate.identifiability.combinations import identify, in_words
-from calibrate.identifiability.fisher import expected_precision
+from calibrate.identifiability.expected import expected_precision
 from calibrate.identifiability.next_measurement import Candidate, next_measurement
 from calibrate.identifiability.profile import Profile, profile_likelihood
 from calibrate.identifiability.stress import StressBand, stress_band

@@ -21,8 +21,9 @@ from calibrate.posterior import Posterior
 from calibrate.statistical_model import Model
 
 _PRIOR_DRAWS = 4096
-# Exponents are rounded to be readable; those that round to zero are left out.
+# Exponents are told rounded, to be readable; those that round to zero are left out.
 _DIGITS = 1
+_LEARNED = 0.95  # largest share of its prior sd that a combination is told with
 _TOGETHER = 0.7  # least absolute correlation of pairs that are told
 _BEST = 2  # combinations that are told
 
@@ -73,7 +74,7 @@ def _on_scale(thetas: np.ndarray, log: np.ndarray) -> np.ndarray:
 def combinations(
     names: tuple[str, ...], after: np.ndarray, before: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Products of powers, the most contracted first.
+    """Products of powers of which something was learned, the most contracted first.
 
     Parameters
     ----------
@@ -85,9 +86,12 @@ def combinations(
     for w in directions.T:
         # The parameter that contributes most to its variance under the prior has exponent 1.
         leading = int(np.argmax(np.abs(w) * prior_sd))
-        exponents = np.round(w / w[leading], _DIGITS) + 0.0
+        exponents = w / w[leading]
         sds = [float(np.sqrt(exponents @ S @ exponents)) for S in (after, before)]
-        kept = {n: float(e) for n, e in zip(names, exponents, strict=True) if e}
+        if sds[0] > _LEARNED * sds[1]:
+            continue
+        rounded = np.round(exponents, _DIGITS) + 0.0
+        kept = {n: float(e) for n, e in zip(names, rounded, strict=True) if e}
         found.append({"exponents": kept, "known_to": sds[0], "prior": sds[1]})
     return sorted(found, key=lambda entry: entry["known_to"] / entry["prior"])
 

@@ -1,4 +1,4 @@
-r"""What data would determine, before there is any: Fisher information.
+r"""Fisher information of the data about the unknowns.
 
 With :math:`g(x)` the data without noise as a function of the unknowns :math:`x = \log\theta`
 (:math:`\theta` itself where it may be 0 or below), and :math:`I_\varepsilon` the information of the
@@ -7,69 +7,25 @@ noise about its mean, the data hold the information
 .. math:: F = J^T I_\varepsilon J, \qquad J = \partial g / \partial x, \qquad
           I_\varepsilon = -\partial^2_\mu \log p(y \mid \mu)\big|_{y = \mu}
 
-about x, and with a prior of covariance P the posterior's covariance is about
+about x, and with a normal prior of covariance P the posterior's covariance is about
 :math:`(F + P^{-1})^{-1}`. Gaussian noise of covariance C has :math:`I_\varepsilon = C^{-1}`; for
-Student's t this is the curvature at its centre, somewhat more than its information. F is averaged
-over draws of the prior, or taken at one theta.
+Student's t this is the curvature at its centre, somewhat more than its information.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from calibrate.identifiability.combinations import combinations, prior_table
 from calibrate.noise.information import information_about_means
 from calibrate.observations import Observations
 from calibrate.statistical_model import Model
 from emulator.errors import InputError
-
-_DRAWS = 64
-
-
-def expected_precision(
-    model: Model, at: Mapping[str, float] | None = None, *, draws: int = _DRAWS
-) -> dict[str, Any]:
-    """What ``model``'s observations would determine, before any data; plain JSON.
-
-    Parameters
-    ----------
-    at : unknowns by name where the information is taken; its mean over ``draws`` draws of the
-        prior by default.
-
-    Returns
-    -------
-    sd : per unknown, its expected posterior sd relative to the prior's, in log theta where all
-        unknowns are positive.
-    combinations : as of :func:`~calibrate.identifiability.identify`; empty where an unknown may be
-        0 or below.
-
-    Raises
-    ------
-    InputError
-        The forward map has no answer at any of the draws, or noise has no known sd.
-    """
-    if any(model.noise_sites.values()):
-        raise InputError(
-            "identifiability: give every noise a known sd, as in GaussianNoise(sd=...)"
-        )
-    names, prior = model.states.unknowns, prior_table(model)
-    positive = bool((prior > 0.0).all())
-    where = prior[:draws] if at is None else np.array([[at[name] for name in names]])
-    information = np.mean(informations(model, where, log=positive), axis=0)
-    before = np.atleast_2d(np.cov(np.log(prior) if positive else prior, rowvar=False))
-    after = np.linalg.inv(information + np.linalg.inv(before))
-    ratio = np.sqrt(np.diagonal(after) / np.diagonal(before))
-    return {
-        "sd": dict(zip(names, ratio.tolist(), strict=True)),
-        "combinations": combinations(names, after, before) if positive else [],
-    }
 
 
 def informations(model: Model, values: np.ndarray, *, log: bool) -> np.ndarray:

@@ -235,6 +235,14 @@ class Model:
             found[name] = prior.sample(k, (count,))
         return found
 
+    def log_prior(self, values: Mapping[str, jax.Array]) -> jax.Array:
+        """Log density of the prior of theta's unknowns, (); ``values`` are numbers by name."""
+        found = jnp.zeros(())
+        for name in self.states.unknowns:
+            prior = self._given_earlier(name, self.prior[name], values)
+            found += prior.log_prob(values[name])
+        return found
+
     def given(
         self, data: np.ndarray | Mapping[str, np.ndarray]
     ) -> tuple[Model, dict[str, jax.Array]]:

@@ -62,6 +62,34 @@ def test_expected_precision_is_the_closed_form(case, forward):
     np.testing.assert_allclose(list(found["sd"].values()), wanted, rtol=0.05)
 
 
+def test_posteriors_are_averaged_in_the_box_of_the_prior(beam, forward):
+    """Data that sees mu + lam alone, by sums over a grid: a box ends where a Gaussian does not."""
+    alike = forward.matrix.copy()
+    alike[..., 1] = alike[..., 0]
+    size = np.linalg.norm(alike[NODES][..., 0])
+    ends, noise = (50.0, 100.0), 2.0
+    prior = {name: dist.Uniform(*ends) for name in ("mu", "lam")}
+    observe = cal.nodal_displacements(beam, NODES)
+    model = cal.model(
+        replace(forward, matrix=alike), observe, cal.GaussianNoise(noise * size), prior,
+        check_scale=False,
+    )  # fmt: skip
+    found = expected_precision(model, data_sets=200)
+    rng, grid = np.random.default_rng(2), np.linspace(*ends, 301)
+    mu, lam = np.meshgrid(grid, grid)
+    sds = []
+    for truth in rng.uniform(*ends, (400, 2)).sum(axis=1):
+        weight = np.exp(-0.5 * ((mu + lam - truth - noise * rng.normal()) / noise) ** 2)
+        weight /= weight.sum()
+        sds.append(np.sqrt(np.sum(weight * np.log(mu) ** 2) - np.sum(weight * np.log(mu)) ** 2))
+    wanted = np.mean(sds) / np.log(grid).std()
+    for ratio in found["sd"].values():
+        assert ratio == pytest.approx(wanted, rel=0.06)
+    # A number has one combination, here nearly the product.
+    (only,) = found["combinations"]
+    assert set(only["exponents"]) == {"mu", "lam"}
+
+
 def test_in_logarithms_it_names_the_combination_the_data_fixes(beam, forward):
     """Data that sees mu - lam only, near mu = lam: their ratio, mu^1 lam^-1."""
     alike = forward.matrix.copy()
