@@ -139,16 +139,15 @@ def _posterior_covariances(
     sensitivity = sensitivities(model, model.observe, log=log)
     shared = jnp.asarray(np.log(prior[count:]) if log else prior[count:])[:_FROM_PRIOR]
     precision = jnp.asarray(np.linalg.inv(before))
-    of_shared = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))(shared)
+    ahead, answers = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))(shared)
     share = len(shared) / (len(shared) + _AROUND)
 
     def first(x: jax.Array, data: dict[str, jax.Array]) -> _Around:
         """A Newton step from where the data was made, in the linear map with a normal prior."""
         means, J, _ = sensitivity(x)
         S = _inverse(J.T @ information_about_means(model.noise, means) @ J + precision)
-        score = jax.grad(lambda x: log_likelihood(*predicted(x), data))(x) - precision @ (
-            x - shared.mean(0)
-        )
+        score = jax.grad(lambda x: log_likelihood(*predicted(x), data))(x)
+        score -= precision @ (x - shared.mean(axis=0))
         step = jnp.where(jnp.isfinite(score), score, 0.0)
         return _Around(x + S @ step, _WIDER * jnp.linalg.cholesky(S))
 
@@ -158,7 +157,7 @@ def _posterior_covariances(
         parts = model.distributions(means, model.noise_values({}))
         each = jax.random.split(noise, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
-        told = jax.vmap(log_likelihood, in_axes=(0, 0, None))(*of_shared, data)
+        told = jax.vmap(log_likelihood, in_axes=(0, 0, None))(ahead, answers, data)
         around = first(x, data)
         for k in keys:
             drawn = around.draw(k, _AROUND)
