@@ -44,12 +44,23 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_atomically(path: str | Path, content: bytes) -> None:
-    """Replace ``path`` by ``content``; on failure the old file stays."""
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+def write_atomically(path: str | Path, content: bytes | memoryview) -> None:
+    """Replace ``path`` by ``content``; on failure the old file stays, and OSError names it."""
+    try:
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def write_netcdf(path: str | Path, content: Any) -> None:
+    """Write a Dataset or DataTree of xarray as netCDF.
+
+    It is made in memory first: a disk that is full would end the process inside HDF5.
+    """
+    write_atomically(path, content.to_netcdf(engine="h5netcdf"))
 
 
 def to_json(content: Any) -> str:

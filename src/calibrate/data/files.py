@@ -22,8 +22,8 @@ import xarray as xr
 
 from calibrate.observations import Field
 from calibrate.state_names import in_state, split, states_of
+from emulator import store
 from emulator.errors import InputError
-from emulator.store import replacing, write_atomically
 
 STATE = "state"
 """Column of a CSV file that names the load state of a row."""
@@ -252,7 +252,7 @@ def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
     writer.writeheader()
     for state, blocks in states.items():
         writer.writerows({**({STATE: state} if named else {}), **row} for row in _rows(blocks))
-    write_atomically(path, text.getvalue().encode())
+    store.write_atomically(path, text.getvalue().encode())
 
 
 def _rows(blocks: Sequence[Block]) -> list[dict[str, str]]:
@@ -290,5 +290,4 @@ def write_netcdf(path: str | Path, states: Mapping[str, Sequence[Block]]) -> Non
         for field, array in block:
             dims = [f"point_{k}", *(f"component_{n}" for n in np.shape(array)[1:])]
             variables[in_state(field.variable, state)] = (dims[: np.ndim(array)], np.asarray(array))
-    with replacing(path) as temporary:
-        xr.Dataset(variables).to_netcdf(temporary, engine="h5netcdf")
+    store.write_netcdf(path, xr.Dataset(variables))

@@ -28,7 +28,7 @@ from calibrate.statistical_model import Data, FEMLikelihood, Model
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.shown import Shown
-from emulator.store import replacing
+from emulator.store import write_netcdf
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,8 +111,7 @@ class Posterior(Shown):
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""
-        with replacing(path) as temporary:
-            self.tree.to_netcdf(temporary, engine="h5netcdf")
+        write_netcdf(path, self.tree)
 
 
 def read_tree(path: str | Path) -> xr.DataTree:

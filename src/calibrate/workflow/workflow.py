@@ -12,6 +12,7 @@ from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from shutil import copyfile
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
@@ -144,18 +145,33 @@ def infer(
                 "--force (in Python: force=True), or name another folder"
             )
         posterior, run, observe, data = _sampled(run, folder / SAMPLING, progress=progress)
-        # Earlier results are removed first and the posterior is written last: a run that is killed
-        # leaves no posterior, rather than one beside the certificate of another.
-        for name in _RESULTS:
-            (folder / name).unlink(missing_ok=True)
-        write_data(folder / DATA, observe, data)
-        write_json(folder / RUN, asdict(run))
-        registry.keep_forward(posterior.model.full, folder / FORWARD)
-        if posterior.model.error is not None:
-            save_arrays(folder / ERROR, posterior.model.error.arrays(), {})
-        posterior.tree.attrs["run"] = json.dumps(asdict(run))
-        posterior.save(folder / POSTERIOR)
+        with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as made:
+            _keep(posterior, run, observe, data, Path(made))
+            folder.mkdir(exist_ok=True)
+            # Earlier results go first and the posterior comes last: a run that is killed leaves no
+            # posterior, rather than one beside the certificate of another.
+            for name in _RESULTS:
+                (folder / name).unlink(missing_ok=True)
+            for path in sorted(Path(made).iterdir(), key=lambda path: path.name == POSTERIOR):
+                path.replace(folder / path.name)
     return posterior
+
+
+def _keep(
+    posterior: Posterior,
+    run: Run,
+    observe: Observations,
+    data: Mapping[str, np.ndarray],
+    folder: Path,
+) -> None:
+    """Write all that a run leaves."""
+    write_data(folder / DATA, observe, data)
+    write_json(folder / RUN, asdict(run))
+    registry.keep_forward(posterior.model.full, folder / FORWARD)
+    if posterior.model.error is not None:
+        save_arrays(folder / ERROR, posterior.model.error.arrays(), {})
+    posterior.tree.attrs["run"] = json.dumps(asdict(run))
+    posterior.save(folder / POSTERIOR)
 
 
 def _sampled(

@@ -1,8 +1,10 @@
 """A kept result is certified only with the run and the forward map it was sampled with."""
 
+import errno
 import json
 import shutil
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -130,16 +132,22 @@ def test_a_posterior_that_names_no_run_is_refused(infer_once, folder):
         read_posterior(folder)
 
 
-def test_a_new_result_takes_the_old_map_with_it(infer_once, folder, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
+def test_a_result_is_replaced_at_once_or_not_at_all(infer_once, folder, monkeypatch):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    (folder / "certificate.json").touch()
+    (folder / "error.safetensors").touch()
     monkeypatch.setattr("calibrate.workflow.workflow.sample", lambda *_, **__: infer_once[1])
-    monkeypatch.setattr("calibrate.workflow.workflow.write_data", stop)
-    (folder / "report.html").touch()
-    with pytest.raises(KeyboardInterrupt):
-        infer(RUN, folder, force=True)
-    assert {path.name for path in folder.iterdir()} == {"run.json", "data.csv"}
+    with monkeypatch.context() as patch:
+        full = OSError(errno.ENOSPC, "No space left on device")
+        patch.setattr("emulator.store.os.fsync", Mock(side_effect=[None, full]))
+        with pytest.raises(OSError, match="No space left on device: '.*run.json'"):
+            infer(RUN, folder, force=True)
+    assert {path.name for path in folder.parent.iterdir()} == {folder.name}
+    assert all((folder / name).read_bytes() == content for name, content in before.items())
+    infer(RUN, folder, force=True)
+    # Nothing stays of the earlier one that the new one does not have.
+    assert {path.name for path in folder.iterdir()} == set(before)
+    read_posterior(folder)
 
 
 def test_results_that_are_there_are_not_replaced(folder):

@@ -142,10 +142,9 @@ def write(found: xr.DataTree, scene: Scene, folder: Path) -> None:
     from calibrate.figures.sensitivity import draw
     from calibrate.sensitivity_analysis import FIELD
     from emulator.geometry.io import write_nodal
-    from emulator.store import replacing
+    from emulator.store import write_netcdf
 
-    with replacing(folder / "sensitivity.nc") as temporary:
-        found.to_netcdf(temporary, engine="h5netcdf")
+    write_netcdf(folder / "sensitivity.nc", found)
     draw(found, scene, folder)
     if FIELD in found.children:
         data = found[FIELD].to_dataset()
