@@ -13,16 +13,19 @@ and as too large when
 with the noise's standard deviation :math:`\sigma` (the largest plausible one where it is inferred)
 and n numbers. The second conditions keep noisy data: however large the noise, data made at
 :math:`g_s` meets one of them with a probability below 4e-6. The first conditions keep data from a
-corner of the prior that no draw came near.
+corner of the prior that no draw came near. Before data is refused it is looked for: at more draws,
+and by descents of :math:`\|y - g(x)\|` from the nearest, as a second mode may be small.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import minimize
 
 from calibrate.noise import Noise
 from calibrate.observations import Observation, Observations
@@ -30,6 +33,7 @@ from emulator.errors import InputError
 
 _DRAWS = 32  # predictions at draws of the prior
 PRIOR_DRAWS = 4096  # whose extremes stand for the ends of a parameter's prior
+_MORE_DRAWS, _DESCENTS, _STEPS = 256, 4, 30  # before data is refused
 _FACTOR = 2.0
 _NOISE_SD = 5.0
 _OVERRULE = "check_scale=False or --no-unit-check overrules"
@@ -52,7 +56,44 @@ def check_magnitudes(
     """
     predictions = predict_over_prior(predict, observe, draws)
     for name, part in observe.parts.items():
-        check_magnitude(name, part, data[name], predictions[name], noise[name].upper_sd)
+        about = name, part, data[name]
+        if complaint(*about, predictions[name], noise[name].upper_sd) is None:
+            continue
+        more = _nearer(predict, name, data[name], draws)
+        known = np.concatenate([predictions[name], more])
+        found = complaint(*about, known, noise[name].upper_sd)
+        if found is not None:
+            raise InputError(found)
+
+
+def _nearer(predict: Predict, name: str, data: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    """Predictions (s, ...) at more draws, and at the ends of descents towards the data."""
+
+    def gap(x: jax.Array) -> jax.Array:
+        means, valid = predict(x)
+        return jnp.where(valid, jnp.log1p(jnp.sum((means[name] - data) ** 2)), jnp.inf)
+
+    rows = draws[:_MORE_DRAWS]
+    gaps = np.asarray(jax.jit(partial(jax.lax.map, gap))(jnp.asarray(rows)))
+    both = jax.jit(jax.value_and_grad(gap))
+    ends = [draws.min(axis=0), draws.max(axis=0)]
+    width = np.where(ends[1] > ends[0], ends[1] - ends[0], 1.0)
+
+    def scaled(z: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = both(jnp.asarray(ends[0] + width * z))
+        return float(value), np.nan_to_num(np.asarray(slope) * width)
+
+    reached = [
+        ends[0] + width * minimize(
+            scaled, (rows[k] - ends[0]) / width, jac=True, method="L-BFGS-B",
+            bounds=[(0.0, 1.0)] * len(width), options={"maxiter": _STEPS},
+        ).x
+        for k in np.argsort(gaps)[:_DESCENTS]
+        if np.isfinite(gaps[k])
+    ]  # fmt: skip
+    one = jax.jit(predict)
+    found = [one(jnp.asarray(x)) for x in (*rows, *reached)]
+    return np.stack([np.asarray(means[name]) for means, valid in found if bool(valid)])
 
 
 def predict_over_prior(
@@ -101,21 +142,20 @@ def predict_over_prior(
     return {name: np.stack(values) for name, values in found.items()}
 
 
-def check_magnitude(
+def complaint(
     name: str, part: Observation, data: np.ndarray, predictions: np.ndarray, sd: float
-) -> None:
-    """Raise :class:`InputError` where data (...) is far from all of ``predictions`` (s, ...)."""
+) -> str | None:
+    """A line where data (...) is far from all of ``predictions`` (s, ...), else None."""
     y, g = np.ravel(data), predictions.reshape(len(predictions), -1)
     norms = np.array([_norm(row) for row in g])
     if not norms.min() > 0.0:
-        return  # a body that may be at rest explains data of any size
+        return None  # a body that may be at rest explains data of any size
     size, count = _norm(y), y.size
     along = np.array([row @ y for row in g / norms[:, None]])
     small = (size < norms / _FACTOR) & (norms - along > _NOISE_SD * sd)
     apart = np.array([_norm(y - row) for row in g])
     large = (size > _FACTOR * norms) & (apart > sd * (np.sqrt(count) + _NOISE_SD))
-    if small.all() or large.all():
-        raise InputError(_complaint(name, part, y, g, norms))
+    return _complaint(name, part, y, g, norms) if small.all() or large.all() else None
 
 
 def _complaint(

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.data.magnitude import PRIOR_DRAWS, check_magnitude, predict_over_prior
+from calibrate.data.magnitude import (
+    PRIOR_DRAWS,
+    check_magnitudes,
+    complaint,
+    predict_over_prior,
+)
+from calibrate.observations import Observations
 from emulator.errors import InputError
 from linear_support import linear_forward
 
@@ -79,7 +85,7 @@ def test_noise_alone_never_makes_data_refused(forward, beam, sd):
     corners = [low, high, np.array([low[0], high[1]]), np.array([high[0], low[1]])]
     for theta in [*corners, *rng.uniform(low, high, (200, 2))]:
         data = np.asarray(model.forward(jnp.asarray(theta))) + rng.normal(0.0, sd, (4, 3))
-        check_magnitude("displacement", observe, data, predictions, sd)
+        assert complaint("displacement", observe, data, predictions, sd) is None
 
 
 def test_the_smallest_and_the_largest_prediction_are_among_those_made(model, beam):
@@ -94,7 +100,22 @@ def test_the_smallest_and_the_largest_prediction_are_among_those_made(model, bea
 def test_a_body_that_may_be_at_rest_explains_small_data(beam):
     observe = cal.nodal_displacements(beam, NODES)
     g = np.stack([np.zeros((4, 3)), np.ones((4, 3))])
-    check_magnitude("displacement", observe, np.full((4, 3), 1e-6), g, 1e-9)
+    assert complaint("displacement", observe, np.full((4, 3), 1e-6), g, 1e-9) is None
+
+
+def test_a_second_mode_is_no_other_unit(beam):
+    """A narrow hill in the box of the prior: ten times the displacement of all the rest."""
+    observe = Observations({"displacement": cal.nodal_displacements(beam, NODES)})
+    noise = {"displacement": cal.GaussianNoise(sd=0.1)}
+
+    def predict(x):
+        hill = jnp.exp(-0.5 * jnp.sum((x - 0.21) ** 2) / 0.06**2)
+        return {"displacement": jnp.ones((4, 3)) * (1.0 + 9.0 * hill)}, jnp.array(True)
+
+    draws = np.random.default_rng(1).random((PRIOR_DRAWS, 3))
+    check_magnitudes(predict, observe, noise, draws, {"displacement": np.full((4, 3), 10.0)})
+    with pytest.raises(InputError, match="larger than predicted .* against 1 to 10 mm"):
+        check_magnitudes(predict, observe, noise, draws, {"displacement": np.full((4, 3), 40.0)})
 
 
 def test_one_outlier_is_no_wrong_unit(model, exact):
