@@ -17,6 +17,8 @@ from emulator.geometry.mesh import Mesh
 # How far outside the body a point may lie, as a fraction of the body's size. Measured surface
 # points rarely lie on the mesh to the last digit.
 _SLACK = 1e-3
+_SEVERAL, _LEAST, _MOST = 3, 0.003, 5.0  # points; their span as a share of the body's
+_UNITS = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
 _ON_THE_FACE = 1e-9  # round-off of a barycentric coordinate
 _CANDIDATES = 32  # nearest elements, by their straight-edged shape, in which a point is sought
 _NEWTON_STEPS = 12  # at most; an element with straight edges takes one
@@ -48,6 +50,7 @@ def locate_gradients(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Element (d,) of each point and its barycentric coordinates there, (d, 4)."""
+    _check_extent(mesh, points)
     straight = MeshTet(mesh.nodes.T.copy(), mesh.corners.T.copy(), sort_t=False, validate=False)
     finder, nodes = straight.element_finder(), mesh.nodes[mesh.elements]
     elements, coordinates = [], []
@@ -62,6 +65,21 @@ def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         elements.append(int(found[0]))
         coordinates.append(inside[0])
     return np.array(elements), np.array(coordinates)
+
+
+def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
+    """Refuse several points that are together next to nothing of the body, or far more than it."""
+    if len(points) < _SEVERAL:
+        return
+    span, body = (float(np.ptp(x, axis=0).max()) for x in (points, mesh.nodes))
+    if span == 0.0 or _LEAST * body <= span <= _MOST * body:
+        return
+    # The unit whose points would span nearest to the body's size.
+    unit, factor = min(_UNITS.items(), key=lambda item: abs(np.log(item[1] * span / body)))
+    raise InputError(
+        f"{len(points)} points span {span:.3g} mm, the body {body:.3g} mm: {unit} instead of mm? "
+        f"multiply their coordinates by {factor:g}"
+    )
 
 
 def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

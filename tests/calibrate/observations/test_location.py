@@ -81,3 +81,12 @@ def test_points_just_outside_a_curved_wall_are_moved_onto_it(curved):
     assert gap.max() < 3e-4 * curved.mesh.size
     with pytest.raises(InputError, match="landmark 0 at .* lies outside the body, about"):
         cal.landmarks(curved, on_edges[:1] + 5e-3 * curved.mesh.size * outward[:1])
+
+
+def test_points_in_another_unit_are_refused(beam):
+    """Those in metres lie inside, all at the clamp; their displacements are next to nothing."""
+    points = spread_landmarks(beam, 12, 3)
+    locate(beam.mesh, points[:4] * 0.5)
+    for factor, unit, repair in ((1e-3, "m", "1000"), (1e3, "µm", "0.001")):
+        with pytest.raises(InputError, match=f"12 points span .* {unit} instead of mm.* {repair}$"):
+            locate(beam.mesh, factor * points)
