@@ -120,8 +120,14 @@ def test_a_body_without_cavity(capsys):
     assert beam.about()["pressure"] is None
     with pytest.raises(InputError, match="no cavity whose pressure varies"):
         beam.curve({"mu": "0.5", "lam": "0.5"})
-    assert main(["explore", "nowhere"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    for words, message in (
+        (["nowhere"], "nowhere"),
+        (["liver", "--emulator", "once_clamped_beam"], "is of scene 'once_clamped_beam'"),
+    ):
+        assert main(["explore", *words]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert said.count("\n") == 1
 
 
 @pytest.mark.slow

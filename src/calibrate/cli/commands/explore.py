@@ -8,6 +8,7 @@ import webbrowser
 from typing import Any
 
 from calibrate.cli.common import DONE, emit, needing_plotly
+from emulator.errors import InputError
 
 
 def register(commands: Any) -> None:
@@ -20,7 +21,10 @@ def register(commands: Any) -> None:
         "only; end with Ctrl-C.",
         epilog="example: calibrate explore left_ventricle",
     )
-    parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
+    parser.add_argument(
+        "body", metavar="EMULATOR|SCENE", help="an emulator's shipped name or folder, or a scene"
+    )
+    parser.add_argument("--emulator", metavar="E", help="of the scene: shipped name or folder")
     parser.add_argument("--port", type=int, default=0, help="default: a free one")
     parser.add_argument("--no-browser", action="store_true", help="print the address alone")
 
@@ -29,9 +33,16 @@ def run(arguments: argparse.Namespace) -> int:
     """Serve until interrupted."""
     with needing_plotly("exploring needs"):
         from calibrate.explorer import LOOPBACK, Explorer, serve
+    from emulator.catalogue import find_scene
     from emulator.surrogates import load
 
-    explorer = Explorer(load(arguments.emulator))
+    emulator = load(arguments.emulator or arguments.body)
+    if arguments.emulator and find_scene(arguments.body).fingerprint != emulator.scene.fingerprint:
+        raise InputError(
+            f"--emulator {arguments.emulator} is of scene '{emulator.scene.name}', or of another "
+            f"mesh, not of '{arguments.body}'"
+        )
+    explorer = Explorer(emulator)
     with serve(explorer, arguments.port) as server:
         address = f"http://{LOOPBACK}:{server.server_address[1]}/"
         told = {"scene": explorer.scene.name, "address": address}
