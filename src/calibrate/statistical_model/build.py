@@ -30,9 +30,9 @@ def model(
     observe : one observation, or several by name, e.g. ``{"displacement": ..., "volume": ...}``;
         noise and data are then given by the same names. ``volume@p8`` is the volume in the load
         state ``p8``; a noise under ``volume`` is that of every state.
-    prior : of every parameter; the scene's box by default. In several load states, the loads'
-        parameters have one prior for each state, or separate ones under ``pressure@p8``. A
-        :class:`~calibrate.priors.JointPrior` correlates some and leaves the box to others.
+    prior : of parameters by name; the others have the scene's box. In several load states, the
+        loads' parameters have one prior for each state, or separate ones under ``pressure@p8``. A
+        :class:`~calibrate.priors.JointPrior` correlates some.
     known : parameters that are not inferred, by the same names.
     check_scale : ``False`` to take data however far from every prediction
         (:mod:`calibrate.data.magnitude`).

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 
-from calibrate.priors import box_prior, dependence_of
+from calibrate.priors import box_prior
 from calibrate.state_names import in_state, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
@@ -73,34 +73,32 @@ def load_states(
     Parameters
     ----------
     prior, known : distributions and known values by ``parameter`` or ``parameter@state``; a
-        parameter of the loads that is named without a state is meant in every state. What neither
-        names has the scene's box as its prior, unless a prior is given that is not joint.
+        parameter of the loads that is named without a state is meant in every state that is not
+        named. What neither names has the scene's box as its prior.
 
     Raises
     ------
     InputError
-        A name that is no parameter or state, one both known and with a prior, or one with neither.
+        A name that is no parameter or state, or one both known and with a prior.
     """
     given, known = dict(prior or {}), dict(known or {})
     by_state = _by_state(scene, states, (*given, *known))
-    boxed = prior is None or dependence_of(prior) is not None
-    default = box_prior(scene) if boxed else {}
+    default = box_prior(scene)
     entries: list[list[str | float]] = []
     priors: dict[str, dist.Distribution] = {}
     for state in states:
         row: list[str | float] = []
         for parameter in scene.parameter_names:
             name = in_state(parameter, state) if parameter in by_state else parameter
-            value = known.get(name, known.get(parameter))
-            distribution = given.get(name, given.get(parameter))
+            value, distribution = known.get(name), given.get(name)
+            if value is None and distribution is None:
+                value, distribution = known.get(parameter), given.get(parameter)
             if value is not None and distribution is not None:
                 raise InputError(f"'{name}' is known and has a prior; give one of them")
             if value is not None:
                 row.append(float(value))
                 continue
-            distribution = distribution or default.get(parameter)
-            if distribution is None:
-                raise InputError(f"prior has no distribution for parameter '{name}'")
+            distribution = distribution or default[parameter]
             row.append(name)
             priors[name] = distribution
         entries.append(row)
