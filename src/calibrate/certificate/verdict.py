@@ -168,6 +168,9 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
         return "not certified", [
             Finding(apart, "train a better map, or put FEM into the likelihood")
         ]
+    if np.isnan(tail.k_hat):
+        few = "too few FEM runs to judge the tail of their weights"
+        return "undecided", [Finding(few, "80 FEM runs or more")]
     if tail.heavy or not tail.pool >= SMALLEST_POOL:
         heavy = "the weights' tail is too heavy to trust their errors"
         return "undecided", [Finding(heavy, "more FEM runs")]

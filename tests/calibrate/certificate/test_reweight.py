@@ -42,7 +42,7 @@ def test_the_reweighted_posterior_is_fems_and_is_accepted(biased):
 def test_it_leaves_the_posterior_alone(biased):
     posterior, fem, _ = biased
     before = {name: values.copy() for name, values in posterior.draws().items()}
-    reweighted = cal.reweight(posterior, LinearSimulator(fem), draws=60)
+    reweighted = cal.reweight(posterior, LinearSimulator(fem), draws=80)
     assert "reweighted" in reweighted.tree.attrs
     assert "reweighted" not in posterior.tree.attrs
     for name, values in posterior.draws().items():

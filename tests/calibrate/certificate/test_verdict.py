@@ -76,7 +76,10 @@ def test_a_heavy_tail_is_undecided_and_an_irregular_map_is_not_certified():
     heavy = replace(RIGHT.tail, k_hat=0.8, largest=20.0)
     assert verdict(tail=heavy)[0] == "undecided"
     assert verdict(tail=replace(heavy, largest=2.0))[0] == "accepted"  # k-hat cries wolf
-    assert verdict(tail=replace(heavy, k_hat=np.nan))[0] == "undecided"
+    # A number that is not there is not good news, however even the weights look.
+    found, words = verdict(tail=replace(RIGHT.tail, k_hat=np.nan))
+    assert found == "undecided"
+    assert "too few FEM runs to judge the tail of their weights: 80 FEM runs or more" in words
     assert verdict(tail=replace(RIGHT.tail, pool=50.0))[0] == "undecided"
     assert verdict(tail=replace(RIGHT.tail, spread=3.0))[0] == "not certified"
     assert verdict(tail=replace(RIGHT.tail, spread=np.inf, ess=0.0))[0] == "not certified"

@@ -127,10 +127,10 @@ def test_infer_and_certify(capsys, block, tmp_path):
     assert abs(row["mean"] - 9.0) < 4 * row["sd"]
     names = {path.name for path in (tmp_path / "r").iterdir()}
     assert names == {"run.json", "data.csv", "forward.safetensors", "posterior.nc"}
-    code, result = answer(capsys, "certify", tmp_path / "r", "--draws", 50)
+    code, result = answer(capsys, "certify", tmp_path / "r", "--draws", 80)
     assert (code, result["verdict"]) == (1, "not certified")  # a few linear tetrahedra, tight data
     assert "on a finer mesh" in result["certificate"]["reason"]
-    code, result = answer(capsys, "certify", tmp_path / "r", "--draws", 50, "--no-mesh")
+    code, result = answer(capsys, "certify", tmp_path / "r", "--draws", 80, "--no-mesh")
     assert (code, result["verdict"]) == (0, "accepted")
     assert result["certificate"]["reason"].endswith("on this mesh")
     assert json.loads((tmp_path / "r" / "certificate.json").read_text())["verdict"] == "accepted"

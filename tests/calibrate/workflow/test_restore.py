@@ -170,7 +170,7 @@ def test_two_runs_do_not_share_a_folder(folder):
 def test_a_reweighted_posterior_is_kept_and_certified_like_any_other(infer_once, tmp_path, capsys):
     source, target = tmp_path / "s", tmp_path / "t"
     infer(replace(RUN, draws=250), source)
-    words = ["certify", str(source), "--draws", "60", "--reweight", str(target), "--json"]
+    words = ["certify", str(source), "--draws", "80", "--reweight", str(target), "--json"]
     assert main(words) == 0
     assert json.loads(capsys.readouterr().out)["verdict"] == "accepted"
     names = {path.name for path in target.iterdir()}
