@@ -25,7 +25,6 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
 from calibrate.certificate.correction import Correction
 from calibrate.certificate.estimates import (
@@ -61,6 +60,7 @@ from calibrate.statistical_model import FEMLikelihood
 from emulator.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import executor
+from emulator.progress import counting
 
 _FEM_RUNS = 200
 _FEWEST = 25
@@ -123,7 +123,7 @@ def examine(
     with (
         threadpool_limits(1, user_api="blas"),
         executor(scheduler) as execute,
-        tqdm(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
+        counting(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
     ):
         likelihood = FEMLikelihood(posterior.model, simulator, execute)
         solver = Solver(predictive, likelihood, bar)

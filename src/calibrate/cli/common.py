@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import shutil
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -177,5 +176,5 @@ def _cell(value: object) -> str:
 
 
 def show_progress(arguments: argparse.Namespace) -> bool:
-    """Whether to show progress bars: without ``--json`` and on a terminal."""
-    return not arguments.json and sys.stderr.isatty()
+    """Whether to show progress on standard error: without ``--json``."""
+    return not arguments.json

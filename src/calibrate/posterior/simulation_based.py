@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from scipy.stats import beta
-from tqdm import tqdm
 
 from calibrate.arviz import ecdf_utils
 from calibrate.posterior import predictions
@@ -34,6 +33,7 @@ from calibrate.posterior.posterior import sample
 from calibrate.statistical_model import Model
 from emulator.errors import InputError, check_seed
 from emulator.fem.campaign import executor, in_process
+from emulator.progress import counting
 from emulator.surrogates.protocol import solved_by
 
 LOG_LIKELIHOOD = "log likelihood"
@@ -254,7 +254,7 @@ def _replicates(
     model: Model, made: predictions.Prior, draw: Sample, seed: int, *, progress: bool
 ) -> Iterator[Replicate]:
     rows = range(len(next(iter(made.draws.values()))))
-    for r in tqdm(rows, "calibration", disable=not progress, unit="data set"):
+    for r in counting(rows, "calibration", disable=not progress, unit="data set"):
         data = {name: values[r] for name, values in made.data.items()}
         true = {name: values[r] for name, values in made.draws.items()}
         found = draw(data, seed + r)

@@ -39,6 +39,7 @@ from calibrate.samplers.run import Chains, compile_chains, join
 from calibrate.samplers.stopping import converged
 from calibrate.statistical_model import Data
 from emulator.errors import InputError, SolverError
+from emulator.progress import counting
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class DelayedAcceptance:
         """
         if context.fem is None:
             raise InputError(f"{options.label}: there is no FEM likelihood to decide by")
-        with tqdm(desc=self.name, total=0, disable=not context.progress, unit="draw") as bar:
+        with counting(desc=self.name, total=0, disable=not context.progress, unit="draw") as bar:
             run = _Run(density, data, options, seed, context, bar)
             for rounds in range(1, options.rounds + 1):
                 draws = run.draw(rounds * options.draws)
@@ -184,7 +185,7 @@ class _Run:
 
         A killed run does this part again, or it is already beyond it: it solves no FEM.
         """
-        with tqdm(disable=True, total=0) as bar:
+        with counting(disable=True, total=0) as bar:
             cheap = Chains(
                 BLACKJAX_NUTS, self.wide, self.data, self.options.cheap(), Checkpoint(), bar
             )

@@ -29,6 +29,7 @@ from calibrate.samplers.protocol import Context, Draws, Kernel
 from calibrate.samplers.stopping import converged
 from calibrate.statistical_model import Data
 from emulator.errors import SolverError
+from emulator.progress import counting
 
 _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
@@ -71,7 +72,7 @@ class ChainSampler:
             No starting point with a finite density was found.
         """
         pilot_key, key = jax.random.split(jax.random.key(seed))
-        with tqdm(desc=self.name, total=0, disable=not context.progress) as bar:
+        with counting(desc=self.name, total=0, disable=not context.progress) as bar:
             chains = Chains(self, density, data, options, context.checkpoint, bar)
             if not chains.resume():
                 chains.start_straightened(pilot_key, key)

@@ -34,6 +34,7 @@ from calibrate.samplers.options import check_counts, check_target_accept
 from calibrate.samplers.protocol import Context, Draws
 from calibrate.statistical_model import Data
 from emulator.errors import InputError, SolverError
+from emulator.progress import counting
 
 # Log likelihood of particles where the forward map has no answer. Finite, because its product with
 # a temperature of 0 must be 0; so low that such particles die out at the first step.
@@ -123,7 +124,7 @@ class TemperedSMC:
             A population did not reach the posterior in ``options.temperatures`` steps.
         """
         programs = _compile(density, options)
-        with tqdm(desc=self.name, total=options.chains, disable=not context.progress) as bar:
+        with counting(desc=self.name, total=options.chains, disable=not context.progress) as bar:
             found = _run(programs, data, options, seed, context, bar)
         heights = programs.finish(found.particles, data)
         rates = np.asarray(found.acceptance_rate)

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from tqdm import tqdm
 
 from calibrate.noise.information import information_about_means
 from calibrate.observations.mesh_error import on_finer
@@ -19,6 +18,7 @@ from emulator.error.mesh_error import mesh_error
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Solver, solve_rows
+from emulator.progress import counting
 
 FEWEST = 8
 
@@ -55,7 +55,7 @@ def with_error(
     draws = model.prior_draws(jax.random.key(seed), runs)
     unknowns, errors = [], []
     what = "error of map and mesh" if of_mesh else "error of the map"
-    for k in tqdm(range(runs), what, disable=not progress, unit="run"):
+    for k in counting(range(runs), what, disable=not progress, unit="run"):
         values = {name: draw[k] for name, draw in draws.items()}
         means, valid = data(values)
         if bool(valid) and (found := exact(model.states.thetas(values))) is not None:

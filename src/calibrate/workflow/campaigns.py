@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 import zarr
-from tqdm import tqdm
 
 from calibrate.provenance import versions
 from emulator.errors import InputError, look_up
@@ -18,6 +17,7 @@ from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.campaign import Executor, Neighbours, Solver, executor, solve_rows
 from emulator.fem.campaign.designs import DESIGNS
 from emulator.fem.campaign.zarr_rows import Question, ZarrRows, make_store, writing
+from emulator.progress import counting
 from emulator.scenes.scene import Scene
 
 
@@ -125,7 +125,7 @@ def _solve_missing(rows: ZarrRows, solver: Solver, execute: Executor, progress: 
         execute=execute,
     )
     total = len(rows.thetas)
-    with tqdm(
+    with counting(
         total=total, initial=total - len(missing), desc="FEM", disable=not progress, unit="run"
     ) as bar:
         for row in solved:

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from tqdm import tqdm
-
 from emulator.errors import InputError
+from emulator.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.pignn import Architecture
@@ -81,7 +80,7 @@ def _problems(
             "use recipe network or paper"
         )
     first = prepare(scenes[0], plan, architecture)
-    others = tqdm(scenes[1:], "prepare", disable=not progress)
+    others = counting(scenes[1:], "prepare", disable=not progress)
     # Starting from the first one's network also checks that each scene can have its weights.
     problems = [first, *(prepare(s, plan, architecture, start=first.emulator) for s in others)]
     return problems, [p.training for p in problems if p.training is not None]

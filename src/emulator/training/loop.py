@@ -8,9 +8,9 @@ from typing import Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from emulator.errors import SolverError
+from emulator.progress import counting
 from emulator.training.checkpoint import Session, State
 from emulator.training.network import NetworkTraining
 
@@ -81,7 +81,7 @@ class Bar:
     """A progress bar with the loss; a hook."""
 
     def __init__(self, name: str, state: State, total: int, *, shown: bool) -> None:
-        self._bar = tqdm(desc=name, initial=state.done, total=total, disable=not shown)
+        self._bar = counting(desc=name, initial=state.done, total=total, disable=not shown)
 
     def __call__(self, state: State, total: int) -> int:
         """One step further."""

@@ -45,9 +45,9 @@ import optax
 import scipy.linalg
 import scipy.sparse as sp
 from flax import nnx
-from tqdm import tqdm
 
 from emulator.fem.campaign import Runs
+from emulator.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network.part import Network
 from emulator.surrogates.network.pignn import Architecture
@@ -273,7 +273,7 @@ class Modal:
         many = jax.jit(lambda carry: jax.lax.scan(iterate, carry, None, length=_AT_ONCE))
         carry, measure = (branch, solver.init(branch)), jax.jit(misfit)
         best, least = branch, float(measure(branch))
-        with tqdm(desc="L-BFGS", total=iterations, disable=not progress) as bar:
+        with counting(desc="L-BFGS", total=iterations, disable=not progress) as bar:
             for _ in range(iterations // _AT_ONCE):
                 carry, _ = many(carry)
                 now = float(measure(carry[0]))

@@ -22,9 +22,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from tqdm import tqdm
 
 from emulator.errors import InputError
+from emulator.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.family import (
@@ -125,7 +125,7 @@ def train_family(
         folder, _check(runs), f"{len(runs)} bodies", plan, architecture, resume=resume
     )
     plan, architecture = session.plan, session.architecture or architecture
-    described = [describe(r.scene) for r in tqdm(runs, "describe", disable=not progress)]
+    described = [describe(r.scene) for r in counting(runs, "describe", disable=not progress)]
     standard = _standard(described)
     sizes = _sizes(runs, described)
     key = np.random.default_rng(plan.seed)

@@ -50,14 +50,13 @@ def run(arguments: argparse.Namespace) -> int:
     check_seed(arguments.seed, "effects")
     scene = find_scene(*scene_words(arguments))
     observe = observations(parse_observation(scene, arguments.observe, arguments.seed))
-    quiet = arguments.json or not sys.stderr.isatty()
     found = recommend(
         scene,
         observe,
         tolerances(arguments.tolerance, observe),
         samples=arguments.samples,
         seed=arguments.seed,
-        say=(lambda _: None) if quiet else (lambda what: print(what, "...", file=sys.stderr)),
+        say=(lambda _: None) if arguments.json else (lambda what: print(what, "...", file=sys.stderr)),
     )
     emit(report(found), as_json=arguments.json, text=summary(found))
     return DONE

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from emulator.errors import InputError
 from emulator.fem.campaign import Neighbours, Solver, run_campaign, solve_rows
 from emulator.fem.campaign.designs import sobol
 from emulator.fem.campaign.memory import MemoryRows
 from emulator.fem.simulator import Simulator
+from emulator.progress import counting
 from emulator.scenes.scene import Scene
 
 SEED = 90_210  # separate test points: training and reduced models use small seeds
@@ -85,7 +85,7 @@ def outside_reference(
     numbers = range(known, known + cases)
     starts = Neighbours(scene, rows)
     found = solve_rows(Solver(simulator), rows.thetas, numbers=numbers, starts=starts)
-    for row in tqdm(found, "FEM outside", total=cases, disable=not progress, unit="run"):
+    for row in counting(found, "FEM outside", total=cases, disable=not progress, unit="run"):
         rows.write(row)
     solved = [number for number in numbers if number in rows.converged()]
     fields = [rows.field(number).displacement for number in solved]

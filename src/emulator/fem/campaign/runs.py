@@ -9,12 +9,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from emulator.fem.campaign.engine import Executor, Solver, in_process, solve_rows
 from emulator.fem.campaign.memory import MemoryRows
 from emulator.fem.campaign.starts import Neighbours, Predictor
 from emulator.fem.simulator import Simulator
+from emulator.progress import counting
 
 
 class Runs(NamedTuple):
@@ -91,7 +91,7 @@ def run_campaign(
         starts=Neighbours(simulator.scene, rows, predictor),
         execute=execute,
     )
-    for row in tqdm(solved, "FEM", total=len(thetas), disable=not progress, unit="run"):
+    for row in counting(solved, "FEM", total=len(thetas), disable=not progress, unit="run"):
         row.solution.require_converged(f"FEM run {row.number}")
         rows.write(row)
     found = rows.in_order()
