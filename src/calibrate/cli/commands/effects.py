@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         tolerances(arguments.tolerance, observe),
         samples=arguments.samples,
         seed=arguments.seed,
-        say=(lambda _: None) if arguments.json else (lambda what: print(what, "...", file=sys.stderr)),
+        say=lambda what: None if arguments.json else print(what, "...", file=sys.stderr),
     )
     emit(report(found), as_json=arguments.json, text=summary(found))
     return DONE

@@ -113,13 +113,27 @@ def run(arguments: argparse.Namespace) -> int:
     result = replace(result, record=record)
     save_emulator(result, arguments.out)
     remove_checkpoint(arguments.out)
-    steps = record["plan"]["steps"]
-    text = f"trained {scene.name}: {steps} steps, {record['seconds']:.0f} s, in {arguments.out}"
     runs = record["plan"]["simulations"]
+    text = _told(arguments.out, scene.name, record)
     if not fixed and plan.runs > runs:
         text += f"\n{runs} of {plan.runs} FEM runs fit into the budget: more time, smaller errors"
+    text += f"\nwritten to {arguments.out}; next: calibrate infer {arguments.scene} "
+    text += f"--emulator {arguments.out} --data measured.csv --out RUN"
     emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
     return DONE
+
+
+def _told(folder: str, scene: str, record: Mapping[str, Any]) -> str:
+    """What was done, and how far the emulator is from FEM runs that it did not see."""
+    plan = record["plan"]
+    counts = [f"{plan['simulations']} FEM runs"] if plan["simulations"] else []
+    counts += [f"{plan['steps']} steps"] if plan["steps"] else []
+    text = f"trained {scene}: {', '.join([*counts, f'{record["seconds"]:.0f} s'])}"
+    found = record.get("discrepancy") or {}
+    error = found.get("held_out_err_u_mm", {}).get(found.get("on"))
+    if error is None:
+        return f"{text}; its error: calibrate evaluate {folder}"
+    return f"{text}; {error:.2g} mm from FEM at held-out runs"
 
 
 def _default_recipe(start: Any) -> str:
