@@ -8,7 +8,8 @@ import pytest
 
 import emulator as em
 from calibrate.cli import main
-from calibrate.cli.commands.predict import cavities, summary
+from calibrate.cli.commands.predict import summary
+from calibrate.cli.volumes import volume_lines, volumes
 from emulator.geometry.cavity import Cavity
 
 CENTRE = ("mu=75", "lam=60")
@@ -76,8 +77,13 @@ def test_cavities():
     u = jnp.zeros(scene.held.shape)
     cavity = Cavity(scene.mesh, "endocardium")
     volume = float(cavity(u[cavity.nodes]))
-    assert cavities(scene, u, None) == {
-        "endocardium": {"volume_ml": pytest.approx(volume), "error_ml": None}
-    }
+    assert volumes(scene, u) == {
+        "endocardium": {
+            "rest_ml": pytest.approx(volume), "volume_ml": pytest.approx(volume), "error_ml": None
+        }
+    }  # fmt: skip
     estimate = SimpleNamespace(valid=True, of=lambda quantity: quantity(u) - volume + 2.0)
-    assert cavities(scene, u, estimate)["endocardium"]["error_ml"] == pytest.approx(2.0)
+    found = volumes(scene, u, estimate)
+    assert found["endocardium"]["error_ml"] == pytest.approx(2.0)
+    (line,) = volume_lines(found)
+    assert line == f"cavity 'endocardium': {volume:.6g} mL, at rest {volume:.6g} mL, error +2 mL"

@@ -7,6 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import DONE, FAILED, add_theta, assignments, check_vtu, emit
+from calibrate.cli.volumes import volume_lines, volumes
 from emulator.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         "guard": against.sentence(scene),
         "max_displacement": float(np.linalg.norm(u, axis=1).max()) if finite else None,
         "least_J": float(against.least_J) if finite else None,
-        "volumes": cavities(scene, u, estimate) if finite else {},
+        "volumes": volumes(scene, u, estimate) if finite else {},
         "error": None if estimate is None else error_of(estimate),
     }
     if arguments.out and finite and against.least_J > 0.0:
@@ -91,25 +92,6 @@ def anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
         **{n: min(max(v, box[n][0]), box[n][1]) if n in box else v for n, v in values.items()}
     )
     return jnp.array([values[name] for name in scene.parameter_names])
-
-
-def cavities(
-    scene: Scene, u: jax.Array, estimate: ErrorEstimate | None
-) -> dict[str, dict[str, float | None]]:
-    """Volume in mL of each cavity, and its estimated error if there is one."""
-    from emulator.geometry.cavity import Cavity
-    from emulator.scenes.cavities import cavity_sets
-
-    found: dict[str, dict[str, float | None]] = {}
-    for name in cavity_sets(scene):
-        cavity = Cavity(scene.mesh, name)
-
-        def volume(u: jax.Array, cavity: Cavity = cavity) -> jax.Array:
-            return cavity(u[cavity.nodes])
-
-        error = None if estimate is None or not estimate.valid else float(estimate.of(volume))
-        found[name] = {"volume_ml": float(volume(u)), "error_ml": error}
-    return found
 
 
 def error_of(estimate: ErrorEstimate) -> dict[str, Any]:
@@ -137,9 +119,7 @@ def summary(result: dict[str, Any]) -> str:
         if largest is not None
         else f"{result['scene']}: no finite displacement"
     ]
-    for name, cavity in result["volumes"].items():
-        error = "" if cavity["error_ml"] is None else f", error {cavity['error_ml']:+.2g} mL"
-        lines.append(f"cavity '{name}': {cavity['volume_ml']:.6g} mL{error}")
+    lines += volume_lines(result["volumes"])
     error = result["error"]
     if error is not None and not error["valid"]:
         lines.append("error: could not be estimated")

@@ -16,6 +16,7 @@ from calibrate.cli.common import (
     emit,
     scene_words,
 )
+from calibrate.cli.volumes import volume_lines, volumes
 
 
 def register(commands: Any) -> None:
@@ -74,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         "stable": stable,
         "max_displacement": float(np.linalg.norm(solution.displacement, axis=1).max()),
         "J_range": [float(J.min()), float(J.max())],
+        "volumes": volumes(scene, solution.displacement),
     }
     reactions: dict[str, list[float]] = {}
     if status is Status.CONVERGED:
@@ -91,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     lines.append(
         f"J from {J.min():.4f} to {J.max():.4f}, relative residual {result['residual']:.1e}"
     )
+    lines += volume_lines(result["volumes"])
     for name, force in reactions.items():
         components = ", ".join(f"{component:.5g}" for component in force)
         lines.append(f"force of the support '{name}' on the body: {components} mN")
