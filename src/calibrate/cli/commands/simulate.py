@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     stable = None
     if status is Status.CONVERGED and not open_patch:
         stable = simulator.is_stable(solution.displacement, theta)
-    result = {
+    result: dict[str, Any] = {
         "scene": scene.name,
         "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
         "status": status.name.lower(),
