@@ -137,7 +137,7 @@ def infer(
     if folder is None:
         return _sampled(run, None, progress=progress)[0]
     folder = Path(folder)
-    with exclusive(folder, "run"):
+    with exclusive(folder / RUN, "run"):
         there = [name for name in _RESULTS if (folder / name).exists()]
         if there and not force:
             raise InputError(
@@ -145,9 +145,8 @@ def infer(
                 "--force (in Python: force=True), or name another folder"
             )
         posterior, run, observe, data = _sampled(run, folder / SAMPLING, progress=progress)
-        with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as made:
+        with TemporaryDirectory(dir=folder, prefix=".new.") as made:
             _keep(posterior, run, observe, data, Path(made))
-            folder.mkdir(exist_ok=True)
             # Earlier results go first and the posterior comes last: a run that is killed leaves no
             # posterior, rather than one beside the certificate of another.
             for name in _RESULTS:

@@ -142,7 +142,8 @@ def test_a_result_is_replaced_at_once_or_not_at_all(infer_once, folder, monkeypa
         patch.setattr("emulator.store.os.fsync", Mock(side_effect=[None, full]))
         with pytest.raises(OSError, match="No space left on device: '.*run.json'"):
             infer(RUN, folder, force=True)
-    assert {path.name for path in folder.parent.iterdir()} == {folder.name}
+    there = {path.name for path in folder.iterdir()}
+    assert there == {*before, "certificate.json", "error.safetensors"}
     assert all((folder / name).read_bytes() == content for name, content in before.items())
     infer(RUN, folder, force=True)
     # Nothing stays of the earlier one that the new one does not have.
@@ -159,11 +160,11 @@ def test_results_that_are_there_are_not_replaced(folder):
 
 def test_two_runs_do_not_share_a_folder(folder):
     with (
-        exclusive(folder, "run"),
+        exclusive(folder / "run.json", "run"),
         pytest.raises(InputError, match="another run is writing to it; wait until it ends"),
     ):
         infer(RUN, folder, force=True)
-    assert not list(folder.parent.glob("*.lock"))
+    assert not list(folder.glob("*.lock"))
 
 
 @pytest.mark.slow
