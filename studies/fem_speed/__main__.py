@@ -70,7 +70,7 @@ def check(cases: list[Case], *, quick: bool) -> None:
     ours, plain = found["ours, cold"], found["scikit-fem + SciPy, cold"]
     assert plain["median_s"] > 10.0 * ours["median_s"]
     for case in cases:
-        assert case.get("times_as_long", 1.0) >= 1.0, case["name"]
+        assert case.get("times_as_long", 1.0) > 0.8, case["name"]
         assert case.get("jit_s", 0.0) <= 1.2 * case.get("python_s", 0.0), case["name"]
 
 

@@ -69,6 +69,7 @@ def tables(cases: list[Case]) -> str:
             f"{case['times_as_long']:.1f}",
             *(f"{1e3 * case[k]:.0f} ms" for k in ("ours_warm_s", "fenicsx_warm_s")),
             f"{case['difference']:.0e}",
+            str(case["gave_up"]),
         ]
         for case in cases
         if "fenicsx_s" in case
@@ -104,8 +105,8 @@ def tables(cases: list[Case]) -> str:
                 solves,
             ),
             *table(
-                "| processor seconds | ours | FEniCSx | times as long | ours, warm | FEniCSx, "
-                "warm | difference |",
+                "| beside FEniCSx | ours | FEniCSx | times as long | ours, warm | FEniCSx, "
+                "warm | difference | FEniCSx gave up |",
                 beside,
             ),
             *table("| Python and `jit` | theta | as many iterations | largest difference |", alike),
