@@ -11,7 +11,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,9 @@ def check_folder(path: str | Path) -> Path:
 
 @contextmanager
 def exclusive(path: str | Path, what: str) -> Iterator[Path]:
-    """``path``, which no other process that asks the same has meanwhile; its folder is made.
+    """``path``, which no other process that asks the same has meanwhile.
+
+    Its folder is made, and goes again if it stays empty.
 
     Raises
     ------
@@ -105,6 +107,7 @@ def exclusive(path: str | Path, what: str) -> Iterator[Path]:
     """
     path = Path(path)
     check_folder(path.parent)
+    new = not path.parent.exists()
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(path.parent / f".{path.name}.lock")
     try:
@@ -116,6 +119,9 @@ def exclusive(path: str | Path, what: str) -> Iterator[Path]:
     finally:
         Path(lock.lock_file).unlink(missing_ok=True)
         lock.release()
+        if new:
+            with suppress(OSError):  # it has something in it
+                path.parent.rmdir()
 
 
 def read_json(path: str | Path) -> Any:
