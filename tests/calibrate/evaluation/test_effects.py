@@ -6,6 +6,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.cli import main
+from calibrate.evaluation import effects
 from calibrate.evaluation.effects import Comparison, recommend, tolerances
 from calibrate.observations import observations, spread_landmarks
 from emulator.errors import InputError, SolverError
@@ -29,7 +30,16 @@ def corners(pulled):
 
 @pytest.fixture(scope="module")
 def loose(pulled, corners):
-    return recommend(pulled, corners, 2.0, samples=2)
+    """With factorisations for a clock, since a solve takes a millisecond of a busy machine."""
+    clocked = effects._clocked
+
+    def counted(simulator, theta):
+        _, solution = clocked(simulator, theta)
+        return float(solution.factorisations), solution
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(effects, "_clocked", counted)
+        return recommend(pulled, corners, 2.0, samples=2)
 
 
 def test_changes_are_those_of_fem(pulled, corners, loose):
@@ -51,7 +61,7 @@ def test_changes_are_those_of_fem(pulled, corners, loose):
 
 
 def test_what_saves_time_goes_and_the_tolerance_is_kept(loose):
-    # Small strains need one factorisation, whatever the clock of a busy machine says of the rest.
+    # Small strains need one factorisation.
     assert "finite strain" in loose.left_out
     assert loose.chosen.ratio < 1.0
     assert loose.chosen.changes["displacement"] <= 2.0
