@@ -74,7 +74,9 @@ def _nearer(predict: Predict, name: str, data: np.ndarray, draws: np.ndarray) ->
         return jnp.where(valid, jnp.log1p(jnp.sum((means[name] - data) ** 2)), jnp.inf)
 
     rows = draws[:_MORE_DRAWS]
-    gaps = np.asarray(jax.jit(partial(jax.lax.map, gap))(jnp.asarray(rows)))
+    means, valid = jax.jit(partial(jax.lax.map, predict))(jnp.asarray(rows))
+    known, valid = np.asarray(means[name]), np.asarray(valid)
+    gaps = np.where(valid, [_norm(row - data) for row in known], np.inf)
     both = jax.jit(jax.value_and_grad(gap))
     ends = [draws.min(axis=0), draws.max(axis=0)]
     width = np.where(ends[1] > ends[0], ends[1] - ends[0], 1.0)
@@ -92,8 +94,8 @@ def _nearer(predict: Predict, name: str, data: np.ndarray, draws: np.ndarray) ->
         if np.isfinite(gaps[k])
     ]  # fmt: skip
     one = jax.jit(predict)
-    found = [one(jnp.asarray(x)) for x in (*rows, *reached)]
-    return np.stack([np.asarray(means[name]) for means, valid in found if bool(valid)])
+    ended = [one(jnp.asarray(x)) for x in reached]
+    return np.stack([*known[valid], *(np.asarray(m[name]) for m, fine in ended if bool(fine))])
 
 
 def predict_over_prior(

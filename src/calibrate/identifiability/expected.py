@@ -10,7 +10,8 @@ of a Student's t about a Newton step from :math:`x_r`,
 
 with the Fisher information F of :mod:`calibrate.identifiability.fisher`, the prior's covariance P
 and the share :math:`\alpha` of draws from the prior; :math:`\hat x` and S are then those of the
-weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000). Posteriors are
+weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000). Where too few draws
+carry the weight the covariance is S. Posteriors are
 averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
 the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
 :math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
@@ -38,6 +39,7 @@ _DATA_SETS = 64
 _FROM_PRIOR, _AROUND = 3072, 512  # draws of the prior, shared, and of Student's t, a data set
 _ROUNDS = 2  # of Student's t
 _BATCH = 128
+_EFFECTIVE = 30.0  # draws; of fewer the covariance is that of the linear map and a normal prior
 _DOF = 5.0
 _WIDER = 1.3  # Student's t than the covariance it is told
 
@@ -140,6 +142,7 @@ def _posterior_covariances(
     shared = jnp.asarray(np.log(prior[count:]) if log else prior[count:])[:_FROM_PRIOR]
     precision = jnp.asarray(np.linalg.inv(before))
     ahead, answers = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))(shared)
+    p_shared = jax.vmap(log_prior)(shared)
     share = len(shared) / (len(shared) + _AROUND)
 
     def first(x: jax.Array, data: dict[str, jax.Array]) -> _Around:
@@ -158,7 +161,8 @@ def _posterior_covariances(
         each = jax.random.split(noise, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
         told = jax.vmap(log_likelihood, in_axes=(0, 0, None))(ahead, answers, data)
-        around = first(x, data)
+        around = start = first(x, data)
+        C = normal = start.root @ start.root.T / _WIDER**2
         for k in keys:
             drawn = around.draw(k, _AROUND)
             inside = jax.vmap(log_prior)(drawn)
@@ -168,17 +172,17 @@ def _posterior_covariances(
                 lambda x: log_likelihood(*predicted(x), data), asked, batch_size=_BATCH
             )
             points = jnp.concatenate([shared, drawn])
-            p = jnp.concatenate([jax.vmap(log_prior)(shared), inside])
+            p = jnp.concatenate([p_shared, inside])
             mixture = jnp.logaddexp(
                 jnp.log(share) + p, jnp.log1p(-share) + around.log_density(points)
             )
             weights = jax.nn.softmax(p + jnp.concatenate([told, likely]) - mixture)
             mean = weights @ points
             off = points - mean
-            C = (weights[:, None] * off).T @ off
-            # A few draws that carry all weight have next to no spread.
-            floor = 1e-12 * jnp.diag(jnp.diagonal(jnp.asarray(before)))
-            around = _Around(mean, _WIDER * jnp.linalg.cholesky(C + floor))
+            # A few draws that carry all weight have next to no spread, and would promise too much.
+            enough = 1.0 / jnp.sum(weights**2) >= _EFFECTIVE
+            C = jnp.where(enough, (weights[:, None] * off).T @ off, normal)
+            around = _Around(mean, _WIDER * jnp.linalg.cholesky(C))
         return C, valid & jnp.isfinite(C).all()
 
     truths = jnp.asarray(np.log(prior[:count]) if log else prior[:count])

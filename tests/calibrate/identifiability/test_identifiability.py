@@ -11,6 +11,7 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.identifiability import (
+    expected,
     expected_precision,
     next_measurement,
     profile_likelihood,
@@ -88,6 +89,15 @@ def test_posteriors_are_averaged_in_the_box_of_the_prior(beam, forward):
     # A number has one combination, here nearly the product.
     (only,) = found["combinations"]
     assert set(only["exponents"]) == {"mu", "lam"}
+
+
+def test_too_few_draws_promise_no_more_than_the_linear_map(case, monkeypatch):
+    """Two draws that carry all weight have next to no spread."""
+    model, _, _, covariance, _, sd = case
+    monkeypatch.setattr(expected, "_AROUND", 4)
+    found = expected_precision(model, data_sets=8)
+    wanted = np.sqrt(np.diagonal(covariance)) / sd
+    np.testing.assert_allclose(list(found["sd"].values()), wanted, rtol=0.05)
 
 
 def test_in_logarithms_it_names_the_combination_the_data_fixes(beam, forward):
