@@ -59,6 +59,7 @@ class StressState(NamedTuple):
     fraction : of the last step that was taken; below 1 where elements would have been crushed, 0
     where there was no step.
     definite : whether the tangent of the last step was positive definite.
+    refused : steps in a row whose own tangent was not, and that were tried again.
     """
 
     u: jax.Array
@@ -66,6 +67,7 @@ class StressState(NamedTuple):
     error: jax.Array
     fraction: jax.Array
     definite: jax.Array
+    refused: jax.Array
 
 
 class _Tried(NamedTuple):
@@ -94,8 +96,8 @@ class StressIterates:
 
     def begin(self, u: jax.Array) -> StressState:
         """The state at ``u`` (n, 3) mm that Newton's method would start from."""
-        unknown = jnp.full((), jnp.inf, float)
-        return StressState(u, _measures_of(self.system, u), unknown, jnp.ones(()), jnp.array(True))
+        unknown, measures = jnp.full((), jnp.inf, float), _measures_of(self.system, u)
+        return StressState(u, measures, unknown, jnp.ones(()), jnp.array(True), jnp.array(0))
 
     def step(
         self,
@@ -133,6 +135,7 @@ class StressIterates:
 
         most = jnp.where(again, 2, 1)
         tried = while_loop(lambda t: ~t.definite & (t.tries < most), attempt, first)
+        state = state._replace(refused=jnp.where(tried.tries > 1, state.refused + 1, 0))
         lost = state._replace(fraction=jnp.zeros(()), definite=tried.definite)
         return cond(tried.definite, lambda: self._moved(state, tried.move), lambda: lost)
 
@@ -141,7 +144,8 @@ class StressIterates:
         fraction = self._fraction(state.u, move)
         ahead, measures = _taken(self.system, state.u, state.measures, self.theta, move, fraction)
         _, error = level_balance(self.system, ahead, self.theta, self.level)
-        return StressState(ahead, measures, error, fraction, jnp.array(True))
+        taken = {"error": error, "fraction": fraction, "definite": jnp.array(True)}
+        return state._replace(u=ahead, measures=measures, **taken)
 
     def _fraction(self, u: jax.Array, move: jax.Array) -> jax.Array:
         """How much of a step crushes no element; 0 if almost none of it does."""
