@@ -15,6 +15,8 @@ Volumes = dict[str, dict[str, float | None]]
 
 def volumes(scene: Scene, u: jax.Array, estimate: ErrorEstimate | None = None) -> Volumes:
     """Of each cavity in mL: at rest, at ``u`` (n, 3) mm, and its estimated error, if any."""
+    import jax
+
     from emulator.geometry.cavity import Cavity
     from emulator.scenes.cavities import cavity_sets
 
@@ -26,7 +28,7 @@ def volumes(scene: Scene, u: jax.Array, estimate: ErrorEstimate | None = None) -
             return cavity(u[cavity.nodes])
 
         error = None if estimate is None or not estimate.valid else float(estimate.of(volume))
-        loaded = float(volume(u))
+        loaded = float(jax.jit(volume)(u))
         found[name] = {"rest_ml": float(cavity.rest), "volume_ml": loaded, "error_ml": error}
     return found
 

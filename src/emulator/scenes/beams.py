@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from emulator.geometry.bodies.box import box, toward_ends
 from emulator.geometry.mesh import Mesh
@@ -17,21 +19,25 @@ Cells = tuple[int, int, int]
 
 _G = 9.80  # m/s2, as published
 BEAM = (100.0, 10.0, 10.0)  # mm, as published
-_SIZES = {
+BEAM_SIZES = {
     1: {"cells": (12, 4, 5), "grading": 1.0},
     2: {"cells": (20, 2, 2), "grading": 1.5},
 }
 
 
 def beam_mesh(
-    cells: Cells | None, order: int, grading: float | None, clamped: tuple[str, ...]
+    cells: Cells | None,
+    order: int,
+    grading: float | None,
+    clamped: tuple[str, ...],
+    sizes: Mapping[int, Mapping[str, Any]] = BEAM_SIZES,
 ) -> tuple[Mesh, dict[str, object]]:
     """A beam whose cells are shorter at its clamps, and the sizes that it was made with.
 
     An edge that is clamped is a singularity; at the same number of nodes as even cells, cells that
     are shorter there are a third as far from the limit (``studies/elements``).
     """
-    made = resolved(_SIZES, order, cells=cells, grading=grading)
+    made = resolved(sizes, order, cells=cells, grading=grading)
     along = toward_ends(made["cells"][0], made["grading"], clamped)
     mesh = box(BEAM, made["cells"], order, along)
     return mesh, {**made, "cells": list(made["cells"])}

@@ -12,10 +12,10 @@ from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 
 SIZES = {
-    1: {"rings": 15, "around": 32, "layers": (3, 2)},
-    2: {"rings": 10, "around": 20, "layers": (2, 1)},
+    1: {"rings": 15, "around": 32, "layers": (3, 2), "grading": 1.0},
+    2: {"rings": 12, "around": 24, "layers": (2, 2), "grading": 1.5},
 }
-"""Rings, nodes around and layers of the mesh by default."""
+"""Rings, nodes around, layers and grading of the mesh by default."""
 
 
 def biventricle(
@@ -26,6 +26,7 @@ def biventricle(
     kappa: float = 25.0,
     right_pressure: float = 2.0 * KPA_PER_MMHG,
     order: int = 2,
+    grading: float | None = None,
 ) -> Scene:
     """Holzapfel-Ogden ventricles, each under its own cavity pressure, their base held.
 
@@ -36,7 +37,7 @@ def biventricle(
 
     Parameters
     ----------
-    rings, around, layers : of the mesh, as in
+    rings, around, layers, grading : of the mesh, as in
         :func:`~emulator.geometry.bodies.biventricle.biventricle`; by default what the elements'
         order needs.
     angles : helix angle in degrees on the endocardia and on the epicardium.
@@ -44,7 +45,7 @@ def biventricle(
     right_pressure : in the right ventricle, kPa.
     order : of the elements; 1, linear, as published.
     """
-    made = resolved(SIZES, order, rings=rings, around=around, layers=layers)
+    made = resolved(SIZES, order, rings=rings, around=around, layers=layers, grading=grading)
     mesh = geometry.biventricle(**made)
     rule = Biventricle(angles)
     return Scene(

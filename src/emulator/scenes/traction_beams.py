@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from emulator.mechanics.laws import find_law
-from emulator.scenes.beams import Cells, beam_mesh
+from emulator.scenes.beams import BEAM_SIZES, Cells, beam_mesh
 from emulator.scenes.left_ventricle import MYOCARDIUM
 from emulator.scenes.loads import Traction
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
+
+# Stiff fibres along a beam that bends: what is missing through its height shows first.
+_SIZES = {1: BEAM_SIZES[1], 2: {"cells": (14, 2, 4), "grading": 2.0}}
 
 
 def _beam(
@@ -24,7 +27,7 @@ def _beam(
     order: int,
     grading: float | None,
 ) -> Scene:
-    mesh, made = beam_mesh(cells, order, grading, ("left",))
+    mesh, made = beam_mesh(cells, order, grading, ("left",), _SIZES)
     angle = np.radians(fibre_angle)
     return Scene(
         name=name,

@@ -14,7 +14,12 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.geometry.bodies.body import body
 from emulator.geometry.bodies.disc import disc
-from emulator.geometry.bodies.ellipsoid import HUMAN, EllipsoidalWall, wall_midpoints
+from emulator.geometry.bodies.ellipsoid import (
+    HUMAN,
+    EllipsoidalWall,
+    toward_base,
+    wall_midpoints,
+)
 from emulator.geometry.bodies.footprint import Footprint, open_sheet, spread
 from emulator.geometry.bodies.prisms import extrude, stacked
 from emulator.geometry.bodies.right_ventricle import RightVentricle, Septum
@@ -29,13 +34,14 @@ def biventricle(
     around: int = 32,
     layers: tuple[int, int] = (3, 2),
     order: int = 1,
+    grading: float = 1.0,
 ) -> Mesh:
     """Both ventricles; the right one lies towards positive x.
 
     Parameters
     ----------
     left, right : dimensions.
-    rings, around : of the left ventricle, as in
+    rings, around, grading : of the left ventricle, as in
         :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`.
     layers : through the left wall and through the right free wall.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the true surfaces.
@@ -48,7 +54,7 @@ def biventricle(
         raise InputError(f"biventricle: {layers} layers through the walls; expected at least 1")
     through, strips = layers
     septum = Septum(left, right)
-    flat = _laid_out(septum, rings, around, strips)
+    flat = _laid_out(septum, rings, around, strips, grading)
     wall = stacked(len(flat.r), through)
     in_wall = _in_columns(wall, flat.r, flat.phi)
     sheet, in_sheet = _sheet(flat, wall, strips)
@@ -98,7 +104,7 @@ class _Flat:
         return np.setdiff1d(self.opened.inner, self.opened.line)
 
 
-def _laid_out(septum: Septum, rings: int, around: int, strips: int) -> _Flat:
+def _laid_out(septum: Septum, rings: int, around: int, strips: int, grading: float) -> _Flat:
     """The disc opened around the septum, which takes half of ``around`` on every full ring."""
     radius, angle, triangles = disc(rings, around)
     angle = np.angle(np.exp(1j * angle))  # from -pi to pi
@@ -115,6 +121,7 @@ def _laid_out(septum: Septum, rings: int, around: int, strips: int) -> _Flat:
     rim = np.flatnonzero((radius == 1.0) & ~inside)
     xi, eta, r, phi = (part[opened.origin] for part in (xi, eta, radius, angle))
     base = r == 1.0
+    r, eta = toward_base(r, grading), np.where(eta > 0.0, toward_base(eta, grading), eta)
     r, phi = _made_room(septum, opened, rim, half_angle, xi, eta, r, phi)
     return _Flat(opened, r, phi, xi, eta, base)
 

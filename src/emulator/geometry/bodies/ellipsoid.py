@@ -87,6 +87,13 @@ HUMAN = EllipsoidalWall(23.0, 58.0, 34.0, 65.0, base=20.0)
 7 mm at the apex; the cavity is 46 mm wide and 78 mm long."""
 
 
+def toward_base(radius: np.ndarray, grading: float) -> np.ndarray:
+    """Radii in the disc, from 0 to 1, moved towards 1, the base, where ``grading`` is above 1."""
+    if not 0.0 < grading < np.inf:
+        raise InputError(f"ellipsoid: grading {grading} of the rings; expected above 0")
+    return 1.0 - (1.0 - np.minimum(radius, 1.0)) ** grading
+
+
 def truncated_ellipsoid(
     wall: EllipsoidalWall,
     rings: int,
@@ -118,10 +125,8 @@ def truncated_ellipsoid(
     """
     if layers < 1:
         raise InputError(f"ellipsoid: {layers} layers through the wall; expected at least 1")
-    if not 0.0 < grading < np.inf:
-        raise InputError(f"ellipsoid: grading {grading} of the rings; expected above 0")
     radius, angle, triangles = disc(rings, around)
-    radius = 1.0 - (1.0 - radius) ** grading
+    radius = toward_base(radius, grading)
     r, phi = np.tile(radius, layers + 1), np.tile(angle, layers + 1)
     t = np.repeat(np.arange(layers + 1) / layers, len(radius))
     depth = t * _thickness(r, phi, *thicker)
