@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
@@ -118,3 +119,6 @@ class LinearSimulator:
         u, valid = self.forward.evaluate(theta)
         status = Status.CONVERGED if bool(valid) else Status.ITERATION_LIMIT
         return Solution(u, jnp.array(status), *[jnp.array(0.0)] * 4)
+
+    def sensitivities(self, u, theta):
+        return jnp.moveaxis(jax.jacfwd(self.forward)(theta), -1, 0)

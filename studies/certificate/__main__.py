@@ -48,7 +48,7 @@ def row(case, problem, simulator, budget, *, nuts=False) -> dict[str, Any]:
     if nuts and case.sampled:
         data = posterior.data["displacement"]
         posterior = cal.sample(posterior.model, data, options=NUTS, seed=case.seed)
-    certificate = certify(posterior, simulator, draws=budget, seed=case.seed)
+    certificate = certify(posterior, simulator, draws=budget or case.budget, seed=case.seed)
     draws = np.stack(list(posterior.draws().values()), axis=1)
     e = certificate.evidence
     return {
@@ -126,7 +126,7 @@ def main() -> None:
     parser.add_argument("--only", help="kinds to run, comma-separated")
     parser.add_argument("--fem", action="store_true", help="the beam's, judged by FEM itself")
     parser.add_argument("--nuts", action="store_true", help="draws by NUTS, not independent ones")
-    parser.add_argument("--draws", type=int, default=200, help="FEM runs a certificate")
+    parser.add_argument("--draws", type=int, help="FEM runs a certificate; by default the case's")
     parser.add_argument("--out", type=Path, default=HERE)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []

@@ -1,16 +1,19 @@
 """Wrong maps and wrong draws of every kind, each with the posterior it leads to."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 from studies.certificate.problems import (
+    APART,
     Map,
     Problem,
     by_quadrature,
+    five,
+    mirror,
     moments_of,
     posterior_of,
     sample_grid,
@@ -35,15 +38,17 @@ class Case:
     seed: int
     make: Callable[..., Any]
     good: bool = False
+    budget: int = 200
 
     @property
     def sampled(self):
         """Whether the map or the noise is what is wrong, and not the draws."""
-        return self.kind not in ("few", "stuck")
+        return self.kind not in ("few", "stuck", "two_points")
 
     @property
     def name(self):
-        return f"{self.problem}, {self.kind} {self.size:g}, seed {self.seed}"
+        runs = "" if self.budget == 200 else f", {self.budget} runs"
+        return f"{self.problem}, {self.kind} {self.size:g}, seed {self.seed}{runs}"
 
 
 def with_map(problem, error, seed, *, noise=1.0, draws=None):
@@ -147,6 +152,15 @@ def hides(problem, size, seed):
     return with_map(problem, lambda theta: jnp.where(theta[0] > middle, step, 0.0), seed)
 
 
+def bump(problem, size, seed):
+    """``size`` mm wrong in a ball that holds no mass: it moves nothing."""
+    along = principal(problem, seed)
+    step = size * pattern(problem, seed)
+    return with_map(
+        problem, lambda theta: jnp.where(jnp.abs(along(theta) - 9.0) < 2.0, 1.0, 0.0) * step, seed
+    )
+
+
 def spoiled(problem, size, seed):
     """Every sensitivity wrong by a random ``size`` of itself, as from spoiled weights."""
     rng = np.random.default_rng([7, seed])
@@ -180,6 +194,51 @@ def _half(weights, kept):
     return np.where(kept, weights, 0.0) / weights[kept].sum()
 
 
+def hidden_mode(problem, size, seed):
+    """The map is ``size`` mm wrong within 4 sd of one of two modes: no draw is there."""
+    rng, data = np.random.default_rng([8, seed]), problem.data(seed)
+    straight = five()
+    along, up = mirror(straight)
+    # Given what is even, the rest is Gaussian; the flat prior's density of x is APART / |x| there.
+    shifted = replace(straight, truth=problem.truth)
+    even = gaussian(shifted, straight.forward, data, problem.noise)
+    at = rng.multivariate_normal(*even, size=40 * DRAWS)
+    value = along @ straight.truth
+    square = APART**2 + 2.0 * APART * (at @ along - value)
+    x = np.sqrt(np.maximum(square, 1e-12))
+    rows = rng.choice(len(at), size=DRAWS, p=(weights := (square > 0.0) / x) / weights.sum())
+    modes = [at + (sign * x - (at @ along - value))[:, None] * up for sign in (1.0, -1.0)]
+    points = np.concatenate([mode[rows] for mode in modes])
+    truth = points.mean(axis=0), points.std(axis=0)
+    other, whiten = modes[1][rows].mean(axis=0), np.linalg.inv(np.cov(modes[1][rows].T))
+    step = size * pattern(problem, seed)
+
+    def error(theta):
+        off = theta - other
+        return step * jnp.where(off @ whiten @ off < 16.0 * len(other), 1.0, 0.0)
+
+    exact = problem.forward
+    wrong = Map(
+        problem.scene, lambda theta, nodes: exact.function(theta, nodes) + error(theta)[nodes],
+        exact.nodes,
+    )  # fmt: skip
+    flat = {p.name: dist.Uniform(p.low, p.high) for p in problem.scene.parameters}
+    observe = cal.nodal_displacements(problem.scene, problem.nodes)
+    model = cal.model(wrong, observe, cal.GaussianNoise(sd=problem.noise), flat)
+    return posterior_of(model, data, modes[0][rows]), truth
+
+
+def two_points(problem, size, seed):  # noqa: ARG001 - as every case
+    """Draws with FEM's mean and covariance, each at one of two places along every axis."""
+    posterior, truth = with_map(problem, _nothing(problem), seed)
+    draws = np.stack(list(posterior.draws().values()), axis=1)
+    rng = np.random.default_rng([9, seed])
+    mean, root = draws.mean(axis=0), np.linalg.cholesky(np.cov(draws.T))
+    signs = rng.choice([-1.0, 1.0], size=draws.shape)
+    moved = mean + (signs + 0.02 * rng.normal(size=signs.shape)) @ root.T
+    return posterior_of(posterior.model, posterior.data["displacement"], moved), truth
+
+
 def few(problem, size, seed):
     """``size`` draws in four chains; above 100 they are correlated by 0.98 from one to the next."""
     posterior, truth = with_map(problem, _nothing(problem), seed)
@@ -200,12 +259,12 @@ def cases(quick: bool = False) -> list[Case]:
     """Every kind on every problem it makes sense on."""
     found = []
 
-    def add(problems, make, sizes, seeds, *, good_below=-1.0, name=None):
+    def add(problems, make, sizes, seeds, *, good_below=-1.0, budget=200):
         for problem in problems:
             for size in sizes:
                 for seed in seeds[:1] if quick else seeds:
                     found.append(
-                        Case(problem, name or make.__name__, size, seed, make, size <= good_below)
+                        Case(problem, make.__name__, size, seed, make, size <= good_below, budget)
                     )
 
     two = ("beam", "five")
@@ -218,10 +277,17 @@ def cases(quick: bool = False) -> list[Case]:
     add(two, constant, (0.02, 0.1, 0.3, 1.0), (0, 1), good_below=good)
     add(two, growing, (0.02, 0.05, 0.1, 0.3), (0,), good_below=good)
     add(("beam",), rough, (0.02, 0.1, 0.3, 1.0), (0, 1), good_below=good)
+    add(("five",), bump, (1.0, 20.0), (0, 1), good_below=100.0)
     add(two, spoiled, (1e-4, 1e-2, 1e-1), (0,), good_below=1e-4)
     add(two, wrong_noise, (0.4, 0.6, 0.85, 1.2, 1.7, 2.5), (0,))
     add(two, few, (40, 2000), (0,))
     add(("beam", "modes"), hides, (1.0, 5.0), (0, 1))
     add(("modes",), stuck, (1, 2), (0, 1))
     add(("modes",), constant, (0.0, 0.02), (0, 1), good_below=good)
+    add(("hidden",), hidden_mode, (1.0, 5.0), tuple(range(8)))
+    add(two, two_points, (1,), (0, 1, 2))
+    for budget in (50, 80):
+        add(("beam", "modes"), hides, (1.0, 5.0), (0, 1), budget=budget)
+        add(("hidden",), hidden_mode, (5.0,), (0, 1, 2, 3), budget=budget)
+        add(("modes",), stuck, (1,), (0, 1), budget=budget)
     return found

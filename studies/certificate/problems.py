@@ -6,6 +6,7 @@ beam   : the shipped emulator of the once-clamped beam (1e-9 mm from FEM); (mu, 
          bent ridge; quadrature.
 five   : a map linear in the ventricle's five parameters; closed form.
 modes  : a map even in mu - 75 kPa: two modes; quadrature.
+hidden : five's map, even in one direction: two modes, 12 sd apart; Gaussian in what is even.
 """
 
 from dataclasses import dataclass, field, replace
@@ -56,10 +57,14 @@ class ExactSimulator:
 
     def __init__(self, forward):
         self.scene, self._solve = forward.scene, jax.jit(forward)
+        self._slopes = jax.jit(jax.jacfwd(forward))
 
     def solve(self, theta, start=None):  # noqa: ARG002 - as FEM takes it
         u = self._solve(theta)
         return Solution(u, jnp.array(Status.CONVERGED), *[jnp.array(0.0)] * 4)
+
+    def sensitivities(self, u, theta):  # noqa: ARG002 - as FEM takes it
+        return jnp.moveaxis(self._slopes(theta), -1, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +192,38 @@ def five():
     forward = linear(scene, matrix, np.zeros((len(scene.mesh.nodes), 3)))
     nodes = spread_nodes(scene, 20, 1)
     return Problem("five", replace(forward), nodes, 0.2, 0.5 * (low + high))
+
+
+APART = 6.0  # sd of each mode of ``hidden`` from the plane between them
+
+
+def hidden():
+    """Data see the square of the widest direction of ``five``, scaled to the slope 1 at a mode."""
+    problem = five()
+    along, up = mirror(problem)
+    centre, linear_ = problem.truth, problem.forward
+
+    def function(theta, nodes):
+        x = along @ (theta - centre)
+        even = 0.5 * (x**2 / APART - APART)
+        return linear_.function(theta + (even - x) * up, nodes)
+
+    forward = replace(linear_, function=function)
+    return Problem("hidden", forward, problem.nodes, problem.noise, centre + APART * up)
+
+
+def mirror(problem):
+    """Direction ``along`` (p,) in which ``x = along . (theta - truth)`` has sd 1, and a step of it.
+
+    ``up`` (p,) changes x by 1 and whatever is independent of x in the posterior by nothing.
+    """
+    at, p = problem.forward.at(problem.nodes), len(problem.truth)
+    base = np.asarray(at(jnp.zeros(p))).ravel()
+    A = np.stack([np.asarray(at(jnp.eye(p)[k])).ravel() - base for k in range(p)], axis=1)
+    covariance = problem.noise**2 * np.linalg.inv(A.T @ A)
+    sd = np.sqrt(np.diag(covariance))
+    along = np.eye(p)[0] / sd[0]
+    return along, covariance @ along
 
 
 def modes():

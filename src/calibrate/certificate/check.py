@@ -1,6 +1,7 @@
 r"""A check against FEM with a fixed number of solves.
 
-1. **Train.** FEM at draws of the posterior, evenly spaced, around them, and at draws of the prior.
+1. **Train.** FEM at draws of the posterior, evenly spaced, around them, at draws of the prior, and
+   where descents of its own misfit lead from those (:mod:`calibrate.certificate.descents`).
    What the map misses there is learned (:mod:`calibrate.certificate.correction`), and a pool of
    cheap points follows the corrected map's posterior wherever it leads
    (:mod:`calibrate.certificate.pool`). Further runs, in rounds, go where the correction is so
@@ -20,13 +21,15 @@ honest however good or bad the correction is, and small where it is good.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibrate.certificate.correction import Correction
+from calibrate.certificate.descents import descend
 from calibrate.certificate.estimates import (
     Tests,
     figures_of,
@@ -65,7 +68,8 @@ from emulator.progress import counting
 _FEM_RUNS = 200
 _FEWEST = 25
 # Shares of the runs that train the correction; the others test it.
-_AT_DRAWS, _AROUND, _AT_PRIOR, _ADAPTIVE = 0.15, 0.1, 0.1, 0.2
+_AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
+_FEWEST_DESCENTS = 16  # runs; fewer end nowhere
 _ROUNDS = 5  # in which the adaptive ones are chosen
 # Shares of the test points: from the corrected posterior, the map's, where FEM may find the data
 # likely, around the draws, and from the whole pool.
@@ -93,6 +97,7 @@ def examine(
     simulator: Simulator,
     *,
     draws: int | None = None,
+    at_most: int | None = None,
     mesh: int | None = None,
     seed: int = 0,
     scheduler: str | None = None,
@@ -100,6 +105,7 @@ def examine(
 ) -> Check:
     """Check ``posterior`` with ``draws`` FEM runs, 200 by default.
 
+    at_most : while these leave the verdict undecided, they are doubled, up to so many.
     mesh : solves on the next finer mesh (:mod:`calibrate.certificate.mesh`): 0 for none, up to 15;
         by default four more than there are unknowns.
     scheduler : address of a Dask scheduler whose workers solve; otherwise this process does.
@@ -117,6 +123,7 @@ def examine(
     if mesh is not None and not 0 <= mesh <= MOST_RUNS:
         raise InputError(f"certify: {mesh} solves on the finer mesh; give 0 to {MOST_RUNS}")
     predictive = Predictive(posterior.model, posterior.data)
+    most = count if at_most is None else max(count, at_most)
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
     # More threads than one for small matrices oversubscribe the cores: twice the time.
@@ -127,24 +134,31 @@ def examine(
     ):
         likelihood = FEMLikelihood(posterior.model, simulator, execute)
         solver = Solver(predictive, likelihood, bar)
-        at_draws, training, correction, pool = _train(solver, z, count, rng)
-        tests = _test(solver, pool, count - len(training.z), rng)
+        begun = _begin(solver, z, count, rng)
+        training, spent = begun.runs, 0
+        while True:
+            training, correction, pool = _train(solver, z, begun.ends, training, count, most, rng)
+            tests = _test(solver, pool, spent + count - len(training.z), rng)
+            every = joined([training, tests.runs])
+            spent = len(every.z)
+            figures = figures_of(posterior, predictive, pool, tests)
+            chosen = pool.z[resampled(pool, DRAWS, rng)]
+            evidence = Evidence(
+                *figures,
+                sampling_of(posterior),
+                physics_of(begun.at_draws, training, tests, pool),
+                tail_of(pool, tests, missed_by(predictive, correction, every), len(begun.ends)),
+                misfits(predictive, correction, chosen, _key(rng)),
+            )
+            if judge(evidence).verdict != "undecided" or spent >= most:
+                break
+            # Twice as many altogether; the earlier tests train, and fresh points test.
+            count, training = min(spent, most - spent), every
+            bar.total = spent + count
         bar.set_description("finer mesh")
-        change = mesh_change(predictive, simulator, joined([training, tests.runs]), pool, mesh, rng)
-    chosen = pool.z[resampled(pool, DRAWS, rng)]
-    draws_changes, corrected_changes, mean, sd = figures_of(posterior, predictive, pool, tests)
-    evidence = Evidence(
-        draws_changes,
-        corrected_changes,
-        mean,
-        sd,
-        sampling_of(posterior),
-        physics_of(at_draws, training, tests, pool),
-        tail_of(pool, tests, missed_by(predictive, correction, joined([training, tests.runs]))),
-        misfits(predictive, correction, chosen, _key(rng)),
-        change,
-    )
-    return Check(judge(evidence), posterior, predictive, pool, tests)
+        change = mesh_change(predictive, simulator, every, pool, mesh, rng)
+    certificate = judge(replace(evidence, mesh=change))
+    return Check(certificate, posterior, predictive, pool, tests)
 
 
 def certify(
@@ -152,6 +166,7 @@ def certify(
     simulator: Simulator,
     *,
     draws: int | None = None,
+    at_most: int | None = None,
     mesh: int | None = None,
     seed: int = 0,
     scheduler: str | None = None,
@@ -159,6 +174,7 @@ def certify(
 ) -> Certificate:
     """The certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200).
 
+    While they leave the verdict undecided they are doubled, up to ``at_most`` if that is given.
     ``mesh`` is the number of solves on the next finer mesh, 0 for none. ``scheduler`` is the
     address of a Dask scheduler whose workers solve, as of :func:`calibrate.campaign`.
     """
@@ -166,6 +182,7 @@ def certify(
         posterior,
         simulator,
         draws=draws,
+        at_most=at_most,
         mesh=mesh,
         seed=seed,
         scheduler=scheduler,
@@ -182,32 +199,65 @@ def _refuse_fem_draws(posterior: Posterior) -> None:
         )
 
 
-def _train(
-    solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[Runs, Runs, Correction, Pool]:
-    """Runs at the posterior's draws, all training runs, the correction they say, and its pool."""
+class _Begun(NamedTuple):
+    """FEM where draws, their surroundings, the prior and descents are.
+
+    at_draws : runs at draws. runs : all of them. ends : points around what else FEM finds likely.
+    """
+
+    at_draws: Runs
+    runs: Runs
+    ends: tuple[np.ndarray, ...]
+
+
+def _begin(solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator) -> _Begun:
+    """The runs that any correction needs, their numbers in proportion to ``count``."""
     predictive = solver.predictive
     rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
     at_draws = solver(z[rows], stability=_STABILITY)
     # Next to the draws the map may hide a part of the posterior, by an error that draws of the
     # prior are too far apart to show.
-    wide = around_draws(z, rng).sample(rng, max(round(_AROUND * count), 4))
+    wide = solver(around_draws(z, rng).sample(rng, max(round(_AROUND * count), 4)))
     prior = predictive.prior_draws(_key(rng), max(round(_AT_PRIOR * count), 4))
-    runs = joined([at_draws, solver(wide), solver(prior)])
-    correction = correction_from(runs, predictive, count)
-    pool = search(predictive, correction, z, rng)
-    for _ in range(_ROUNDS):
+    at_prior = solver(prior, slopes=True)
+    # Where the map hides a mode altogether, only FEM leads to it.
+    most = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
+    log_prior = np.array([predictive.log_prior(point) for point in at_draws.z])
+    best = float(np.max(log_prior + at_draws.fem))
+    found = descend(solver, at_prior, z, best, most, rng)
+    return _Begun(at_draws, joined([at_draws, wide, at_prior, found.runs]), found.ends)
+
+
+def _train(
+    solver: Solver,
+    z: np.ndarray,
+    ends: tuple[np.ndarray, ...],
+    runs: Runs,
+    count: int,
+    most: int,
+    rng: np.random.Generator,
+) -> tuple[Runs, Correction, Pool]:
+    """All training runs, the correction they say, and its pool.
+
+    ends : points around what else FEM finds likely. runs : to begin with. most : of runs, ever.
+    """
+    predictive = solver.predictive
+    correction = correction_from(runs, predictive, most)
+    pool = search(predictive, correction, z, ends, rng)
+    adaptive = max(round(_ADAPTIVE * count), 1)
+    rounds = min(_ROUNDS, adaptive)
+    for _ in range(rounds):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
-            size = max(round(_ADAPTIVE * count / _ROUNDS), 1)
+            size = round(adaptive / rounds)
             chosen = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
             runs = joined([runs, solver(chosen)])
-        correction = correction_from(runs, predictive, count)
+        correction = correction_from(runs, predictive, most)
         pool = corrected_again(pool, predictive, correction)
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = step(pool, predictive, correction, pool.log_explored, rng)
     pool = polish(pool, predictive, correction, rng)
-    return at_draws, runs, correction, redrawn(pool, predictive, correction, rng)
+    return runs, correction, redrawn(pool, predictive, correction, rng)
 
 
 def _test(solver: Solver, pool: Pool, count: int, rng: np.random.Generator) -> Tests:

@@ -12,8 +12,10 @@ sets the scale :math:`a^2` of the process's variance, in squared noise sd,
 
 .. math:: v(x) = a^2 (k(x, x) + \tau^2 - k(x, X) (k(X, X) + \tau^2 I)^{-1} k(X, x))
 
-Being wrong costs precision, not honesty: :math:`v` only says where to look, and FEM at fresh points
-weighs what the correction says (:mod:`calibrate.certificate.check`).
+Being wrong costs precision where FEM is asked: :math:`v` only says where to look, and FEM at fresh
+points weighs what the correction says (:mod:`calibrate.certificate.check`). Where no point looks,
+nothing is known; so descents of FEM's own misfit look (:mod:`calibrate.certificate.descents`). And no correction at all is one of the candidates: a process that a bump far from the posterior
+spoils everywhere is worse than none.
 """
 
 from __future__ import annotations
@@ -72,17 +74,27 @@ def corrections(correction: Correction, x: jax.Array) -> jax.Array:
     return jax.vmap(lambda one: correct(correction, one)[0])(x)
 
 
-def fit(x: np.ndarray, errors: np.ndarray, scales: np.ndarray, rows: int) -> Correction:
-    """The process fitted to ``errors`` (n, m) at features ``x`` (n, q).
+def fit(
+    x: np.ndarray,
+    errors: np.ndarray,
+    scales: np.ndarray,
+    rows: int,
+    likely: np.ndarray | None = None,
+) -> Correction:
+    """The process fitted to ``errors`` (n, m) at features ``x`` (n, q); none where that is better.
 
     Parameters
     ----------
     scales : noise level of each datum, (m,); leave-one-out errors are judged in it.
     rows : of the result, padded with zeros, so that programs are compiled once.
+    likely : (n,) bool, points at which the process has to be better than none; all by default.
     """
-    best, result = np.inf, nothing(rows, x.shape[1], errors.shape[1])
+    none, result = (nothing(rows, x.shape[1], errors.shape[1]) for _ in range(2))
     result.at[: len(x)] = x
     linear = _TREND * (1.0 + x @ x.T)
+    plain = np.mean((errors / scales) ** 2, axis=1)
+    judged = slice(None) if likely is None or not likely.any() else likely
+    best, there = np.inf, np.inf
     distances = ((x[:, None] - x) ** 2).sum(axis=-1)
     for trial, nugget in product(_LENGTHS, _NUGGETS):
         kernel = linear + np.exp(-0.5 * distances / trial**2) + nugget * np.eye(len(x))
@@ -94,9 +106,11 @@ def fit(x: np.ndarray, errors: np.ndarray, scales: np.ndarray, rows: int) -> Cor
         # Geometric mean over the points: the prior's corners must not outvote the posterior.
         loss = np.log(square + _NEGLIGIBLE**2).mean()
         if loss < best:
-            best = loss
+            best, there = loss, np.log(square[judged] + _NEGLIGIBLE**2).mean()
             result.weights[: len(x)], result.inverse[: len(x), : len(x)] = weights, inverse
             result = result._replace(
                 length=trial, nugget=nugget, scale=float(np.mean(square / variance))
             )
-    return result
+    if there < np.log(plain[judged] + _NEGLIGIBLE**2).mean():
+        return result
+    return none._replace(scale=float(np.mean(plain / (np.diag(linear) + 1.0))))

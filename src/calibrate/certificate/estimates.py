@@ -10,7 +10,7 @@ from scipy.special import chdtri
 
 from calibrate.arviz import array_stats
 from calibrate.certificate.correction import Correction
-from calibrate.certificate.evidence import Changes, Figure, Physics, Sampling, Tail
+from calibrate.certificate.evidence import LARGEST_MASS, Changes, Figure, Physics, Sampling, Tail
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.pool import Pool, effective, normalised
 from calibrate.certificate.predictive import Predictive
@@ -52,33 +52,58 @@ def figures_of(
     x = np.stack([here[name] for name in names], axis=1)
     corrected = pool.corrected
     by_fem, by_map = normalised(tests.log_fem(pool)), normalised(tests.log_corrected(pool))
+    # Whether a point is below each quantile of the draws, and of the corrected posterior.
+    edges = np.hstack([_quantiles(draws, None), _quantiles(x, corrected)]).ravel()
+    below = np.repeat(x, edges.size // x.shape[1], axis=1) <= edges
+
+    def figures(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        share = weights / total if (total := weights.sum()) > 0.0 else weights * np.nan
+        return np.concatenate([moments(x[rows], weights), share @ below[rows]])
 
     def change(used: np.ndarray) -> np.ndarray:
-        at = x[tests.rows]
-        return moments(at, by_fem * used) - moments(at, by_map * used)
+        return figures(tests.rows, by_fem * used) - figures(tests.rows, by_map * used)
 
-    base, base_error = jackknife(lambda used: moments(x, corrected * used), len(x))
+    every = np.arange(len(x))
+    base, base_error = jackknife(lambda used: figures(every, corrected * used), len(x))
     step, step_error = jackknife(change, len(tests.rows))
     found, error = base + step, np.hypot(base_error, step_error)
-    plain = moments(draws, np.ones(len(draws)))
+    # The draws' own share: a quantile may be a draw that comes often.
+    here_too = np.repeat(draws, edges.size // x.shape[1], axis=1) <= edges
+    plain = np.concatenate([moments(draws, np.ones(len(draws))), here_too.mean(axis=0)])
     p = len(names)
     mean = _named(names, found[:p], error[:p])
     sd_found = np.exp(found[p : 2 * p])
     sd = _named(names, sd_found, sd_found * error[p : 2 * p])
-    of_draws = _changes(names, found - plain, error, np.exp(plain[p : 2 * p]))
-    of_corrected = _changes(names, step, step_error, np.exp(base[p : 2 * p]))
+    of_draws = _changes(names, found - plain, error, np.exp(plain[p : 2 * p]), 0)
+    of_corrected = _changes(names, step, step_error, np.exp(base[p : 2 * p]), 1)
     return of_draws, of_corrected, mean, sd
 
 
-def _changes(names: tuple[str, ...], d: np.ndarray, e: np.ndarray, sd: np.ndarray) -> Changes:
-    """Changes ``d`` of moments and their errors, with means in ``sd`` (p,)."""
+def _quantiles(x: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Quantiles (p, 3) of points (s, p) at the levels of :data:`LARGEST_MASS`."""
+    method = "linear" if weights is None else "inverted_cdf"
+    return np.quantile(x, list(LARGEST_MASS), axis=0, weights=weights, method=method).T
+
+
+def _changes(
+    names: tuple[str, ...], d: np.ndarray, e: np.ndarray, sd: np.ndarray, of: int
+) -> Changes:
+    """Changes ``d`` of moments and masses and their errors ``e``, with means in ``sd`` (p,).
+
+    of : quantiles of the draws, 0, or of the corrected posterior, 1.
+    """
     p = len(names)
+    d_mass, e_mass = (each[-6 * p :].reshape(p, 2, 3)[:, of].T for each in (d, e))
     pairs = tuple(f"{a} and {b}" for a, b in combinations(names, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         return Changes(
             _named(names, d[:p] / sd, e[:p] / sd),
             _named(names, d[p : 2 * p], e[p : 2 * p]),
-            _named(pairs, d[2 * p :], e[2 * p :]),
+            _named(pairs, d[2 * p : -6 * p], e[2 * p : -6 * p]),
+            {
+                level: _named(names, values, errors)
+                for level, values, errors in zip(LARGEST_MASS, d_mass, e_mass, strict=True)
+            },
         )
 
 
@@ -132,14 +157,14 @@ def missed_by(predictive: Predictive, correction: Correction, runs: Runs) -> int
     return int(np.sum(likely & ~(at.prior + at.corrected > fem - _MISSED)))
 
 
-def tail_of(pool: Pool, tests: Tests, missed: int) -> Tail:
+def tail_of(pool: Pool, tests: Tests, missed: int, ends: int = 0) -> Tail:
     """Tail of FEM's weights, and how irregularly FEM and the corrected map differ."""
     log_fem, log_map = tests.log_fem(pool), tests.log_corrected(pool)
     threshold = float(min(1.0 - 1.0 / np.log10(len(log_fem)), 0.7))  # Vehtari et al. 2024, Eq. 13
     weights = normalised(log_fem)
     both = np.isfinite(log_fem) & np.isfinite(log_map)
     if not both.any():
-        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, effective(pool.corrected), missed)
+        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, effective(pool.corrected), missed, ends)
     share = normalised(np.where(both, log_map, -np.inf))[both]
     ratio = (log_fem - log_map)[both]
     spread = float(np.sqrt(share @ (ratio - share @ ratio) ** 2))
@@ -151,6 +176,7 @@ def tail_of(pool: Pool, tests: Tests, missed: int) -> Tail:
         spread,
         effective(pool.corrected),
         missed,
+        ends,
     )
 
 

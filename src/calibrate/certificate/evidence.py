@@ -13,6 +13,9 @@ from calibrate.posterior.fit import Misfit
 LARGEST_SHIFT = 0.25
 LARGEST_LOG_SD = float(np.log(1.2))
 LARGEST_CORRELATION_CHANGE = 0.2
+# Of FEM's mass below a quantile of the draws: what the largest shift and change of sd together do
+# to a Gaussian. Two points may have the right mean and sd.
+LARGEST_MASS = {0.05: 0.06, 0.5: 0.12, 0.95: 0.06}
 # Of the mesh: beyond, the posterior is about the mesh and not about the tissue.
 LARGEST_MESH_SHIFT = 0.5
 LARGEST_MESH_LOG_SD = float(np.log(1.25))
@@ -40,17 +43,24 @@ class Figure:
             return True
         return False if abs(self.value) - _ERRORS * self.error > limit else None
 
+    def more(self, limit: float) -> float:
+        """How many times as many runs would decide, if its value stays: errors fall as a root."""
+        gap = abs(limit - abs(self.value))
+        return (_ERRORS * self.error / gap) ** 2 if gap > 0.0 else np.inf
+
 
 @dataclass(frozen=True)
 class Changes:
     """What FEM changes of a posterior, by parameter.
 
     shift : of the mean, in sd of the draws. log_sd : of the sd. correlation : of each pair.
+    mass : below the quantiles of the draws, by their level.
     """
 
     shift: dict[str, Figure]
     log_sd: dict[str, Figure]
     correlation: dict[str, Figure]
+    mass: dict[float, dict[str, Figure]] = field(default_factory=dict)
 
     def judged(self) -> list[tuple[str, Figure, float]]:
         """Every figure in words, with its limit."""
@@ -61,6 +71,9 @@ class Changes:
               for n, f in self.log_sd.items()),
             *((f"correlation of {n} changes by {f.value:+.2f}", f, LARGEST_CORRELATION_CHANGE)
               for n, f in self.correlation.items()),
+            *((f"below the {100 * level:.0f} % quantile of {n} FEM has "
+               f"{100 * (level + f.value):.0f} %", f, LARGEST_MASS[level])
+              for level, figures in self.mass.items() for n, f in figures.items()),
         ]  # fmt: skip
 
     def within(self) -> bool | None:
@@ -105,6 +118,7 @@ class Tail:
     spread : sd of the log ratio of FEM's likelihood over the corrected map's.
     pool : effective points under the corrected map.
     missed : FEM runs of all kinds that FEM finds likely and the corrected map does not.
+    ends : places that FEM finds likely and draws or map do not know, where its descents ended.
     """
 
     k_hat: float
@@ -114,6 +128,7 @@ class Tail:
     spread: float
     pool: float
     missed: int
+    ends: int = 0
 
     @property
     def heavy(self) -> bool:

@@ -138,9 +138,16 @@ def tempered(log_weights: np.ndarray, least: float) -> np.ndarray:
 
 
 def search(
-    predictive: Predictive, correction: Correction, draws: np.ndarray, rng: np.random.Generator
+    predictive: Predictive,
+    correction: Correction,
+    draws: np.ndarray,
+    ends: tuple[np.ndarray, ...],
+    rng: np.random.Generator,
 ) -> Pool:
-    """A pool that knows the draws (s, p) of z, what is beyond them, and what the prior leads to."""
+    """A pool that knows the draws (s, p) of z, what is beyond them, and what the prior leads to.
+
+    ends : points around whatever else FEM finds likely.
+    """
     key = jax.random.key(int(rng.integers(2**31)))
     z = predictive.prior_draws(key, PRIOR)
     pool = Pool(z, predictive.evaluate(z, correction), PRIOR, (), (), np.zeros((0, PRIOR)))
@@ -152,6 +159,9 @@ def search(
     pool = extend(pool, predictive, correction, near, NEAR, rng)
     pool = replace(pool, wide=len(pool.proposals))
     pool = extend(pool, predictive, correction, around_draws(draws, rng), WIDE, rng)
+    for points in ends:
+        kernels = around(points, widths(draws.shape[1]), NEAR_FREEDOM, rng)
+        pool = extend(pool, predictive, correction, kernels, STEP, rng)
     return polish(pool, predictive, correction, rng)
 
 

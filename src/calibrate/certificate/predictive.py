@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from calibrate.certificate.correction import Correction, correct, corrections
+from calibrate.certificate.correction import Correction, correct, corrections, nothing
 from calibrate.samplers.density import Density, density_of
 from calibrate.statistical_model import Data, Model
 
@@ -76,6 +76,19 @@ class Predictive:
         """Points (count, p) from the prior."""
         return _inside(self._prior_draws(jax.random.split(rng_key, count)))
 
+    @cached_property
+    def uncorrected(self) -> Correction:
+        """The correction of this model's data that is zero."""
+        return nothing(1, len(self.model.states.unknowns), len(self.scales))
+
+    def log_prior(self, z: np.ndarray) -> float:
+        """Log density of the prior at one point (p,)."""
+        return float(self._log_prior(z))
+
+    @cached_property
+    def _log_prior(self) -> Any:
+        return jax.jit(self._density.log_prior)
+
     def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
         """Log densities at points (s, p)."""
         return self._in_blocks(lambda block: self._evaluate_block(block, correction), z)
@@ -88,6 +101,46 @@ class Predictive:
         """The corrected map's data without noise, flat (s, m)."""
         features, means = self.features(z), self.means(z)[0]
         return means + np.asarray(corrections(correction, features))
+
+    def curvature(
+        self, z: np.ndarray, means: np.ndarray, slopes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        r"""Gradient (p,) of FEM's log posterior at ``z`` (p,), and minus its curvature (p, p).
+
+        .. math::
+            \nabla \log\pi = J^T \nabla_m \ell + \partial_z \ell + \nabla \log p, \qquad
+            H = -J^T \nabla_m^2 \ell\, J + \operatorname{diag}(s^{-2})
+
+        (Gauss-Newton), with :math:`\ell` the log likelihood of FEM's means :math:`m` (m,), their
+        derivatives in ``z``, :math:`J`, by ``slopes`` (m, S, p), and the prior's sd :math:`s`.
+        """
+        gradient, curvature = self._curvature(z, means, slopes)
+        return np.asarray(gradient), np.asarray(curvature) + np.diag(self.prior_sd**-2)
+
+    @cached_property
+    def prior_sd(self) -> np.ndarray:
+        """Sd (p,) of the prior's z."""
+        return self.prior_draws(jax.random.key(1), _WIDTH_DRAWS).std(axis=0)
+
+    @cached_property
+    def _curvature(self) -> Any:
+        def told(z: jax.Array, means: jax.Array, slopes: jax.Array) -> tuple[jax.Array, jax.Array]:
+            _, unravel = ravel_pytree(self._means(self._constrain(z))[0])
+
+            def likelihood(at: jax.Array, flat: jax.Array) -> jax.Array:
+                draws = self._constrain(at)
+                return self.model.fem_log_likelihood(draws, unravel(flat), self.data)
+
+            def thetas(at: jax.Array) -> jax.Array:
+                return self.model.states.thetas(self._constrain(at))
+
+            J = jnp.tensordot(slopes, jax.jacfwd(thetas)(z), axes=2)
+            in_z, in_means = jax.grad(likelihood, argnums=(0, 1))(z, means)
+            second = jax.hessian(likelihood, argnums=1)(z, means)
+            gradient = J.T @ in_means + in_z + jax.grad(self._density.log_prior)(z)
+            return gradient, -J.T @ second @ J
+
+        return jax.jit(told)
 
     def features(self, z: np.ndarray) -> np.ndarray:
         """Unknowns of theta (s, q) on their parameters' scales, standardised by the prior."""

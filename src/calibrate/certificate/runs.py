@@ -7,11 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from scipy.special import chdtri
 from tqdm import tqdm
 
 from calibrate.certificate.correction import Correction, fit, nothing
 from calibrate.certificate.predictive import Predictive
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood, Likelihoods
+
+_LIKELY = 0.999  # mass of the Gaussian around the likeliest run, in which a correction is judged
 
 
 class Runs(NamedTuple):
@@ -20,6 +23,7 @@ class Runs(NamedTuple):
     fem : log likelihoods (s,), ``-inf`` where FEM did not converge.
     means : FEM's data without noise, flat (s, m); NaN where it did not converge.
     smallest_J : (s,). stable : minimum of the energy, saddle, or ``None`` for not asked, (s,).
+    slopes : derivatives (m, S, p) of the means in theta of each load state, or ``None``, (s,).
     """
 
     z: np.ndarray
@@ -27,6 +31,7 @@ class Runs(NamedTuple):
     means: np.ndarray
     smallest_J: np.ndarray
     stable: tuple[bool | None, ...]
+    slopes: tuple[np.ndarray | None, ...]
 
     @property
     def converged(self) -> np.ndarray:
@@ -42,6 +47,7 @@ def joined(parts: list[Runs]) -> Runs:
         np.concatenate([p.means for p in parts]),
         np.concatenate([p.smallest_J for p in parts]),
         tuple(s for p in parts for s in p.stable),
+        tuple(s for p in parts for s in p.slopes),
     )
 
 
@@ -56,15 +62,20 @@ class Solver:
     def __post_init__(self) -> None:
         self._known: dict[bytes, Likelihoods] = {}
 
-    def __call__(self, z: np.ndarray, *, stability: int = 0) -> Runs:
-        """FEM at points (s, p); at the first ``stability`` of them, also whether it is stable."""
+    def __call__(self, z: np.ndarray, *, stability: int = 0, slopes: bool = False) -> Runs:
+        """FEM at points (s, p); at the first ``stability`` of them, also whether it is stable.
+
+        slopes : whether the slopes of points that are new are wanted.
+        """
         keys = [point.tobytes() for point in z]
         new = list(dict.fromkeys(key for key in keys if key not in self._known))
         draws, rows = self.predictive.constrain(z), [keys.index(key) for key in new]
         each = [{name: values[s] for name, values in draws.items()} for s in rows]
         asked = {k for k, s in enumerate(rows) if s < stability}
         self.bar.update(len(keys) - len(new))
-        for k, told in self.likelihood.many(each, self.predictive.data, stability=asked):
+        for k, told in self.likelihood.many(
+            each, self.predictive.data, stability=asked, slopes=slopes
+        ):
             self._known[new[k]] = told
             self.bar.update()
         found = [self._known[key] for key in keys]
@@ -75,6 +86,7 @@ class Solver:
             np.array([ravel_pytree(f.means)[0] if f.converged else missing for f in found]),
             np.array([f.smallest_J for f in found]),
             tuple(f.stable for f in found),
+            tuple(f.slopes for f in found),
         )
 
 
@@ -85,4 +97,6 @@ def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction
     fine = valid & runs.converged
     if fine.sum() < x.shape[1] + 2:
         return nothing(rows, x.shape[1], means.shape[1])
-    return fit(x[fine], (runs.means - means)[fine], predictive.scales, rows)
+    least = runs.fem.max() - 0.5 * chdtri(predictive.dimension, 1.0 - _LIKELY)
+    likely = runs.fem[fine] > least
+    return fit(x[fine], (runs.means - means)[fine], predictive.scales, rows, likely)

@@ -27,6 +27,8 @@ SMALLEST_P_WORST = 0.001
 # different whatever the tail; at 1.5 a tenth of the FEM runs would count.
 LARGEST_SPREAD = 1.5
 SMALLEST_POOL = 200.0  # effective points under the corrected map
+_MORE = "more FEM runs (--until decided)"
+_MANY = 20.0  # times as many runs; beyond, it is not known how many would decide
 _WIDEN = "or allow for it in the likelihood (--mesh-error)"
 _QUADRATIC = f"make the elements quadratic (order = 2), {_WIDEN}"
 _REFINE = f"emulate the finer mesh (calibrate train finer:SCENE --recipe two_meshes), {_WIDEN}"
@@ -92,6 +94,9 @@ class Certificate(Shown):
             **_columns("shift", e.draws.shift),
             **_columns("log_sd_change", e.draws.log_sd),
             **_columns("correlation_change", e.draws.correlation),
+            "mass_change": {
+                f"{level:g}": _columns("below", figures) for level, figures in e.draws.mass.items()
+            },
             **_columns("mean_fem", e.mean),
             **_columns("sd_fem", e.sd),
             "mesh": {
@@ -170,28 +175,33 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
         ]
     if np.isnan(tail.k_hat):
         few = "too few FEM runs to judge the tail of their weights"
-        return "undecided", [Finding(few, "80 FEM runs or more")]
+        return "undecided", [Finding(few, "100 FEM runs or more")]
     if tail.heavy or not tail.pool >= SMALLEST_POOL:
         heavy = "the weights' tail is too heavy to trust their errors"
-        return "undecided", [Finding(heavy, "more FEM runs")]
+        if tail.ends:
+            away = f"FEM finds the data likely away from the draws, in {tail.ends} places"
+            heavy = f"{away}, and {heavy}"
+        return "undecided", [Finding(heavy, _MORE)]
     if tail.missed:
         missed = f"{tail.missed} FEM runs are likely where the corrected map says they are not"
         hidden = f"{missed}, so the map may hide a part of the posterior"
-        return "undecided", [Finding(hidden, "train a better map, or more FEM runs")]
+        return "undecided", [Finding(hidden, f"train a better map, or {_MORE}")]
     agree = draws.within()
     beyond = [words for words, f, limit in draws.judged() if f.within(limit) is False]
     if agree:
         worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
         return "accepted", [Finding(f"no mean moves by more than {worst:.2f} posterior sd")]
     if agree is None:
-        near = [words for words, f, limit in draws.judged() if f.within(limit) is None]
-        close = f"{near[0]}, too close to the limit for its error"
-        return "undecided", [Finding(close, "more FEM runs")]
+        near = [each for each in draws.judged() if each[1].within(each[2]) is None]
+        close = f"{near[0][0]}, too close to the limit for its error"
+        times = max(figure.more(limit) for _, figure, limit in near)
+        some = f", some {_rounded(evidence.physics.runs * times)}" if times < _MANY else ""
+        return "undecided", [Finding(close, _MORE + some)]
     repaired = corrected.within()
     if repaired:
         return "reweight", [Finding(words, "use the reweighted posterior") for words in beyond]
     verdict: Verdict = "undecided" if repaired is None else "not certified"
-    remedy = "more FEM runs" if repaired is None else "train a better map"
+    remedy = _MORE if repaired is None else "train a better map"
     still = "and reweighting does not repair it"
     return verdict, [Finding(f"{words}, {still}", remedy) for words in beyond]
 
@@ -243,6 +253,11 @@ def _misfit(observations: dict[str, Misfit]) -> Iterator[Finding]:
         elif not m.p <= 1.0 - SMALLEST_P:
             close = f"{name} fits closer than its noise allows, posterior predictive p {m.p:.3f}"
             yield Finding(close, "its noise sd is too large")
+
+
+def _rounded(number: float) -> int:
+    """Up to the next hundred."""
+    return int(np.ceil(number / 100.0)) * 100
 
 
 def _columns(name: str, figures: dict[str, Figure]) -> dict[str, dict[str, float]]:

@@ -259,6 +259,7 @@ def certify_and_keep(
     folder: str | Path,
     *,
     draws: int | None = None,
+    at_most: int | None = None,
     mesh: int | None = None,
     load_steps: int = 1,
     reweight_to: str | Path | None = None,
@@ -267,7 +268,7 @@ def certify_and_keep(
 ) -> Certificate:
     """Check a posterior against FEM and write certificate.json.
 
-    ``mesh`` is the number of solves on a finer mesh, 0 for none. ``load_steps`` are those of every
+    ``at_most`` and ``mesh`` as of :func:`calibrate.certify`. ``load_steps`` are those of every
     solve. ``scheduler`` is the address of a Dask scheduler whose workers solve. With
     ``reweight_to``, the reweighted posterior is kept in that folder, ready to be certified in its
     turn, where the verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
@@ -279,7 +280,13 @@ def certify_and_keep(
     """
     simulator = simulator_of(posterior.model.forward.scene, load_steps)
     check = examine(
-        posterior, simulator, draws=draws, mesh=mesh, scheduler=scheduler, progress=progress
+        posterior,
+        simulator,
+        draws=draws,
+        at_most=at_most,
+        mesh=mesh,
+        scheduler=scheduler,
+        progress=progress,
     )
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     (Path(folder) / REPORT).unlink(missing_ok=True)  # it tells an earlier verdict

@@ -74,9 +74,10 @@ _PULLED = 2
 # (docs/experiments.md, "Stresses as iterates").
 _CARRIED = 0.9
 _MOST_AT_LEVEL = 12  # steps at a level of a ramp; where more are needed, none will do
-# Relative residual after a step below which the next increment is twice as long, and indefinite
-# tangents in a row that show the first two ramps to be too steep; the others get over theirs
-# (docs/experiments.md, "Ramps: sooner lost, sooner up").
+# The first two ramps are the steep ones: a relative residual after a step below which their next
+# increment is twice as long, and indefinite tangents in a row that show them to be too steep. The
+# others get over theirs (docs/experiments.md, "Ramps: sooner lost, sooner up").
+_GENTLE = Route.RAMP + 2
 _EASILY = 0.3
 _TOO_STEEP = 2
 # Relative residual up to which a start is begun from; that of rest is about 1 (docs/experiments.md,
@@ -232,10 +233,11 @@ def _judged(state: PathState, mip: StressState) -> tuple[jax.Array, jax.Array, j
     """Next level of a ramp after a step; whether the ramp is lost, and whether it is left."""
     _, increment, steps = jnp.array(_RAMPS)[state.route]
     sound = (mip.fraction > 0.0) & jnp.isfinite(mip.error) & mip.definite
-    sound &= (mip.refused < _TOO_STEEP) | (state.route >= Route.RAMP + 2)
+    gentle = state.route >= _GENTLE
+    sound &= (mip.refused < _TOO_STEEP) | gentle
     found = sound & (state.level == 1.0) & (mip.error <= NEAR)
     spent = (state.on_ramp + 1 >= steps) | (state.at_level + 1 >= _MOST_AT_LEVEL)
-    easy = (mip.error < _EASILY) & (state.on_ramp > 1)
+    easy = (mip.error < _EASILY) & (state.on_ramp > 1) & ~gentle
     higher = jnp.minimum(1.0, state.level + jnp.where(easy, 2.0, 1.0) * increment)
     level = jnp.where(mip.error < _CARRIED, higher, state.level)
     lost = ~sound | (~found & spent)

@@ -130,6 +130,30 @@ def test_an_error_that_grows_along_the_ridge_is_not_accepted(beam, fem, data):
     assert certificate.verdict == "reweight"
 
 
+def test_two_points_of_the_right_mean_and_sd_are_not_accepted(beam, fem, data):
+    """Their 90 % interval holds two thirds of FEM's mass."""
+    posterior = exact_posterior(linear_model(beam, forward=fem), data)
+    theta, rng = np.asarray(posterior.thetas()), np.random.default_rng(0)
+    signs = rng.choice([-1.0, 1.0], theta.shape) + 0.02 * rng.normal(size=theta.shape)
+    points = theta.mean(axis=0) + signs @ np.linalg.cholesky(np.cov(theta.T)).T
+    certificate = cal.certify(posterior_of(posterior.model, data, points), LinearSimulator(fem))
+    assert certificate.verdict == "reweight"
+    assert "below the 5 % quantile of" in certificate.reason
+    assert 0.08 < max(f.value for f in certificate.evidence.draws.mass[0.05].values()) < 0.2
+
+
+def test_runs_are_doubled_until_they_decide(beam, fem, data):
+    posterior = exact_posterior(linear_model(beam, forward=fem), data)
+    few = cal.certify(posterior, LinearSimulator(fem), draws=40)
+    assert few.verdict == "undecided"
+    assert "too few FEM runs" in few.reason
+    more = cal.certify(posterior, LinearSimulator(fem), draws=40, at_most=200)
+    assert more.verdict == "accepted"
+    assert 40 < more.evidence.physics.runs <= 200
+    # What is decided costs no more.
+    assert cal.certify(posterior, LinearSimulator(fem), at_most=1000).evidence.physics.runs == 200
+
+
 def test_misfit_is_not_certified(beam, fem, data):
     spoiled = data.copy()
     spoiled[2, 0] += 1.5

@@ -57,3 +57,15 @@ def test_it_matches_a_gaussian_process_solved_otherwise():
         for nugget in (1e-6, 1e-4, 1e-2, 1.0, 1e2)
     ]
     assert min(np.abs(gap).max() for gap in gaps) < 1e-6
+
+
+def test_a_bump_far_from_what_is_likely_spoils_nothing():
+    """A process through it would be wrong everywhere; none is right where it counts."""
+    x = points(60)
+    far = x[:, 0] > 1.0
+    errors = np.where(far[:, None], 20.0, 0.0) * np.ones(2)
+    correction = fit(x, errors, np.ones(2), 60, ~far)
+    np.testing.assert_array_equal(at(correction, x), np.zeros((60, 2)))
+    assert correction.scale > 0.0  # it is known to be uncertain
+    # Wrong where it counts: a poor process is better than none.
+    assert np.abs(at(fit(x, errors, np.ones(2), 60, far), x)).max() > 1.0

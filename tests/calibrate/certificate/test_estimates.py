@@ -44,6 +44,6 @@ def test_runs_that_fem_finds_likely_and_the_map_does_not_are_counted(beam):
     by_hand = np.sum(likely & (log_likelihoods(step, data, points) < exact - 3.0))
     seen, missing = (Predictive(m, m.check_data(data)) for m in (right, wrong))
     z = seen.unconstrain({"mu": points[:, 0], "lam": points[:, 1]})
-    runs = Runs(z, exact, np.zeros((6, 9)), np.ones(6), (None,) * 6)
+    runs = Runs(z, exact, np.zeros((6, 9)), np.ones(6), (None,) * 6, (None,) * 6)
     assert missed_by(missing, nothing(1, 2, 9), runs) == by_hand > 0
     assert missed_by(seen, nothing(1, 2, 9), runs) == 0

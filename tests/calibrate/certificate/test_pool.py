@@ -60,7 +60,7 @@ def test_the_pool_is_the_posterior_wherever_the_draws_are(case, predictive):
         {"mu": 52.0 + np.arange(50.0) / 50, "lam": 90 + np.zeros(50)},
     ):
         z = predictive.unconstrain(values)
-        pool = search(predictive, nothing(1, 2, 9), z, np.random.default_rng(0))
+        pool = search(predictive, nothing(1, 2, 9), z, (), np.random.default_rng(0))
         assert effective(pool.corrected) > 500.0
         mean, sd = mean_and_sd(pool.corrected, predictive.constrain(pool.z)["mu"])
         assert abs(mean - exact[0]) < 0.15 * exact[1]

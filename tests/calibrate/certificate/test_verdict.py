@@ -79,7 +79,7 @@ def test_a_heavy_tail_is_undecided_and_an_irregular_map_is_not_certified():
     # A number that is not there is not good news, however even the weights look.
     found, words = verdict(tail=replace(RIGHT.tail, k_hat=np.nan))
     assert found == "undecided"
-    assert "too few FEM runs to judge the tail of their weights: 80 FEM runs or more" in words
+    assert "too few FEM runs to judge the tail of their weights: 100 FEM runs or more" in words
     assert verdict(tail=replace(RIGHT.tail, pool=50.0))[0] == "undecided"
     assert verdict(tail=replace(RIGHT.tail, spread=3.0))[0] == "not certified"
     assert verdict(tail=replace(RIGHT.tail, spread=np.inf, ess=0.0))[0] == "not certified"

@@ -23,6 +23,14 @@ def register(commands: Any) -> None:
     parser = commands.add_parser("certify", help="check a posterior against FEM")
     parser.add_argument("folder", metavar="DIR", help="written by calibrate infer")
     parser.add_argument("--draws", type=int, help="FEM runs (default 200)")
+    parser.add_argument(
+        "--until",
+        choices=["decided"],
+        help="while the verdict is undecided, double the FEM runs, up to --at-most",
+    )
+    parser.add_argument(
+        "--at-most", type=int, metavar="N", help="FEM runs altogether (default 1000)"
+    )
     finer = parser.add_mutually_exclusive_group()
     finer.add_argument(
         "--mesh-runs",
@@ -49,12 +57,18 @@ def run(arguments: argparse.Namespace) -> int:
         target = check_folder(arguments.reweight)
         if target.resolve() == Path(arguments.folder).resolve():
             raise InputError(f"--reweight {target}: that is DIR itself; name another folder")
+    if arguments.at_most is not None and arguments.until is None:
+        raise InputError("--at-most is of --until decided; give both, or --draws")
+    at_most = None
+    if arguments.until is not None:
+        at_most = 1000 if arguments.at_most is None else arguments.at_most
     scheduler, progress = scheduler_word(arguments), show_progress(arguments)
     plan, posterior = read_posterior(arguments.folder)
     certificate = certify_and_keep(
         posterior,
         arguments.folder,
         draws=arguments.draws,
+        at_most=at_most,
         mesh=0 if arguments.no_mesh else arguments.mesh_runs,
         load_steps=plan.load_steps if arguments.load_steps is None else arguments.load_steps,
         reweight_to=arguments.reweight,

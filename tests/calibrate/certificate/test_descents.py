@@ -1,0 +1,75 @@
+"""A mode that the map hides and no draw has seen: FEM's own derivatives lead there."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import calibrate as cal
+from calibrate.certificate.descents import descend
+from calibrate.certificate.predictive import Predictive
+from calibrate.certificate.runs import Solver
+from calibrate.statistical_model import FEMLikelihood
+from certificate_support import grid_of, linear_model, posterior_of
+from emulator.progress import counting
+from linear_support import LinearForward, LinearSimulator, Step, linear_forward
+
+APART = 12.0  # kPa from the plane mu = 75 to each of two modes
+TRUTH = (63.0, 68.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Even(LinearForward):
+    """Linear in ``(mu - 75)^2``, with the slope of the linear map at the modes."""
+
+    def __call__(self, theta):
+        off = theta[0] - 75.0
+        folded = 75.0 - 0.5 * (off**2 / APART + APART)
+        return super().__call__(jnp.stack([folded, theta[1]]))
+
+
+@pytest.fixture(scope="module")
+def fem(beam):
+    return linear_forward(beam, size=0.02, of=Even)
+
+
+@pytest.fixture(scope="module")
+def posterior(beam, fem):
+    """Draws of the lower mode; the map is ten noise sd wrong around the other."""
+    right = linear_model(beam, forward=fem)
+    rng = np.random.default_rng(3)
+    data = np.asarray(right.forward(jnp.asarray(TRUTH))) + rng.normal(0.0, 0.1, (3, 3))
+    points = grid_of(200)
+    folded = points.copy()
+    folded[:, 0] = 75.0 - 0.5 * ((points[:, 0] - 75.0) ** 2 / APART + APART)
+    A, b = np.asarray(right.forward.matrix).reshape(-1, 2), np.asarray(right.forward.shift).ravel()
+    log = -0.5 * ((folded @ A.T + b - data.ravel()) ** 2).sum(1) / 0.1**2 - np.log(points).sum(1)
+    weights = np.exp(log - log.max()) * (points[:, 0] < 75.0)
+    rows = rng.choice(len(points), size=4000, p=weights / weights.sum())
+    draws = points[rows] + rng.uniform(-0.125, 0.125, (4000, 2))
+    return posterior_of(linear_model(beam, forward=Step(fem, 75.0)), data, draws)
+
+
+def test_descents_end_at_the_mode_that_the_map_hides(fem, posterior):
+    predictive, rng = Predictive(posterior.model, posterior.data), np.random.default_rng(0)
+    z = predictive.unconstrain(posterior.draws())
+    with counting(total=1, desc="", disable=True, unit="run") as bar:
+        likelihood = FEMLikelihood(posterior.model, LinearSimulator(fem))
+        solver = Solver(predictive, likelihood, bar)
+        starts = z[:1] + np.array([[0.0, 2.2], [1.0, 1.9], [-0.5, 3.0]])  # lam, mu
+        best = float(predictive.log_prior(z[0]) + solver(z[:1]).fem[0])
+        found = descend(solver, solver(starts, slopes=True), z, best, 12, rng)
+    assert len(found.runs.z) <= 12
+    assert len(found.ends) == 1
+    ends = predictive.constrain(found.ends[0])
+    mean = {name: values.mean() for name, values in posterior.draws().items()}
+    assert abs(ends["mu"].mean() - (150.0 - mean["mu"])) < 1.0
+    assert abs(ends["lam"].mean() - mean["lam"]) < 1.0
+
+
+@pytest.mark.parametrize("draws", [60, 150])
+def test_a_hidden_mode_is_not_accepted(fem, posterior, draws):
+    certificate = cal.certify(posterior, LinearSimulator(fem), draws=draws)
+    assert certificate.verdict != "accepted"
+    assert certificate.evidence.tail.ends == 1
