@@ -2,10 +2,11 @@
 
     python -m studies.certificate
     python -m studies.certificate --quick --out DIR    # three posteriors
+    python -m studies.certificate --until 1000    # FEM runs doubled while a verdict is undecided
     python -m studies.certificate --fem --nuts         # the beam's: FEM judges what NUTS drew
 
-Writes results.json and certificate.png (with --fem, --nuts or both: fem.json, nuts.json or
-fem_nuts.json), and asserts what the README of the study says.
+Writes results.json and certificate.png (with --fem, --nuts, --until or several: fem.json,
+fem_nuts.json, until.json), and asserts what the README of the study says.
 """
 
 import argparse
@@ -41,14 +42,16 @@ MARKS = {
 }
 
 
-def row(case, problem, simulator, budget, *, nuts=False) -> dict[str, Any]:
+def row(case, problem, simulator, budget, *, nuts=False, at_most=None) -> dict[str, Any]:
     """Verdict and truth of one case; with ``nuts``, of NUTS's draws from its wrong model."""
     begin = time.perf_counter()
     posterior, (mean, sd) = case.make(problem, case.size, case.seed)
     if nuts and case.sampled:
         data = posterior.data["displacement"]
         posterior = cal.sample(posterior.model, data, options=NUTS, seed=case.seed)
-    certificate = certify(posterior, simulator, draws=budget or case.budget, seed=case.seed)
+    certificate = certify(
+        posterior, simulator, draws=budget or case.budget, at_most=at_most, seed=case.seed
+    )
     draws = np.stack(list(posterior.draws().values()), axis=1)
     e = certificate.evidence
     return {
@@ -71,6 +74,8 @@ def row(case, problem, simulator, budget, *, nuts=False) -> dict[str, Any]:
         "p": min(m.p for m in e.misfit.values()),
         "k_hat": e.tail.k_hat,
         "pool": e.tail.pool,
+        "runs": e.physics.runs,
+        "sound": case.sampled and case.kind != "wrong_noise",
         "seconds": time.perf_counter() - begin,
     }
 
@@ -85,6 +90,7 @@ def is_wrong(case) -> bool:
 
 def conclude(rows) -> dict[str, Any]:
     good = [r for r in rows if r["good"]]
+    within = [r for r in rows if r["sound"] and r["true_shift"] < 0.2 and r["true_sd"] < 0.15]
     repaired = [r for r in rows if r["status"] == "reweight"]
     return {
         "posteriors": len(rows),
@@ -95,6 +101,8 @@ def conclude(rows) -> dict[str, Any]:
         ],
         "good": len(good),
         "good_verdicts": dict(Counter(r["status"] for r in good)),
+        "within": len(within),
+        "within_verdicts": dict(Counter(r["status"] for r in within)),
         "reweighted_largest_error_of_a_mean": max((r["found_mean"] for r in repaired), default=0.0),
         "reweighted_largest_error_of_an_sd": max((r["found_sd"] for r in repaired), default=0.0),
     }
@@ -127,6 +135,7 @@ def main() -> None:
     parser.add_argument("--fem", action="store_true", help="the beam's, judged by FEM itself")
     parser.add_argument("--nuts", action="store_true", help="draws by NUTS, not independent ones")
     parser.add_argument("--draws", type=int, help="FEM runs a certificate; by default the case's")
+    parser.add_argument("--until", type=int, metavar="N", help="double runs until decided, up to N")
     parser.add_argument("--out", type=Path, default=HERE)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
@@ -141,7 +150,8 @@ def main() -> None:
             exact = ExactSimulator(problem.forward)
             built[case.problem] = problem, Simulator(problem.scene) if arguments.fem else exact
         problem, simulator = built[case.problem]
-        rows.append(row(case, problem, simulator, arguments.draws, nuts=arguments.nuts))
+        options = {"nuts": arguments.nuts, "at_most": arguments.until}
+        rows.append(row(case, problem, simulator, arguments.draws, **options))
         r = rows[-1]
         print(
             f"{r['name']:38s} {r['status']:13s} true {r['true_shift']:6.2f} {r['true_sd']:6.2f} "
@@ -153,7 +163,7 @@ def main() -> None:
     summary = conclude(rows)
     print(summary)
     header = study_header(HERE, SEED)
-    routes = [name for name in ("fem", "nuts") if getattr(arguments, name)]
+    routes = [name for name in ("fem", "nuts", "until") if getattr(arguments, name)]
     name = "_".join(routes) or "results"
     write_json(arguments.out / f"{name}.json", {**header, "summary": summary, "cases": rows})
     if not routes:

@@ -14,8 +14,9 @@ sets the scale :math:`a^2` of the process's variance, in squared noise sd,
 
 Being wrong costs precision where FEM is asked: :math:`v` only says where to look, and FEM at fresh
 points weighs what the correction says (:mod:`calibrate.certificate.check`). Where no point looks,
-nothing is known; so descents of FEM's own misfit look (:mod:`calibrate.certificate.descents`). And no correction at all is one of the candidates: a process that a bump far from the posterior
-spoils everywhere is worse than none.
+nothing is known; so descents of FEM's own misfit look (:mod:`calibrate.certificate.descents`). And
+no correction at all is one of the candidates: a process that a bump far from the posterior spoils
+everywhere is worse than none.
 """
 
 from __future__ import annotations

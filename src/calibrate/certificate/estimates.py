@@ -81,8 +81,10 @@ def figures_of(
 
 def _quantiles(x: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
     """Quantiles (p, 3) of points (s, p) at the levels of :data:`LARGEST_MASS`."""
-    method = "linear" if weights is None else "inverted_cdf"
-    return np.quantile(x, list(LARGEST_MASS), axis=0, weights=weights, method=method).T
+    levels = np.array(list(LARGEST_MASS))
+    if weights is None:
+        return np.quantile(x, levels, axis=0).T
+    return np.quantile(x, levels, axis=0, weights=weights, method="inverted_cdf").T
 
 
 def _changes(
