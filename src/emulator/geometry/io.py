@@ -11,6 +11,7 @@ from typing import Any
 
 import meshio
 import numpy as np
+from scipy.spatial import cKDTree
 
 from emulator.errors import InputError
 from emulator.geometry.directions import across, from_elements, from_nodes
@@ -30,6 +31,7 @@ _UNIT = 1e-3
 # Fibres and sheets that were interpolated are made orthogonal again, if the cosine between them is
 # below this at nine points in ten: at a jump, as between two walls, it may be anything.
 _SKEW = 0.2
+_COINCIDENT = 1e-9  # of the body's extent, below which nodes are at the same place
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +215,22 @@ def _mesh(found: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
     number[used] = np.arange(len(used))
     nodes = points[used]
     elements = orient(nodes, number[elements])
-    return Mesh(nodes, elements, *read_sets(found, number, elements)), used
+    mesh = Mesh(nodes, elements, *read_sets(found, number, elements))
+    _check_coincident(nodes, used)
+    return mesh, used
+
+
+def _check_coincident(nodes: np.ndarray, used: np.ndarray) -> None:
+    """Refuse nodes at the same place: elements that touch there are not joined."""
+    pairs = cKDTree(nodes).query_pairs(
+        _COINCIDENT * np.ptp(nodes, axis=0).max(), output_type="ndarray"
+    )
+    if len(pairs):
+        one, other = np.sort(used[pairs[0]])
+        raise InputError(
+            f"its nodes {one} and {other} are at the same place, {len(pairs)} such pairs, so that "
+            "what touches there is not joined; merge them"
+        )
 
 
 def _tetrahedra(found: meshio.Mesh) -> str:

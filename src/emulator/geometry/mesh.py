@@ -12,7 +12,7 @@ import numpy as np
 from skfem import MeshTet
 
 from emulator.errors import InputError
-from emulator.geometry.tetrahedra import boundary_facets, signed_volumes
+from emulator.geometry.tetrahedra import boundary_facets, folded, signed_volumes
 
 # A tetrahedron is taken for flat when its volume is below this fraction of its longest edge cubed;
 # a well-shaped one has about 0.1. Round-off in the corner coordinates is many orders smaller.
@@ -51,7 +51,8 @@ class Mesh:
     Raises
     ------
     InputError
-        Wrong shapes, indices out of range, NaN, an inverted or a flat element, an unused node.
+        Wrong shapes, indices out of range, NaN, an inverted or a flat element, elements folded over
+        each other, an unused node.
     """
 
     nodes: np.ndarray
@@ -108,6 +109,13 @@ class Mesh:
                     f"mesh: element {first} has {word}, {int(wrong.sum())} such of "
                     f"{len(self.elements)}; repair the mesh or reorder its corners"
                 )
+        pairs = folded(self.elements)
+        if len(pairs):
+            one, other = np.sort(pairs[0])
+            raise InputError(
+                f"mesh: elements {one} and {other} lie on the same side of the face that they "
+                f"share, {len(pairs)} such pairs: the mesh is tangled; repair it"
+            )
 
     def _check_facets(self) -> None:
         if not self.facet_sets:

@@ -1,4 +1,4 @@
-"""Local numbering of a tetrahedron; signed volumes, orientation and boundary facets.
+"""Local numbering of a tetrahedron; signed volumes, orientation, boundary facets, parts.
 
 Linear elements have four corners. Quadratic ones add a node on each edge, in VTK's order.
 """
@@ -6,6 +6,8 @@ Linear elements have four corners. Quadratic ones add a node on each edge, in VT
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 # Edge k carries local node 4 + k of a quadratic element.
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
@@ -52,3 +54,26 @@ def boundary_facets(elements: np.ndarray) -> np.ndarray:
         np.sort(faces[:, :3], axis=1), axis=0, return_index=True, return_counts=True
     )
     return faces[first[counts == 1]]
+
+
+def folded(elements: np.ndarray) -> np.ndarray:
+    """Pairs (k, 2) of positively oriented tetrahedra on the same side of a face that they share.
+
+    Neighbours list their common face in opposite senses. Where a mesh is tangled they do not,
+    though every element has a positive volume. Of three at one face, two are on the same side.
+    """
+    faces = np.concatenate([elements[:, face] for face in FACES])
+    owner = np.tile(np.arange(len(elements)), len(FACES))
+    a, b, c = faces.T
+    sense = (a < b) ^ (b < c) ^ (a < c)  # of the permutation that sorts the corners
+    keys = np.column_stack([np.sort(faces, axis=1), sense])
+    order = np.lexsort(keys.T)
+    same = (keys[order][1:] == keys[order][:-1]).all(axis=1)
+    return np.column_stack([owner[order][:-1][same], owner[order][1:][same]])
+
+
+def parts(elements: np.ndarray, nodes: int) -> np.ndarray:
+    """Number (n,) of the connected part that each of the ``nodes`` belongs to, from 0."""
+    first, others = np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel()
+    graph = coo_array((np.ones(len(first)), (first, others)), shape=(nodes, nodes))
+    return connected_components(graph, directed=False)[1]

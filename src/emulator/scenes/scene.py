@@ -30,7 +30,8 @@ from emulator.scenes.loads.load import Load
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.regions import Tissue, checked_regions, region_quantities
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
-from emulator.scenes.supports.dirichlet import free_motions, prescribe
+from emulator.scenes.supports.dirichlet import prescribe
+from emulator.scenes.supports.rigid import check_motions
 from emulator.shown import Shown
 
 
@@ -176,15 +177,7 @@ class Scene(Shown):
         if not self.supports:
             raise InputError(f"scene '{self.name}': no support, the body could move freely")
         self.prescribed  # noqa: B018 - supports that contradict each other are named first
-        resisted = [support.resisted(self.mesh) for support in self.supports]
-        points = np.concatenate([each.points for each in resisted])
-        directions = np.concatenate([each.directions for each in resisted])
-        free = free_motions(points, directions)
-        if free:
-            raise InputError(
-                f"scene '{self.name}': its supports leave {free} of the 6 rigid motions free, "
-                "the body could move or turn; hold more nodes or components"
-            )
+        check_motions(self.name, self.mesh, self.supports)
 
     def _check_loads(self) -> None:
         for part in self.parts:

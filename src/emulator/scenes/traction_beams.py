@@ -13,7 +13,7 @@ from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 
 # Stiff fibres along a beam that bends: what is missing through its height shows first.
-_SIZES = {1: BEAM_SIZES[1], 2: {"cells": (14, 2, 4), "grading": 2.0}}
+_SIZES = {1: BEAM_SIZES[1], 2: {"cells": (14, 2, 5), "grading": 2.0}}
 
 
 def _beam(

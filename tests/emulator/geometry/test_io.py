@@ -321,3 +321,14 @@ def test_unusable_mesh_files_are_named(tmp_path, capsys):
     )
     with pytest.raises(InputError, match="hex.vtu: it has hexahedron cells; expected tetrahedra"):
         read_mesh(tmp_path / "hex.vtu")
+
+
+def test_nodes_at_the_same_place_are_refused(tmp_path):
+    """Two blocks that touch, each with nodes of its own."""
+    mesh = box((1.0, 1.0, 1.0), (1, 1, 1))
+    count = len(mesh.nodes)
+    points = np.concatenate([mesh.nodes, mesh.nodes + [1.0, 0.0, 0.0]])
+    cells = np.concatenate([mesh.elements, mesh.elements + count])
+    meshio.Mesh(points, [("tetra", cells)]).write(tmp_path / "two.vtu")
+    with pytest.raises(InputError, match=r"are at the same place, 4 such pairs.*merge them"):
+        read_mesh(tmp_path / "two.vtu")

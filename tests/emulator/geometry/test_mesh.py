@@ -7,7 +7,7 @@ from emulator.errors import InputError
 from emulator.geometry.bodies.box import box, toward_ends
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import orient, signed_volumes
+from emulator.geometry.tetrahedra import orient, parts, signed_volumes
 
 NODES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)
 GOOD = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
@@ -125,3 +125,23 @@ def test_indices_with_a_fraction_are_not_cut_off():
     with pytest.raises(InputError, match="elements has numbers with a fraction"):
         replace(mesh, elements=mesh.elements + 0.7)
     assert replace(mesh, elements=mesh.elements.astype(float)).elements.dtype == np.int64
+
+
+def test_tangled_elements_are_refused_though_every_volume_is_positive():
+    """A corner pulled through the opposite face: its elements are inverted, then turned round."""
+    mesh = box((3.0, 3.0, 3.0), (3, 3, 3))
+    nodes = mesh.nodes.copy()
+    inner = int(np.argmin(np.abs(nodes - 1.0).sum(axis=1)))
+    nodes[inner] += 1.7
+    elements = orient(nodes, mesh.elements)
+    assert signed_volumes(nodes, elements).min() > 0.0
+    assert (signed_volumes(nodes, mesh.elements) < 0.0).any()
+    with pytest.raises(InputError, match=r"lie on the same side of the face .* mesh is tangled"):
+        Mesh(nodes, elements)
+
+
+def test_parts_of_a_body_are_told_apart():
+    mesh = box((1.0, 1.0, 1.0), (1, 1, 1))
+    count = len(mesh.nodes)
+    part = parts(np.concatenate([mesh.elements, mesh.elements + count]), 2 * count)
+    np.testing.assert_array_equal(part, np.repeat([0, 1], count))

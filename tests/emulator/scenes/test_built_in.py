@@ -30,7 +30,7 @@ COARSE = {
 NODES = {
     "once_clamped_beam": (390, 1025),
     "turned_beam": (390, 1025),
-    "traction_beam_guccione": (390, 1305),
+    "traction_beam_guccione": (390, 1595),
     "twisting_cube": (343, 729),
     "liver": (923, 3871),
     "left_ventricle": (1564, 4627),

@@ -8,6 +8,7 @@ import emulator as em
 from emulator.catalogue import find_scene, scene_from_origin
 from emulator.errors import InputError
 from emulator.geometry.bodies.box import box
+from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.scenes import BUILT_IN, Parameter, Support
 from emulator.scenes.loads import FollowerPressure, Gravity
@@ -230,3 +231,17 @@ def test_a_load_cannot_share_the_name_of_a_parameter_of_the_law(beam):
     load = FollowerPressure("right", parameter="mu")
     with pytest.raises(InputError, match="load FollowerPressure and law 'neo_hookean' both have"):
         replace(beam, loads=(load,))
+
+
+def test_a_part_without_a_support_is_named():
+    """Two blocks apart, one clamped: what would be a singular tangent is one line."""
+    block = box((10.0, 10.0, 10.0), (1, 1, 1))
+    count = len(block.nodes)
+    nodes = np.concatenate([block.nodes, block.nodes + [30.0, 0.0, 0.0]])
+    elements = np.concatenate([block.elements, block.elements + count])
+    mesh = Mesh(nodes, elements, {"left": block.node_set("left")})
+    whole = em.scenes.once_clamped_beam((1, 1, 1), order=1)
+    with pytest.raises(
+        InputError, match=r"2 parts, and supports leave the one of 8 nodes about \(35"
+    ):
+        replace(whole, mesh=mesh)

@@ -91,19 +91,3 @@ def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> tuple[np.nda
                 )
             held[nodes, axis], values[nodes, axis] = True, wanted[:, axis]
     return frozen_array(held, bool), frozen_array(values)
-
-
-def free_motions(points: np.ndarray, directions: np.ndarray) -> int:
-    """How many of the six rigid motions remain.
-
-    ``points`` (k, 3) cannot move along ``directions`` (k, 3). A small rigid motion ``a + w x X``
-    moves a point along its direction by ``a . d + w . (X x d)``; the rank of these rows is the
-    number of motions stopped.
-    """
-    if not len(points):
-        return 6
-    centred = points - points.mean(axis=0)
-    size = np.linalg.norm(np.ptp(points, axis=0))
-    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    rows = np.hstack([unit, np.cross(centred, unit) / (size if size > 0.0 else 1.0)])
-    return 6 - int(np.linalg.matrix_rank(rows.T @ rows, tol=1e-12 * len(rows), hermitian=True))
