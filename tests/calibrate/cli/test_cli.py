@@ -134,6 +134,13 @@ def test_infer_and_certify(capsys, block, tmp_path):
     assert (code, result["verdict"]) == (0, "accepted")
     assert result["certificate"]["reason"].endswith("on this mesh")
     assert json.loads((tmp_path / "r" / "certificate.json").read_text())["verdict"] == "accepted"
+    few = ["certify", tmp_path / "r", "--draws", 40, "--no-mesh"]
+    assert answer(capsys, *few)[1]["verdict"] == "undecided"
+    code, result = answer(capsys, *few, "--until", "decided", "--at-most", 160)
+    assert (code, result["verdict"]) == (0, "accepted")
+    assert 40 < result["certificate"]["draws"] <= 160
+    assert main(["certify", str(tmp_path / "r"), "--at-most", "160"]) == 2
+    assert "--at-most is of --until decided" in capsys.readouterr().err
 
 
 @pytest.mark.slow
