@@ -13,6 +13,7 @@ from studies.certificate.problems import (
     Problem,
     by_quadrature,
     five,
+    gaussian,
     mirror,
     moments_of,
     posterior_of,
@@ -82,16 +83,6 @@ def with_map(problem, error, seed, *, noise=1.0, draws=None):
         truth = mean, np.sqrt(np.diag(covariance))
         chosen = rng.multivariate_normal(*gaussian(problem, wrong, data, used), size=DRAWS)
     return posterior_of(model, data, chosen), truth
-
-
-def gaussian(problem, forward, data, sd):
-    """Mean and covariance of a linear map's posterior under a flat prior, from its values."""
-    at, p = forward.at(problem.nodes), len(problem.truth)
-    base = np.asarray(at(jnp.zeros(p))).ravel()
-    columns = [np.asarray(at(jnp.eye(p)[k])).ravel() - base for k in range(p)]
-    A = np.stack(columns, axis=1)
-    covariance = sd**2 * np.linalg.inv(A.T @ A)
-    return covariance @ A.T @ (data.ravel() - base) / sd**2, covariance
 
 
 def pattern(problem: Problem, seed: int) -> np.ndarray:
@@ -206,7 +197,8 @@ def hidden_mode(problem, size, seed):
     value = along @ straight.truth
     square = APART**2 + 2.0 * APART * (at @ along - value)
     x = np.sqrt(np.maximum(square, 1e-12))
-    rows = rng.choice(len(at), size=DRAWS, p=(weights := (square > 0.0) / x) / weights.sum())
+    weights = (square > 0.0) / x
+    rows = rng.choice(len(at), size=DRAWS, p=weights / weights.sum())
     modes = [at + (sign * x - (at @ along - value))[:, None] * up for sign in (1.0, -1.0)]
     points = np.concatenate([mode[rows] for mode in modes])
     truth = points.mean(axis=0), points.std(axis=0)

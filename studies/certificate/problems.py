@@ -126,6 +126,16 @@ def by_quadrature(problem, predictions, data, sd):
     return weights / weights.sum()
 
 
+def gaussian(problem, forward, data, sd):
+    """Mean and covariance of a linear map's posterior under a flat prior, from its values."""
+    at, p = forward.at(problem.nodes), len(problem.truth)
+    base = np.asarray(at(jnp.zeros(p))).ravel()
+    columns = [np.asarray(at(jnp.eye(p)[k])).ravel() - base for k in range(p)]
+    A = np.stack(columns, axis=1)
+    covariance = sd**2 * np.linalg.inv(A.T @ A)
+    return covariance @ A.T @ (data.ravel() - base) / sd**2, covariance
+
+
 def sample_grid(problem, weights, count, rng):
     """Independent draws (count, p), uniform within a cell."""
     points, _ = problem.grid()
@@ -217,12 +227,8 @@ def mirror(problem):
 
     ``up`` (p,) changes x by 1 and whatever is independent of x in the posterior by nothing.
     """
-    at, p = problem.forward.at(problem.nodes), len(problem.truth)
-    base = np.asarray(at(jnp.zeros(p))).ravel()
-    A = np.stack([np.asarray(at(jnp.eye(p)[k])).ravel() - base for k in range(p)], axis=1)
-    covariance = problem.noise**2 * np.linalg.inv(A.T @ A)
-    sd = np.sqrt(np.diag(covariance))
-    along = np.eye(p)[0] / sd[0]
+    _, covariance = gaussian(problem, problem.forward, problem.data(0), problem.noise)
+    along = np.eye(len(covariance))[0] / np.sqrt(covariance[0, 0])
     return along, covariance @ along
 
 

@@ -113,8 +113,8 @@ def examine(
     Raises
     ------
     InputError
-        The simulator is for another scene, too few runs are asked for, FEM has decided on the
-        draws already, or a scheduler does not answer.
+        The simulator is for another scene, too few runs are asked for, or fewer at most, FEM has
+        decided on the draws already, or a scheduler does not answer.
     """
     _refuse_fem_draws(posterior)
     count = _FEM_RUNS if draws is None else draws
@@ -123,7 +123,10 @@ def examine(
     if mesh is not None and not 0 <= mesh <= MOST_RUNS:
         raise InputError(f"certify: {mesh} solves on the finer mesh; give 0 to {MOST_RUNS}")
     predictive = Predictive(posterior.model, posterior.data)
-    most = count if at_most is None else max(count, at_most)
+    most = count if at_most is None else at_most
+    if most < count:
+        raise InputError(f"certify: at most {most} FEM runs, but {count} to begin with")
+    sampling = sampling_of(posterior)
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
     # More threads than one for small matrices oversubscribe the cores: twice the time.
@@ -145,7 +148,7 @@ def examine(
             chosen = pool.z[resampled(pool, DRAWS, rng)]
             evidence = Evidence(
                 *figures,
-                sampling_of(posterior),
+                sampling,
                 physics_of(begun.at_draws, training, tests, pool),
                 tail_of(pool, tests, missed_by(predictive, correction, every), len(begun.ends)),
                 misfits(predictive, correction, chosen, _key(rng)),
@@ -222,9 +225,7 @@ def _begin(solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator) 
     at_prior = solver(prior, slopes=True)
     # Where the map hides a mode altogether, only FEM leads to it.
     most = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
-    log_prior = np.array([predictive.log_prior(point) for point in at_draws.z])
-    best = float(np.max(log_prior + at_draws.fem))
-    found = descend(solver, at_prior, z, best, most, rng)
+    found = descend(solver, at_prior, at_draws, z, most, rng)
     return _Begun(at_draws, joined([at_draws, wide, at_prior, found.runs]), found.ends)
 
 

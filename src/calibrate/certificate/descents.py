@@ -9,9 +9,8 @@ posterior,
 with :math:`\nabla \log\pi` and :math:`H` of :meth:`Predictive.curvature`, none longer than the
 prior is wide; where FEM finds less there, half of the step is tried next. One that is about to end
 among the draws, where the map finds the data likely, too, has nothing to tell and gets no more
-runs. What the others find trains the
-correction like any run, and the pool gets points around each end that FEM finds likely: Gaussian
-ones, with the covariance :math:`H^{-1}`.
+runs. What the others find trains the correction like any run, and the pool gets points around each
+end that FEM finds likely: Gaussian ones, with the covariance :math:`H^{-1}`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from scipy.linalg import eigh
 from scipy.special import chdtri
 
 from calibrate.certificate.predictive import Predictive
-from calibrate.certificate.runs import Runs, Solver, joined
+from calibrate.certificate.runs import Runs, Solver, joined, least_likely
 
 ROUNDS = 4  # runs of a descent
 _LONGEST = 1.0  # of a step, in sd of the prior
@@ -60,16 +59,18 @@ class _Descent:
 def descend(
     solver: Solver,
     starts: Runs,
+    at_draws: Runs,
     draws: np.ndarray,
-    best: float,
     count: int,
     rng: np.random.Generator,
 ) -> Found:
     """``count`` FEM runs of descents that begin at runs with slopes, away from ``draws`` (s, p).
 
-    best : the largest log posterior that FEM has at a draw.
+    at_draws : runs at some of the draws.
     """
     predictive = solver.predictive
+    prior = predictive.evaluate(at_draws.z, predictive.uncorrected).prior
+    best = float(np.max(prior + at_draws.fem))
     known = _Known(predictive, draws, best)
     begun = [_begin(predictive, starts, k) for k in range(len(starts.z))]
     active = [descent for descent in begun if descent is not None]
@@ -85,7 +86,7 @@ def descend(
         left -= len(chosen)
         for k, descent in enumerate(chosen):
             _advance(predictive, descent, runs, k)
-    likely = best - 0.5 * chdtri(draws.shape[1], 1.0 - _LIKELY)
+    likely = least_likely(best, draws.shape[1], _LIKELY)
     ends = known.without([replace(d, target=d.z) for d in active if d.log > likely])
     return Found(joined([_none_of(starts), *every]), _around_ends(ends, predictive.prior_sd, rng))
 
@@ -118,7 +119,7 @@ class _Known:
         values, vectors = eigh(covariance + 1e-12 * np.eye(len(covariance)))
         self._whiten = vectors / np.sqrt(values)
         self._far = chdtri(len(values), 1.0 - _AMONG)
-        self._least = best - 0.5 * chdtri(len(values), 1.0 - _LIKELY) - _MISSED
+        self._least = least_likely(best, len(values), _LIKELY) - _MISSED
 
     def without(self, descents: list[_Descent]) -> list[_Descent]:
         """Those whose target is not known."""
@@ -141,11 +142,11 @@ def _begin(predictive: Predictive, runs: Runs, k: int) -> _Descent | None:
     if slopes is None or not np.isfinite(runs.fem[k]):
         return None
     z = runs.z[k]
-    gradient, curvature = predictive.curvature(z, runs.means[k], slopes)
+    prior, gradient, curvature = predictive.curvature(z, runs.means[k], slopes)
     if not (np.isfinite(gradient).all() and np.isfinite(curvature).all()):
         return None
     step, promise = _step(gradient, curvature, predictive.prior_sd)
-    log = predictive.log_prior(z) + runs.fem[k]
+    log = prior + runs.fem[k]
     return _Descent(z, log, curvature, z + step, log + promise)
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.special import chdtri
 
 from calibrate.arviz import array_stats
 from calibrate.certificate.correction import Correction
@@ -14,7 +13,7 @@ from calibrate.certificate.evidence import LARGEST_MASS, Changes, Figure, Physic
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.pool import Pool, effective, normalised
 from calibrate.certificate.predictive import Predictive
-from calibrate.certificate.runs import Runs
+from calibrate.certificate.runs import Runs, least_likely
 from calibrate.posterior import Posterior
 
 # Log weights closer together than this are equal to 0.1 %: their tail has no shape to fit.
@@ -146,16 +145,15 @@ def physics_of(at_draws: Runs, training: Runs, tests: Tests, pool: Pool) -> Phys
 
 
 def missed_by(predictive: Predictive, correction: Correction, runs: Runs) -> int:
-    r"""Number of runs that FEM finds likely and the corrected map does not.
+    """Number of runs that FEM finds likely and the corrected map does not.
 
-    Likely: within the density that bounds 99 % of a Gaussian around the best run, so that
-    :math:`\log\pi > \max\log\pi - \tfrac12 \chi^2_p(0.99)`. There the correction should be right,
-    because these runs taught it; where it is not, the map errs by a jump that no smooth process
-    follows, and the pool may be empty where FEM's posterior is.
+    Likely: within the density that bounds 99 % of a Gaussian around the best run. There the
+    correction should be right, because these runs taught it; where it is not, the map errs by a
+    jump that no smooth process follows, and the pool may be empty where FEM's posterior is.
     """
     at = predictive.evaluate(runs.z, correction)
     fem = np.where(runs.converged, at.prior + runs.fem, -np.inf)
-    likely = fem > fem.max() - 0.5 * chdtri(runs.z.shape[1], 1.0 - _LIKELY)
+    likely = fem > least_likely(fem.max(), runs.z.shape[1], _LIKELY)
     return int(np.sum(likely & ~(at.prior + at.corrected > fem - _MISSED)))
 
 

@@ -81,14 +81,6 @@ class Predictive:
         """The correction of this model's data that is zero."""
         return nothing(1, len(self.model.states.unknowns), len(self.scales))
 
-    def log_prior(self, z: np.ndarray) -> float:
-        """Log density of the prior at one point (p,)."""
-        return float(self._log_prior(z))
-
-    @cached_property
-    def _log_prior(self) -> Any:
-        return jax.jit(self._density.log_prior)
-
     def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
         """Log densities at points (s, p)."""
         return self._in_blocks(lambda block: self._evaluate_block(block, correction), z)
@@ -104,8 +96,8 @@ class Predictive:
 
     def curvature(
         self, z: np.ndarray, means: np.ndarray, slopes: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        r"""Gradient (p,) of FEM's log posterior at ``z`` (p,), and minus its curvature (p, p).
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        r"""Log prior at ``z`` (p,); of FEM's log posterior, the gradient (p,), minus the curvature.
 
         .. math::
             \nabla \log\pi = J^T \nabla_m \ell + \partial_z \ell + \nabla \log p, \qquad
@@ -114,8 +106,9 @@ class Predictive:
         (Gauss-Newton), with :math:`\ell` the log likelihood of FEM's means :math:`m` (m,), their
         derivatives in ``z``, :math:`J`, by ``slopes`` (m, S, p), and the prior's sd :math:`s`.
         """
-        gradient, curvature = self._curvature(z, means, slopes)
-        return np.asarray(gradient), np.asarray(curvature) + np.diag(self.prior_sd**-2)
+        prior, gradient, curvature = self._curvature(z, means, slopes)
+        curvature = np.asarray(curvature) + np.diag(self.prior_sd**-2)
+        return float(prior), np.asarray(gradient), curvature
 
     @cached_property
     def prior_sd(self) -> np.ndarray:
@@ -124,7 +117,7 @@ class Predictive:
 
     @cached_property
     def _curvature(self) -> Any:
-        def told(z: jax.Array, means: jax.Array, slopes: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def told(z: jax.Array, means: jax.Array, slopes: jax.Array) -> tuple[jax.Array, ...]:
             _, unravel = ravel_pytree(self._means(self._constrain(z))[0])
 
             def likelihood(at: jax.Array, flat: jax.Array) -> jax.Array:
@@ -137,8 +130,8 @@ class Predictive:
             J = jnp.tensordot(slopes, jax.jacfwd(thetas)(z), axes=2)
             in_z, in_means = jax.grad(likelihood, argnums=(0, 1))(z, means)
             second = jax.hessian(likelihood, argnums=1)(z, means)
-            gradient = J.T @ in_means + in_z + jax.grad(self._density.log_prior)(z)
-            return gradient, -J.T @ second @ J
+            prior, in_prior = jax.value_and_grad(self._density.log_prior)(z)
+            return prior, J.T @ in_means + in_z + in_prior, -J.T @ second @ J
 
         return jax.jit(told)
 

@@ -17,6 +17,14 @@ from calibrate.statistical_model.fem_likelihood import FEMLikelihood, Likelihood
 _LIKELY = 0.999  # mass of the Gaussian around the likeliest run, in which a correction is judged
 
 
+def least_likely(best: float, dimension: int, mass: float) -> float:
+    r"""Log density that bounds ``mass`` of a Gaussian whose largest is ``best``.
+
+    .. math:: \log\pi > \max\log\pi - \tfrac12 \chi^2_p(\text{mass})
+    """
+    return best - 0.5 * float(chdtri(dimension, 1.0 - mass))
+
+
 class Runs(NamedTuple):
     """FEM at points z (s, p).
 
@@ -97,6 +105,5 @@ def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction
     fine = valid & runs.converged
     if fine.sum() < x.shape[1] + 2:
         return nothing(rows, x.shape[1], means.shape[1])
-    least = runs.fem.max() - 0.5 * chdtri(predictive.dimension, 1.0 - _LIKELY)
-    likely = runs.fem[fine] > least
+    likely = runs.fem[fine] > least_likely(runs.fem.max(), predictive.dimension, _LIKELY)
     return fit(x[fine], (runs.means - means)[fine], predictive.scales, rows, likely)

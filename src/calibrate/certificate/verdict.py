@@ -179,7 +179,8 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
     if tail.heavy or not tail.pool >= SMALLEST_POOL:
         heavy = "the weights' tail is too heavy to trust their errors"
         if tail.ends:
-            away = f"FEM finds the data likely away from the draws, in {tail.ends} places"
+            places = "one place" if tail.ends == 1 else f"{tail.ends} places"
+            away = f"FEM finds the data likely away from the draws, in {places}"
             heavy = f"{away}, and {heavy}"
         return "undecided", [Finding(heavy, _MORE)]
     if tail.missed:

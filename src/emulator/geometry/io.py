@@ -11,7 +11,6 @@ from typing import Any
 
 import meshio
 import numpy as np
-from scipy.spatial import cKDTree
 
 from emulator.errors import InputError
 from emulator.geometry.directions import across, from_elements, from_nodes
@@ -20,7 +19,7 @@ from emulator.geometry.foreign import as_meshio
 from emulator.geometry.groups import MARK, own_node_sets, read_sets
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
-from emulator.geometry.tetrahedra import orient
+from emulator.geometry.tetrahedra import coincident, orient
 from emulator.store import replacing
 
 # meshio's cells by the elements' order: (tetrahedron, triangle).
@@ -31,7 +30,6 @@ _UNIT = 1e-3
 # Fibres and sheets that were interpolated are made orthogonal again, if the cosine between them is
 # below this at nine points in ten: at a jump, as between two walls, it may be anything.
 _SKEW = 0.2
-_COINCIDENT = 1e-9  # of the body's extent, below which nodes are at the same place
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,21 +214,14 @@ def _mesh(found: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
     nodes = points[used]
     elements = orient(nodes, number[elements])
     mesh = Mesh(nodes, elements, *read_sets(found, number, elements))
-    _check_coincident(nodes, used)
-    return mesh, used
-
-
-def _check_coincident(nodes: np.ndarray, used: np.ndarray) -> None:
-    """Refuse nodes at the same place: elements that touch there are not joined."""
-    pairs = cKDTree(nodes).query_pairs(
-        _COINCIDENT * np.ptp(nodes, axis=0).max(), output_type="ndarray"
-    )
+    pairs = coincident(nodes)
     if len(pairs):
         one, other = np.sort(used[pairs[0]])
         raise InputError(
             f"its nodes {one} and {other} are at the same place, {len(pairs)} such pairs, so that "
             "what touches there is not joined; merge them"
         )
+    return mesh, used
 
 
 def _tetrahedra(found: meshio.Mesh) -> str:

@@ -8,6 +8,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+_COINCIDENT = 1e-9  # of the body's extent, below which nodes are at the same place
 
 # Edge k carries local node 4 + k of a quadratic element.
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
@@ -77,3 +80,9 @@ def parts(elements: np.ndarray, nodes: int) -> np.ndarray:
     first, others = np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel()
     graph = coo_array((np.ones(len(first)), (first, others)), shape=(nodes, nodes))
     return connected_components(graph, directed=False)[1]
+
+
+def coincident(nodes: np.ndarray) -> np.ndarray:
+    """Pairs (k, 2) of ``nodes`` at the same place: elements that touch there are not joined."""
+    near = _COINCIDENT * np.ptp(nodes, axis=0).max()
+    return cKDTree(nodes).query_pairs(near, output_type="ndarray")

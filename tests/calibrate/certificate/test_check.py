@@ -236,6 +236,8 @@ def test_certify_refuses_what_makes_no_sense(beam, cube, fem, data):
         cal.certify(posterior, em.Simulator(cube))
     with pytest.raises(InputError, match="10 FEM runs asked for; give 25 or more"):
         cal.certify(posterior, LinearSimulator(fem), draws=10)
+    with pytest.raises(InputError, match="at most 100 FEM runs, but 200 to begin with"):
+        cal.certify(posterior, LinearSimulator(fem), at_most=100)
 
 
 @pytest.mark.slow

@@ -58,14 +58,34 @@ def test_descents_end_at_the_mode_that_the_map_hides(fem, posterior):
         likelihood = FEMLikelihood(posterior.model, LinearSimulator(fem))
         solver = Solver(predictive, likelihood, bar)
         starts = z[:1] + np.array([[0.0, 2.2], [1.0, 1.9], [-0.5, 3.0]])  # lam, mu
-        best = float(predictive.log_prior(z[0]) + solver(z[:1]).fem[0])
-        found = descend(solver, solver(starts, slopes=True), z, best, 12, rng)
+        found = descend(solver, solver(starts, slopes=True), solver(z[:1]), z, 12, rng)
     assert len(found.runs.z) <= 12
     assert len(found.ends) == 1
     ends = predictive.constrain(found.ends[0])
     mean = {name: values.mean() for name, values in posterior.draws().items()}
     assert abs(ends["mu"].mean() - (150.0 - mean["mu"])) < 1.0
     assert abs(ends["lam"].mean() - mean["lam"]) < 1.0
+
+
+def test_gradient_and_curvature_are_those_of_differences(fem, posterior):
+    predictive = Predictive(posterior.model, posterior.data)
+    z = predictive.unconstrain({"mu": np.array([83.0]), "lam": np.array([71.0])})[0]
+    with counting(total=1, desc="", disable=True, unit="run") as bar:
+        likelihood = FEMLikelihood(posterior.model, LinearSimulator(fem))
+        solver = Solver(predictive, likelihood, bar)
+        here = solver(z[None], slopes=True)
+        ahead, behind = (solver(z + sign * 1e-4 * np.eye(2)) for sign in (1.0, -1.0))
+    prior, gradient, curvature = predictive.curvature(z, here.means[0], here.slopes[0])
+
+    def log_prior(points):
+        return predictive.evaluate(points, predictive.uncorrected).prior
+
+    assert prior == pytest.approx(log_prior(z[None])[0])
+    rise = log_prior(ahead.z) + ahead.fem - log_prior(behind.z) - behind.fem
+    np.testing.assert_allclose(gradient, rise / 2e-4, rtol=1e-5)
+    J = (ahead.means - behind.means).T / 2e-4
+    wanted = J.T @ J / 0.1**2 + np.diag(predictive.prior_sd**-2)
+    np.testing.assert_allclose(curvature, wanted, rtol=1e-5)
 
 
 @pytest.mark.parametrize("draws", [60, 150])
