@@ -158,8 +158,8 @@ def examine(
             # Twice as many altogether; the earlier tests train, and fresh points test.
             count, training = min(spent, most - spent), every
             bar.total = spent + count
-        bar.set_description("finer mesh")
-        change = mesh_change(predictive, simulator, every, pool, mesh, rng)
+        bar.close()
+        change = mesh_change(predictive, simulator, every, pool, mesh, rng, progress=progress)
     certificate = judge(replace(evidence, mesh=change))
     return Check(certificate, posterior, predictive, pool, tests)
 

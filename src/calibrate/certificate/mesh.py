@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from tqdm import tqdm
 
 from calibrate.certificate.correction import Correction, corrections, fit, nothing
 from calibrate.certificate.evidence import Figure, MeshChange
@@ -30,6 +31,8 @@ from calibrate.observations.mesh_error import on_finer
 from emulator.error.mesh_error import MeshError, MeshErrorEstimate, mesh_error
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
+from emulator.fem.campaign import at_once, in_order
+from emulator.progress import counting
 
 MOST_RUNS = 15
 _FEWEST = 4  # points
@@ -59,6 +62,8 @@ def mesh_change(
     pool: Pool,
     count: int | None,
     rng: np.random.Generator,
+    *,
+    progress: bool = False,
 ) -> MeshChange:
     """What the next finer mesh changes of the corrected posterior.
 
@@ -78,7 +83,11 @@ def mesh_change(
         return MeshChange(why=str(reason))
     states = len(predictive.model.states.states)
     points = points_for(predictive.dimension, states, count)
-    told = changed(predictive, _by_fem(predictive, error, observe), runs, pool, points, rng)
+    with counting(
+        total=points * states, desc="finer mesh", disable=not progress, unit="solve"
+    ) as bar:
+        by_fem = _by_fem(predictive, error, observe, bar)
+        told = changed(predictive, by_fem, runs, pool, points, rng)
     error.forget()
     nodes, linear = len(error.finer.scene.mesh.nodes), simulator.scene.mesh.order == 1
     model_error = predictive.model.error
@@ -86,9 +95,12 @@ def mesh_change(
     return replace(told, runs=points * states, nodes=nodes, linear=linear, widened=widened)
 
 
-def _by_fem(predictive: Predictive, error: MeshError, observe: Observations) -> Differences:
-    """FEM's differences; each solve on the finer mesh begins near the last one."""
+def _by_fem(
+    predictive: Predictive, error: MeshError, observe: Observations, bar: tqdm
+) -> Differences:
+    """FEM's differences; solves on the finer mesh begin near the first one, several at once."""
     model, near = predictive.model, dict[int, MeshErrorEstimate]()
+    workers = at_once(error.finer.scene)
 
     def flat(seen: Observations, thetas: jax.Array, fields: list[jax.Array]) -> np.ndarray:
         stacked = jnp.stack([u[seen.nodes] for u in fields])
@@ -96,18 +108,22 @@ def _by_fem(predictive: Predictive, error: MeshError, observe: Observations) -> 
 
     def one(thetas: jax.Array) -> np.ndarray | None:
         try:
-            for s, theta in enumerate(thetas):
-                near[s] = error(theta, model.full(theta), near=near.get(s))
+            told = [
+                error(theta, model.full(theta), near=near.get(s)) for s, theta in enumerate(thetas)
+            ]
         except SolverError:
             return None
-        told = [near[s] for s in range(len(thetas))]
+        for s, each in enumerate(told):
+            near.setdefault(s, each)
         fine = flat(observe, thetas, [each.fine for each in told])
         return fine - flat(model.observe, thetas, [each.coarse for each in told])
 
     def differences(z: np.ndarray) -> Iterator[np.ndarray | None]:
         draws = predictive.constrain(z)
-        for k in range(len(z)):
-            yield one(model.states.thetas({name: values[k] for name, values in draws.items()}))
+        each = ({name: values[k] for name, values in draws.items()} for k in range(len(z)))
+        for found in in_order(one, map(model.states.thetas, each), workers):
+            bar.update(len(model.states.states))
+            yield found
 
     return differences
 

@@ -19,8 +19,9 @@ over.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from threading import Lock
 from typing import NamedTuple
 
 import jax
@@ -75,12 +76,16 @@ class MeshErrorEstimate(NamedTuple):
 class MeshError:
     """Errors of a simulator's mesh; made by :func:`mesh_error`.
 
+    Threads may share one: steps on the finer mesh are taken at once, solves there, which may keep
+    a factor, one by one.
+
     fine : the simulator on the finer mesh.
     """
 
     simulator: Simulator
     finer: Finer
     fine: Simulator
+    _alone: Lock = field(default_factory=Lock, repr=False)
 
     def __call__(
         self,
@@ -110,9 +115,10 @@ class MeshError:
         stepped = self._stepped(theta, begin)
         if stepped is not None:
             return MeshErrorEstimate(theta, coarse, stepped, solved=False)
-        solution = self.fine.solve(theta, begin)
-        if not solution.converged:  # strains of locked elements may be too rough to begin with
-            solution = self.fine.solve(theta)
+        with self._alone:
+            solution = self.fine.solve(theta, begin)
+            if not solution.converged:  # strains of locked elements may be too rough to begin with
+                solution = self.fine.solve(theta)
         fine = solution.require_converged(f"{what}, on the finer one").displacement
         return MeshErrorEstimate(theta, coarse, fine, solved=True)
 

@@ -17,6 +17,7 @@ from emulator.fem.campaign.place import executor
 from emulator.fem.campaign.row import Row, Task
 from emulator.fem.campaign.runs import Runs, StoredRuns, run_campaign
 from emulator.fem.campaign.starts import Neighbours, Predictor
+from emulator.fem.campaign.threads import at_once, in_order
 
 __all__ = [
     "Executor",
@@ -27,7 +28,9 @@ __all__ = [
     "Solver",
     "StoredRuns",
     "Task",
+    "at_once",
     "executor",
+    "in_order",
     "in_process",
     "run_campaign",
     "solve_rows",

@@ -15,7 +15,9 @@ import numpy as np
 from emulator.errors import InputError, SolverError
 from emulator.fem.balance import relative_residual
 from emulator.fem.campaign.row import Row, Task
+from emulator.fem.campaign.threads import at_once, in_order
 from emulator.fem.energy import potential_energy, volume_ratio
+from emulator.fem.linear.suitesparse import keep_factors
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
 
@@ -101,8 +103,16 @@ Executor = Callable[[Solver, Iterator[Task]], Iterator[Row]]
 
 
 def in_process(solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
-    """The executor of this process: one task after the other, none taken before it is solved."""
-    return map(solver, tasks)
+    """The executor of this process: as many solves at once as it has cores and memory for.
+
+    One where a factor is kept between solves, or the solver is called from Python (large meshes),
+    and where the simulator is not FEM's own: nobody said that threads may share it.
+    """
+    simulator, workers = solver.simulator, 1
+    if isinstance(simulator, Simulator) and not simulator.system.stepwise:
+        workers = at_once(simulator.scene)
+    keep_factors(workers)
+    return in_order(solver, tasks, workers)
 
 
 def solve_rows(
@@ -113,7 +123,7 @@ def solve_rows(
     starts: Starts = lambda _: (),
     execute: Executor = in_process,
 ) -> Iterator[Row]:
-    """Solve at every theta (c, p), lazily: a row is solved when it is asked for.
+    """Solve at every theta (c, p), lazily: few rows are begun that nobody has asked for.
 
     All loops over FEM solves are this one.
 

@@ -50,6 +50,12 @@ def _made_ready() -> None:
     sparsax.set_num_cache_size(2)
 
 
+def keep_factors(count: int) -> None:
+    """Keep as many factors of a pattern as threads solve at once, and two at least."""
+    _made_ready()
+    sparsax.set_num_cache_size(max(2, count))
+
+
 def forget_factors() -> None:
     """Free all factors, for a matrix whose own may need the memory."""
     sparsax.clear_cache()

@@ -99,7 +99,8 @@ def test_where_a_start_fails_rest_is_tried(simulator, thetas, monkeypatch):
 
     monkeypatch.setattr(em.Simulator, "solve", shy)
     runs = run_campaign(simulator, thetas[:3])
-    assert [start is None for start in starts] == [True, False, True, False, True]
+    assert starts[0] is None  # the others, on threads of their own, in any order
+    assert sorted(start is None for start in starts[1:]) == [False, False, True, True]
     assert jnp.isfinite(runs.displacement).all()
 
 
