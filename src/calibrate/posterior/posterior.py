@@ -15,9 +15,11 @@ import numpyro.distributions as dist
 import xarray as xr
 
 from calibrate.arviz import stats
+from calibrate.observations import Observation
 from calibrate.observations.present import missing_values
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.posterior.fit import misfits
+from calibrate.posterior.predictions import predicted
 from calibrate.posterior.tree import make_tree
 from calibrate.provenance import versions
 from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws, r_hat
@@ -73,6 +75,36 @@ class Posterior(Shown):
         if state is not None and state not in states:
             raise InputError(f"load state '{state}' is unknown; known: {', '.join(states)}")
         return self.model.states.thetas(self.draws())[:, states.index(state or states[0])]
+
+    def predict(
+        self, known: Mapping[str, float], observe: Observation, *, state: str | None = None
+    ) -> np.ndarray:
+        """What ``observe`` would say at every draw, without noise, (s, *shape).
+
+        Parameters
+        ----------
+        known : parameters that are given instead of drawn, such as another pressure:
+            ``posterior.predict({"pressure": 1.2}, cal.CavityVolume(scene))``.
+        observe : an observation of the scene; it need not be one of the model's.
+        state : load state whose parameters are drawn, where there are several.
+
+        Raises
+        ------
+        InputError
+            An unknown parameter or state, a value that is not finite, an observation of another
+            mesh, or a draw at which the forward map has no answer.
+        """
+        scene, thetas = self.model.forward.scene, self.thetas(state)
+        if np.max(observe.nodes) >= len(scene.mesh.nodes):
+            raise InputError(f"prediction: the observation is not of scene '{scene.name}'")
+        for name, value in known.items():
+            if name not in scene.parameter_names:
+                names = ", ".join(scene.parameter_names)
+                raise InputError(f"prediction: '{name}' is no parameter; there are {names}")
+            if not np.isfinite(value):
+                raise InputError(f"prediction: {name} is {value}; give a finite number")
+            thetas = thetas.at[:, scene.parameter_names.index(name)].set(value)
+        return predicted(self.model.full, observe, thetas)
 
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
         """Per parameter: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""

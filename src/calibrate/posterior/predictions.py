@@ -20,8 +20,10 @@ import numpyro.distributions as dist
 from numpyro import handlers
 
 from calibrate.noise.spatial import SpatialNormal
+from calibrate.observations import Observation
 from calibrate.statistical_model import Data, Model
-from emulator.surrogates.protocol import Prediction, SolvingMap, evaluate_all
+from emulator.errors import InputError
+from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, evaluate_all
 
 REPLICATES = 500  # draws of the posterior, and of the prior, that data is replicated at
 
@@ -47,6 +49,24 @@ def log_likelihood(model: Model, draws: Draws, data: Mapping[str, Any]) -> dict[
     has no density of a single one have one number a draw instead, (chains, draws).
     """
     return _unflat(_programs(model).log_likelihood(_flat(draws), data), draws)
+
+
+def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> np.ndarray:
+    """What ``observe`` says without noise, (s, *shape), at ``thetas`` (s, p).
+
+    Raises
+    ------
+    InputError
+        ``forward`` has no answer at one of them.
+    """
+    found = evaluate_all(forward.at(np.asarray(observe.nodes)), thetas)
+    failed = int((~np.asarray(found.valid)).sum())
+    if failed:
+        raise InputError(
+            f"prediction: {forward.label} has no answer at {failed} of {len(thetas)} draws; is what"
+            " is known inside its range?"
+        )
+    return np.asarray(jax.jit(jax.vmap(observe))(found.displacement, thetas))
 
 
 def replicates(model: Model, draws: Draws, rng_key: jax.Array) -> dict[str, np.ndarray]:

@@ -1,9 +1,10 @@
 """FEM at many theta: the one loop over solves, in this process or on a Dask cluster.
 
 A design of theta becomes tasks (:mod:`.row`), each with displacements to start from
-(:mod:`.starts`). An executor solves them (:mod:`.engine`, :mod:`.cluster`) and hands back rows in
-the order they are finished, which are kept in memory (:mod:`.memory`) or in a Zarr store
-(:mod:`.zarr_rows`). Zarr and Dask are imported only by who asks for them.
+(:mod:`.starts`). An executor solves them, several at once (:mod:`.threads`, :mod:`.engine`,
+:mod:`.cluster`), and hands back rows as they are finished, which are kept in memory
+(:mod:`.memory`) or in a Zarr store (:mod:`.zarr_rows`). Zarr and Dask are imported only by who asks
+for them.
 """
 
 from emulator.fem.campaign.engine import (
