@@ -79,7 +79,7 @@ class Posterior(Shown):
     def predict(
         self, known: Mapping[str, float], observe: Observation, *, state: str | None = None
     ) -> np.ndarray:
-        """What ``observe`` would say at every draw, without noise, (s, *shape).
+        """What ``observe`` would say at every draw, without noise: one ``(s, *shape)`` array.
 
         Parameters
         ----------

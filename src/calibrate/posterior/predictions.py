@@ -52,7 +52,7 @@ def log_likelihood(model: Model, draws: Draws, data: Mapping[str, Any]) -> dict[
 
 
 def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> np.ndarray:
-    """What ``observe`` says without noise, (s, *shape), at ``thetas`` (s, p).
+    """What ``observe`` says without noise, ``(s, *shape)``, at ``thetas`` (s, p).
 
     Raises
     ------
