@@ -100,7 +100,7 @@ def _by_fem(
 ) -> Differences:
     """FEM's differences; solves on the finer mesh begin near the first one, several at once."""
     model, near = predictive.model, dict[int, MeshErrorEstimate]()
-    workers = at_once(error.finer.scene)
+    workers = at_once(error.simulator, len(error.finer.scene.mesh.nodes))
 
     def flat(seen: Observations, thetas: jax.Array, fields: list[jax.Array]) -> np.ndarray:
         stacked = jnp.stack([u[seen.nodes] for u in fields])

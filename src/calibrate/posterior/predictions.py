@@ -22,8 +22,13 @@ from numpyro import handlers
 from calibrate.noise.spatial import SpatialNormal
 from calibrate.observations import Observation
 from calibrate.statistical_model import Data, Model
-from emulator.errors import InputError
-from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, evaluate_all
+from emulator.surrogates.protocol import (
+    ForwardMap,
+    Prediction,
+    SolvingMap,
+    evaluate_all,
+    require_answers,
+)
 
 REPLICATES = 500  # draws of the posterior, and of the prior, that data is replicated at
 
@@ -60,12 +65,7 @@ def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> n
         ``forward`` has no answer at one of them.
     """
     found = evaluate_all(forward.at(np.asarray(observe.nodes)), thetas)
-    failed = int((~np.asarray(found.valid)).sum())
-    if failed:
-        raise InputError(
-            f"prediction: {forward.label} has no answer at {failed} of {len(thetas)} draws; is what"
-            " is known inside its range?"
-        )
+    require_answers(forward, found, "prediction")
     return np.asarray(jax.jit(jax.vmap(observe))(found.displacement, thetas))
 
 

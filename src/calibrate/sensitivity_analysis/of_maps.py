@@ -19,9 +19,9 @@ from emulator.errors import InputError
 from emulator.fem.campaign import executor, in_process
 from emulator.surrogates.protocol import (
     ForwardMap,
-    Prediction,
     SolvingMap,
     evaluate_all,
+    require_answers,
     solved_by,
 )
 
@@ -153,7 +153,7 @@ class _Outputs:
     def values(self, thetas: jax.Array) -> np.ndarray:
         """Numbers (n, m) at ``thetas`` (n, p)."""
         predicted = evaluate_all(self._map, thetas)
-        self._require(predicted)
+        require_answers(self._map, predicted, "sensitivity")
         return np.asarray(jax.jit(jax.vmap(self.of))(predicted.displacement, thetas))
 
     def slopes(self, thetas: jax.Array) -> np.ndarray:
@@ -162,7 +162,7 @@ class _Outputs:
             slope = jax.jacfwd(lambda theta: self.of(self._map(theta), theta))
             return np.asarray(jax.jit(lambda t: jax.lax.map(slope, t))(thetas))
         predicted, moved = self._map.slopes_all(thetas)
-        self._require(predicted)
+        require_answers(self._map, predicted, "sensitivity")
         return np.asarray(jax.jit(jax.vmap(self._along))(predicted.displacement, moved, thetas))
 
     def _along(self, u: jax.Array, moved: jax.Array, theta: jax.Array) -> jax.Array:
@@ -172,14 +172,6 @@ class _Outputs:
             return jax.jvp(self.of, (u, theta), (du, direction))[1]
 
         return jax.vmap(along, out_axes=-1)(moved, jnp.eye(len(theta)))
-
-    def _require(self, predicted: Prediction) -> None:
-        invalid = ~np.asarray(predicted.valid)
-        if invalid.any():
-            raise InputError(
-                f"sensitivity: {self._map.label} has no answer at {invalid.sum()} of "
-                f"{len(invalid)} theta"
-            )
 
 
 def _some(function: Function, entries: slice) -> Function:

@@ -76,8 +76,8 @@ class MeshErrorEstimate(NamedTuple):
 class MeshError:
     """Errors of a simulator's mesh; made by :func:`mesh_error`.
 
-    Threads may share one: steps on the finer mesh are taken at once, solves there, which may keep
-    a factor, one by one.
+    Threads may share one whose simulator they may share (:func:`emulator.fem.campaign.at_once`):
+    steps on the finer mesh are taken at once, solves there, which may keep a factor, one by one.
 
     fine : the simulator on the finer mesh.
     """

@@ -94,6 +94,15 @@ def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
     return jax.jit(lambda t: jax.lax.map(forward.evaluate, t, batch_size=_AT_ONCE))(thetas)
 
 
+def require_answers(forward: ForwardMap, predicted: Prediction, what: str) -> None:
+    """:class:`InputError` where one of many predictions is not valid; ``what`` begins its line."""
+    invalid = ~np.asarray(predicted.valid)
+    if invalid.any():
+        raise InputError(
+            f"{what}: {forward.label} has no answer at {invalid.sum()} of {len(invalid)} theta"
+        )
+
+
 def solved_by(forward: ForwardMap, execute: Executor) -> ForwardMap:
     """``forward`` with its solves at many theta done by ``execute``.
 

@@ -90,5 +90,10 @@ def test_draws_at_which_the_map_has_no_answer_are_named(beam):
     data = np.asarray(model.forward(emulator.scene.centre))
     inside = posterior_of(model, data, np.tile(emulator.scene.centre, (8, 1)), 2)
     assert np.isfinite(inside.predict({}, tip)).all()
-    with pytest.raises(em.InputError, match="has no answer at 8 of 8 draws"):
+    with pytest.raises(em.InputError, match="has no answer at 8 of 8 theta"):
         inside.predict({"mu": 1e4}, tip)
+
+
+def test_an_observation_without_nodes_is_predicted(beam, posterior):
+    found = posterior.predict({"mu": 75.0}, cal.MeasuredParameter(beam, "mu"))
+    np.testing.assert_array_equal(found.ravel(), 75.0)

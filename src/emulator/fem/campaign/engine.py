@@ -17,7 +17,6 @@ from emulator.fem.balance import relative_residual
 from emulator.fem.campaign.row import Row, Task
 from emulator.fem.campaign.threads import at_once, in_order
 from emulator.fem.energy import potential_energy, volume_ratio
-from emulator.fem.linear.suitesparse import keep_factors
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
 
@@ -103,16 +102,8 @@ Executor = Callable[[Solver, Iterator[Task]], Iterator[Row]]
 
 
 def in_process(solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
-    """The executor of this process: as many solves at once as it has cores and memory for.
-
-    One where a factor is kept between solves, or the solver is called from Python (large meshes),
-    and where the simulator is not FEM's own: nobody said that threads may share it.
-    """
-    simulator, workers = solver.simulator, 1
-    if isinstance(simulator, Simulator) and not simulator.system.stepwise:
-        workers = at_once(simulator.scene)
-    keep_factors(workers)
-    return in_order(solver, tasks, workers)
+    """The executor of this process: as many solves at once as it has cores and memory for."""
+    return in_order(solver, tasks, at_once(solver.simulator))
 
 
 def solve_rows(

@@ -12,18 +12,26 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
-from emulator.scenes.scene import Scene
+from emulator.fem.linear.suitesparse import keep_factors
+from emulator.fem.simulator import Simulator
 
 _BYTES_A_NODE = 100_000  # of one more solve beside others; 54 000 measured at 33 605 nodes
 _SHARE = 0.5  # of the machine's memory
 
 
-def at_once(scene: Scene) -> int:
-    """Solves of ``scene`` that this machine does at once: one a core that this process may use,
-    fewer where memory would not hold them.
+def at_once(simulator: Simulator, nodes: int | None = None) -> int:
+    """Solves that this machine does at once: one a core that this process may use, fewer where
+    memory would not hold them.
+
+    One where a factor is kept between solves, or the solver is called from Python: large meshes.
+    And one of a simulator that is not FEM's own: nobody said that threads may share it.
+
+    nodes : of the mesh that is solved on; the simulator's by default.
     """  # noqa: D205
-    each = _BYTES_A_NODE * len(scene.mesh.nodes)
-    return max(1, min(_cores(), int(_SHARE * _memory() / each)))
+    if not isinstance(simulator, Simulator) or simulator.system.stepwise:
+        return 1
+    each = _BYTES_A_NODE * (nodes or len(simulator.scene.mesh.nodes))
+    return max(1, int(min(_cores(), _SHARE * _memory() / each)))
 
 
 def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Iterator[R]:
@@ -31,7 +39,8 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
 
     The first task is done alone: what it compiles, the others use. After it a task is taken when
     all but ``workers`` of those before it have been given back, so that what a task is made of,
-    such as a start from rows so far, does not depend on which thread was quicker.
+    such as a start from rows so far, does not depend on which thread was quicker. Each thread has
+    room for a factor of its own while they work.
     """
     for task in tasks:
         yield function(task)
@@ -41,6 +50,7 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
         return
     under_way: deque[Future[R]] = deque()
     pool = ThreadPoolExecutor(workers)
+    keep_factors(workers)
     try:
         for task in tasks:
             under_way.append(pool.submit(function, task))
@@ -50,6 +60,7 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
             yield under_way.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)
+        keep_factors(1)
 
 
 def _cores() -> int:

@@ -21,6 +21,7 @@ from emulator.fem.linear.foreign import register
 from emulator.fem.linear.protocol import Outcome, Structure
 
 _CHOLMOD, _UMFPACK = "calibrate_cholmod", "calibrate_umfpack"
+_KEPT = 2  # factors of a pattern
 
 
 def _outcome(message: str) -> int | None:
@@ -46,14 +47,14 @@ def _made_ready() -> None:
     for library in ThreadpoolController().lib_controllers:
         if "sparsax" in library.filepath:
             library.set_num_threads(1)
-    sparsax.set_umf_cache_size(2)
-    sparsax.set_num_cache_size(2)
+    sparsax.set_umf_cache_size(_KEPT)
+    sparsax.set_num_cache_size(_KEPT)
 
 
 def keep_factors(count: int) -> None:
-    """Keep as many factors of a pattern as threads solve at once, and two at least."""
+    """Keep ``count`` factors of a pattern, one a thread that solves, and no fewer than two."""
     _made_ready()
-    sparsax.set_num_cache_size(max(2, count))
+    sparsax.set_num_cache_size(max(_KEPT, count))
 
 
 def forget_factors() -> None:

@@ -70,13 +70,23 @@ def test_whoever_stops_asking_stops_the_work():
     assert max(begun) <= 4
 
 
-def test_no_more_at_once_than_cores_and_memory(beam, monkeypatch):
+def test_no_more_at_once_than_cores_and_memory(simulator, monkeypatch):
+    nodes = len(simulator.scene.mesh.nodes)
     monkeypatch.setattr(threads, "_cores", lambda: 8)
-    assert at_once(beam) == 8
-    monkeypatch.setattr(threads, "_memory", lambda: 6.5e5 * len(beam.mesh.nodes))
-    assert at_once(beam) == 3
-    monkeypatch.setattr(threads, "_memory", lambda: 0.0)
-    assert at_once(beam) == 1
+    assert at_once(simulator) == 8
+    monkeypatch.setattr(threads, "_memory", lambda: 6.5e5 * nodes)
+    assert at_once(simulator) == 3
+    assert at_once(simulator, nodes=3 * nodes) == 1
+    for memory, solves in ((0.0, 1), (float("inf"), 8)):
+        monkeypatch.setattr(threads, "_memory", lambda memory=memory: memory)
+        assert at_once(simulator) == solves
+
+
+def test_what_keeps_a_factor_or_is_not_fem_is_not_shared(simulator, monkeypatch):
+    monkeypatch.setattr(threads, "_cores", lambda: 8)
+    monkeypatch.setattr(type(simulator.system), "stepwise", True)
+    assert at_once(simulator) == 1
+    assert at_once(object()) == 1
 
 
 def test_a_campaign_on_threads_has_the_solutions_of_one_after_the_other(beam, monkeypatch):
