@@ -244,4 +244,4 @@ def redrawn(
 
 def corrected_again(pool: Pool, predictive: Predictive, correction: Correction) -> Pool:
     """``pool`` under another correction."""
-    return replace(pool, at=predictive.evaluate(pool.z, correction))
+    return replace(pool, at=predictive.evaluate_again(pool.z, pool.at, correction))

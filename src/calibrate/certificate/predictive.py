@@ -39,12 +39,14 @@ class Evaluated(NamedTuple):
     cheap : likelihood that the draws are from: the map's, with what is allowed for its error.
     corrected : likelihood of the map with its correction, and nothing allowed but for the mesh.
     variance : of the correction, in squared noise sd.
+    means : the map's data without noise, flat (s, m); NaN where it has no answer.
     """
 
     prior: Any
     cheap: Any
     corrected: Any
     variance: Any
+    means: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,19 @@ class Predictive:
 
     def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
         """Log densities at points (s, p)."""
-        return self._in_blocks(lambda block: self._evaluate_block(block, correction), z)
+        prior, cheap, means = self._in_blocks(self._map_block, z)
+        nothing_yet = np.full(len(z), -np.inf)
+        at = Evaluated(prior, cheap, nothing_yet, nothing_yet, means)
+        return self.evaluate_again(z, at, correction)
+
+    def evaluate_again(self, z: np.ndarray, at: Evaluated, correction: Correction) -> Evaluated:
+        """``at`` of the points (s, p) under another correction; the map is not asked again."""
+
+        def block(points: jax.Array, means: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return self._correction_block(points, means, correction)
+
+        corrected, variance = self._in_blocks(block, z, at.means)
+        return at._replace(corrected=corrected, variance=variance)
 
     def means(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The map's data without noise, flat (s, m), and whether it has an answer (s,)."""
@@ -118,11 +132,9 @@ class Predictive:
     @cached_property
     def _curvature(self) -> Any:
         def told(z: jax.Array, means: jax.Array, slopes: jax.Array) -> tuple[jax.Array, ...]:
-            _, unravel = ravel_pytree(self._means(self._constrain(z))[0])
-
             def likelihood(at: jax.Array, flat: jax.Array) -> jax.Array:
                 draws = self._constrain(at)
-                return self.model.fem_log_likelihood(draws, unravel(flat), self.data)
+                return self.model.fem_log_likelihood(draws, self._unravel(flat), self.data)
 
             def thetas(at: jax.Array) -> jax.Array:
                 return self.model.states.thetas(self._constrain(at))
@@ -181,25 +193,43 @@ class Predictive:
         means, valid = self.model.predict(draws)
         return {name: jnp.where(valid, mean, 0.0) for name, mean in means.items()}, valid
 
-    def _evaluate(self, z: jax.Array, correction: Correction) -> Evaluated:
+    def _by_map(self, z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Log prior and likelihood, and the data without noise, flat (m,)."""
         draws = self._constrain(z)
         means, valid = self._means(draws)
-        flat, unravel = ravel_pytree(means)
-        step, variance = correct(correction, self._features(draws))
-        moved = unravel(flat + step)
         cheap = self.model.map_log_likelihood(draws, self.data)
-        corrected = self.model.fem_log_likelihood(draws, moved, self.data)
-        prior = self._density.log_prior(z)
-        prior, cheap, corrected = (
-            jnp.where(fine & jnp.isfinite(value), value, -jnp.inf)
-            for fine, value in ((True, prior), (valid, cheap), (valid, corrected))
+        flat = jnp.where(valid, ravel_pytree(means)[0], jnp.nan)
+        return (
+            _finite(self._density.log_prior(z)),
+            _finite(jnp.where(valid, cheap, -jnp.inf)),
+            flat,
         )
-        return Evaluated(prior, cheap, corrected, variance)
+
+    def _by_correction(
+        self, z: jax.Array, flat: jax.Array, correction: Correction
+    ) -> tuple[jax.Array, jax.Array]:
+        """Log likelihood of the map's data ``flat`` (m,) corrected, and the variance of that."""
+        draws = self._constrain(z)
+        step, variance = correct(correction, self._features(draws))
+        moved = self._unravel(flat + step)
+        return _finite(self.model.fem_log_likelihood(draws, moved, self.data)), variance
+
+    def _unravel(self, flat: jax.Array) -> dict[str, jax.Array]:
+        """Data by name from flat ones (m,)."""
+        parts = self.model.observe.parts
+        return ravel_pytree({name: jnp.zeros(parts[name].shape) for name in parts})[1](flat)
 
     @cached_property
-    def _evaluate_block(self) -> Any:
-        def block(z: jax.Array, correction: Correction) -> Evaluated:
-            return jax.lax.map(lambda x: self._evaluate(x, correction), z, batch_size=_BATCH)
+    def _map_block(self) -> Any:
+        return jax.jit(lambda z: jax.lax.map(self._by_map, z, batch_size=_BATCH))
+
+    @cached_property
+    def _correction_block(self) -> Any:
+        def block(z: jax.Array, means: jax.Array, correction: Correction) -> Any:
+            def one(x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+                return self._by_correction(*x, correction)
+
+            return jax.lax.map(one, (z, means), batch_size=_BATCH)
 
         return jax.jit(block)
 
@@ -215,14 +245,20 @@ class Predictive:
     def _prior_draws(self) -> Any:
         return jax.jit(jax.vmap(self._density.prior_draw))
 
-    def _in_blocks(self, program: Any, z: np.ndarray) -> Any:
-        """``program`` of points (s, p), in blocks of one shape; the last one is filled up."""
-        padded = np.concatenate([z, np.repeat(z[-1:], -len(z) % _BLOCK, axis=0)])
+    def _in_blocks(self, program: Any, *points: np.ndarray) -> Any:
+        """``program`` of arrays (s, ...), in blocks of one shape; the last one is filled up."""
+        count = len(points[0])
+        padded = [np.concatenate([x, np.repeat(x[-1:], -count % _BLOCK, axis=0)]) for x in points]
         parts = [
-            jax.tree.map(np.asarray, program(jnp.asarray(padded[k : k + _BLOCK])))
-            for k in range(0, len(padded), _BLOCK)
+            jax.tree.map(np.asarray, program(*(jnp.asarray(x[k : k + _BLOCK]) for x in padded)))
+            for k in range(0, len(padded[0]), _BLOCK)
         ]
-        return jax.tree.map(lambda *arrays: np.concatenate(arrays)[: len(z)], *parts)
+        return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:count], *parts)
+
+
+def _finite(log_density: jax.Array) -> jax.Array:
+    """``-inf`` where it is not a number."""
+    return jnp.where(jnp.isfinite(log_density), log_density, -jnp.inf)
 
 
 def _inside(z: jax.Array) -> np.ndarray:

@@ -50,17 +50,16 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
         return
     under_way: deque[Future[R]] = deque()
     pool = ThreadPoolExecutor(workers)
-    keep_factors(workers)
-    try:
-        for task in tasks:
-            under_way.append(pool.submit(function, task))
-            if len(under_way) > workers:
+    with keep_factors(workers):
+        try:
+            for task in tasks:
+                under_way.append(pool.submit(function, task))
+                if len(under_way) > workers:
+                    yield under_way.popleft().result()
+            while under_way:
                 yield under_way.popleft().result()
-        while under_way:
-            yield under_way.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-        keep_factors(1)
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _cores() -> int:

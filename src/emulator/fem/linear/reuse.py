@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.protocol import Direct, Outcome
-from emulator.fem.linear.suitesparse import forget_factors
+from emulator.fem.linear.suitesparse import keep_factors
 from emulator.fem.loop import while_loop
 
 TOLERANCE = 1e-10  # of the residual, in the norm of the reference's inverse
@@ -77,9 +77,9 @@ class KeptFactor:
             found = self._beside(tangent, self._kept, b)
             if bool(found.convex & (found.reduction <= TOLERANCE)):
                 return found.x, jnp.asarray(Outcome.OK, jnp.int32)
-        forget_factors()  # two of such a mesh may not fit into memory
         self._kept = None
-        x, outcome = self._factorised(tangent, b)
+        with keep_factors(1):  # two of such a mesh may not fit into memory
+            x, outcome = jax.block_until_ready(self._factorised(tangent, b))
         self.factorisations += 1
         if int(outcome) == Outcome.OK:
             self._kept = tangent

@@ -6,6 +6,8 @@ CHOLMOD for positive definite matrices, UMFPACK for any. A refusal is an outcome
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -22,6 +24,7 @@ from emulator.fem.linear.protocol import Outcome, Structure
 
 _CHOLMOD, _UMFPACK = "calibrate_cholmod", "calibrate_umfpack"
 _KEPT = 2  # factors of a pattern
+_room = [_KEPT]  # the last is in force; the cache is the library's, and the process has one
 
 
 def _outcome(message: str) -> int | None:
@@ -48,17 +51,28 @@ def _made_ready() -> None:
         if "sparsax" in library.filepath:
             library.set_num_threads(1)
     sparsax.set_umf_cache_size(_KEPT)
-    sparsax.set_num_cache_size(_KEPT)
+    sparsax.set_num_cache_size(_room[-1])
 
 
-def keep_factors(count: int) -> None:
-    """Keep ``count`` factors of a pattern, one a thread that solves, and no fewer than two."""
+@contextmanager
+def keep_factors(count: int) -> Iterator[None]:
+    """Inside, keep ``count`` Cholesky factors of a pattern.
+
+    As many as there are threads that solve; one where two would not fit into memory: a
+    factorisation then takes the room of the one before. Without, two are kept.
+    """
     _made_ready()
-    sparsax.set_num_cache_size(max(_KEPT, count))
+    _room.append(count)
+    sparsax.set_num_cache_size(count)
+    try:
+        yield
+    finally:
+        _room.remove(count)
+        sparsax.set_num_cache_size(_room[-1])
 
 
 def forget_factors() -> None:
-    """Free all factors, for a matrix whose own may need the memory."""
+    """Free all factors and all orderings of patterns, which take as long as a factorisation."""
     sparsax.clear_cache()
 
 
