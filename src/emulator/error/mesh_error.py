@@ -31,6 +31,7 @@ import numpy as np
 from emulator.error.step import Distance, newton_distance
 from emulator.errors import InputError
 from emulator.fem.linear.suitesparse import forget_factors
+from emulator.fem.loop import jit
 from emulator.fem.simulator import Simulator
 from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene
@@ -131,7 +132,7 @@ class MeshError:
 
     @cached_property
     def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:
-        return jax.jit(partial(newton_distance, self.fine.system))
+        return jit(partial(newton_distance, self.fine.system))
 
     def _stepped(self, theta: jax.Array, u: jax.Array) -> jax.Array | None:
         """The finer mesh's displacement (f, 3) a few steps from ``u``; None if one is not sound."""

@@ -21,7 +21,7 @@ from emulator._precision import require_float64
 from emulator.errors import InputError, SolverError
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.linear import Outcome, find_solver
-from emulator.fem.loop import compiled, one_by_one
+from emulator.fem.loop import compiled, jit, one_by_one
 from emulator.fem.options import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
@@ -198,7 +198,7 @@ class Simulator(Shown):
         find = partial(find_equilibrium, self.system, self.options)
         alone = one_by_one(find)
 
-        @jax.jit
+        @jit
         def closed(theta: jax.Array, start: jax.Array) -> Solution:
             return alone(theta, start)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.loop import compiled, cond, while_loop
+from emulator.fem.loop import compiled, cond, jit, while_loop, with_arrays
 
 
 class Spring:
@@ -57,6 +57,38 @@ def test_derivatives_and_jit_go_through():
     assert jax.grad(spring.force)(2.0) == 3.0
     assert jax.jit(jax.grad(spring.force, argnums=1))(2.0, 1.0) == -1.0
     np.testing.assert_array_equal(jax.vmap(spring.force)(jnp.arange(3.0)), [0.0, 3.0, 6.0])
+
+
+def test_what_a_function_closes_over_is_not_in_its_program():
+    """Nor what a program inside it does: a mesh's arrays would be kept on disk with it."""
+    table = np.random.default_rng(0).normal(size=(4, 1000))
+    inner = jit(lambda x: x * table[0] + jnp.asarray(table[1]))
+
+    def outer(x, *, shift=0.0):
+        return inner(x) + jnp.where(x > 0.0, table[2], shift)
+
+    x = jnp.linspace(-1.0, 1.0, 1000)
+    program = with_arrays(outer, (x,), {"shift": 2.0})
+    written = program.func.lower(*program.args, jax.tree.leaves(((x,), {"shift": 2.0}))).as_text()
+    assert len(written) < len(jax.jit(outer).lower(x, shift=2.0).as_text()) / 10
+    np.testing.assert_array_equal(jit(outer)(x, shift=2.0), outer(x, shift=2.0))
+
+
+def test_transformations_go_through_and_shapes_have_programs_of_their_own(counted):
+    table = jnp.arange(6.0)
+    double = jit(lambda x: {"twice": jnp.vdot(table[: len(x)], x**2), "len": len(x)})
+
+    def total(x):
+        return double(x)["twice"]
+
+    x = jnp.ones(3)
+    assert total(x) == total(2.0 * x) / 4.0 == 3.0
+    assert counted().count("jit(<lambda>)") == 1
+    assert total(jnp.ones(6)) == 15.0
+    assert double(x)["len"] == 3
+    np.testing.assert_array_equal(jax.grad(total)(x), 2.0 * table[:3])
+    np.testing.assert_array_equal(jax.jit(jax.hessian(total))(x), np.diag(2.0 * table[:3]))
+    np.testing.assert_array_equal(jax.vmap(total)(jnp.stack([x, 2.0 * x])), [3.0, 12.0])
 
 
 @pytest.mark.parametrize("decision", [True, False])

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.protocol import Direct, Outcome
 from emulator.fem.linear.suitesparse import keep_factors
-from emulator.fem.loop import while_loop
+from emulator.fem.loop import jit, while_loop
 
 TOLERANCE = 1e-10  # of the residual, in the norm of the reference's inverse
 _PATIENCE = 6  # steps after which half the pace that the last allowed step needs is asked for
@@ -55,10 +55,10 @@ class KeptFactor:
         self._kept: jax.Array | None = None
         as_long = int(_STEPS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
         self._steps = max(_PATIENCE, as_long)
-        jit = (lambda function: function) if direct.on_host else jax.jit
-        self._product = jax.jit(pattern.product)
-        self._factorised = jit(partial(direct.solve, pattern, definite=True))
-        self._beside = jit(self._conjugate_gradients)
+        program = (lambda function: function) if direct.on_host else jit
+        self._product = jit(pattern.product)
+        self._factorised = program(partial(direct.solve, pattern, definite=True))
+        self._beside = program(self._conjugate_gradients)
         self.factorisations = 0
 
     @staticmethod
