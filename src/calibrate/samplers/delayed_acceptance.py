@@ -21,6 +21,7 @@ there. So the cheap likelihood is raised to a power below 1, :math:`\pi^* \propt
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -77,7 +78,7 @@ class DelayedAcceptanceOptions(ChainOptions):
 class _Place(NamedTuple):
     """Where the chains are; arrays (chains, ...)."""
 
-    states: Any  # of the cheap sampler
+    states: Any  # of the cheap sampler, each chain's
     z: Any
     cheap_lp: Any
     log_w: Any
@@ -218,13 +219,12 @@ class _Run:
         }
         return jax.tree.map(lambda array: array[:, None], Draws(self.place.z, statistics))
 
-    def _propose(self, states: Any) -> tuple[_Place, dict[str, np.ndarray]]:
+    def _propose(self, states: Any) -> tuple[_Place, Mapping[str, np.ndarray]]:
         """Where the cheap sampler leads, without weights; its statistics (chains, transitions)."""
-        states, draws = self.programs.advance(
-            states, self.data, self.map_, count=self.options.transitions
-        )
-        z, statistics = jax.tree.map(np.asarray, (draws.z, draws.statistics))
-        return _Place(states, z[:, -1], statistics["lp"][:, -1], None), statistics
+        transitions = self.options.transitions
+        states, draws = self.programs.advance(states, self.data, self.map_, transitions)
+        place = _Place(states, draws.z[:, -1], draws.statistics["lp"][:, -1], None)
+        return place, draws.statistics
 
     def _log_w(self, z: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """FEM's less the tempered log likelihood (chains,), where wanted; ``-inf`` elsewhere."""
@@ -256,8 +256,7 @@ class _Run:
 
     def _template(self) -> _State:
         map_ = transport.standard_identity(self.density.dimension)
-        keys = jax.random.split(jax.random.key(0), self.options.chains)
-        states, _ = jax.eval_shape(self.programs.start, keys, self.data, map_)
+        states, _ = self.programs.shapes(self.options.chains, self.data, map_)
         number = np.zeros(())
         place = _Place(states, number, number, number)
         count = np.zeros((), int)
@@ -266,14 +265,15 @@ class _Run:
 
 def _choose(accepted: np.ndarray, proposed: _Place, current: _Place) -> _Place:
     """The proposed place of each chain where accepted; random keys go on either way."""
-    current = current._replace(states=current.states._replace(rng_key=proposed.states.rng_key))
+    states = tuple(
+        new if yes else old._replace(rng_key=new.rng_key)
+        for yes, new, old in zip(accepted, proposed.states, current.states, strict=True)
+    )
 
-    def chosen(new: Any, old: Any) -> Any:
-        return jnp.where(accepted.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+    def chosen(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+        return np.where(accepted.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
-    states = jax.tree.map(chosen, proposed.states, current.states)
-    rest = jax.tree.map(lambda new, old: np.asarray(chosen(new, old)), proposed[1:], current[1:])
-    return _Place(states, *rest)
+    return _Place(states, *map(chosen, proposed[1:], current[1:]))
 
 
 DELAYED_ACCEPTANCE = DelayedAcceptance()

@@ -19,6 +19,10 @@ from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import potential_energy
 
 from calibrate.statistical_model import Data, Model
+from emulator.fem.campaign import at_once
+from emulator.machine import cores
+from emulator.surrogates.fem import FEMForward
+from emulator.surrogates.protocol import ForwardMap
 
 
 class Density(NamedTuple):
@@ -31,6 +35,7 @@ class Density(NamedTuple):
     constrain : (z (s, p),) -> draws by name, each (s,).
     unconstrain : (draw by name, each ()) -> z (p,).
     names : of the coordinates, (p,), in their order.
+    at_once : threads that may ask for it at the same time.
     """
 
     log_density: Callable[[jax.Array, Data], jax.Array]
@@ -40,6 +45,7 @@ class Density(NamedTuple):
     constrain: Callable[[jax.Array], dict[str, jax.Array]]
     unconstrain: Callable[[Mapping[str, jax.Array]], jax.Array]
     names: tuple[str, ...]
+    at_once: int = 1
 
     @property
     def dimension(self) -> int:
@@ -87,7 +93,13 @@ def density_of(model: Model) -> Density:
         jax.jit(jax.vmap(draw)),
         unconstrain,
         names,
+        _at_once(model.forward),
     )
+
+
+def _at_once(forward: ForwardMap) -> int:
+    """One evaluation a core; FEM's need memory, too."""
+    return at_once(forward.simulator) if isinstance(forward, FEMForward) else cores()
 
 
 @lru_cache(maxsize=4)

@@ -3,14 +3,15 @@
 A pilot run straightens the posterior (:mod:`calibrate.samplers.transport`); the draws returned are
 from a second run with fresh starting points. Both use the same compiled program.
 
-Chains run one after the other inside that program. Vectorised, every transition of all chains would
-take as many gradients as the longest trajectory among them (docs/experiments.md, "NUTS chains one
-after the other").
+That program is one chain's, and as many chains run at once as there are cores. Vectorised, every
+transition of all chains would take as many gradients as the longest trajectory among them
+(docs/experiments.md, "NUTS chains one after the other", "Chains on threads").
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, ClassVar, NamedTuple
@@ -85,15 +86,62 @@ class ChainSampler:
         return draws
 
 
-class Programs(NamedTuple):
-    """Compiled functions of all chains.
+class Programs:
+    """Compiled functions of one chain, for as many at once as threads may ask for a density.
 
-    start : (keys, data, map) -> states, their log densities.
-    advance : (states, data, map, count=) -> states, :class:`Draws`.
+    Parameters
+    ----------
+    start : (key, data, map) -> state, its log density.
+    advance : (state, data, map, count) -> state, :class:`Draws`.
     """
 
-    start: Callable[..., Any]
-    advance: Callable[..., Any]
+    def __init__(
+        self, start: Callable[..., Any], advance: Callable[..., Any], at_once: int
+    ) -> None:
+        self._start, self._advance, self._at_once = start, advance, at_once
+        self._compiled: dict[Any, Callable[..., Any]] = {}
+
+    def start(
+        self, keys: jax.Array, data: Data, map_: transport.StandardMap
+    ) -> tuple[tuple[Any, ...], np.ndarray]:
+        """States of chains, by ``keys`` (c,), and their log densities (c,)."""
+        begun = self._of_all("start", self._start, tuple(keys), data, map_)
+        states, heights = zip(*begun, strict=True)
+        return states, np.array(heights)
+
+    def advance(
+        self, states: tuple[Any, ...], data: Data, map_: transport.StandardMap, count: int
+    ) -> tuple[tuple[Any, ...], Draws]:
+        """``count`` iterations of all chains: their states, and draws (c, count, ...)."""
+        advance = partial(self._advance, count=count)
+        done = self._of_all(f"advance {count}", advance, states, data, map_)
+        states, draws = zip(*done, strict=True)
+        return states, jax.tree.map(lambda *chains: np.stack(chains), *draws)
+
+    def shapes(
+        self, chains: int, data: Data, map_: transport.StandardMap
+    ) -> tuple[tuple[Any, ...], Draws]:
+        """States and draws (c, 1, ...), as far as structure and types are concerned."""
+        state, _ = jax.eval_shape(self._start, jax.random.key(0), data, map_)
+        _, draws = jax.eval_shape(partial(self._advance, count=1), state, data, map_)
+        every = jax.tree.map(lambda x: jax.ShapeDtypeStruct((chains, *x.shape), x.dtype), draws)
+        return (state,) * chains, every
+
+    def _of_all(
+        self, name: str, function: Callable[..., Any], chains: tuple[Any, ...], *arrays: Any
+    ) -> list[Any]:
+        """``function`` of each chain and the arrays, compiled before threads ask for it."""
+        key = name, *map(jax.typeof, jax.tree.leaves((chains[0], *arrays)))
+        program = self._compiled.get(key)
+        if program is None:
+            program = jax.jit(function).lower(chains[0], *arrays).compile()
+            self._compiled[key] = program
+
+        def one(chain: Any) -> Any:
+            return jax.block_until_ready(program(chain, *arrays))
+
+        with ThreadPoolExecutor(min(self._at_once, len(chains))) as pool:
+            return list(pool.map(one, chains))
 
 
 @lru_cache(maxsize=4)
@@ -127,13 +175,7 @@ def compile_chains(sampler: ChainSampler, density: Density, options: ChainOption
 
         return jax.lax.scan(step, state, length=count)
 
-    def start_all(keys: jax.Array, data: Data, map_: transport.StandardMap) -> Any:
-        return jax.lax.map(lambda key: start(key, data, map_), keys)
-
-    def advance_all(states: Any, data: Data, map_: transport.StandardMap, count: int) -> Any:
-        return jax.lax.map(partial(advance, data=data, map_=map_, count=count), states)
-
-    return Programs(jax.jit(start_all), jax.jit(advance_all, static_argnames="count"))
+    return Programs(start, advance, density.at_once)
 
 
 class _State(NamedTuple):
@@ -142,7 +184,7 @@ class _State(NamedTuple):
     run: Any  # _PILOT or _FINAL
     warmed: Any  # iterations of warm-up done
     map_: transport.StandardMap
-    states: Any
+    states: tuple[Any, ...]
     draws: Draws
 
 
@@ -219,9 +261,9 @@ class Chains:
 
     def _advance(self, wanted: int) -> tuple[Draws, int]:
         count = min(_CHUNK, wanted)
-        self.states, draws = self.programs.advance(self.states, self.data, self.map_, count=count)
+        self.states, draws = self.programs.advance(self.states, self.data, self.map_, count)
         self._show(count)
-        return jax.tree.map(np.asarray, draws), count
+        return draws, count
 
     def _show(self, count: int) -> None:
         pilot = 0 if self.density.dimension == 1 else self._warmup + self._pilot
@@ -237,10 +279,7 @@ class Chains:
     def _template(self) -> _State:
         number = jax.ShapeDtypeStruct((), int)
         map_ = transport.standard_identity(self.density.dimension)
-        keys = jax.random.split(jax.random.key(0), self.options.chains)
-        states, _ = jax.eval_shape(self.programs.start, keys, self.data, map_)
-        advance = partial(self.programs.advance, count=1)
-        _, draws = jax.eval_shape(advance, states, self.data, map_)
+        states, draws = self.programs.shapes(self.options.chains, self.data, map_)
         return _State(number, number, map_, states, draws)
 
 

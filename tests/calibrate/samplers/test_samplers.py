@@ -1,14 +1,22 @@
 """Every sampler of the registry against a closed form, and the rules that all of them share."""
 
+import threading
+from dataclasses import replace
+
 import arviz_stats
+import jax
 import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.samplers import SAMPLERS, BlackJAXNUTSOptions, find_sampler, r_hat
+from calibrate.samplers import SAMPLERS, BlackJAXNUTSOptions, density, find_sampler, r_hat
+from calibrate.samplers.density import density_of
+from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.options import ChainOptions
+from calibrate.samplers.run import Programs
 from calibrate.samplers.stopping import converged
 from emulator.errors import InputError
+from emulator.surrogates.fem import fem_forward
 from linear_support import PRIOR_MEAN, PRIOR_SD, LinearFEM, closed_form, linear_problem
 
 
@@ -91,3 +99,43 @@ def test_an_unknown_sampler_and_options_of_another_are_refused(problem):
 def test_limits_that_cannot_work(bad):
     with pytest.raises(InputError, match=f"chains: {next(iter(bad))} is"):
         ChainOptions(**bad)
+
+
+def test_chains_run_side_by_side_and_draw_what_they_draw_alone(beam):
+    """Two chains meet inside the density: neither could go on without the other."""
+    model, data = linear_problem(beam)
+    posterior = density_of(model)
+    together = threading.Barrier(2, timeout=60.0)
+
+    def met(z, data):
+        value = posterior.log_density(z, data)
+        return value + jax.pure_callback(wait, jax.ShapeDtypeStruct((), float), value)
+
+    def wait(value):
+        together.wait()
+        return np.zeros_like(value)
+
+    def start(key, data, map_):
+        z = jax.random.normal(key, (posterior.dimension,))
+        return z, met(z, data)
+
+    keys = jax.random.split(jax.random.key(0), 4)
+    programs = Programs(start, lambda state, data, map_, count: (state, None), at_once=2)
+    states, heights = programs.start(keys, data, None)
+    for key, z, height in zip(keys, states, heights, strict=True):
+        np.testing.assert_array_equal(z, jax.random.normal(key, (posterior.dimension,)))
+        np.testing.assert_allclose(height, posterior.log_density(z, data), rtol=1e-12)
+
+    def drawn(at_once):
+        options = NUTSOptions(draws=40, warmup=40, rounds=1)
+        return NUTS.sample(posterior._replace(at_once=at_once), data, options, seed=3)
+
+    np.testing.assert_array_equal(drawn(3).z, drawn(1).z)
+
+
+def test_as_many_chains_at_once_as_the_map_bears(beam, simulator, monkeypatch):
+    monkeypatch.setattr(density, "cores", lambda: 8)
+    monkeypatch.setattr(density, "at_once", lambda simulator: 3)
+    model, _ = linear_problem(beam)
+    assert density_of.__wrapped__(model).at_once == 8
+    assert density_of.__wrapped__(replace(model, forward=fem_forward(simulator))).at_once == 3

@@ -7,13 +7,13 @@ one core. Two solves on two cores take 0.56 of the time of one after the other o
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from emulator.fem.linear.suitesparse import keep_factors
 from emulator.fem.simulator import Simulator
+from emulator.machine import cores, memory
 
 _BYTES_A_NODE = 100_000  # of one more solve beside others; 54 000 measured at 33 605 nodes
 _SHARE = 0.5  # of the machine's memory
@@ -31,7 +31,7 @@ def at_once(simulator: Simulator, nodes: int | None = None) -> int:
     if not isinstance(simulator, Simulator) or simulator.system.stepwise:
         return 1
     each = _BYTES_A_NODE * (nodes or len(simulator.scene.mesh.nodes))
-    return max(1, int(min(_cores(), _SHARE * _memory() / each)))
+    return max(1, int(min(cores(), _SHARE * memory() / each)))
 
 
 def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Iterator[R]:
@@ -60,18 +60,3 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
                 yield under_way.popleft().result()
         finally:
             pool.shutdown(cancel_futures=True)
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _memory() -> float:
-    """Bytes of memory of this machine; without bounds where it does not say."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):
-        return float("inf")
