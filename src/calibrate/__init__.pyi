@@ -28,6 +28,7 @@ from .samplers import Density, NUTSOptions, density_of
 from .sensitivity_analysis import sensitivity
 from .statistical_model import Model
 from .statistical_model.build import model
+from .um_bridge import serve
 from .workflow import load
 from .workflow.campaigns import campaign
 
@@ -66,6 +67,7 @@ __all__ = [
     "sbc",
     "segment_strains",
     "sensitivity",
+    "serve",
     "strains",
     "surface_points",
     "truncated",

@@ -1,4 +1,4 @@
-"""From a mesh and a data file to a certified posterior: seconds of each command.
+"""From a bare mesh and a data file to the report of a certified posterior: each command's seconds.
 
 ``python -m studies.mesh_to_certificate [--ventricles N] [--mesh RINGS AROUND LAYERS]``. Each
 command is a process of its own, and the cache of compiled programs is empty before the first, as
@@ -37,65 +37,13 @@ VENTRICLES = {
     "human": (EllipsoidalWall(23.0, 58.0, 34.0, 65.0, 20.0), (8, 28, 3)),
     "dilated, thin": (EllipsoidalWall(30.0, 62.0, 38.0, 68.0, 22.0), (10, 36, 2)),
 }
-SCENE = """
-law = "holzapfel_ogden"
-mesh = "mesh.vtu"
-
-[fibres]
-rule = "helix"
-angles = [60.0, -60.0]
-
-[[supports]]
-node_set = "base"
-
-[[loads]]
-kind = "cavity_pressure"
-facet_set = "endocardium"
-
-[parameters.a]
-unit = "kPa"
-range = [0.2, 0.52]
-scale = "log"
-
-[parameters.b]
-unit = ""
-range = [1.0, 4.2]
-scale = "log"
-
-[parameters.a_f]
-unit = "kPa"
-range = [3.0, 10.36]
-scale = "log"
-
-[parameters.b_f]
-unit = ""
-range = [1.0, 4.46]
-scale = "log"
-
-[parameters.pressure]
-unit = "kPa"
-range = [0.53, 1.33]
-
-[constants]
-kappa = 25.0
-"""
-
-
-def prepare(name: str, size: tuple[int, int, int], folder: Path) -> int:
-    """What a user begins with: mesh, scene file and measurements; the number of nodes."""
-    mesh = truncated_ellipsoid(VENTRICLES[name][0], *size, 2, grading=1.5)
-    write_mesh(folder / "mesh.vtu", mesh)
-    (folder / "scene.toml").write_text(SCENE)
-    run = Run(
-        str(folder / "scene.toml"),
-        truth=TRUTH,
-        observe="landmarks:24+volume",
-        noise=NOISE,
-        seed=SEED,
-    )
-    observe, data = make_data(run, find_scene(run.scene))
-    write_data(folder / "data.csv", observe, data)
-    return len(mesh.nodes)
+STAGES = {
+    "init": "init (a first scene file)",
+    "train": "train (21 FEM runs)",
+    "infer": "infer (NUTS, 4 x 1000)",
+    "certify": "certify (200 FEM runs)",
+    "report": "report (one HTML page)",
+}
 
 
 def timed(folder: Path, *words: str) -> tuple[float, dict[str, Any]]:
@@ -113,30 +61,44 @@ def timed(folder: Path, *words: str) -> tuple[float, dict[str, Any]]:
     return seconds, json.loads(done.stdout)
 
 
+def measure(folder: Path) -> int:
+    """The data file of the body, by FEM; the number of nodes of its mesh."""
+    run = Run(
+        str(folder / "body.toml"),
+        truth=TRUTH,
+        observe="landmarks:24+volume",
+        noise=NOISE,
+        seed=SEED,
+    )
+    scene = find_scene(run.scene)
+    write_data(folder / "data.csv", *make_data(run, scene))
+    return len(scene.mesh.nodes)
+
+
 def one(name: str, size: tuple[int, int, int]) -> dict[str, Any]:
-    """Train, infer and certify on one ventricle."""
+    """From the mesh file of one ventricle to the page of its posterior."""
+    noise = [f"{key}={value}" for key, value in NOISE.items()]
+    known = ("body.toml", "--emulator", "emulator", "--data", "data.csv", "--noise", *noise)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        nodes = prepare(name, size, folder)
-        train_s, _ = timed(
-            folder, "train", "scene.toml", "--recipe", "mechanics", "--out", "emulator"
-        )
-        noise = [f"{key}={value}" for key, value in NOISE.items()]
-        known = ("scene.toml", "--emulator", "emulator", "--data", "data.csv")
-        infer_s, result = timed(
-            folder, "infer", *known, "--noise", *noise, "--no-certify", "--out", "posterior"
-        )
-        certify_s, certificate = timed(folder, "certify", "posterior")
+        mesh = truncated_ellipsoid(VENTRICLES[name][0], *size, grading=1.5)
+        write_mesh(folder / "body.msh", mesh)
+        seconds = {"init": timed(folder, "init", "body.msh")[0]}
+        nodes = measure(folder)
+        recipe = ("--recipe", "mechanics", "--out", "emulator")
+        seconds["train"], _ = timed(folder, "train", "body.toml", *recipe)
+        out = ("--no-certify", "--out", "posterior")
+        seconds["infer"], result = timed(folder, "infer", *known, *out)
+        seconds["certify"], certificate = timed(folder, "certify", "posterior")
+        seconds["report"], _ = timed(folder, "report", "posterior")
     table = result["parameters"]
     z = {n: (TRUTH[n] - row["mean"]) / row["sd"] for n, row in table.items()}
     case = {
         "name": name,
         "status": certificate["verdict"],
         "nodes": nodes,
-        "train_s": round(train_s, 1),
-        "infer_s": round(infer_s, 1),
-        "certify_s": round(certify_s, 1),
-        "total_s": round(train_s + infer_s + certify_s, 1),
+        **{f"{stage}_s": round(took, 1) for stage, took in seconds.items()},
+        "total_s": round(sum(seconds.values()), 1),
         "r_hat": max(row["r_hat"] for row in table.values()),
         "ess_bulk": min(row["ess_bulk"] for row in table.values()),
         "ess_tail": min(row["ess_tail"] for row in table.values()),
@@ -145,9 +107,9 @@ def one(name: str, size: tuple[int, int, int]) -> dict[str, Any]:
         "mesh": certificate["certificate"]["mesh"],
         "truth_z": z,
     }
+    stages = ", ".join(f"{stage} {took:.0f} s" for stage, took in seconds.items())
     print(
-        f"{name:14s} {nodes} nodes: train {train_s:.0f} s, infer {infer_s:.0f} s, certify "
-        f"{certify_s:.0f} s, total {case['total_s']:.0f} s; {case['status']}, "
+        f"{name:14s} {nodes} nodes: {stages}, total {case['total_s']:.0f} s; {case['status']}, "
         f"R-hat {case['r_hat']:.4f}, ESS {case['ess_bulk']:.0f}, {case['divergences']} divergences",
         flush=True,
     )
@@ -160,12 +122,8 @@ def draw(cases: list[dict[str, Any]], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7.5, 1.2 + 0.6 * len(cases)), layout="constrained")
     names = [f"{case['name']}\n{case['nodes']} nodes" for case in cases]
     left = np.zeros(len(cases))
-    for key, label in (
-        ("train_s", "train (21 FEM runs)"),
-        ("infer_s", "infer (NUTS, 4 x 1000)"),
-        ("certify_s", "certify (200 FEM runs)"),
-    ):
-        seconds = np.array([case[key] for case in cases])
+    for stage, label in STAGES.items():
+        seconds = np.array([case[f"{stage}_s"] for case in cases])
         axes.barh(names, seconds, left=left, label=label)
         left += seconds
     axes.axvline(AIM, color="0.3", ls="--", label="aim: 5 minutes")

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import add_scene, assignments, scene_words
 from calibrate.cli.forward import add_forward, forward_options
 from calibrate.cli.noise_words import discrepancy_words, noise_scale_words, noise_words
 from emulator.errors import InputError
+
+if TYPE_CHECKING:
+    from emulator.surrogates.additive import Emulator
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
@@ -164,3 +167,17 @@ def emulator_word(word: str | None) -> str | None:
     from emulator.surrogates import shipped
 
     return word if word is None or word in shipped() else _absolute(word)
+
+
+def emulator_of(body: str, emulator: str | None = None) -> Emulator:
+    """The emulator called ``body``, or the one of a scene: ``emulator``, or the one shipped."""
+    from emulator.catalogue import find_scene
+    from emulator.surrogates import load
+
+    found = load(emulator or body)
+    if emulator and find_scene(body).fingerprint != found.scene.fingerprint:
+        raise InputError(
+            f"--emulator {emulator} is of scene '{found.scene.name}', or of another mesh, not of "
+            f"'{body}'"
+        )
+    return found

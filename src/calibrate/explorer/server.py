@@ -6,7 +6,6 @@ import json
 import threading
 from collections.abc import Mapping
 from functools import cached_property
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from plotly.offline import get_plotlyjs
 
+from calibrate.local_server import Handler, Server, listen
 from calibrate.observations.pressure_volume import PressureVolume, pressure_volume
 from emulator.error.estimate import error_bar
 from emulator.errors import InputError
@@ -24,8 +24,6 @@ from emulator.geometry.cavity import Cavity
 from emulator.geometry.facets import surface_mesh
 from emulator.scenes.cavities import cavity_sets
 from emulator.surrogates.additive import Emulator
-
-LOOPBACK = "127.0.0.1"
 
 
 class Explorer:
@@ -162,57 +160,34 @@ class Explorer:
         return jax.jit(self._curve.volumes)
 
 
-class _Handler(BaseHTTPRequestHandler):
-    """Answers one request; the explorer is the server's."""
-
-    server: _Server
-    protocol_version = "HTTP/1.1"
+class _Handler(Handler):
+    """Answers one request; the explorer is the server's subject."""
 
     def do_GET(self) -> None:
         """The page, or an answer."""
         address = urlsplit(self.path)
-        # A page elsewhere that has its name resolved to this machine sends its own name.
-        if self.headers.get("Host", "").split(":")[0] not in (LOOPBACK, "localhost"):
-            self._send(403, b"this page is for this machine only\n", "text/plain")
+        if self.is_foreign():
+            self.send(403, b"this page is for this machine only\n", "text/plain")
             return
         if address.path == "/":
-            self._send(200, self.server.explorer.page, "text/html; charset=utf-8")
+            self.send(200, self.server.subject.page, "text/html; charset=utf-8")
             return
         name = address.path.removeprefix("/")
         if name not in ("at", "curve", "error", "compare"):
-            self._send(404, b"there are /, /at, /curve, /error and /compare\n", "text/plain")
+            self.send(404, b"there are /, /at, /curve, /error and /compare\n", "text/plain")
             return
         try:
-            found = getattr(self.server.explorer, name)(dict(parse_qsl(address.query)))
+            found = getattr(self.server.subject, name)(dict(parse_qsl(address.query)))
         except InputError as fault:
-            self._send(400, f"{fault}\n".encode(), "text/plain; charset=utf-8")
+            self.send(400, f"{fault}\n".encode(), "text/plain; charset=utf-8")
             return
         if isinstance(found, bytes):
-            self._send(200, found, "application/octet-stream")
+            self.send(200, found, "application/octet-stream")
         else:
-            self._send(200, json.dumps(found).encode(), "application/json")
-
-    def _send(self, code: int, content: bytes, kind: str) -> None:
-        self.send_response(code)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, *_: object) -> None:
-        """Say nothing of each request."""
+            self.send(200, json.dumps(found).encode(), "application/json")
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-
-    def __init__(self, explorer: Explorer, port: int) -> None:
-        self.explorer = explorer
-        super().__init__((LOOPBACK, port), _Handler)
-
-
-def serve(explorer: Explorer, port: int = 0) -> ThreadingHTTPServer:
+def serve(explorer: Explorer, port: int = 0) -> Server:
     """A server on the loopback address, ready for ``serve_forever``; port 0 takes a free one.
 
     Raises
@@ -220,7 +195,4 @@ def serve(explorer: Explorer, port: int = 0) -> ThreadingHTTPServer:
     InputError
         A port that is taken, or none.
     """
-    try:
-        return _Server(explorer, port)
-    except (OSError, OverflowError) as error:
-        raise InputError(f"port {port}: {error}; give another, or 0 for a free one") from error
+    return listen(_Handler, explorer, port)

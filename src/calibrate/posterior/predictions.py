@@ -21,14 +21,9 @@ from numpyro import handlers
 
 from calibrate.noise.spatial import SpatialNormal
 from calibrate.observations import Observation
+from calibrate.observations.outputs import Outputs
 from calibrate.statistical_model import Data, Model
-from emulator.surrogates.protocol import (
-    ForwardMap,
-    Prediction,
-    SolvingMap,
-    evaluate_all,
-    require_answers,
-)
+from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, evaluate_all
 
 REPLICATES = 500  # draws of the posterior, and of the prior, that data is replicated at
 
@@ -64,9 +59,14 @@ def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> n
     InputError
         ``forward`` has no answer at one of them.
     """
-    found = evaluate_all(forward.at(np.asarray(observe.nodes)), thetas)
-    require_answers(forward, found, "prediction")
-    return np.asarray(jax.jit(jax.vmap(observe))(found.displacement, thetas))
+    asked: Any = (forward, observe)
+    return _outputs(*asked).values(thetas).reshape(-1, *observe.shape)
+
+
+@lru_cache(maxsize=4)
+def _outputs(forward: ForwardMap, observe: Observation) -> Outputs:
+    """Kept, so that a loop over pressures compiles once."""
+    return Outputs(forward, {"observed": observe})
 
 
 def replicates(model: Model, draws: Draws, rng_key: jax.Array) -> dict[str, np.ndarray]:

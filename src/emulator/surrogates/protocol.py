@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -87,11 +88,16 @@ class SolvingMap(ABC):
 _AT_ONCE = 64  # theta evaluated side by side
 
 
+def evaluator(forward: ForwardMap) -> Callable[[jax.Array], Prediction]:
+    """Predictions at many theta (c, p), by a program that is compiled when first called."""
+    if isinstance(forward, SolvingMap):
+        return forward.evaluate_all
+    return jax.jit(lambda t: jax.lax.map(forward.evaluate, t, batch_size=_AT_ONCE))
+
+
 def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
     """Predictions at many theta (c, p); fields gain a leading axis."""
-    if isinstance(forward, SolvingMap):
-        return forward.evaluate_all(thetas)
-    return jax.jit(lambda t: jax.lax.map(forward.evaluate, t, batch_size=_AT_ONCE))(thetas)
+    return evaluator(forward)(thetas)
 
 
 def require_answers(forward: ForwardMap, predicted: Prediction, what: str) -> None:

@@ -8,7 +8,7 @@ import webbrowser
 from typing import Any
 
 from calibrate.cli.common import DONE, emit, needing_plotly
-from emulator.errors import InputError
+from calibrate.cli.model_words import emulator_of
 
 
 def register(commands: Any) -> None:
@@ -32,17 +32,10 @@ def register(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until interrupted."""
     with needing_plotly("exploring needs"):
-        from calibrate.explorer import LOOPBACK, Explorer, serve
-    from emulator.catalogue import find_scene
-    from emulator.surrogates import load
+        from calibrate.explorer import Explorer, serve
+    from calibrate.local_server import LOOPBACK
 
-    emulator = load(arguments.emulator or arguments.body)
-    if arguments.emulator and find_scene(arguments.body).fingerprint != emulator.scene.fingerprint:
-        raise InputError(
-            f"--emulator {arguments.emulator} is of scene '{emulator.scene.name}', or of another "
-            f"mesh, not of '{arguments.body}'"
-        )
-    explorer = Explorer(emulator)
+    explorer = Explorer(emulator_of(arguments.body, arguments.emulator))
     with serve(explorer, arguments.port) as server:
         address = f"http://{LOOPBACK}:{server.server_address[1]}/"
         told = {"scene": explorer.scene.name, "address": address}

@@ -1,0 +1,81 @@
+"""``calibrate serve``: a forward map for other programs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from calibrate.cli.common import DONE, emit
+from calibrate.cli.model_words import emulator_of
+from emulator.errors import InputError
+
+
+def register(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "serve",
+        help="an emulator, or FEM, for other programs, by the UM-Bridge protocol",
+        description="The model 'forward': theta to what is observed, with derivatives, for QUEENS, "
+        "tinyDA, PyMC and whatever else speaks UM-Bridge. End with Ctrl-C.",
+        epilog="example: calibrate serve left_ventricle --observe landmarks:24+volume",
+    )
+    parser.add_argument(
+        "body", metavar="EMULATOR|SCENE", help="an emulator's shipped name or folder, or a scene"
+    )
+    parser.add_argument("--emulator", metavar="E", help="of the scene: shipped name or folder")
+    parser.add_argument("--fem", action="store_true", help="FEM of the scene instead")
+    parser.add_argument(
+        "--observe",
+        metavar="WHAT",
+        help="as for infer (default: the volumes of the scene's cavities, or landmarks:24)",
+    )
+    parser.add_argument("--port", type=int, default=4242, help="default 4242; 0 for a free one")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="default: this machine alone; 0.0.0.0 for all that reach it, without a password",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve until interrupted."""
+    from calibrate.observations import parse_observation
+    from calibrate.um_bridge import NAME, serve
+    from emulator.catalogue import find_scene
+    from emulator.fem import Simulator
+    from emulator.scenes.cavities import cavity_sets
+    from emulator.surrogates.fem import fem_forward
+    from emulator.surrogates.protocol import ForwardMap
+
+    if arguments.fem and arguments.emulator:
+        raise InputError("serve: --fem takes no --emulator")
+    forward: ForwardMap
+    if arguments.fem:
+        forward = fem_forward(Simulator(find_scene(arguments.body)))
+    else:
+        forward = emulator_of(arguments.body, arguments.emulator).cache()
+    scene = forward.scene
+    default = "volume" if cavity_sets(scene) else "landmarks:24"
+    observe = parse_observation(scene, arguments.observe or default)
+    with serve(forward, observe, arguments.port, arguments.host) as server:
+        model = server.subject
+        address = f"http://{arguments.host}:{server.server_address[1]}"
+        outputs = [
+            {"name": name, "numbers": size, "unit": model.units[name]}
+            for name, size in zip(model.units, model.output_sizes, strict=True)
+        ]
+        names = list(scene.parameter_names)
+        told = {"address": address, "name": NAME, "input": names, "output": outputs}
+        numbers = ", ".join("{name} ({numbers}, {unit})".format_map(each) for each in outputs)
+        text = (
+            f"{address}, model '{NAME}': {model.label} of {scene.name}\n"
+            f"input: {', '.join(names)}\noutput: {numbers}\nCtrl-C ends it"
+        )
+        emit(told, as_json=arguments.json, text=text)
+        sys.stdout.flush()
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            print("ended", file=sys.stderr)
+    return DONE

@@ -1,0 +1,63 @@
+"""HTTP to this machine: what the explorer's page and the UM-Bridge protocol share."""
+
+from __future__ import annotations
+
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from emulator.errors import InputError
+
+LOOPBACK = "127.0.0.1"
+_OF_THIS_MACHINE = (LOOPBACK, "localhost")
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Answers one request about the server's ``subject``."""
+
+    server: Server
+    protocol_version = "HTTP/1.1"
+
+    def is_foreign(self) -> bool:
+        """Whether a page elsewhere asks that has its name resolved to this machine.
+
+        It sends its own name. A server that listens to other machines expects other names.
+        """
+        named = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+        return self.server.server_address[0] == LOOPBACK and named not in _OF_THIS_MACHINE
+
+    def send(self, code: int, content: bytes, kind: str) -> None:
+        """Answer with ``content`` of the media type ``kind``."""
+        self.send_response(code)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing of each request."""
+
+
+class Server(ThreadingHTTPServer):
+    """Requests of several threads about one ``subject``."""
+
+    daemon_threads = True
+
+    def __init__(self, handler: type[Handler], subject: Any, host: str, port: int) -> None:
+        self.subject = subject
+        super().__init__((host, port), handler)
+
+
+def listen(handler: type[Handler], subject: Any, port: int = 0, host: str = LOOPBACK) -> Server:
+    """A server, ready for ``serve_forever``; port 0 takes a free one.
+
+    Raises
+    ------
+    InputError
+        A port that is taken, or none; an address that is not this machine's.
+    """
+    try:
+        return Server(handler, subject, host, port)
+    except (OSError, OverflowError) as error:
+        where = f"port {port}" if host == LOOPBACK else f"{host}, port {port}"
+        raise InputError(f"{where}: {error}; give another, or 0 for a free port") from error
