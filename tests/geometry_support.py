@@ -34,17 +34,6 @@ def volume(mesh):
     return float((J @ weights).sum())
 
 
-def dihedral_angles(mesh):
-    """The six dihedral angles (m, 6) in degrees of each element, by its corners."""
-    corner = mesh.nodes[mesh.elements[:, :4]]
-    normals = []
-    for a, b, c in _FACES:
-        n = np.cross(corner[:, b] - corner[:, a], corner[:, c] - corner[:, a])
-        normals.append(n / np.linalg.norm(n, axis=1, keepdims=True))
-    cosines = [-np.einsum("mi,mi->m", normals[a], normals[b]) for a, b in _EDGES]
-    return np.degrees(np.arccos(np.clip(np.stack(cosines, axis=1), -1.0, 1.0)))
-
-
 def assert_sound(mesh, patches=()):
     """Positive volumes, a conforming mesh, a closed surface that the facet sets divide up.
 

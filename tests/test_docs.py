@@ -40,6 +40,17 @@ def test_the_site_builds_without_a_warning(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_examples_of_the_readme_run(capsys):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    names = {}
+    for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
+        exec(compile(code, "README.md", "exec"), names)
+    said = capsys.readouterr().out
+    assert "accepted" in said
+    assert 120.0 < float(said.split()[-1]) < 180.0  # mL
+
+
+@pytest.mark.slow
 def test_the_quick_start_runs(capsys):
     text = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)

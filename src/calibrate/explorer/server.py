@@ -96,7 +96,11 @@ class Explorer:
         if self._curve is None:
             raise InputError(f"scene '{self.scene.name}' has no cavity whose pressure varies")
         volumes = self._volumes(self.theta(position))
-        return {"pressure": self._curve.pressures.tolist(), "volume": np.asarray(volumes).tolist()}
+        return {
+            "pressure": self._curve.pressures.tolist(),
+            "volume": np.asarray(volumes).tolist(),
+            "rest": self._curve.rest,
+        }
 
     def error(self, position: Mapping[str, str]) -> dict[str, Any]:
         """The guard's verdict, and the estimated error in mm and mL."""

@@ -11,22 +11,29 @@ import numpy as np
 
 from calibrate.observations.volume import CavityVolume
 from emulator.scenes.cavities import inflated_cavity
+from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap
 
 _PRESSURES = 12
 
 
+def in_mmhg(kpa: float) -> str:
+    """A pressure of so many kPa in both units."""
+    return f"{kpa:.3g} kPa ({kpa / KPA_PER_MMHG:.3g} mmHg)"
+
+
 class PressureVolume(NamedTuple):
     """A pressure-volume curve as a function of theta.
 
-    volume : of the cavity. parameter : the pressure in it.
+    volume : of the cavity. parameter : the pressure in it. rest : mL, of the unloaded body.
     pressures : (k,), in the parameter's unit.
     volumes : theta (p,), of any pressure, -> (k,) mL.
     """
 
     volume: CavityVolume
     parameter: Parameter
+    rest: float
     pressures: np.ndarray
     volumes: Callable[[jax.Array], jax.Array]
 
@@ -48,4 +55,5 @@ def pressure_volume(forward: ForwardMap) -> PressureVolume | None:
 
         return jax.lax.map(one, jnp.asarray(pressures))
 
-    return PressureVolume(volume, parameter, pressures, volumes)
+    rest = float(volume.cavity.rest)
+    return PressureVolume(volume, parameter, rest, pressures, volumes)

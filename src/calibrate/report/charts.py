@@ -14,9 +14,10 @@ from scipy.stats import rankdata
 from calibrate.figures.palette import BLUE, COLOURS, VERMILION
 from calibrate.identifiability.stress import stress_band
 from calibrate.observations import Observation
-from calibrate.observations.pressure_volume import pressure_volume
+from calibrate.observations.pressure_volume import in_mmhg, pressure_volume
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
+from emulator.scenes.loads import KPA_PER_MMHG
 
 _CHAINS = COLOURS[:6]
 _BAND = "rgba(0, 114, 178, 0.22)"
@@ -185,12 +186,21 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
         x=[*low, *high[::-1]], y=[*p, *p[::-1]], fill="toself", fillcolor=_BAND, line_width=0,
         name="90 % of the posterior", hoverinfo="skip",
     )  # fmt: skip
-    figure.add_scatter(x=middle, y=p, line_color=BLUE, name="median")
+    figure.add_scatter(
+        x=middle, y=p, line_color=BLUE, name="median", text=[in_mmhg(each) for each in p],
+        hovertemplate="%{x:.1f} mL at %{text}",
+    )  # fmt: skip
+    figure.add_scatter(
+        x=[curve.rest, middle[0]], y=[0.0, p[0]], line={"color": BLUE, "dash": "dot"},
+        marker={"color": BLUE, "size": 8, "symbol": "circle-open"}, mode="lines+markers",
+        name="without load, as the mesh is",
+    )  # fmt: skip
     for seen, part in model.observe.parts.items():
         if part.to_json() == curve.volume.to_json():
             _add_measured(figure, posterior, seen, name)
     figure.update_layout(
-        xaxis_title="cavity volume (mL)", yaxis_title=f"{name} ({curve.parameter.unit})"
+        xaxis_title="cavity volume (mL)",
+        yaxis_title=f"{name} ({curve.parameter.unit}; 1 mmHg is {KPA_PER_MMHG:.3f})",
     )
     return figure
 

@@ -16,6 +16,7 @@ import numpy as np
 from emulator.errors import InputError, look_up
 from emulator.geometry.io import Body, read_body, write_mesh
 from emulator.geometry.mesh import Mesh
+from emulator.geometry.quality import mesh_quality
 from emulator.geometry.tetrahedra import EDGES
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.quantity import Quantity
@@ -92,6 +93,9 @@ def draft(
     body, mesh_name = _in_mm(body, mesh_path, out, unit, notes)
     if body.mesh.order == 1:
         notes.append(_LINEAR)
+    quality = mesh_quality(body.mesh)
+    if quality.flat or quality.parts > 1:
+        notes.append(quality.sentence())
     chosen = _law(body, law, notes)
     support = _support(body.mesh, notes)
     for load, lines, note in _loads(body.mesh):

@@ -98,6 +98,10 @@ def test_the_body_deforms_by_the_draws(ventricle_posterior):
     assert figure.data[2].name == "fibres"
 
 
+def curve_rest(posterior):
+    return float(cal.CavityVolume(posterior.model.forward.scene).cavity.rest)
+
+
 def test_charts_say_what_was_drawn(ventricle_posterior):
     named = dict(charts.against_data(ventricle_posterior))
     assert set(named) == {"displacement", "volume"}
@@ -105,7 +109,11 @@ def test_charts_say_what_was_drawn(ventricle_posterior):
     curve = charts.volume_band(ventricle_posterior)
     median = curve.data[1]
     assert (np.diff(median.x) > 0.0).all()  # a stiffer pressure, a larger cavity
-    assert curve.data[2].x[0] == pytest.approx(float(ventricle_posterior.data["volume"]))
+    unloaded = curve.data[2]
+    assert (unloaded.x[0], unloaded.y[0]) == (curve_rest(ventricle_posterior), 0.0)
+    assert unloaded.x[1] == median.x[0] > unloaded.x[0]
+    assert median.text[-1].endswith(f"({median.y[-1] / 0.133322:.3g} mmHg)")
+    assert curve.data[3].x[0] == pytest.approx(float(ventricle_posterior.data["volume"]))
     ranks = [
         t for t in charts.traces(ventricle_posterior).data if t.type == "scatter" and t.line.shape
     ]

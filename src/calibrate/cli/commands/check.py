@@ -60,7 +60,9 @@ def register(commands: Any) -> None:
 
 
 def _add_mesh(kinds: Any) -> None:
-    mesh = kinds.add_parser("mesh", help="how far a scene's mesh is from a finer one of its body")
+    mesh = kinds.add_parser(
+        "mesh", help="shapes of its elements, and how far it is from a finer one"
+    )
     add_scene(mesh)
     add_theta(mesh)
     mesh.add_argument(
@@ -81,11 +83,13 @@ def run_mesh(arguments: argparse.Namespace) -> int:
     from calibrate.observations.mesh_error import errors_of
     from emulator.catalogue import find_scene
     from emulator.error.mesh_error import mesh_error
+    from emulator.geometry.quality import mesh_quality
     from emulator.store import check_folder, write_json
 
     folder = None if arguments.out is None else check_folder(arguments.out)
     scene = find_scene(*scene_words(arguments))
     theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
+    quality = mesh_quality(scene.mesh)
     found = mesh_error(scene)
     told = found(theta)
     rows = errors_of(found, told, arguments.observe, arguments.seed)
@@ -94,6 +98,7 @@ def run_mesh(arguments: argparse.Namespace) -> int:
         "scene": scene.name,
         "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
         "nodes": len(scene.mesh.nodes),
+        "quality": {**quality._asdict(), "place": quality.place.tolist()},
         "finer_nodes": len(found.finer.scene.mesh.nodes),
         "err_u": {"median": float(np.median(told.err_u)), "max": float(np.max(told.err_u))},
         "displacement": {"median": float(np.median(length)), "max": float(length.max())},
@@ -106,7 +111,8 @@ def run_mesh(arguments: argparse.Namespace) -> int:
     ]
     text = (
         f"{scene.name}: {result['nodes']} nodes, beside {result['finer_nodes']} on a finer mesh of "
-        f"the same body\ndisplacement: off by {result['err_u']['median']:.3g} mm (median of the "
+        f"the same body\n{quality.sentence()}\n"
+        f"displacement: off by {result['err_u']['median']:.3g} mm (median of the "
         f"nodes), {result['err_u']['max']:.3g} mm at most, of {result['displacement']['max']:.4g}\n"
         + table(header, cells)
     )

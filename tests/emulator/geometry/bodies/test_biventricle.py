@@ -5,7 +5,8 @@ from emulator.errors import InputError
 from emulator.geometry.bodies.biventricle import biventricle
 from emulator.geometry.bodies.ellipsoid import HUMAN
 from emulator.geometry.bodies.right_ventricle import RightVentricle, Septum
-from geometry_support import assert_sound, dihedral_angles, order_of, volume
+from emulator.geometry.quality import dihedral_angles
+from geometry_support import assert_sound, order_of, volume
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -10,7 +10,8 @@ from emulator.geometry.bodies.ellipsoid import (
     land_ventricle,
     truncated_ellipsoid,
 )
-from geometry_support import assert_sound, dihedral_angles, order_of, volume
+from emulator.geometry.quality import dihedral_angles
+from geometry_support import assert_sound, order_of, volume
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -4,7 +4,8 @@ import pytest
 from emulator.errors import InputError
 from emulator.geometry.bodies.organ import organ
 from emulator.geometry.bodies.organ import volume as exact
-from geometry_support import assert_sound, dihedral_angles, order_of, volume
+from emulator.geometry.quality import dihedral_angles
+from geometry_support import assert_sound, order_of, volume
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -3,7 +3,8 @@ import pytest
 
 from emulator.errors import InputError
 from emulator.geometry.bodies.sphere import sphere_octant
-from geometry_support import assert_sound, dihedral_angles, order_of, volume
+from emulator.geometry.quality import dihedral_angles
+from geometry_support import assert_sound, order_of, volume
 
 
 @pytest.mark.parametrize("order", [1, 2])

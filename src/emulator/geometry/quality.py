@@ -1,0 +1,76 @@
+r"""How well shaped the elements of a mesh are.
+
+The dihedral angle between two faces with outward normals :math:`n_i, n_j` is
+:math:`\pi - \arccos(n_i \cdot n_j)`, 70.5 degrees in a regular tetrahedron. Small ones make the
+stiffness matrix ill-conditioned, large ones (near 180) make gradients wrong: flat elements have
+both. A curved element's Jacobian varies; where it nearly vanishes, the element nearly folds.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from emulator.geometry.discretisation import discretise
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import FACES, parts
+
+FLAT = 3.0
+"""Degrees; elements with a smaller dihedral angle are worth a word."""
+
+
+class MeshQuality(NamedTuple):
+    """Shapes of a mesh's elements.
+
+    parts : disconnected ones.
+    angle : smallest dihedral angle, degrees. flat : elements with one below :data:`FLAT`.
+    place : (3,) mm, middle of the element with the smallest angle.
+    jacobian : least ratio of an element's smallest Jacobian to its mean, at quadrature points; 1
+        where elements are straight.
+    """
+
+    parts: int
+    angle: float
+    flat: int
+    place: np.ndarray
+    jacobian: float
+
+    def sentence(self) -> str:
+        """All of it, in one line."""
+        place = ", ".join(f"{x:.4g}" for x in self.place)
+        pieces = "1 part" if self.parts == 1 else f"{self.parts} parts"
+        text = f"{pieces}; smallest dihedral angle {self.angle:.3g} degrees, at ({place})"
+        if self.flat:
+            text += f", {self.flat} element{'s' * (self.flat > 1)} below {FLAT:g}: remesh there"
+        if self.jacobian < 1.0:
+            text += f"; least Jacobian {self.jacobian:.2f} of its element's mean"
+        return text
+
+
+def mesh_quality(mesh: Mesh) -> MeshQuality:
+    """The quality of a mesh, from its corners, and from quadrature points where it is curved."""
+    angles = dihedral_angles(mesh)
+    smallest = angles.min(axis=1)
+    worst = int(np.argmin(smallest))
+    weights = discretise(mesh).weights
+    ratio = float((weights.min(axis=1) / weights.mean(axis=1)).min())
+    return MeshQuality(
+        parts=int(parts(mesh.elements, len(mesh.nodes)).max()) + 1,
+        angle=float(smallest[worst]),
+        flat=int((smallest < FLAT).sum()),
+        place=mesh.nodes[mesh.elements[worst, :4]].mean(axis=0),
+        jacobian=min(round(ratio, 12), 1.0),
+    )
+
+
+def dihedral_angles(mesh: Mesh) -> np.ndarray:
+    """The six dihedral angles of each element, by its corners, (m, 6) degrees."""
+    corners = mesh.nodes[mesh.elements[:, :4]]
+    normals = []
+    for a, b, c in FACES:
+        normal = np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a])
+        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    cosines = [np.einsum("mi,mi->m", one, other) for one, other in combinations(normals, 2)]
+    return 180.0 - np.degrees(np.arccos(np.clip(np.stack(cosines, axis=1), -1.0, 1.0)))

@@ -1,0 +1,95 @@
+"""Posteriors that are wrong by another route than the map's values: none of them is accepted.
+
+Gradients that are not the map's, one observation of two, a noise level that one number has to tell.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import calibrate as cal
+from certificate_support import exact_data, grid_of, linear_model, quadrature
+from emulator.surrogates.protocol import Prediction
+from linear_support import LinearForward, LinearSimulator, linear_forward
+
+OPTIONS = cal.NUTSOptions(warmup=300, draws=500, rounds=1)
+CLOSE_SD, CLOSE_SPREAD = 0.5, 0.25  # beyond either, no posterior may be accepted
+
+
+@dataclass(frozen=True, eq=False)
+class WrongGradients(LinearForward):
+    """The right values; ``factor`` times the derivatives."""
+
+    factor: float = 1.0
+
+    def __call__(self, theta):
+        exact = super().__call__
+        wrong = self.factor * (exact(theta) - jax.lax.stop_gradient(exact(theta)))
+        return jax.lax.stop_gradient(exact(theta)) + wrong
+
+    def evaluate(self, theta):
+        return Prediction(self(theta), jnp.all(theta < self.limit))
+
+
+@pytest.fixture(scope="module")
+def fem(beam):
+    return linear_forward(beam, size=0.02)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, 0.2, 5.0])
+def test_gradients_that_are_not_the_map_s(beam, fem, factor):
+    """Acceptance knows the values: draws are slow, or right, or the certificate sees it."""
+    wrong = linear_forward(beam, size=0.02, of=WrongGradients, factor=factor)
+    model = linear_model(beam, forward=wrong)
+    data = exact_data(linear_model(beam, forward=fem))
+    posterior = cal.sample(model, data, options=OPTIONS, predictions=False)
+    verdict = cal.certify(posterior, LinearSimulator(fem), draws=100).verdict
+    points, weights = grid_of(), quadrature(fem, data)
+    mean = weights @ points
+    sd = np.sqrt(weights @ (points - mean) ** 2)
+    draws = np.stack(list(posterior.draws().values()), axis=-1).reshape(-1, 2)
+    shift = np.abs(draws.mean(axis=0) - mean) / sd
+    spread = np.abs(draws.std(axis=0) / sd - 1.0)
+    if (shift > CLOSE_SD).any() or (spread > CLOSE_SPREAD).any():
+        assert verdict != "accepted"
+    if factor in (-1.0, 5.0):  # trajectories are thrown off for good
+        assert (shift > CLOSE_SD).any()
+
+
+@pytest.mark.parametrize("wrong_at", [(3, 11), (20,)])
+def test_one_observation_of_two_is_wrong(beam, fem, wrong_at):
+    """By five sd of its noise at every node it sees; the other one is exact."""
+    shift = fem.shift.copy()
+    shift[list(wrong_at)] += 0.5
+    observe = {
+        "first": cal.nodal_displacements(beam, [3, 11]),
+        "second": cal.nodal_displacements(beam, [20]),
+    }
+    noise = dict.fromkeys(observe, cal.GaussianNoise(sd=0.1))
+    u = np.asarray(fem(jnp.array([72.0, 68.0])))
+    rng = np.random.default_rng(0)
+    data = {
+        name: u[part.nodes] + 0.1 * rng.normal(size=part.shape) for name, part in observe.items()
+    }
+    for forward, good in ((replace(fem, shift=shift), False), (fem, True)):
+        posterior = cal.sample(cal.model(forward, observe, noise), data, options=OPTIONS)
+        verdict = cal.certify(posterior, LinearSimulator(fem), draws=100).verdict
+        assert (verdict == "accepted") is good
+
+
+def test_a_noise_level_from_one_number(beam, fem):
+    """Its posterior narrows to a needle at sd 0: that is said, of the right map as of a wrong one."""
+    observe = cal.length_between(beam, "left", "right")
+    model = cal.model(fem, observe, cal.GaussianNoise(sd_scale=0.2))
+    theta = jnp.array([72.0, 68.0])
+    data = float(observe(fem(theta)[observe.nodes], theta)) + 0.1
+    wrong = replace(fem, matrix=1.5 * fem.matrix)
+    for forward, finding in ((fem, "transitions diverged"), (wrong, "mean of noise_sd moves")):
+        posterior = cal.sample(replace(model, forward=forward.at(observe.nodes)), data)
+        assert (posterior.draws()["noise_sd"] > 0.0).all()
+        certificate = cal.certify(posterior, LinearSimulator(fem), draws=100)
+        assert certificate.verdict != "accepted"
+        assert finding in " ".join(certificate.findings)
