@@ -121,5 +121,17 @@ def products_in_words(combinations: list[dict[str, Any]], best: int) -> list[str
 
 
 def _product(exponents: dict[str, float]) -> str:
+    """As a quotient, the largest exponents first."""
     ordered = sorted(exponents.items(), key=lambda item: -abs(item[1]))
-    return " ".join(name if e == 1.0 else f"{name}^{e:g}" for name, e in ordered)
+
+    def factors(sign: float) -> str:
+        return " ".join(
+            name if sign * e == 1.0 else f"{name}^{sign * e:g}"
+            for name, e in ordered
+            if sign * e > 0
+        )
+
+    above, below = factors(1.0), factors(-1.0)
+    if not below:
+        return above
+    return f"{above or 1} / {f'({below})' if ' ' in below else below}"

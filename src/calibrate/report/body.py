@@ -140,7 +140,10 @@ def _add_controls(figure: go.Figure, names: list[str], colours: dict[str, np.nda
     figure.update_layout(
         sliders=[{"steps": steps, "currentvalue": {"prefix": "shape: "}, "pad": {"t": 10}}],
         updatemenus=[{"buttons": buttons, "x": 0.0, "xanchor": "left", "y": 1.12}],
-        scene_camera_eye={"x": 1.1, "y": 1.1, "z": 0.7},
+        scene_camera={
+            "eye": {"x": 1.45, "y": 1.45, "z": 0.9},
+            "center": {"x": 0, "y": 0, "z": -0.1},
+        },
         scene={"aspectmode": "data", **{f"{a}axis": {"title": f"{a} (mm)"} for a in "xyz"}},
         height=680,
         legend={"x": 0.0, "y": 0.0},

@@ -59,7 +59,9 @@ def _one_number(name: str, part: Observation, values: np.ndarray, measured: floa
         )
     )  # fmt: skip
     figure.add_vline(x=measured, line={"color": VERMILION, "width": 3}, annotation_text="measured")
-    figure.update_layout(xaxis_title=f"{name} ({part.unit})", yaxis={"showticklabels": False})
+    figure.update_layout(
+        xaxis_title=f"predicted {name} ({part.unit})", yaxis={"showticklabels": False}
+    )
     return figure
 
 
@@ -126,12 +128,27 @@ def traces(posterior: Posterior) -> go.Figure:
             rank = go.Scatter(x=edges, y=[*counts, counts[-1]], line_shape="hv", **line)
             for column, drawn in enumerate((density, trace, rank), start=1):
                 figure.add_trace(drawn, row, column)
+        _add_prior(figure, posterior, name, draws, row)
         even = draws.shape[1] / 20.0
         figure.add_hline(y=even, line={"color": "grey", "dash": "dot"}, row=row, col=3)
         figure.update_yaxes(title_text=label, showticklabels=False, row=row, col=1)
         figure.update_yaxes(rangemode="tozero", row=row, col=3)
     figure.update_layout(barmode="overlay", height=120 + 170 * len(labels))
     return figure
+
+
+def _add_prior(
+    figure: go.Figure, posterior: Posterior, name: str, draws: np.ndarray, row: int
+) -> None:
+    """The prior's density over the range of the draws, behind them."""
+    prior = posterior.model.sampled_priors.get(name)
+    if prior is None or prior.shape():
+        return
+    x = np.linspace(draws.min(), draws.max(), 100)
+    density = np.exp(np.asarray(prior.log_prob(x)))
+    line = {"color": "grey", "width": 2, "dash": "dash"}
+    shown = {"name": "prior", "legendgroup": "prior", "showlegend": row == 1}
+    figure.add_trace(go.Scatter(x=x, y=density, mode="lines", line=line, **shown), row, 1)
 
 
 def pairs(posterior: Posterior) -> go.Figure:
@@ -187,8 +204,8 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
         name="90 % of the posterior", hoverinfo="skip",
     )  # fmt: skip
     figure.add_scatter(
-        x=middle, y=p, line_color=BLUE, name="median", text=[in_mmhg(each) for each in p],
-        hovertemplate="%{x:.1f} mL at %{text}",
+        x=middle, y=p, mode="lines", line_color=BLUE, name="median",
+        text=[in_mmhg(each) for each in p], hovertemplate="%{x:.1f} mL at %{text}",
     )  # fmt: skip
     figure.add_scatter(
         x=[curve.rest, middle[0]], y=[0.0, p[0]], line={"color": BLUE, "dash": "dot"},
@@ -200,7 +217,7 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
             _add_measured(figure, posterior, seen, name)
     figure.update_layout(
         xaxis_title="cavity volume (mL)",
-        yaxis_title=f"{name} ({curve.parameter.unit}; 1 mmHg is {KPA_PER_MMHG:.3f})",
+        yaxis_title=f"{name} (kPa; 1 kPa is {1.0 / KPA_PER_MMHG:.1f} mmHg)",
     )
     return figure
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
+from datetime import datetime
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,6 +17,7 @@ import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
 
+from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
 from calibrate.certificate.verdict import shifts
 from calibrate.identifiability.combinations import identify, in_words
 from calibrate.posterior import Posterior
@@ -52,7 +57,7 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, fem: bool
     run, posterior = read_posterior(folder)
     path = folder / CERTIFICATE
     certificate = read_json(path) if path.is_file() else None
-    page = html_of(run, posterior, certificate, fem=fem)
+    page = html_of(run, posterior, certificate, fem=fem, made=_day(path))
     target = folder / REPORT if out is None else Path(out)
     with replacing(target) as temporary:
         temporary.write_text(page, encoding="utf-8")
@@ -60,9 +65,14 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, fem: bool
 
 
 def html_of(
-    run: Run, posterior: Posterior, certificate: dict[str, Any] | None, *, fem: bool = True
+    run: Run,
+    posterior: Posterior,
+    certificate: dict[str, Any] | None,
+    *,
+    fem: bool = True,
+    made: str = "",
 ) -> str:
-    """The page as text."""
+    """The page as text; ``made``: the day of the certificate."""
     scene = posterior.model.forward.scene
     simulator = simulator_of(scene) if fem else None
     sections = [
@@ -78,25 +88,49 @@ def html_of(
     return (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f"<style>{_STYLE}</style><script>{get_plotlyjs()}</script></head><body>"
-        f"<h1>{escape(scene.name)}</h1>{_verdict(posterior, certificate)}{body}</body></html>"
+        f"<h1>{escape(scene.name)}</h1>{_verdict(run, posterior, certificate, made)}{body}"
+        "</body></html>"
     )
 
 
-def _verdict(posterior: Posterior, certificate: dict[str, Any] | None) -> str:
-    """The certificate's verdict and findings, and what is wrong with the run."""
+def _verdict(run: Run, posterior: Posterior, certificate: dict[str, Any] | None, made: str) -> str:
+    """The certificate's verdict and findings, by what it judged, and what is wrong with the run."""
+    judged = f"Data: {run.data}."
     if certificate is None:
         decided = "fem_solves" in posterior.tree.attrs
         verdict = "decided by FEM" if decided else "not certified"
         findings = [] if decided else ["no certificate yet: run calibrate certify on this folder"]
     else:
         verdict, findings = certificate["verdict"], certificate["findings"]
+        judged = " ".join([*_judged(certificate), judged, made])
     items = "".join(f"<li>{escape(each)}</li>" for each in findings)
     warnings = "".join(f'<p class="warning">{escape(each)}</p>' for each in posterior.warnings())
     colour = _COLOURS.get(verdict, _NOT)
     return (
         f'<div class="verdict" style="background:{colour}"><b>{escape(verdict)}</b>'
-        f"<ul>{items}</ul></div>{warnings}"
+        f"<ul>{items}</ul><small>{escape(judged)}</small></div>{warnings}"
     )
+
+
+def _judged(certificate: dict[str, Any]) -> Iterator[str]:
+    """What a verdict rests on, and what it was held against."""
+    finer = (certificate.get("mesh") or {}).get("runs", 0)
+    runs = f"Judged by {certificate['draws']} FEM runs, {certificate['failed']} failed"
+    yield f"{runs}, and {finer} on a finer mesh." if finer else f"{runs}."
+    k, most = certificate["k_hat"], certificate["k_threshold"]
+    if k is not None and most is not None:
+        yield f"Pareto k {k:.2f}, at most {most:.2f}."
+    yield (
+        f"Limits: {LARGEST_SHIFT:g} sd for a mean, {LARGEST_MESH_SHIFT:g} on a finer mesh, "
+        f"{100.0 * math.expm1(LARGEST_LOG_SD):.0f} % for an sd."
+    )
+
+
+def _day(path: Path) -> str:
+    """When a file was written; nothing where there is none."""
+    if not path.is_file():
+        return ""
+    return f"{datetime.fromtimestamp(path.stat().st_mtime).date()}."
 
 
 def _data(posterior: Posterior) -> str:
@@ -116,7 +150,7 @@ def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | No
     for name, row in posterior.summary().items():
         numbers = [f"{row[key]:.4g}" for key in ("mean", "sd", "low", "high")]
         numbers += [f"{row['r_hat']:.4f}", f"{row['ess_bulk']:.0f}", f"{row['ess_tail']:.0f}"]
-        numbers.append(priors.get(name, priors.get(split(name)[0], "")))
+        numbers.append(_in_words(priors.get(name, priors.get(split(name)[0], ""))))
         numbers += [f"{truth[name]:.4g}" if name in truth else ""] if truth else []
         numbers += [f"{shift[name]:+.2f}" if name in shift else "" for shift in moved.values()]
         rows.append((labels[name], *numbers))
@@ -150,22 +184,44 @@ def _draws(posterior: Posterior) -> str:
 
 def _provenance(run: Run, posterior: Posterior) -> str:
     attributes = {str(k): v for k, v in posterior.tree.attrs.items() if k not in ("run", "observe")}
-    rows = [(key, _short(value)) for key, value in attributes.items()]
+    rows = [(key, told) for key, value in attributes.items() if (told := _told(value))]
     again = (
         "from calibrate.workflow import infer, read_posterior\n\n"
         'run, _ = read_posterior("THIS FOLDER")\n'
         'infer(run, "ANOTHER FOLDER")  # the same draws'
     )
-    settings = escape(json.dumps(asdict(run), indent=2))
+    usual = asdict(Run(run.scene))
+    chosen = {k: v for k, v in asdict(run).items() if k == "scene" or v != usual[k]}
+    settings = escape(json.dumps(chosen, indent=2))
     return (
-        f"{_table(('', ''), rows)}<p>The run (<code>run.json</code>):</p><pre>{settings}</pre>"
+        f"{_table(('', ''), rows)}<p>The run, where it is not as usual (all of it is in "
+        f"<code>run.json</code>):</p><pre>{settings}</pre>"
         f"<p>To repeat it:</p><pre>{escape(again)}</pre>"
     )
 
 
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= 160 else f"{text[:157]}..."
+def _in_words(prior: str) -> str:
+    """A prior as its distribution's name and its range."""
+    found = re.fullmatch(r"(Log)?Uniform\(low=([^,]+), high=([^,]+)\)", prior)
+    if found is None:
+        return prior
+    log, low, high = found.groups()
+    return f"{'log-' if log else ''}uniform, {float(low):g} to {float(high):g}"
+
+
+def _told(value: Any) -> str:
+    """An attribute in words; nothing where it says nothing."""
+    if isinstance(value, str) and value[:1] in ("{", "[", "n"):
+        with suppress(ValueError):
+            value = json.loads(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return ""
+    if isinstance(value, Mapping):
+        parts = {str(k): told for k, v in value.items() if (told := _told(v))}
+        return "; ".join(f"{name}: {told}" if name else told for name, told in parts.items())
+    if isinstance(value, list):
+        return ", ".join(map(_told, value))
+    return "" if value is None else _in_words(str(value))
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -19,7 +19,16 @@ from calibrate.workflow import Run
 pytestmark = pytest.mark.slow  # compiling for a ventricle; test_command.py is quick
 
 TINY = LaplaceOptions(draws=60, chains=2, starts=2)
-CERTIFICATE = {"verdict": "accepted", "findings": ["no mean moves <b>"], "reason": "", "k_hat": 0.1}
+CERTIFICATE = {
+    "verdict": "accepted",
+    "findings": ["no mean moves <b>"],
+    "reason": "",
+    "k_hat": 0.1,
+    "k_threshold": 0.49,
+    "draws": 200,
+    "failed": 0,
+    "mesh": {"runs": 9},
+}
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +67,25 @@ def test_the_verdict_comes_first_and_all_sections_follow(page):
     assert places == sorted(places)
     assert "no mean moves &lt;b&gt;" in page  # text, not markup
     assert "a_f (kPa)" in page
-    assert "LogUniform" in page
+    assert "log-uniform, 0.2 to 0.52" in page
+
+
+def test_the_verdict_says_by_what(ventricle_posterior):
+    run = Run("left_ventricle", data="u.csv")
+    text = html_of(run, ventricle_posterior, CERTIFICATE, fem=False, made="2026-01-02.")
+    assert "Judged by 200 FEM runs, 0 failed, and 9 on a finer mesh. Pareto k 0.10, at most" in text
+    assert "Limits: 0.25 sd for a mean, 0.5 on a finer mesh, 20 % for an sd." in text
+    assert "Data: u.csv. 2026-01-02." in text
+    unknown = CERTIFICATE | {"k_hat": None, "mesh": {}}
+    text = html_of(run, ventricle_posterior, unknown, fem=False)
+    assert "Judged by 200 FEM runs, 0 failed. Limits" in text
+
+
+def test_where_it_comes_from_is_in_words_and_whole(page):
+    told = page[page.index("how to repeat it") :]
+    assert "a: log-uniform, 0.2 to 0.52; b: log-uniform, 1 to 4.2" in told
+    assert not re.search(r"<td>(null|inf|None|\{\})</td>|\.\.\.</td>", told)
+    assert "observe" not in told  # as usual; where data is a file it says nothing
 
 
 def test_it_needs_no_network(page):
@@ -118,6 +145,10 @@ def test_charts_say_what_was_drawn(ventricle_posterior):
         t for t in charts.traces(ventricle_posterior).data if t.type == "scatter" and t.line.shape
     ]
     assert len(ranks) == 2 * 5
+    priors = [t for t in charts.traces(ventricle_posterior).data if t.name == "prior"]
+    assert len(priors) == 5
+    a = priors[0]
+    np.testing.assert_allclose(a.y, 1.0 / (np.array(a.x) * np.log(0.52 / 0.2)), rtol=1e-6)
     assert sum(ranks[0].y[:-1]) == 60
     assert isinstance(charts.stress(ventricle_posterior), go.Figure)
 
