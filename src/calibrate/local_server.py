@@ -60,4 +60,4 @@ def listen(handler: type[Handler], subject: Any, port: int = 0, host: str = LOOP
         return Server(handler, subject, host, port)
     except (OSError, OverflowError) as error:
         where = f"port {port}" if host == LOOPBACK else f"{host}, port {port}"
-        raise InputError(f"{where}: {error}; give another, or 0 for a free port") from error
+        raise InputError(f"{where}: {error}; give another, or 0 for a free one") from error

@@ -17,7 +17,6 @@ import pytest
 
 import calibrate as cal
 import emulator as em
-from calibrate.cli import main
 from calibrate.um_bridge import serve
 from emulator.surrogates.fem import fem_forward
 from linear_support import linear_forward
@@ -202,20 +201,3 @@ def test_from_the_command_line():
         _, said = process.communicate(timeout=60)
     assert process.returncode == 0
     assert said.decode().strip() == "ended"
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["nowhere"], "nowhere"),
-        (["left_ventricle", "--fem", "--emulator", "left_ventricle"], "--fem takes no --emulator"),
-        (["left_ventricle", "--port", "70000"], "port 70000"),
-        (["left_ventricle", "--host", "192.0.2.1", "--port", "0"], "192.0.2.1, port 0: "),
-        (["left_ventricle", "--observe", "volume@a+volume@b"], "several load states"),
-    ],
-)
-def test_bad_words_are_one_line(words, message, capsys):
-    assert main(["serve", *words]) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1

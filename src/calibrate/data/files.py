@@ -94,12 +94,19 @@ class CSVFile(DataFile):
         cells = [[cell.strip() for cell in row] for row in table]
         self.path, self.decimal_comma = path, delimiter != ","
         self.words = cells[0] if cells else []
+        if self.words and all(map(_is_number, self.words)):
+            raise InputError(
+                f"data file {path}: its first line, '{lines[0].strip()[:40]}', has no names of "
+                "columns; put them above it, e.g. node,ux,uy,uz"
+            )
         twice = [w for w in self.words if w and self.words.count(w) > 1]
         if twice:
             raise InputError(f"data file {path}: column '{twice[0]}' is there twice")
         self.rows = {
             k: self._row(k, row) for k, row in enumerate(cells[1:], 1) if any(row) or len(row) > 1
         }
+        if self.words and not self.rows:
+            raise InputError(f"data file {path}: names of columns, and no row below them")
 
     def states(self) -> dict[str, CSVFile]:
         """Rows of each state, by the word in the column ``state``."""
@@ -168,6 +175,14 @@ class CSVFile(DataFile):
             raise InputError(
                 f"data file {self.path}: row {number}, column '{word}' is {found}"
             ) from error
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word.replace(",", "."))
+    except ValueError:
+        return False
+    return True
 
 
 def _lines(path: Path) -> list[str]:

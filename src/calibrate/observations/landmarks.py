@@ -76,7 +76,15 @@ class Landmarks(DisplacementPoints):
         """Observation and data from positions and displacements, both (d, 3) in mm."""
         points, values = arrays["position"], arrays[DISPLACEMENT]
         check_table(points, values)
-        return cls.of(scene, points), values
+        try:
+            return cls.of(scene, points), values
+        except InputError as error:
+            if _are_deformed(scene, points, values):
+                raise InputError(
+                    f"{error}; less their displacements all points lie inside: give positions at "
+                    "rest"
+                ) from error
+            raise
 
     def to_arrays(self, name: str, values: np.ndarray) -> dict[str, np.ndarray]:
         """Reference positions and displacements."""
@@ -93,6 +101,16 @@ class Landmarks(DisplacementPoints):
         members = scene.mesh.elements[elements]
         nodes, position = np.unique(members, return_inverse=True)
         return cls(nodes, points, position.reshape(members.shape), weights)
+
+
+def _are_deformed(scene: Scene, points: np.ndarray, values: np.ndarray) -> bool:
+    """Whether points (d, 3) less their displacements, and not as they are, lie in the body."""
+    seen = np.isfinite(values).all(axis=1)
+    try:
+        locate(scene.mesh, points[seen] - values[seen])
+    except InputError:
+        return False
+    return bool(seen.any())
 
 
 def landmarks(scene: Scene, points: np.ndarray) -> Landmarks:

@@ -186,7 +186,10 @@ def test_dialects_of_csv(beam, tmp_path, text):
         ("d.csv", b"node,ux,uy,uz\n7,0,5,2,25,3\n", "row 1 has 6 values for 4 columns; decimal"),
         ("d.csv", b"node;ux;uy;uz\n7;1.234,5;0;0\n", "row 1, column 'ux' is '1.234,5', not a"),
         ("d.csv", b"node,ux,ux,uz\n7,0,0,0\n", "column 'ux' is there twice"),
-        ("d.csv", b"7,0,1,2\n30,1,2,3\n", "no data; expected columns node,ux,uy,uz or"),
+        ("d.csv", b"7,0,1,2\n30,1,2,3\n", "its first line, '7,0,1,2', has no names of columns"),
+        ("d.csv", b"7;0,5;1;2\n", "its first line, '7;0,5;1;2', has no names of columns"),
+        ("d.csv", b"node,ux,uy,uz\n", "names of columns, and no row below them"),
+        ("d.csv", b"", "no data; expected columns node,ux,uy,uz or"),
     ],
 )
 def test_files_that_cannot_be_read(beam, tmp_path, name, content, message):
@@ -194,6 +197,19 @@ def test_files_that_cannot_be_read(beam, tmp_path, name, content, message):
     with pytest.raises(InputError, match=message) as caught:
         read_data(beam, tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+def test_positions_of_the_deformed_body_are_known_as_such(ventricle, points, tmp_path):
+    """Where they lie outside the body at rest; a point that is nowhere near is no such thing."""
+    u = np.full(points.shape, 40.0)
+    u[0] = np.nan  # not seen
+    for shift, hint in ((u, True), (-u, False)):
+        at = np.where(np.isnan(u), points, points + shift)
+        rows = [",".join(map(str, [*x, *v])) for x, v in zip(at, u, strict=True)]
+        (tmp_path / "d.csv").write_text("x,y,z,ux,uy,uz\n" + "\n".join(rows))
+        with pytest.raises(InputError, match="lies outside the body") as caught:
+            read_data(ventricle, tmp_path / "d.csv")
+        assert ("all points lie inside: give positions at rest" in str(caught.value)) is hint
 
 
 def test_netcdf_is_written_too(ventricle, points, tmp_path):
