@@ -21,7 +21,13 @@ from calibrate.um_bridge import serve
 from emulator.surrogates.fem import fem_forward
 from linear_support import linear_forward
 
-CALL = "import sys; from calibrate.cli import main; sys.exit(main(sys.argv[1:]))"
+# What is started in the background, as all of a test run may be, inherits that Ctrl-C is ignored.
+CALL = """
+import signal, sys
+from calibrate.cli import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.exit(main(sys.argv[1:]))
+"""
 
 
 @contextmanager
@@ -185,19 +191,19 @@ def test_the_protocol_s_own_client(address, forward, observe):
 
 
 def test_from_the_command_line():
-    words = ["serve", "once_clamped_beam", "--port", "0", "--json"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", CALL, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-    try:
-        lines = list(iter(lambda: process.stdout.readline().decode(), "}\n"))
-        told = json.loads("".join([*lines, "}"]))
-        assert told["input"] == ["mu", "lam"]
-        assert told["output"] == [{"name": "displacement", "numbers": 72, "unit": "mm"}]
-        found = ask(told["address"], "Evaluate", asked([70.0, 80.0]))["output"]
-        assert np.abs(found).max() > 1.0
-    finally:
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+    words = [sys.executable, "-c", CALL, "serve", "once_clamped_beam", "--port", "0", "--json"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **pipes) as process:
+        try:
+            lines = list(iter(process.stdout.readline, "}\n"))
+            told = json.loads("".join([*lines, "}"]))
+            assert told["input"] == ["mu", "lam"]
+            assert told["output"] == [{"name": "displacement", "numbers": 72, "unit": "mm"}]
+            found = ask(told["address"], "Evaluate", asked([70.0, 80.0]))["output"]
+            assert np.abs(found).max() > 1.0
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode == 0
-    assert said.decode().strip() == "ended"
+    assert said.strip() == "ended"
