@@ -69,7 +69,7 @@ def with_arrays[R](function: Callable[..., R], arguments: Any, named: Any) -> Ca
     traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments, **named)
     form = jax.tree.structure(shapes)
     with jax.ensure_compile_time_eval():
-        arrays = [jnp.asarray(each) for each in traced.consts]
+        arrays = jax.device_put(traced.consts)  # as jnp.asarray, without a program for each shape
 
     def evaluate(arrays: list[jax.Array], leaves: list[jax.Array]) -> Any:
         return jax.tree.unflatten(form, jax.core.eval_jaxpr(traced.jaxpr, arrays, *leaves))
