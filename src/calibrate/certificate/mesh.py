@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -185,16 +186,23 @@ class _Corrected:
     def __call__(self, z: np.ndarray, D: np.ndarray) -> Correction:
         """The correction, from differences ``D`` (k, m) at points ``z`` (k, p); none for none."""
         predictive, runs = self.predictive, self.runs
-        means, valid = predictive.means(runs.z)
-        x = predictive.features(runs.z)
-        fine = valid & runs.converged
-        errors = runs.means - means
+        x, fine, errors = self._map
         if len(z):
             mesh = fit(predictive.features(z), D, predictive.scales, len(z))
             errors = errors + np.asarray(corrections(mesh, x))
         if fine.sum() < x.shape[1] + 2:
-            return nothing(len(runs.z), x.shape[1], means.shape[1])
+            return nothing(len(runs.z), x.shape[1], errors.shape[1])
         return fit(x[fine], errors[fine], predictive.scales, len(runs.z))
+
+    @cached_property
+    def _map(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Features of the runs, where map and FEM have an answer, and FEM's data less the map's."""
+        means, valid = self.predictive.means(self.runs.z)
+        return (
+            self.predictive.features(self.runs.z),
+            valid & self.runs.converged,
+            self.runs.means - means,
+        )
 
 
 def _solved(

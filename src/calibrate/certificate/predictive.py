@@ -101,7 +101,9 @@ class Predictive:
 
     def means(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The map's data without noise, flat (s, m), and whether it has an answer (s,)."""
-        return self._in_blocks(self._means_block, z)
+        means = self._in_blocks(self._map_block, z)[2]
+        valid = np.isfinite(means).all(axis=1)
+        return np.where(valid[:, None], means, 0.0), valid
 
     def corrected_means(self, z: np.ndarray, correction: Correction) -> np.ndarray:
         """The corrected map's data without noise, flat (s, m)."""
@@ -189,14 +191,10 @@ class Predictive:
     def _constrain(self, z: jax.Array) -> dict[str, jax.Array]:
         return jax.tree.map(lambda values: values[0], self._density.constrain(z[None]))
 
-    def _means(self, draws: Mapping[str, jax.Array]) -> tuple[dict[str, jax.Array], jax.Array]:
-        means, valid = self.model.predict(draws)
-        return {name: jnp.where(valid, mean, 0.0) for name, mean in means.items()}, valid
-
     def _by_map(self, z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Log prior and likelihood, and the data without noise, flat (m,)."""
         draws = self._constrain(z)
-        means, valid = self._means(draws)
+        means, valid = self.model.predict(draws)
         cheap = self.model.map_log_likelihood(draws, self.data)
         flat = jnp.where(valid, ravel_pytree(means)[0], jnp.nan)
         return (
@@ -232,14 +230,6 @@ class Predictive:
             return jax.lax.map(one, (z, means), batch_size=_BATCH)
 
         return jax.jit(block)
-
-    @cached_property
-    def _means_block(self) -> Any:
-        def one(z: jax.Array) -> tuple[jax.Array, jax.Array]:
-            means, valid = self._means(self._constrain(z))
-            return ravel_pytree(means)[0], valid
-
-        return jax.jit(lambda z: jax.lax.map(one, z, batch_size=_BATCH))
 
     @cached_property
     def _prior_draws(self) -> Any:

@@ -23,6 +23,7 @@ from emulator.fem import Simulator, Status
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.facets import surface_mesh
 from emulator.scenes.cavities import cavity_sets
+from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.surrogates.additive import Emulator
 
 
@@ -57,6 +58,7 @@ class Explorer:
             "nodes": np.round(self.scene.mesh.nodes[self._nodes], 4).tolist(),
             "triangles": self._triangles.tolist(),
             "cavities": list(self._cavities),
+            "kpa_per_mmhg": KPA_PER_MMHG,
             "pressure": None if self._curve is None else self._curve.parameter.name,
         }
 

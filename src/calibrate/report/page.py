@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -13,6 +12,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpyro.distributions as dist
 import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
@@ -21,9 +21,9 @@ from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, L
 from calibrate.certificate.verdict import shifts
 from calibrate.identifiability.combinations import identify, in_words
 from calibrate.posterior import Posterior
+from calibrate.posterior.posterior import describe_distribution
 from calibrate.report import charts
 from calibrate.report.body import body_figure
-from calibrate.state_names import split
 from calibrate.workflow import Run, read_posterior, simulator_of
 from calibrate.workflow.workflow import CERTIFICATE, REPORT
 from emulator.store import read_json, replacing
@@ -142,7 +142,7 @@ def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | No
     labels, cut = charts.names_with_units(posterior), posterior.model.prior_cut
     head = ["", "mean", "sd", "5 %", "95 %", "R-hat", "ESS bulk", "ESS tail", "prior"]
     truth = run.truth if run.data == "synthetic" else {}
-    priors = json.loads(posterior.tree.attrs.get("prior", "{}"))
+    priors = posterior.model.sampled_priors
     head += ["truth"] if truth else []
     moved = shifts(certificate or {})
     head += [_MOVED[what] for what in moved]
@@ -150,7 +150,7 @@ def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | No
     for name, row in posterior.summary().items():
         numbers = [f"{row[key]:.4g}" for key in ("mean", "sd", "low", "high")]
         numbers += [f"{row['r_hat']:.4f}", f"{row['ess_bulk']:.0f}", f"{row['ess_tail']:.0f}"]
-        numbers.append(_in_words(priors.get(name, priors.get(split(name)[0], ""))))
+        numbers.append(_in_words(priors[name]) if name in priors else "")
         numbers += [f"{truth[name]:.4g}" if name in truth else ""] if truth else []
         numbers += [f"{shift[name]:+.2f}" if name in shift else "" for shift in moved.values()]
         rows.append((labels[name], *numbers))
@@ -200,13 +200,12 @@ def _provenance(run: Run, posterior: Posterior) -> str:
     )
 
 
-def _in_words(prior: str) -> str:
+def _in_words(prior: dist.Distribution) -> str:
     """A prior as its distribution's name and its range."""
-    found = re.fullmatch(r"(Log)?Uniform\(low=([^,]+), high=([^,]+)\)", prior)
-    if found is None:
-        return prior
-    log, low, high = found.groups()
-    return f"{'log-' if log else ''}uniform, {float(low):g} to {float(high):g}"
+    if not isinstance(prior, dist.LogUniform | dist.Uniform):
+        return describe_distribution(prior)
+    log = "log-" if isinstance(prior, dist.LogUniform) else ""
+    return f"{log}uniform, {float(prior.low):g} to {float(prior.high):g}"
 
 
 def _told(value: Any) -> str:
@@ -221,7 +220,7 @@ def _told(value: Any) -> str:
         return "; ".join(f"{name}: {told}" if name else told for name, told in parts.items())
     if isinstance(value, list):
         return ", ".join(map(_told, value))
-    return "" if value is None else _in_words(str(value))
+    return "" if value is None else str(value)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

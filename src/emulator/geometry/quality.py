@@ -26,7 +26,7 @@ class MeshQuality(NamedTuple):
 
     parts : disconnected ones.
     angle : smallest dihedral angle, degrees. flat : elements with one below :data:`FLAT`.
-    place : (3,) mm, middle of the element with the smallest angle.
+    place : mm, middle of the element with the smallest angle.
     jacobian : least ratio of an element's smallest Jacobian to its mean, at quadrature points; 1
         where elements are straight.
     """
@@ -34,7 +34,7 @@ class MeshQuality(NamedTuple):
     parts: int
     angle: float
     flat: int
-    place: np.ndarray
+    place: tuple[float, float, float]
     jacobian: float
 
     def sentence(self) -> str:
@@ -60,7 +60,7 @@ def mesh_quality(mesh: Mesh) -> MeshQuality:
         parts=int(parts(mesh.elements, len(mesh.nodes)).max()) + 1,
         angle=float(smallest[worst]),
         flat=int((smallest < FLAT).sum()),
-        place=mesh.nodes[mesh.elements[worst, :4]].mean(axis=0),
+        place=tuple(mesh.nodes[mesh.elements[worst, :4]].mean(axis=0).tolist()),
         jacobian=min(round(ratio, 12), 1.0),
     )
 

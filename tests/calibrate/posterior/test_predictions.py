@@ -46,6 +46,20 @@ def test_another_load_and_another_observation_are_predicted_at_every_draw(beam, 
     assert np.abs(unchanged - found).max() > 0.0
 
 
+def test_a_loop_over_loads_compiles_once(beam, posterior):
+    observe, traced = cal.nodal_displacements(beam, [40]), []
+
+    class Counting(type(observe)):
+        def __call__(self, u, theta):
+            traced.append(u)
+            return super().__call__(u, theta)
+
+    counting = Counting(observe.nodes, observe.points)
+    for mu in (60.0, 70.0, 80.0):
+        posterior.predict({"mu": mu}, counting)
+    assert len(traced) == 1
+
+
 def test_a_prediction_of_what_was_observed_is_the_model_s_mean(posterior):
     (observe,) = posterior.model.observe.parts.values()
     found = posterior.predict({}, observe)

@@ -98,7 +98,7 @@ def run_mesh(arguments: argparse.Namespace) -> int:
         "scene": scene.name,
         "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
         "nodes": len(scene.mesh.nodes),
-        "quality": {**quality._asdict(), "place": quality.place.tolist()},
+        "quality": quality._asdict(),
         "finer_nodes": len(found.finer.scene.mesh.nodes),
         "err_u": {"median": float(np.median(told.err_u)), "max": float(np.max(told.err_u))},
         "displacement": {"median": float(np.median(length)), "max": float(length.max())},

@@ -8,6 +8,7 @@ from typing import Any
 
 from calibrate.cli.common import DONE, emit
 from calibrate.cli.model_words import emulator_of
+from calibrate.local_server import LOOPBACK
 from emulator.errors import InputError
 
 
@@ -33,7 +34,7 @@ def register(commands: Any) -> None:
     parser.add_argument("--port", type=int, default=4242, help="default 4242; 0 for a free one")
     parser.add_argument(
         "--host",
-        default="127.0.0.1",
+        default=LOOPBACK,
         help="default: this machine alone; 0.0.0.0 for all that reach it, without a password",
     )
 
