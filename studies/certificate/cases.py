@@ -273,13 +273,13 @@ def cases(quick: bool = False) -> list[Case]:
     add(two, spoiled, (1e-4, 1e-2, 1e-1), (0,), good_below=1e-4)
     add(two, wrong_noise, (0.4, 0.6, 0.85, 1.2, 1.7, 2.5), (0,))
     add(two, few, (40, 2000), (0,))
-    add(("beam", "modes"), hides, (1.0, 5.0), (0, 1))
+    add(("beam", "modes"), hides, (1.0, 5.0), (0, 1, 2, 3))
     add(("modes",), stuck, (1, 2), (0, 1))
     add(("modes",), constant, (0.0, 0.02), (0, 1), good_below=good)
     add(("hidden",), hidden_mode, (1.0, 5.0), tuple(range(8)))
     add(two, two_points, (1,), (0, 1, 2))
     for budget in (50, 80):
         add(("beam", "modes"), hides, (1.0, 5.0), (0, 1), budget=budget)
-        add(("hidden",), hidden_mode, (5.0,), (0, 1, 2, 3), budget=budget)
+        add(("hidden",), hidden_mode, (5.0,), tuple(range(8)), budget=budget)
         add(("modes",), stuck, (1,), (0, 1), budget=budget)
     return found

@@ -71,9 +71,6 @@ _FEWEST = 25
 _AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
 _FEWEST_DESCENTS = 16  # runs; fewer end nowhere
 _ROUNDS = 5  # in which the adaptive ones are chosen
-# Shares of the test points: from the corrected posterior, the map's, where FEM may find the data
-# likely, around the draws, and from the whole pool.
-_CORRECTED, _MAP, _EXPLORED, _WIDE, _POOL = 0.55, 0.15, 0.1, 0.1, 0.1
 _STABILITY = 20  # draws at which the tangent's sign is asked for
 
 
@@ -145,12 +142,13 @@ def examine(
             every = joined([training, tests.runs])
             spent = len(every.z)
             figures = figures_of(posterior, predictive, pool, tests)
+            missed = missed_by(predictive, correction, pool, tests, every)
             chosen = pool.z[resampled(pool, DRAWS, rng)]
             evidence = Evidence(
                 *figures,
                 sampling,
                 physics_of(begun.at_draws, training, tests, pool),
-                tail_of(pool, tests, missed_by(predictive, correction, every), len(begun.ends)),
+                tail_of(pool, tests, missed, len(begun.ends)),
                 misfits(predictive, correction, chosen, _key(rng)),
             )
             if judge(evidence).verdict != "undecided" or spent >= most:
@@ -263,13 +261,10 @@ def _train(
 
 def _test(solver: Solver, pool: Pool, count: int, rng: np.random.Generator) -> Tests:
     """FEM at fresh points of the pool, with the log density they were drawn from."""
-    even = np.full(len(pool.z), 1.0 / len(pool.z))
-    chances = _CORRECTED * pool.corrected + _MAP * pool.cheap + _POOL * even
-    chances += _WIDE * pool.around
-    chances += _EXPLORED * normalised(pool.log_explored)
-    chances = chances / chances.sum()
-    rows = rng.choice(len(chances), size=count, p=chances)
-    return Tests(solver(pool.z[rows]), rows, pool.log_mixture[rows] + np.log(chances[rows]))
+    log_chances = pool.log_chances
+    chances = np.exp(log_chances)
+    rows = rng.choice(len(chances), size=count, p=chances / chances.sum())
+    return Tests(solver(pool.z[rows]), rows, (pool.log_mixture + log_chances)[rows])
 
 
 def resampled(pool: Pool, count: int, rng: np.random.Generator) -> np.ndarray:

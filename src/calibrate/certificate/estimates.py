@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.special import logsumexp
 
 from calibrate.arviz import array_stats
 from calibrate.certificate.correction import Correction
 from calibrate.certificate.evidence import LARGEST_MASS, Changes, Figure, Physics, Sampling, Tail
 from calibrate.certificate.moments import jackknife, moments
-from calibrate.certificate.pool import Pool, effective, normalised
+from calibrate.certificate.pool import Pool, effective, normalised, with_guests
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, least_likely
 from calibrate.posterior import Posterior
@@ -20,6 +21,8 @@ from calibrate.posterior import Posterior
 _EQUAL_WEIGHTS = 1e-3
 _LIKELY = 0.99  # mass of the region that FEM's runs are likely in
 _MISSED = 3.0  # in log likelihood: the corrected map finds a run 20 times less likely than FEM
+# A part of FEM's posterior with this mass is met by a test with this probability.
+_MASS, _MET = 0.1, 0.95
 _FEWEST = 25  # weights that have a tail of five
 
 
@@ -144,17 +147,30 @@ def physics_of(at_draws: Runs, training: Runs, tests: Tests, pool: Pool) -> Phys
     )
 
 
-def missed_by(predictive: Predictive, correction: Correction, runs: Runs) -> int:
-    """Number of runs that FEM finds likely and the corrected map does not.
+def missed_by(
+    predictive: Predictive, correction: Correction, pool: Pool, tests: Tests, runs: Runs
+) -> int:
+    r"""Number of runs around which FEM's posterior may hide from the corrected map and the tests.
 
-    Likely: within the density that bounds 99 % of a Gaussian around the best run. There the
-    correction should be right, because these runs taught it; where it is not, the map errs by a
-    jump that no smooth process follows, and the pool may be empty where FEM's posterior is.
+    FEM finds such a run likely (it is within the density that bounds 99 % of a Gaussian around the
+    best run) and the corrected map, which these runs taught, does not: it errs there by a jump that
+    no smooth process follows. That does no harm where tests come anyway: with :math:`t` of them a
+    volume (:meth:`Pool.log_tested`), a mass :math:`m` of FEM's posterior :math:`\pi / Z` around the
+    run has :math:`m t Z / \pi` of them in expectation. Those runs count whose mass of 0.1 a test
+    would meet with less than 95 %.
     """
-    at = predictive.evaluate(runs.z, correction)
-    fem = np.where(runs.converged, at.prior + runs.fem, -np.inf)
+    there = with_guests(pool, predictive, correction, runs.z)
+    guests = slice(pool.drawn, None)
+    prior, corrected = there.at.prior[guests], there.at.corrected[guests]
+    fem = np.where(runs.converged, prior + runs.fem, -np.inf)
     likely = fem > least_likely(fem.max(), runs.z.shape[1], _LIKELY)
-    return int(np.sum(likely & ~(at.prior + at.corrected > fem - _MISSED)))
+    unforeseen = likely & ~(prior + corrected > fem - _MISSED)
+    log_weights = tests.log_fem(pool)
+    count = len(log_weights)
+    with np.errstate(invalid="ignore"):  # where no test has weight, nothing is met
+        log_z = logsumexp(log_weights) - np.log(count * pool.drawn)
+        expected = _MASS * np.exp(there.log_tested(count)[guests] + log_z - fem)
+    return int(np.sum(unforeseen & ~(expected >= -np.log1p(-_MET))))
 
 
 def tail_of(pool: Pool, tests: Tests, missed: int, ends: int = 0) -> Tail:

@@ -117,7 +117,8 @@ class Tail:
     ess : their effective number. largest : largest weight over the mean one.
     spread : sd of the log ratio of FEM's likelihood over the corrected map's.
     pool : effective points under the corrected map.
-    missed : FEM runs of all kinds that FEM finds likely and the corrected map does not.
+    missed : FEM runs of all kinds that FEM finds likely and the corrected map does not, where tests
+        are too few to meet what it may hide.
     ends : places that FEM finds likely and draws or map do not know, where its descents ended.
     """
 

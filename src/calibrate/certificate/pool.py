@@ -33,6 +33,9 @@ PRIOR = 512
 STEP, SEARCH_ROUNDS, POLISH_ROUNDS = 512, 8, 4
 _TEMPERED_ESS, MOST_TEMPERED = 0.15, 300.0  # of the points, for the next round's kernels
 ENOUGH = 800.0  # effective points at which the pool is good
+# Shares of the points that test: from the corrected posterior, the map's, where FEM may find the
+# data likely, around the draws, and from the whole pool.
+_CORRECTED, _MAP, _EXPLORED, _WIDE, _EVEN = 0.55, 0.15, 0.1, 0.1, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +43,7 @@ class Pool:
     """Points (s, p) with their log densities.
 
     proposals, counts : kernels and how many points each gave; the first ``priors`` points are the
-        prior's.
+        prior's. Points beyond those ``drawn`` are guests, which change nothing of the others.
     wide : which proposal surrounds the draws.
     log_kernels : of each proposal at each point, (c, s).
     at : log prior and likelihoods of the points, (s,) each.
@@ -55,9 +58,14 @@ class Pool:
     wide: int = 0
 
     @property
+    def drawn(self) -> int:
+        """Number of points that come from the proposals."""
+        return self.priors + sum(self.counts)
+
+    @property
     def log_mixture(self) -> np.ndarray:
         """Log density (s,) of the mixture all points come from."""
-        shares = np.log(np.array([self.priors, *self.counts]) / len(self.z))
+        shares = np.log(np.array([self.priors, *self.counts]) / self.drawn)
         components = np.vstack([self.at.prior, *self.log_kernels])
         return logsumexp(components + shares[:, None], axis=0)
 
@@ -74,7 +82,7 @@ class Pool:
         the correction's variance :math:`v`: for Gaussian noise, that of a noise with the
         correction's error added.
         """
-        gap = self.at.corrected - np.max(self.at.corrected, initial=-1e300)
+        gap = self.at.corrected - np.max(self.at.corrected[: self.drawn], initial=-1e300)
         return self.at.prior + gap / (1.0 + self.at.variance) - self.log_mixture
 
     @property
@@ -83,9 +91,35 @@ class Pool:
         return self.at.prior + self.at.cheap - self.log_mixture
 
     @property
-    def around(self) -> np.ndarray:
-        """Weights (s,) of sum 1 of :func:`around_draws`, whatever a map says there."""
-        return normalised(self.log_kernels[self.wide] - self.log_mixture)
+    def log_chances(self) -> np.ndarray:
+        """Log of each point's chance (s,) to test: of several weights, each by its share."""
+        log_around = self.log_kernels[self.wide] - self.log_mixture  # whatever a map says there
+        parts = (
+            (_CORRECTED, self.log_corrected),
+            (_MAP, self.log_cheap),
+            (_EXPLORED, self.log_explored),
+            (_WIDE, log_around),
+            (_EVEN, np.zeros(len(self.z))),
+        )
+        totals = [logsumexp(log[: self.drawn]) for _, log in parts]
+        chances = logsumexp(
+            [
+                np.log(share) + log - total
+                for (share, log), total in zip(parts, totals, strict=True)
+                if np.isfinite(total)
+            ],
+            axis=0,
+        )
+        return chances - logsumexp(chances[: self.drawn])
+
+    def log_tested(self, count: int) -> np.ndarray:
+        r"""Log of how many points a volume of z ``count`` tests are at, around each point (s,).
+
+        In expectation, a point that is tested again counted once:
+        :math:`M q (1 - e^{-n a})` with :math:`M` points of density :math:`q` and chances :math:`a`.
+        """
+        tested = -np.expm1(-count * np.exp(self.log_chances))
+        return np.log(self.drawn) + self.log_mixture + np.log(tested)
 
     @property
     def corrected(self) -> np.ndarray:
@@ -213,17 +247,25 @@ def extend(
     rng: np.random.Generator,
 ) -> Pool:
     """``pool`` with ``count`` points from ``proposal``."""
-    z = proposal.sample(rng, count)
-    new = predictive.evaluate(z, correction)
-    everything = np.concatenate([pool.z, z])
-    before = np.array([q.log_density(z) for q in pool.proposals]).reshape(-1, count)
-    log_kernels = np.vstack(
-        [np.hstack([pool.log_kernels, before]), proposal.log_density(everything)[None]]
-    )
-    at = Evaluated(*(np.concatenate(both) for both in zip(pool.at, new, strict=True)))
-    counts, proposals = (*pool.counts, count), (*pool.proposals, proposal)
+    pool = with_guests(pool, predictive, correction, proposal.sample(rng, count))
     return replace(
-        pool, z=everything, at=at, proposals=proposals, counts=counts, log_kernels=log_kernels
+        pool,
+        proposals=(*pool.proposals, proposal),
+        counts=(*pool.counts, count),
+        log_kernels=np.vstack([pool.log_kernels, proposal.log_density(pool.z)[None]]),
+    )
+
+
+def with_guests(pool: Pool, predictive: Predictive, correction: Correction, z: np.ndarray) -> Pool:
+    """``pool`` with points ``z`` (s, p) that did not come from its proposals."""
+    log_kernels = np.array([q.log_density(z) for q in pool.proposals]).reshape(-1, len(z))
+    new = predictive.evaluate(z, correction)
+    at = Evaluated(*(np.concatenate(both) for both in zip(pool.at, new, strict=True)))
+    return replace(
+        pool,
+        z=np.concatenate([pool.z, z]),
+        at=at,
+        log_kernels=np.hstack([pool.log_kernels, log_kernels]),
     )
 
 

@@ -1,19 +1,22 @@
 """The tail of the weights of FEM's runs, and runs that the corrected map does not foresee."""
 
+import jax
 import numpy as np
 from scipy.stats import chi2, norm
 
+from calibrate.certificate import estimates
 from calibrate.certificate.correction import nothing
 from calibrate.certificate.estimates import _k_hat, missed_by
+from calibrate.certificate.pool import search
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs
-from certificate_support import NODES, exact_data, linear_model
+from certificate_support import NODES, exact_data, exact_posterior, linear_model
 from linear_support import Step, linear_forward
 
 
 def log_likelihoods(forward, data, points):
     at = forward.at(np.array(NODES))
-    return np.array([norm.logpdf(data, np.asarray(at(x)), 0.1).sum() for x in points])
+    return norm.logpdf(data, np.asarray(jax.vmap(at)(points)), 0.1).sum(axis=(1, 2))
 
 
 def test_a_tail_that_is_one_point_drawn_again_has_no_shape_and_no_traceback():
@@ -45,5 +48,21 @@ def test_runs_that_fem_finds_likely_and_the_map_does_not_are_counted(beam):
     seen, missing = (Predictive(m, m.check_data(data)) for m in (right, wrong))
     z = seen.unconstrain({"mu": points[:, 0], "lam": points[:, 1]})
     runs = Runs(z, exact, np.zeros((6, 9)), np.ones(6), (None,) * 6, (None,) * 6)
-    assert missed_by(missing, nothing(1, 2, 9), runs) == by_hand > 0
-    assert missed_by(seen, nothing(1, 2, 9), runs) == 0
+    rng = np.random.default_rng(0)
+    # As of the wrong map: none beyond its step.
+    draws = exact_posterior(right, data, count=400, keep=lambda x: x[:, 0] < 72.5).draws()
+
+    def counted(predictive, tests):
+        pool = search(predictive, nothing(1, 2, 9), predictive.unconstrain(draws), (), rng)
+        chances = np.exp(pool.log_chances)
+        rows = rng.choice(pool.drawn, size=tests, p=chances / chances.sum())
+        at = predictive.constrain(pool.z[rows])
+        found = log_likelihoods(fem, data, np.stack([at["mu"], at["lam"]], axis=1))
+        tested = Runs(pool.z[rows], found, np.zeros((tests, 9)), np.ones(tests), (), ())
+        drawn = (pool.log_mixture + pool.log_chances)[rows]
+        tests = estimates.Tests(tested, rows, drawn)
+        return missed_by(predictive, nothing(1, 2, 9), pool, tests, runs)
+
+    assert counted(missing, 20) == by_hand > 0  # too few tests to meet what is hidden
+    assert counted(missing, 4000) == 0
+    assert counted(seen, 20) == 0

@@ -3,7 +3,14 @@ import numpy as np
 import pytest
 
 from calibrate.certificate.correction import nothing
-from calibrate.certificate.pool import effective, normalised, search, tempered
+from calibrate.certificate.pool import (
+    effective,
+    normalised,
+    redrawn,
+    search,
+    tempered,
+    with_guests,
+)
 from calibrate.certificate.predictive import Predictive
 from calibrate.samplers import density_of
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
@@ -81,3 +88,32 @@ def test_no_density_has_no_weights():
     weights = normalised(np.full(4, -np.inf))
     np.testing.assert_array_equal(weights, 0.0)
     assert effective(weights) == 0.0
+
+
+def test_tests_are_where_they_are_said_to_be(case, predictive):
+    """Distinct points that tests take in a cell, counted in pool after pool."""
+    rng, correction = np.random.default_rng(5), nothing(1, 2, 9)
+    draws = predictive.unconstrain(case[0].draws())
+    mean, sd = draws.mean(axis=0), draws.std(axis=0)
+    pool = search(predictive, correction, draws[:500], (), rng)
+    pools = [redrawn(pool, predictive, correction, rng) for _ in range(40)]
+    side = (np.arange(12) + 0.5) / 6.0 - 1.0
+    square = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    # Where the draws are, at their edge, and where only the prior is: there every point is taken.
+    for centre, width, tests in (
+        (mean, 0.5 * sd, 80),
+        (mean + 1.5 * sd, 0.5 * sd, 400),
+        (np.array([1.5, 2.0]), np.array([1.0, 1.0]), 30_000),
+    ):
+        found, said = [], []
+        for each in pools:
+            guests = with_guests(each, predictive, correction, centre + square * width)
+            np.testing.assert_array_equal(guests.log_chances[: each.drawn], each.log_chances)
+            density = np.exp(guests.log_tested(tests)[each.drawn :])
+            said.append(density.mean() * np.prod(2.0 * width))
+            chances = np.exp(each.log_chances)
+            for _ in range(10):
+                rows = np.unique(rng.choice(each.drawn, size=tests, p=chances / chances.sum()))
+                found.append(np.sum((np.abs(each.z[rows] - centre) < width).all(axis=1)))
+        assert np.mean(found) > 1.0
+        assert np.mean(found) == pytest.approx(np.mean(said), rel=0.1)
