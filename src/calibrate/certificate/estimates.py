@@ -169,8 +169,8 @@ def missed_by(
     count = len(log_weights)
     with np.errstate(invalid="ignore"):  # where no test has weight, nothing is met
         log_z = logsumexp(log_weights) - np.log(count * pool.drawn)
-        expected = _MASS * np.exp(there.log_tested(count)[guests] + log_z - fem)
-    return int(np.sum(unforeseen & ~(expected >= -np.log1p(-_MET))))
+        log_expected = np.log(_MASS) + there.log_tested(count)[guests] + log_z - fem
+    return int(np.sum(unforeseen & ~(log_expected >= np.log(-np.log1p(-_MET)))))
 
 
 def tail_of(pool: Pool, tests: Tests, missed: int, ends: int = 0) -> Tail:

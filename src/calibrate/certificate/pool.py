@@ -33,9 +33,9 @@ PRIOR = 512
 STEP, SEARCH_ROUNDS, POLISH_ROUNDS = 512, 8, 4
 _TEMPERED_ESS, MOST_TEMPERED = 0.15, 300.0  # of the points, for the next round's kernels
 ENOUGH = 800.0  # effective points at which the pool is good
-# Shares of the points that test: from the corrected posterior, the map's, where FEM may find the
-# data likely, around the draws, and from the whole pool.
-_CORRECTED, _MAP, _EXPLORED, _WIDE, _EVEN = 0.55, 0.15, 0.1, 0.1, 0.1
+# Shares of the points that test: from the corrected posterior, from the draws' density, smoothed,
+# where FEM may find the data likely, around the draws, and from the whole pool.
+_CORRECTED, _NEAR, _EXPLORED, _WIDE, _EVEN = 0.55, 0.15, 0.1, 0.1, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Pool:
 
     proposals, counts : kernels and how many points each gave; the first ``priors`` points are the
         prior's. Points beyond those ``drawn`` are guests, which change nothing of the others.
-    wide : which proposal surrounds the draws.
+    near : which proposal has the draws' density, smoothed; the next one surrounds them.
     log_kernels : of each proposal at each point, (c, s).
     at : log prior and likelihoods of the points, (s,) each.
     """
@@ -55,7 +55,7 @@ class Pool:
     proposals: tuple[Kernels, ...] = ()
     counts: tuple[int, ...] = ()
     log_kernels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    wide: int = 0
+    near: int = 0
 
     @property
     def drawn(self) -> int:
@@ -93,12 +93,13 @@ class Pool:
     @property
     def log_chances(self) -> np.ndarray:
         """Log of each point's chance (s,) to test: of several weights, each by its share."""
-        log_around = self.log_kernels[self.wide] - self.log_mixture  # whatever a map says there
+        # Whatever a map says there: corrected or not, it may have gaps.
+        near, around = self.log_kernels[self.near : self.near + 2] - self.log_mixture
         parts = (
             (_CORRECTED, self.log_corrected),
-            (_MAP, self.log_cheap),
+            (_NEAR, near),
             (_EXPLORED, self.log_explored),
-            (_WIDE, log_around),
+            (_WIDE, around),
             (_EVEN, np.zeros(len(self.z))),
         )
         totals = [logsumexp(log[: self.drawn]) for _, log in parts]
@@ -190,8 +191,8 @@ def search(
             break
         pool = step(pool, predictive, correction, pool.log_explored, rng)
     near = around(draws, widths(draws.shape[1]), NEAR_FREEDOM, rng)
+    pool = replace(pool, near=len(pool.proposals))
     pool = extend(pool, predictive, correction, near, NEAR, rng)
-    pool = replace(pool, wide=len(pool.proposals))
     pool = extend(pool, predictive, correction, around_draws(draws, rng), WIDE, rng)
     for points in ends:
         kernels = around(points, widths(draws.shape[1]), NEAR_FREEDOM, rng)
