@@ -39,6 +39,7 @@ QUICK = {
     "networks_alone": "--quick",
     "new_ventricle": "--ventricles 1 --runs 8 --tests 3",
     "objectives": "--quick",
+    "physics_informed": "--quick",
     "poor_emulators": "--quick",
     "published_pressure": "--quick",
     "released_networks": "--quick --published PUBLISHED",

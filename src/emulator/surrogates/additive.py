@@ -4,6 +4,7 @@ r"""The emulator of a scene: a sum of parts, any of which may be absent.
     u(\theta) = \underbrace{P\, u_c(\theta)}_\text{on a coarser mesh}
         + \underbrace{\sum_\alpha \frac{(x - x_0)^\alpha}{\alpha!}\, u_{,\alpha}
         }_\text{Taylor series of FEM at } x_0
+        + \underbrace{\textstyle\sum_\alpha P_\alpha(x)\, v_\alpha}_\text{polynomial}
         + \underbrace{s\, \text{net}(x)}_\text{network}
         + \underbrace{\textstyle\sum_k c_k(x)\, \phi_k}_\text{discrepancy model}
     \quad\text{where free}
@@ -33,12 +34,14 @@ from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.part import Network
 from emulator.surrogates.part import CachedPart, Part
+from emulator.surrogates.polynomial import Polynomial
 from emulator.surrogates.protocol import Prediction, fingerprint_of, inside_only, rows_of
 from emulator.surrogates.taylor import Expansion
 
 PARTS: dict[str, type[Part]] = {
     "coarse": Coarse,
     "taylor": Expansion,
+    "polynomial": Polynomial,
     "network": Network,
     "family": FamilyNetwork,
     "discrepancy": Discrepancy,
@@ -56,6 +59,7 @@ class Emulator(Shown):
     scene : what it emulates.
     coarse : emulator of the same body on a coarser mesh.
     taylor : Taylor series of the equilibrium; of order 0, an offset.
+    polynomial : fitted over the whole box.
     network : graph network.
     family : network that has learned a family of bodies, on this one.
     discrepancy : model of what FEM runs showed the other parts to leave.
@@ -65,6 +69,7 @@ class Emulator(Shown):
     scene: Scene
     coarse: Coarse | None = None
     taylor: Expansion | None = None
+    polynomial: Polynomial | None = None
     network: Network | None = None
     family: FamilyNetwork | None = None
     discrepancy: Discrepancy | None = None

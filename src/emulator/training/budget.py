@@ -49,8 +49,11 @@ class Budget:
             )
 
     def fem_deadline(self, plan: Plan) -> float:
-        """When FEM runs stop to begin; a network alone is trained on all of its plan's."""
-        return self.started + _FEM_SHARE * self.seconds if plan.discrepancy else np.inf
+        """When FEM runs or sweeps stop to begin; a network alone takes all FEM runs of its plan."""
+        if plan.sweeps and not plan.steps:
+            return self.started + _NETWORK_ALONE * self.seconds
+        early = plan.discrepancy or plan.sweeps
+        return self.started + _FEM_SHARE * self.seconds if early else np.inf
 
     def network_deadline(self, plan: Plan) -> float:
         """When the last optimiser step should end."""

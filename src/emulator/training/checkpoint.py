@@ -18,7 +18,7 @@ from emulator.store import fill_tree, named_leaves, read_arrays, save_arrays
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.plan import Plan
 
-CHECKPOINT = "checkpoint.safetensors"
+CHECKPOINT, SWEEPS = "checkpoint.safetensors", "sweeps.safetensors"
 
 
 class State(NamedTuple):
@@ -69,6 +69,10 @@ class Session:
         }
         tree = {"weights": state.weights, "optimiser": state.optimiser, "step": state.done}
         save_arrays(self.path, named_leaves(tree), metadata)
+
+    def announce(self) -> None:
+        """A checkpoint without weights: the plan, of a training whose sweeps come first."""
+        self.write(State({}, (), 0), self.plan.steps)
 
     def first(self, state: State, total: int) -> State:
         """The state to go on from: the checkpoint's, else ``state``, which then is kept."""
@@ -124,7 +128,7 @@ def open_session(
             Architecture.from_json(sizes) if sizes else architecture,
             now - float(metadata["seconds"]),
             json.loads(metadata["start"]),
-            arrays,
+            arrays if len(arrays) > 1 else None,  # weights, besides the number of steps
             float(metadata["loss"]),
         )
     except (KeyError, TypeError) as error:
@@ -132,5 +136,6 @@ def open_session(
 
 
 def remove_checkpoint(folder: str | Path) -> None:
-    """Remove the checkpoint in ``folder``, if there is one."""
-    (Path(folder) / CHECKPOINT).unlink(missing_ok=True)
+    """Remove the checkpoint in ``folder``, and that of its sweeps, if they are there."""
+    for name in (CHECKPOINT, SWEEPS):
+        (Path(folder) / name).unlink(missing_ok=True)

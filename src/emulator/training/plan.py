@@ -20,7 +20,10 @@ class Plan:
     recipe : the name in :data:`RECIPES` it came from, for the record.
     seed : of the weights, the FEM runs' theta, and the batches.
     simulations : FEM runs to train the network on (not used by ``energy``) and to fit the
-        discrepancy model to.
+        discrepancy model to; after sweeps, theta at which the network is taught their polynomial.
+    sweeps : over the box, which replace all FEM runs (:mod:`~emulator.training.sweeps`); with an
+        ``order`` they begin at the series about the centre, FEM's one solution. Without steps their
+        polynomial is the emulator.
     campaign : digest of the campaign whose first ``simulations`` rows are the FEM runs; empty where
         training makes them.
     centred : add the network to a Taylor series about the centre of the box, not to zero.
@@ -47,6 +50,7 @@ class Plan:
     objective: Objective = "both"
     steps: int = 3000
     simulations: int = 256
+    sweeps: int = 0
     batch: int = 16
     learning_rate: float = 1e-3
     schedule: Literal["cosine", "halves"] = "cosine"
@@ -72,12 +76,16 @@ class Plan:
 
     def _faults(self) -> Iterator[str]:
         """What cannot work."""
-        trains = not (self.discrepancy or self.as_learned)
+        trains = not (self.discrepancy or self.as_learned or self.sweeps)
         for name, least in {"steps": int(trains), "batch": 1, "checkpoint_every": 1}.items():
             if getattr(self, name) < least:
                 yield f"{name} is {getattr(self, name)}; it must be {least} or more"
         if not 0.0 < self.learning_rate < math.inf:
             yield f"learning_rate is {self.learning_rate}; it must be positive and finite"
+        if self.sweeps < 0:
+            yield f"{self.sweeps} sweeps; give 16 or more"
+        if self.sweeps and (self.discrepancy or self._by_batches):
+            yield f"recipe '{self.recipe}' takes FEM runs, not sweeps; use recipe physics or sweeps"
         if self.simulations < (1 if self.discrepancy else 0):
             yield f"{self.simulations} simulations; a discrepancy model needs 1 or more"
         if self.objective == "modes" and self.simulations < 1:
@@ -112,11 +120,18 @@ class Plan:
             found = dict.fromkeys(("objective", "batch"), "trains no network")
         elif self.objective == "modes":
             found = {"batch": "takes all FEM runs at every step"}
-        if not self.runs:
+        if not self.sweeps:
+            found["sweeps"] = "makes none"
+        if not (self.runs or (self.sweeps and self.steps)):
             found["simulations"] = "takes no FEM runs"
         if self.as_learned:
             found["seed"] = "draws nothing at random"
         return found
+
+    @property
+    def _by_batches(self) -> bool:
+        """Whether a network is trained on a few theta a step."""
+        return bool(self.steps) and self.objective != "modes"
 
     @property
     def slopes(self) -> bool:
@@ -125,7 +140,9 @@ class Plan:
 
     @property
     def runs(self) -> int:
-        """FEM runs besides the centre's."""
+        """FEM runs besides the centre's; none, not even that one, after sweeps."""
+        if self.sweeps:
+            return 0
         return self.simulations if self.discrepancy or self.objective != "energy" else 0
 
 
@@ -164,6 +181,19 @@ RECIPES: dict[str, Plan] = {
         freeze=2000,
         polish=4000,
     ),
+    "physics": Plan(
+        recipe="physics",
+        objective="modes",
+        decoder="separable",
+        modes=0,
+        sweeps=60,
+        simulations=400,
+        learning_rate=2e-3,
+        steps=20_000,
+        freeze=2000,
+        polish=4000,
+    ),
+    "sweeps": Plan(recipe="sweeps", objective="energy", sweeps=60, steps=0),
     "paper": Plan(
         recipe="paper",
         objective="energy",
@@ -179,7 +209,9 @@ discrepancy model. ``mechanics``: the same without a network, from a mesh to an 
 minute. ``two_meshes``: an emulator on a coarser mesh of the same body, and a discrepancy model of
 a few runs on the scene's own. ``family``: a network that has learned a family of bodies, on this
 one, without any FEM run. ``modal``: a network alone about the FEM solution at the centre, its modes
-by variable projection, their coefficients from values and slopes of FEM runs. ``network``:
+by variable projection, their coefficients from values and slopes of FEM runs. ``physics``: the same
+without any FEM run: what it is taught comes of sweeps over the box, which minimise the energy.
+``sweeps``: their polynomial, without a network. ``network``:
 Algorithm 1 about the FEM solution at the centre, trained on FEM runs and the energy. ``paper``:
 Algorithm 1 from zero, the energy at one theta a step, Adam at 1e-4 and then 1e-5, as released by
 Dalton et al. (2023)."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,6 +18,7 @@ from emulator.fem.campaign.starts import Predictor
 from emulator.scenes.nodes import all_nodes
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
+from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.taylor import Expansion, constant, expand
 from emulator.training.budget import Budget
@@ -22,6 +26,7 @@ from emulator.training.discrepancy_stage import FEWEST
 from emulator.training.network import NetworkTraining, network_training, scales_of, untrained
 from emulator.training.plan import Plan
 from emulator.training.start import architecture_from, family_on, on_finer, with_network_of
+from emulator.training.sweeps import part_of, runs_of, sweep_box
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +35,11 @@ class Problem:
 
     plan : with as many simulations as were run.
     emulator : untrained; without a network where the plan has no optimiser step.
-    runs : FEM solutions, the centre's first.
+    runs : FEM solutions, or what sweeps say in their place, the centre's first.
     training : of the network; None without one.
     series : FEM's own, where the emulator's is of what a family's network leaves or on a coarser
         mesh.
+    swept_mm: error bar of the sweeps, where they replace FEM.
     """
 
     plan: Plan
@@ -41,6 +47,7 @@ class Problem:
     runs: Runs
     training: NetworkTraining | None = None
     series: Expansion | None = None
+    swept_mm: float | None = None
 
     @property
     def architecture(self) -> Architecture | None:
@@ -55,6 +62,7 @@ def prepare(
     *,
     start: Emulator | None = None,
     campaign: StoredRuns | None = None,
+    folder: Path | None = None,
     budget: Budget | None = None,
     progress: bool = False,
 ) -> Problem:
@@ -65,6 +73,7 @@ def prepare(
     start : the emulator whose network to begin from, on any mesh; its architecture then is the
         default. Of a plan on a coarser mesh, the emulator there.
     campaign : FEM runs that are there already; the centre's alone is then solved.
+    folder : where sweeps are kept, and taken up again.
     budget : ends FEM runs in time, except the fewest that a discrepancy model can be judged by.
 
     Raises
@@ -87,13 +96,29 @@ def prepare(
     elif start is not None:
         architecture = architecture_from(start, scene, plan, architecture)
     simulator = Simulator(scene)
-    # Rounded as a file stores it, so that the discrepancy is fitted to the series that is loaded.
-    series = expand(simulator, order=plan.order).rounded() if plan.order else None
-    if budget is not None and series is not None:
-        budget.require("the series about the centre of the box")
-    runs = _runs(simulator, plan, series, campaign, deadline, progress)
+    if plan.sweeps:
+        swept = sweep_box(
+            simulator,
+            plan.sweeps,
+            plan.seed,
+            start=_beginning(simulator, plan, family),
+            folder=folder,
+            deadline=deadline,
+            progress=progress,
+        )
+        plan, series = replace(plan, sweeps=swept.number), None
+        runs = runs_of(simulator, swept, _taught(scene, plan))
+        if not plan.steps:
+            alone = Emulator(scene, polynomial=part_of(simulator, swept))
+            return Problem(plan, alone, runs, swept_mm=swept.left)
+    else:
+        # Rounded as a file stores it: the discrepancy is fitted to the series that is loaded.
+        series = expand(simulator, order=plan.order).rounded() if plan.order else None
+        if budget is not None and series is not None:
+            budget.require("the series about the centre of the box")
+        runs = _runs(simulator, plan, series, campaign, deadline, progress)
     if budget is not None:
-        budget.require(f"{len(runs.theta)} FEM runs")
+        budget.require(f"{plan.sweeps} sweeps" if plan.sweeps else f"{len(runs.theta)} FEM runs")
     if plan.runs:
         plan = replace(plan, simulations=len(runs.theta) - 1)
     if series is None and plan.centred:
@@ -112,7 +137,25 @@ def prepare(
     emulator = replace(emulator, network=network)
     if start is not None:
         emulator = with_network_of(emulator, start)
-    return Problem(plan, emulator, runs, network_training(emulator, plan, runs, scales))
+    training = network_training(emulator, plan, runs, scales)
+    return Problem(plan, emulator, runs, training, swept_mm=swept.left if plan.sweeps else None)
+
+
+def _beginning(
+    simulator: Simulator, plan: Plan, family: FamilyNetwork | None
+) -> Callable[[jax.Array], jax.Array] | None:
+    """Where sweeps begin under the whole load, by position in the box; None at rest."""
+    scene = simulator.scene
+    if family is not None:
+        cached = Emulator(scene, family=family).cache()
+        return lambda position: cached(scene.from_unit(position))
+    return expand(simulator, order=plan.order) if plan.order else None
+
+
+def _taught(scene: Scene, plan: Plan) -> jax.Array:
+    """Theta (c, p) at which a network is taught the polynomial of sweeps, the centre first."""
+    some = design(scene, plan.simulations, plan.seed) if plan.steps else scene.centre[None][:0]
+    return jnp.concatenate([scene.centre[None], some])
 
 
 def _runs(

@@ -48,10 +48,10 @@ def family_on(start: Emulator, scene: Scene, plan: Plan) -> FamilyNetwork:
         A plan that would train it further, or a scene it cannot know.
     """
     assert start.family is not None, "asked only of a family's"
-    if plan.steps or not (plan.discrepancy or plan.as_learned):
+    if plan.steps or not (plan.discrepancy or plan.as_learned or plan.sweeps):
         raise InputError(
             f"recipe '{plan.recipe}' cannot start from a network that has learned a family of "
-            "bodies; use recipe family, without any FEM run, or mechanics"
+            "bodies; use recipe family or sweeps, without any FEM run, or mechanics"
         )
     return on_body(start.family.learned, scene)
 

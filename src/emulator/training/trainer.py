@@ -17,7 +17,13 @@ from emulator.surrogates.files import load, save_emulator
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.aim import Aim
 from emulator.training.budget import Budget
-from emulator.training.checkpoint import Session, State, open_session, remove_checkpoint
+from emulator.training.checkpoint import (
+    SWEEPS,
+    Session,
+    State,
+    open_session,
+    remove_checkpoint,
+)
 from emulator.training.discrepancy_stage import add_discrepancy
 from emulator.training.loop import Hook, Steps, require_finite, run
 from emulator.training.plan import Plan, recipe
@@ -51,10 +57,11 @@ def train(
         replaces ``plan.steps`` by as many as fit, estimated again as the machine gets busier or
         less so, and ``plan.simulations`` by as many as were done in its first third. Where a
         discrepancy model follows, which soon outdoes the network, neither is made larger.
-    resume : continue from the checkpoint in ``folder``, under the plan it was written with and with
-        the network it holds; where no network is trained, ``start`` is needed again. For a plan in
-        steps the result equals that of a run never interrupted; one on a budget keeps the number of
-        steps it was aiming at.
+    resume : continue from the checkpoint in ``folder``, among sweeps or steps, under the plan it
+        was written with and with the network it holds; where no network is trained, ``start`` is
+        needed again. For a plan in steps the result equals that of a run never interrupted; one on
+        a budget keeps the number of steps it was aiming at, and killed among its sweeps goes on
+        without the budget.
     """
     if campaign is not None and not (plan.runs or resume):
         raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
@@ -70,6 +77,9 @@ def train(
         budget = None  # it is in the checkpoint
     else:
         session = replace(session, plan=replace(plan, campaign=digest), start=source)
+        (Path(folder) / SWEEPS).unlink(missing_ok=True)
+        if plan.sweeps:
+            session.announce()
     limit = None if budget is None else Budget(budget, session.began)
     problem = prepare(
         scene,
@@ -77,6 +87,7 @@ def train(
         session.architecture,
         start=start,
         campaign=campaign,
+        folder=Path(folder),
         budget=limit,
         progress=progress,
     )
@@ -151,6 +162,8 @@ def _finish(problem: Problem, state: State, *, progress: bool) -> tuple[Emulator
         loss = require_finite(state)
         emulator = with_weights(emulator, problem.training.finish(state.weights, progress=progress))
     record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
+    if problem.swept_mm is not None:
+        record["sweeps"] = {"number": plan.sweeps, "error_mm": problem.swept_mm}
     if plan.discrepancy:
         emulator, record["discrepancy"] = add_discrepancy(emulator, problem.runs, problem.series)
     return emulator, record

@@ -28,7 +28,9 @@ def register(commands: Any) -> None:
         choices=tuple(RECIPES),
         help="default hybrid: Taylor series, network trained on the energy, discrepancy model of "
         "FEM runs; mechanics: the same without the network, in a minute; modal: a network alone, "
-        "from values and slopes of FEM runs; family: the network of --start, without FEM",
+        "from values and slopes of FEM runs; physics: a network alone without any FEM run, from "
+        "the energy; sweeps: a polynomial, from the energy alone; family: the network of --start, "
+        "without FEM",
     )
     parser.add_argument(
         "--start",
@@ -52,6 +54,7 @@ def register(commands: Any) -> None:
     )
     length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
     parser.add_argument("--simulations", type=int, help="FEM runs to train on")
+    parser.add_argument("--sweeps", type=int, help="of recipes physics and sweeps, in place of FEM")
     parser.add_argument(
         "--campaign",
         metavar="STORE.zarr",
@@ -127,10 +130,14 @@ def _told(folder: str, scene: str, record: Mapping[str, Any]) -> str:
     """What was done, and how far the emulator is from FEM runs that it did not see."""
     plan = record["plan"]
     counts = [f"{plan['simulations']} FEM runs"] if plan["simulations"] else []
+    if "sweeps" in record:
+        counts = [f"no FEM run, {plan['sweeps']} sweeps"]
     counts += [f"{plan['steps']} steps"] if plan["steps"] else []
     text = f"trained {scene}: {', '.join([*counts, f'{record["seconds"]:.0f} s'])}"
     found = record.get("discrepancy") or {}
     error = found.get("held_out_err_u_mm", {}).get(found.get("on"))
+    if "sweeps" in record and not plan["steps"]:
+        return f"{text}; about {record['sweeps']['error_mm']:.1g} mm from equilibrium"
     if error is None:
         return f"{text}; its error: calibrate evaluate {folder}"
     return f"{text}; {error:.2g} mm from FEM at held-out runs"
@@ -145,7 +152,7 @@ def _default_recipe(start: Any) -> str:
 
 def _given(arguments: argparse.Namespace) -> dict[str, Any]:
     """Fields of the plan given on the command line; with ``--resume`` there may be none."""
-    names = ("objective", "steps", "simulations", "batch", "seed")
+    names = ("objective", "steps", "simulations", "sweeps", "batch", "seed")
     given = {name: getattr(arguments, name) for name in names}
     given = {name: value for name, value in given.items() if value is not None}
     others = [n for n in ("recipe", "budget") if getattr(arguments, n) is not None]
@@ -167,7 +174,7 @@ def _refuse_idle(plan: Plan, given: Mapping[str, Any], budget: str | None) -> No
 
 def command_line(scene: str, record: Mapping[str, Any]) -> str:
     """The command that repeats a training exactly, with the steps and runs it really took."""
-    names = ("recipe", "objective", "steps", "simulations", "batch", "seed")
+    names = ("recipe", "objective", "steps", "simulations", "sweeps", "batch", "seed")
     plan = Plan(**record["plan"])
     options = " ".join(f"--{name} {getattr(plan, name)}" for name in names if name not in plan.idle)
     # The record names the emulator training started from by its fingerprint, not by its folder.

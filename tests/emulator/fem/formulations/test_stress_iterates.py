@@ -225,10 +225,15 @@ def test_a_good_start_keeps_its_load_and_a_poor_one_is_left(ventricle, monkeypat
         np.testing.assert_allclose(solution.displacement, u, atol=1e-8)
 
 
-def test_with_mean_dilatation_they_end_where_newton_does():
+@pytest.fixture(scope="module")
+def dilated():
+    return replace(em.scenes.left_ventricle(3, 8, 1), dilatation="mean", origin={})
+
+
+@pytest.mark.slow
+def test_with_mean_dilatation_they_converge_quadratically(dilated):
     """The law sees each element's mean volume ratio; so do the measures and their tangent."""
-    scene = replace(em.scenes.left_ventricle(3, 8, 1), dilatation="mean", origin={})
-    theta = scene.from_unit(jnp.array([1.0, 1.0, 1.0, 1.0, 0.0]))
+    scene, theta = dilated, dilated.from_unit(jnp.array([1.0, 1.0, 1.0, 1.0, 0.0]))
     own, errors = mip(scene, theta), []
     state, step = own.begin(jnp.zeros(scene.held.shape)), jax.jit(own.step)
     for iteration in range(8):
@@ -237,6 +242,10 @@ def test_with_mean_dilatation_they_end_where_newton_does():
     assert errors[-1] < 1e-10
     last = [error for error in errors if 1e-9 < error < 0.1]
     assert all(after < 10.0 * before**1.6 for before, after in pairwise(last))
+
+
+def test_with_mean_dilatation_they_end_where_newton_does(dilated):
+    scene = dilated
     ramps, volumes = (
         em.Simulator(scene, NewtonOptions(stress_iterates=used)).solve(scene.centre)
         for used in (True, False)
@@ -245,7 +254,7 @@ def test_with_mean_dilatation_they_end_where_newton_does():
     assert int(ramps.iterations) <= 0.6 * int(volumes.iterations)  # 10 and 22
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_body_that_is_pulled_by_its_face_climbs_the_ramps(order):
     """Prescribed displacements: fewer than Newton's iterations, the same end."""
     mesh = box((10.0, 10.0, 10.0), (2, 2, 2), order)

@@ -1,0 +1,159 @@
+r"""Where equilibria should be, one guarded step from where a map says they are.
+
+At each theta a few conjugate gradients for the linearised equations,
+
+.. math:: K(v_i, \theta_i)\, e_i = -r(v_i, \theta_i),
+
+beside one Cholesky factor for eight neighbours: of the tangent in the middle of them, where the map
+says. Newton's guard decides how much of :math:`e_i` is taken: it lowers the potential and crushes
+no element. There is no iteration at a theta, and no solution of FEM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.fem import Simulator
+from emulator.fem.campaign.threads import at_once, in_order
+from emulator.fem.halving import largest_good
+from emulator.fem.linear import Outcome
+from emulator.fem.linear.reuse import conjugate_gradients
+from emulator.fem.loop import compiled
+from emulator.fem.system import System
+
+_GROUP = 8  # theta beside one factor
+_MIDDLES = 3  # of a group, whose tangents are tried
+_STEPS, _TOLERANCE = 4, 1e-8  # of conjugate gradients
+_LEAST_J = 0.05
+_LEAST_FRACTION = 2.0**-7
+_ARMIJO, _ROUND_OFF = 1e-4, 1e-13  # as of Newton's method (fem/newton/line_search)
+
+
+class Targets(NamedTuple):
+    """Targets at c theta, in their order.
+
+    fields : (c, f) mm where free. step : (c,) mm, root mean square over the nodes of the whole
+    step. fraction : (c,) of it that was taken, 0 for none. contraction : (c,) of the residual, in
+    the norm of the factor's inverse. gap : (c,) of the potential that the step closes, relative.
+    """
+
+    fields: np.ndarray
+    step: np.ndarray
+    fraction: np.ndarray
+    contraction: np.ndarray
+    gap: np.ndarray
+
+    @property
+    def error(self) -> np.ndarray:
+        """What each target may still be off, (c,) mm: infinite where no step was taken."""
+        with np.errstate(invalid="ignore"):
+            left = self.step * (1.0 - self.fraction + self.fraction * self.contraction)
+        usable = (self.fraction > 0.0) & np.isfinite(left) & np.isfinite(self.fields).all(axis=1)
+        return np.where(usable, left, np.inf)
+
+
+def targets(
+    simulator: Simulator, fields: np.ndarray, position: np.ndarray, level: float
+) -> Targets:
+    """Targets at ``position`` (c, p) in the unit box, c eight times a power of two.
+
+    fields : (c, f) mm where free, as a map says. level : of the loads and moved supports.
+    """
+    system, load = simulator.system, jnp.asarray(level)
+    thetas = np.asarray(simulator.scene.from_unit(jnp.asarray(position)))
+    groups = _groups(position)
+
+    def of_group(rows: np.ndarray) -> Targets:
+        factor = None
+        for middle in rows[:_MIDDLES]:
+            tangent, definite = _tangent(system, fields[middle], thetas[middle], load)
+            if bool(definite):
+                factor = tangent
+                break
+        if factor is None:
+            nothing = np.zeros(len(rows))
+            return Targets(fields[rows], nothing + np.inf, nothing, nothing, nothing + np.inf)
+        each = [_target(system, factor, fields[k], thetas[k], load) for k in rows]
+        return Targets(*(np.stack([np.asarray(x) for x in row]) for row in zip(*each, strict=True)))
+
+    told: Iterator[Targets] = in_order(of_group, iter(groups), at_once(simulator))
+    joined = [np.concatenate(column) for column in zip(*told, strict=True)]
+    back = np.argsort(np.concatenate(groups))
+    return Targets(*(column[back] for column in joined))
+
+
+def on_supports(system: System, v: jax.Array, level: jax.Array | float) -> jax.Array:
+    """Displacement (n, 3) with ``v`` (f,) where free, and held by the supports of ``level``."""
+    return system.extend(v) + level * jnp.asarray(system.scene.held_displacement)
+
+
+def _groups(position: np.ndarray) -> list[np.ndarray]:
+    """Rows of eight neighbours each in ``position`` (c, p), those in the middle first."""
+    parts = [np.arange(len(position))]
+    while len(parts[0]) > _GROUP:
+        halves = []
+        for rows in parts:
+            widest = np.argmax(np.ptp(position[rows], axis=0))
+            order = rows[np.argsort(position[rows, widest], kind="stable")]
+            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
+        parts = halves
+
+    def from_middle(rows: np.ndarray) -> np.ndarray:
+        away = np.sum((position[rows] - position[rows].mean(axis=0)) ** 2, axis=1)
+        return rows[np.argsort(away, kind="stable")]
+
+    return [from_middle(rows) for rows in parts]
+
+
+@compiled
+def _tangent(
+    system: System, v: jax.Array, theta: jax.Array, level: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Nonzeros (nnz,) of the tangent at ``v`` (f,), and whether it is positive definite."""
+    values, solvable = system.safe_tangent(on_supports(system, v, level), theta, level)
+    outcome = system.attempt(values, jnp.zeros_like(v))[1]
+    return values, solvable & (outcome == Outcome.OK)
+
+
+@compiled
+def _target(
+    system: System, factor: jax.Array, v: jax.Array, theta: jax.Array, level: jax.Array
+) -> tuple[jax.Array, ...]:
+    """Of :class:`Targets`, at ``theta`` (p,) from ``v`` (f,), beside the tangent ``factor``."""
+
+    def residual(v: jax.Array) -> jax.Array:
+        return system.residual(on_supports(system, v, level), theta, level)
+
+    def beside(force: jax.Array) -> jax.Array:
+        return system.attempt(factor, force)[0]
+
+    def potential(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return system.potential(on_supports(system, v, level), theta, level)
+
+    r, pulled = jax.linearize(residual, v)
+    step = conjugate_gradients(pulled, beside, -r, _STEPS, _TOLERANCE).x
+    slope = jnp.vdot(r, step)
+    energy, size = potential(v)
+
+    def sound(fraction: jax.Array) -> jax.Array:
+        u = on_supports(system, v + fraction * step, level)
+        return system.least_volume_ratio(u) > _LEAST_J  # False for NaN
+
+    def lower(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        there = potential(v + fraction * step)[0]
+        return there <= energy + _ARMIJO * fraction * slope + _ROUND_OFF * size, there
+
+    trial = largest_good(sound, lower, _LEAST_FRACTION)
+    usable = trial.good & (slope <= 0.0)  # False for NaN
+    fraction = jnp.where(usable, trial.fraction, 0.0)
+    moved = jnp.where(usable, v + fraction * step, v)
+    left = residual(moved)
+    before, after = jnp.vdot(r, beside(r)), jnp.vdot(left, beside(left))
+    contraction = jnp.sqrt(jnp.abs(after) / jnp.where(before > 0.0, before, 1.0))
+    nodes = system.scene.held.shape[0]
+    return moved, jnp.sqrt(jnp.sum(step**2) / nodes), fraction, contraction, -0.5 * slope / size

@@ -1,0 +1,199 @@
+"""Learning from the energy alone: how accurate, in what time, and who wins?
+
+    python -m studies.physics_informed                # cases that are there are kept
+    python -m studies.physics_informed --only beam liver
+    python -m studies.physics_informed --minutes 60   # for each network
+    python -m studies.physics_informed --quick --out DIR  # a coarse beam
+
+No FEM solution is used but where a case says so; FEM judges at 50 theta that nothing has seen.
+Writes results.json, after each case, and physics.png, and asserts what the README says.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from studies.common.output import Case, Results, parser, save
+
+import emulator as em
+from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE, GREEN, ORANGE, PINK, VERMILION
+from emulator.error.comparison import case_errors, quantiles
+from emulator.fem import Runs, run_campaign, sobol
+from emulator.scenes import Scene
+from emulator.surrogates import Architecture, Emulator
+from emulator.surrogates.taylor import expand
+from emulator.training import recipe, train
+from emulator.training.sweeps import part_of, sweep_box
+
+HERE = Path(__file__).parent
+TEST_SEED, SEED = 90_210, 0
+BODIES: dict[str, Callable[[], Scene]] = {
+    "beam": em.scenes.once_clamped_beam,
+    "beam held at both ends": em.scenes.twice_clamped_beam,
+    "cube": em.scenes.twisting_cube,
+    "liver": em.scenes.liver,
+    "ventricle": em.scenes.left_ventricle,
+}
+# err_u in mm of the paper's networks on its own versions of these scenes, trained on a GPU.
+PAPER = {"beam": 2.0e-2, "cube": 8.5e-4, "liver": 8.8e-3, "ventricle": 2.8e-2}
+ERRORS = ("err_u", "err_F", "err_Pi", "err_V")
+SWEEPS, EVERY = 60, 3
+COLOURS = {
+    "sweeps": BLUE,
+    "sweeps about the centre": GREEN,
+    "physics": ORANGE,
+    "paper's recipe": VERMILION,
+    "modal": PINK,
+}
+NETWORKS = {"physics": "physics", "paper's recipe": "paper", "modal": "modal"}
+SMALL = Architecture(
+    steps=2, latent=8, hidden=(16, 16), decoder="separable", modes=6, trunk=(16, 40)
+)
+
+
+def errors_of(emulator: Emulator, known: Runs) -> dict[str, Any]:
+    """Quantiles of the errors against FEM."""
+    found = case_errors(emulator.cache(), known.theta, known.displacement)
+    return {key: quantiles(found.fields[key]) for key in ERRORS if key in found.fields}
+
+
+def sweeping(scene: Scene, known: Runs, sweeps: int, *, centre: bool = False) -> Case:
+    """Sweeps, a few at a time; with ``centre``, from FEM's series about the centre."""
+    simulator = em.Simulator(scene)
+    began = time.perf_counter()
+    start = expand(simulator, order=3) if centre else None
+    seconds, curve = time.perf_counter() - began, []
+    with tempfile.TemporaryDirectory() as folder:
+        for count in range(16, sweeps + 1, EVERY):
+            began = time.perf_counter()
+            try:
+                state = sweep_box(simulator, count, SEED, start=start, folder=Path(folder))
+            except em.SolverError:  # not yet at the whole load
+                seconds += time.perf_counter() - began
+                continue
+            seconds += time.perf_counter() - began
+            emulator = Emulator(scene, polynomial=part_of(simulator, state))
+            errors = errors_of(emulator, known)
+            curve.append(
+                {
+                    "sweeps": state.number,
+                    "seconds": round(seconds, 1),
+                    "degree": state.polynomial.degree,
+                    "error_bar_mm": state.left,
+                    "err_u": errors["err_u"],
+                }
+            )
+            if state.done:
+                break
+    return {"fem_solutions": int(centre), "seconds": round(seconds, 1), "curve": curve,
+            "modes": len(emulator.polynomial.modes), "errors": errors}  # fmt: skip
+
+
+def network(scene: Scene, known: Runs, name: str, minutes: float, small: bool) -> Case:
+    """The network that a recipe trains in so many minutes."""
+    plan = replace(recipe(name), seed=SEED)
+    sizes = SMALL if small and plan.decoder == "separable" else None
+    if small:
+        plan = replace(plan, steps=60, simulations=20, freeze=30, polish=50)
+    with tempfile.TemporaryDirectory() as folder:
+        budget = None if small else 60.0 * minutes
+        emulator = train(scene, plan, folder, architecture=sizes, budget=budget)
+    record = emulator.record
+    runs = 0 if plan.sweeps else plan.runs + int(plan.centred)
+    return {"fem_solutions": runs, "seconds": record["seconds"], "steps": record["plan"]["steps"],
+            "errors": errors_of(emulator, known)}  # fmt: skip
+
+
+class Body:
+    """A scene, and FEM at theta that nothing has seen, solved when it is asked for."""
+
+    def __init__(self, name: str, scene: Scene, tests: int) -> None:
+        self.name, self.scene, self._tests = name, scene, tests
+
+    @cached_property
+    def known(self) -> Runs:
+        """The FEM solutions that judge."""
+        return run_campaign(em.Simulator(self.scene), sobol(self.scene, self._tests, TEST_SEED))
+
+    def case(self, way: str, given: Any) -> Case:
+        """One way of learning it."""
+        if way in NETWORKS:
+            found = network(self.scene, self.known, NETWORKS[way], given.minutes, given.quick)
+        else:
+            centre = way == "sweeps about the centre"
+            sweeps = 30 if given.quick else SWEEPS
+            found = sweeping(self.scene, self.known, sweeps, centre=centre)
+        jax.clear_caches()
+        size = float(jnp.mean(jnp.linalg.norm(self.known.displacement, axis=-1)))
+        nodes = len(self.scene.mesh.nodes)
+        return {"body": self.name, "way": way, "nodes": nodes, "displacement_mm": size, **found}
+
+
+def draw(cases: list[Case], path: Path) -> None:
+    """Error against time, a panel a body."""
+    plt = pyplot()
+    bodies = list(dict.fromkeys(case["body"] for case in cases))
+    figure, panels = plt.subplots(
+        1, len(bodies), figsize=(3.3 * len(bodies) + 0.7, 3.9), layout="constrained", squeeze=False
+    )
+    for axes, body in zip(panels[0], bodies, strict=True):
+        for case in (case for case in cases if case["body"] == body):
+            curve = case.get("curve") or [
+                {"seconds": case["seconds"], "err_u": case["errors"]["err_u"]}
+            ]
+            colour = COLOURS[case["way"]]
+            x = [max(point["seconds"], 1.0) for point in curve]
+            y = [point["err_u"]["median"] for point in curve]
+            axes.plot(x, y, "o-", color=colour, label=case["way"], ms=4)
+            if "curve" in case:
+                bars = [point["error_bar_mm"] for point in curve]
+                axes.plot(x, bars, ":", color=colour, lw=1)
+        if body in PAPER:
+            axes.axhline(PAPER[body], color="0.5", lw=0.8)
+            axes.text(1.2, PAPER[body] * 1.2, "the paper's", color="0.4", size=8)
+        axes.set(xscale="log", yscale="log", title=body, xlabel="seconds")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(color="0.92")
+    panels[0][0].set_ylabel("median err_u, mm (dotted: said by the sweeps)")
+    panels[0][0].legend(frameon=False, fontsize=8)
+    figure.suptitle("Learning from the energy alone")
+    save(figure, path)
+
+
+def main() -> None:
+    """Run the study."""
+    arguments = parser(__doc__, HERE)
+    arguments.add_argument("--only", nargs="*", help="bodies")
+    arguments.add_argument("--ways", nargs="*", choices=tuple(COLOURS), help="ways of learning")
+    arguments.add_argument("--minutes", type=float, default=60.0, help="for each network")
+    arguments.add_argument("--tests", type=int, default=50)
+    given = arguments.parse_args()
+    bodies = BODIES
+    if given.quick:
+        bodies = {"beam": lambda: em.scenes.once_clamped_beam((4, 2, 2), order=1)}
+        given.tests = 4
+    settings = {"tests": given.tests, "quick": given.quick}
+    results = Results(given.out, TEST_SEED, again=given.again, settings=settings)
+    for name, make in bodies.items():
+        if given.only and name not in given.only:
+            continue
+        body = Body(name, make(), given.tests)
+        for way in given.ways or COLOURS:
+            results.case(f"{name}, {way}", partial(body.case, way, given))
+    draw(results.cases, given.out / "physics.png")
+    if given.quick:
+        return
+    for case in results.cases:
+        if case["way"] in ("sweeps", "physics") and case["body"] in PAPER:
+            assert case["errors"]["err_u"]["median"] < PAPER[case["body"]], case["name"]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Equilibria over the whole box from residuals alone."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.errors import InputError, SolverError
+from emulator.fem import simulator as fem_simulator
+from emulator.fem import sobol
+from emulator.surrogates import load, save_emulator
+from emulator.surrogates.network.pignn import Architecture
+from emulator.training import Plan, recipe, train
+from emulator.training import sweeps as module
+from emulator.training.checkpoint import CHECKPOINT, SWEEPS
+from emulator.training.sweeps import runs_of, sweep_box
+from emulator.training.targets import targets
+
+SMALL = Architecture(
+    steps=2, latent=8, hidden=(16, 16), decoder="separable", modes=6, trunk=(16, 40)
+)
+
+
+@pytest.fixture(scope="module")
+def swept(beam):
+    """Of a body whose simulator never solves: the counter proves that no FEM solution is used."""
+    return sweep_box(em.Simulator(beam), 45, 0)
+
+
+@pytest.fixture
+def no_fem(monkeypatch):
+    """Every FEM solution is an error."""
+
+    def refuse(*_):
+        raise AssertionError("a FEM solution was asked for")
+
+    monkeypatch.setattr(fem_simulator, "find_equilibrium", refuse)
+
+
+@pytest.fixture
+def equilibrium(beam, simulator):
+    """Positions (8, 2) and the free displacements (8, f) there."""
+    thetas = sobol(beam, 8, 1)
+    fields = [simulator.system.restrict(simulator(theta)) for theta in thetas]
+    return np.asarray(jax.vmap(beam.to_unit)(thetas)), np.stack(fields)
+
+
+def test_they_end_where_fem_does(beam, simulator, swept):
+    """Within what they say of themselves; the displacement is some millimetres."""
+    thetas = sobol(beam, 6, 9)
+    runs = runs_of(simulator, swept, thetas)
+    exact = jnp.stack([simulator(theta) for theta in thetas])
+    errors = jnp.sqrt(jnp.mean(jnp.sum((runs.displacement - exact) ** 2, axis=-1), axis=-1))
+    size = jnp.sqrt(jnp.mean(jnp.sum(exact**2, axis=-1)))
+    assert swept.level == 1.0
+    assert swept.left < 1e-7 * size
+    assert jnp.median(errors) < 2.0 * swept.left + 1e-9 * size
+    slopes = jnp.moveaxis(jax.jacfwd(simulator)(thetas[0]), -1, 0)
+    np.testing.assert_allclose(runs.sensitivities[0], slopes, atol=1e-5 * jnp.abs(slopes).max())
+    energy = simulator.system.potential(exact[0], thetas[0])[0]
+    np.testing.assert_allclose(runs.energy[0], energy, rtol=1e-10)
+
+
+def test_supports_that_move_are_followed(cube):
+    simulator = em.Simulator(cube)
+    swept = sweep_box(simulator, 30, 0)
+    theta = sobol(cube, 1, 3)
+    there, exact = runs_of(simulator, swept, theta).displacement[0], simulator(theta[0])
+    np.testing.assert_allclose(there, exact, atol=1e-3 * jnp.abs(exact).max())
+    np.testing.assert_array_equal(there[cube.held], exact[cube.held])
+
+
+def test_a_target_at_equilibrium_is_where_it_was(simulator, equilibrium):
+    position, fields = equilibrium
+    found = targets(simulator, fields, position, 1.0)
+    np.testing.assert_allclose(found.fields, fields, atol=1e-9)
+    assert (found.step < 1e-9).all()
+
+
+def test_a_target_near_equilibrium_is_nearer(simulator, equilibrium):
+    """By the contraction that it says, in the norm that it says it in, about."""
+    position, fields = equilibrium
+    away = 1.02 * fields
+    found = targets(simulator, away, position, 1.0)
+    before, after = (np.linalg.norm(x - fields, axis=1) for x in (away, found.fields))
+    np.testing.assert_array_equal(found.fraction, 1.0)
+    assert (after < 0.2 * before).all()
+    assert (found.contraction < 0.2).all()
+    np.testing.assert_allclose(found.step, np.sqrt(before**2 / 45), rtol=0.2)
+    assert (found.gap > 0.0).all()
+    assert (found.error < found.step).all()
+
+
+@pytest.mark.parametrize("wrong", [np.nan, 1e3, 1e300])
+def test_nonsense_gives_no_target(simulator, equilibrium, wrong):
+    position, fields = equilibrium
+    spoiled = fields.copy()
+    spoiled[3] *= wrong
+    found = targets(simulator, spoiled, position, 1.0)
+    assert found.fraction[3] == 0.0
+    assert found.error[3] == np.inf
+    others = np.delete(np.arange(8), 3)
+    assert np.isfinite(found.error[others]).all()
+
+
+def test_killed_they_go_on_to_the_same_bits(beam, simulator, tmp_path, monkeypatch):
+    whole = sweep_box(simulator, 24, 1)
+    monkeypatch.setattr(module, "_WRITE_EVERY", 0.0)
+    sweep, done = module._sweep, []
+
+    def kill(*arguments):
+        done.append(0)
+        if len(done) == 18:
+            raise KeyboardInterrupt
+        return sweep(*arguments)
+
+    monkeypatch.setattr(module, "_sweep", kill)
+    with pytest.raises(KeyboardInterrupt):
+        sweep_box(simulator, 24, 1, folder=tmp_path)
+    monkeypatch.setattr(module, "_sweep", sweep)
+    resumed = sweep_box(simulator, 24, 1, folder=tmp_path)
+    np.testing.assert_array_equal(whole.polynomial.coefficients, resumed.polynomial.coefficients)
+    assert resumed.number == 24
+
+
+def test_from_fems_series_about_the_centre_they_need_no_ramp(beam, simulator, tmp_path):
+    plan = replace(recipe("sweeps"), order=2, sweeps=12)
+    emulator, theta = train(beam, plan, tmp_path), sobol(beam, 1, 5)[0]
+    exact = simulator(theta)
+    assert emulator.record["sweeps"]["number"] <= 12
+    np.testing.assert_allclose(emulator(theta), exact, atol=1e-5 * jnp.abs(exact).max())
+
+
+def test_too_few_are_told(simulator):
+    with pytest.raises(SolverError, match="16 sweeps followed the equilibria to [1-9]+ % of the"):
+        sweep_box(replace_load(simulator), 16, 0)
+
+
+def replace_load(simulator):
+    """The beam under a thousand times its weight, which sixteen sweeps do not reach."""
+    scene = simulator.scene
+    (load,) = scene.loads
+    heavier = replace(load, density=1000.0 * load.density)
+    return em.Simulator(replace(scene, loads=(heavier,), origin={}))
+
+
+def test_a_recipe_without_fem_and_without_a_network(beam, no_fem, tmp_path):
+    emulator = train(beam, replace(recipe("sweeps"), sweeps=40), tmp_path / "train")
+    assert list(emulator.parts) == ["polynomial"]
+    assert emulator.record["sweeps"]["number"] <= 40
+    save_emulator(emulator, tmp_path / "saved")
+    theta = beam.from_unit(jnp.array([0.3, 0.8]))
+    again = load(tmp_path / "saved", beam)
+    np.testing.assert_array_equal(again.cache()(theta), emulator.cache()(theta))
+
+
+def test_a_network_that_never_saw_fem_killed_and_resumed(beam, no_fem, tmp_path, monkeypatch):
+    """The centre's solution of sweeps and the network; killed among sweeps, the same weights."""
+    plan = replace(
+        recipe("physics"), sweeps=20, simulations=12, steps=20, freeze=10, polish=50,
+        checkpoint_every=10,
+    )  # fmt: skip
+    whole = train(beam, plan, tmp_path / "whole", architecture=SMALL)
+    assert list(whole.parts) == ["taylor", "network"]
+    assert len(whole.taylor.indices) == 0
+    assert whole.record["plan"]["sweeps"] == whole.record["sweeps"]["number"] == 20
+    monkeypatch.setattr(module, "_WRITE_EVERY", 0.0)
+    keep = module._keep
+
+    def kill(folder, state):
+        keep(folder, state)
+        if state.number == 7:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "_keep", kill)
+    killed = tmp_path / "killed"
+    with pytest.raises(KeyboardInterrupt):
+        train(beam, plan, killed, architecture=SMALL)
+    assert (killed / CHECKPOINT).is_file()
+    assert (killed / SWEEPS).is_file()
+    monkeypatch.setattr(module, "_keep", keep)
+    resumed = train(beam, Plan(), killed, architecture=SMALL, resume=True)
+    leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
+    for a, b in zip(*leaves, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_cannot_be_swept_is_refused(simulator):
+    with pytest.raises(InputError, match="15 sweeps; the loads rise over 15, give 16 or more"):
+        sweep_box(simulator, 15, 0)
+    with pytest.raises(InputError, match="recipe 'hybrid' takes FEM runs, not sweeps"):
+        replace(recipe("hybrid"), sweeps=60)
+    assert "simulations" in recipe("sweeps").idle
+    assert recipe("physics").runs == 0
