@@ -3,6 +3,7 @@
     python -m studies.physics_informed                # cases that are there are kept
     python -m studies.physics_informed --only beam liver
     python -m studies.physics_informed --minutes 60   # for each network
+    python -m studies.physics_informed --only --family 20    # ventricles no network has seen
     python -m studies.physics_informed --quick --out DIR  # a coarse beam
 
 No FEM solution is used but where a case says so; FEM judges at 50 theta that nothing has seen.
@@ -27,7 +28,8 @@ from calibrate.figures.palette import BLUE, GREEN, ORANGE, PINK, VERMILION
 from emulator.error.comparison import case_errors, quantiles
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
-from emulator.surrogates import Architecture, Emulator
+from emulator.scenes.ventricle_family import ventricles
+from emulator.surrogates import Architecture, Emulator, load
 from emulator.surrogates.taylor import expand
 from emulator.training import recipe, train
 from emulator.training.sweeps import part_of, sweep_box
@@ -45,6 +47,7 @@ BODIES: dict[str, Callable[[], Scene]] = {
 PAPER = {"beam": 2.0e-2, "cube": 8.5e-4, "liver": 8.8e-3, "ventricle": 2.8e-2}
 ERRORS = ("err_u", "err_F", "err_Pi", "err_V")
 SWEEPS, EVERY = 60, 3
+FAMILY_SEED, FAMILY_TESTS, FAMILY_SWEEPS = 1, 5, (0, 4, 16)
 COLOURS = {
     "sweeps": BLUE,
     "sweeps about the centre": GREEN,
@@ -111,6 +114,22 @@ def network(scene: Scene, known: Runs, name: str, minutes: float, small: bool) -
             "errors": errors_of(emulator, known)}  # fmt: skip
 
 
+def from_family(shape: dict[str, Any]) -> Case:
+    """Sweeps on a ventricle that the family's network has not seen, from where that says."""
+    scene, learned = em.scenes.left_ventricle(**shape), load("ventricle_family")
+    known = run_campaign(em.Simulator(scene), sobol(scene, FAMILY_TESTS, TEST_SEED))
+    rows = []
+    for sweeps in FAMILY_SWEEPS:
+        with tempfile.TemporaryDirectory() as folder:
+            plan = recipe("family") if not sweeps else replace(recipe("sweeps"), sweeps=sweeps)
+            began = time.perf_counter()
+            emulator = train(scene, plan, folder, start=learned)
+            seconds = round(time.perf_counter() - began, 1)
+        rows.append({"sweeps": sweeps, "seconds": seconds, "errors": errors_of(emulator, known)})
+    jax.clear_caches()
+    return {"nodes": len(scene.mesh.nodes), "fem_solutions": 0, "family": rows}
+
+
 class Body:
     """A scene, and FEM at theta that nothing has seen, solved when it is asked for."""
 
@@ -174,6 +193,7 @@ def main() -> None:
     arguments.add_argument("--ways", nargs="*", choices=tuple(COLOURS), help="ways of learning")
     arguments.add_argument("--minutes", type=float, default=60.0, help="for each network")
     arguments.add_argument("--tests", type=int, default=50)
+    arguments.add_argument("--family", type=int, default=0, help="unseen ventricles, up to 20")
     given = arguments.parse_args()
     bodies = BODIES
     if given.quick:
@@ -182,15 +202,17 @@ def main() -> None:
     settings = {"tests": given.tests, "quick": given.quick}
     results = Results(given.out, TEST_SEED, again=given.again, settings=settings)
     for name, make in bodies.items():
-        if given.only and name not in given.only:
+        if given.only is not None and name not in given.only:
             continue
         body = Body(name, make(), given.tests)
         for way in given.ways or COLOURS:
             results.case(f"{name}, {way}", partial(body.case, way, given))
-    draw(results.cases, given.out / "physics.png")
+    for k, shape in enumerate(ventricles(20, FAMILY_SEED)[: given.family]):
+        results.case(f"unseen ventricle {k}", partial(from_family, shape))
+    draw([case for case in results.cases if "body" in case], given.out / "physics.png")
     if given.quick:
         return
-    for case in results.cases:
+    for case in (case for case in results.cases if "body" in case):
         if case["way"] in ("sweeps", "physics") and case["body"] in PAPER:
             assert case["errors"]["err_u"]["median"] < PAPER[case["body"]], case["name"]
 

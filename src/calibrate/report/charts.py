@@ -24,6 +24,7 @@ _BAND = "rgba(0, 114, 178, 0.22)"
 _MOST_TRACED = 500  # draws of a chain in a trace
 _MOST_PAIRED = 800  # draws in a pair plot
 _CURVES = 60  # draws of a pressure-volume band
+_VOLUMES = 400  # draws of volumes
 
 
 def names_with_units(posterior: Posterior) -> dict[str, str]:
@@ -220,6 +221,21 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
         yaxis_title=f"{name} (kPa; 1 kPa is {1.0 / KPA_PER_MMHG:.1f} mmHg)",
     )
     return figure
+
+
+def state_volumes(posterior: Posterior) -> dict[str, np.ndarray]:
+    """Cavity volumes (s,) in mL at draws, by load state; none of one state, or without a cavity."""
+    model = posterior.model
+    curve = pressure_volume(model.full)
+    if curve is None or len(model.states.states) < 2:
+        return {}
+    wall = model.full.at(curve.volume.nodes)
+    volume = jax.jit(lambda t: jax.lax.map(lambda theta: curve.volume.cavity(wall(theta)), t))
+    count = len(posterior.thetas(model.states.states[0]))
+    rows = np.linspace(0, count - 1, min(_VOLUMES, count)).astype(int)
+    return {
+        state: np.asarray(volume(posterior.thetas(state)[rows])) for state in model.states.states
+    }
 
 
 def _add_measured(figure: go.Figure, posterior: Posterior, seen: str, pressure: str) -> None:

@@ -12,6 +12,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpyro.distributions as dist
 import plotly.graph_objects as go
 from plotly.io import to_html
@@ -174,7 +175,27 @@ def _known(posterior: Posterior) -> str:
     words = escape(in_words(identify(posterior))).replace("\n", "<br>")
     found = f"<p>{words}</p>{_chart(charts.stress(posterior))}"
     curve = charts.volume_band(posterior)
-    return found + (_chart(curve) if curve is not None else "")
+    found += _chart(curve) if curve is not None else ""
+    return found + _ejection(charts.state_volumes(posterior))
+
+
+def _ejection(volumes: Mapping[str, np.ndarray]) -> str:
+    """Volumes by load state, and what of the largest the smallest leaves out; nothing of none."""
+    if not volumes:
+        return ""
+    rows = [(state, _median(values)) for state, values in volumes.items()]
+    medians = {state: float(np.median(values)) for state, values in volumes.items()}
+    full, empty = (pick(medians, key=medians.__getitem__) for pick in (max, min))
+    ejected = 100.0 * (1.0 - volumes[empty] / volumes[full])
+    return (
+        f"{_table(('load state', 'cavity volume (mL), median and 90 %'), rows)}"
+        f"<p>Ejection fraction from {escape(full)} to {escape(empty)}: {_median(ejected)} %.</p>"
+    )
+
+
+def _median(values: np.ndarray) -> str:
+    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
+    return f"{middle:.1f} ({low:.1f} to {high:.1f})"
 
 
 def _draws(posterior: Posterior) -> str:

@@ -153,6 +153,31 @@ def test_charts_say_what_was_drawn(ventricle_posterior):
     assert isinstance(charts.stress(ventricle_posterior), go.Figure)
 
 
+def test_two_load_states_have_an_ejection_fraction(ventricle_posterior):
+    """By hand, of draws that know each state's pressure; one state has none."""
+    forward = ventricle_posterior.model.full
+    scene, seen = forward.scene, CavityVolume(forward.scene)
+    model = cal.model(
+        forward,
+        {"volume@full": seen, "volume@empty": seen},
+        {name: cal.GaussianNoise(sd=1.0) for name in ("volume@full", "volume@empty")},
+        known={"pressure@full": 1.2, "pressure@empty": 0.6},
+    )
+    volume = lambda p: float(seen.cavity(forward.at(seen.nodes)(scene.centre.at[4].set(p))))
+    data = {"volume@full": volume(1.2), "volume@empty": volume(0.6)}
+    posterior = cal.sample(model, data, sampler="laplace", options=TINY, seed=0)
+    volumes = charts.state_volumes(posterior)
+    assert list(volumes) == ["full", "empty"]
+    thetas = posterior.thetas("full")
+    by_hand = float(seen.cavity(forward.at(seen.nodes)(thetas[0])))
+    assert volumes["full"][0] == pytest.approx(by_hand)
+    text = html_of(Run("left_ventricle"), posterior, CERTIFICATE, fem=False)
+    found = re.search(r"Ejection fraction from full to empty: ([0-9.]+) \(", text)
+    expected = 100.0 * (1.0 - np.median(volumes["empty"] / volumes["full"]))
+    assert float(found[1]) == pytest.approx(expected, abs=0.1)
+    assert charts.state_volumes(ventricle_posterior) == {}
+
+
 def test_in_a_browser(page, tmp_path):
     """The slider moves the mesh, and nothing complains or calls out."""
     path = tmp_path / "page.html"

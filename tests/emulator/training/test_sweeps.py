@@ -134,6 +134,21 @@ def test_from_fems_series_about_the_centre_they_need_no_ramp(beam, simulator, tm
     np.testing.assert_allclose(emulator(theta), exact, atol=1e-5 * jnp.abs(exact).max())
 
 
+@pytest.mark.slow
+def test_from_a_familys_network_to_a_body_it_has_not_seen(tmp_path):
+    """Before the first FEM run: from 0.4 mm down to less than a tenth."""
+    scene, learned = em.scenes.left_ventricle(order=1), load("ventricle_family")
+    simulator, thetas = em.Simulator(scene), sobol(scene, 3, 3)
+    exact = jnp.stack([simulator(theta) for theta in thetas])
+
+    def error(plan):
+        there = train(scene, plan, tmp_path, start=learned).cache()(thetas)
+        return float(jnp.median(jnp.mean(jnp.linalg.norm(there - exact, axis=-1), axis=-1)))
+
+    assert error(recipe("family")) > 0.2
+    assert error(replace(recipe("sweeps"), sweeps=6)) < 0.1
+
+
 def test_too_few_are_told(simulator):
     with pytest.raises(SolverError, match="16 sweeps followed the equilibria to [1-9]+ % of the"):
         sweep_box(replace_load(simulator), 16, 0)
