@@ -168,7 +168,7 @@ def draw(cases: list[Case], path: Path) -> None:
                 {"seconds": case["seconds"], "err_u": case["errors"]["err_u"]}
             ]
             colour = COLOURS[case["way"]]
-            x = [max(point["seconds"], 1.0) for point in curve]
+            x = [point["seconds"] for point in curve]
             y = [point["err_u"]["median"] for point in curve]
             axes.plot(x, y, "o-", color=colour, label=case["way"], ms=4)
             if "curve" in case:
@@ -176,12 +176,17 @@ def draw(cases: list[Case], path: Path) -> None:
                 axes.plot(x, bars, ":", color=colour, lw=1)
         if body in PAPER:
             axes.axhline(PAPER[body], color="0.5", lw=0.8)
-            axes.text(1.2, PAPER[body] * 1.2, "the paper's", color="0.4", size=8)
-        axes.set(xscale="log", yscale="log", title=body, xlabel="seconds")
+            place = axes.get_yaxis_transform()
+            axes.text(
+                0.98, PAPER[body] * 1.3, "the paper's", color="0.4", size=8, ha="right",
+                transform=place,
+            )  # fmt: skip
+        axes.set(yscale="log", title=body, xlabel="seconds", xlim=(0.0, None))
+        axes.margins(y=0.12)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(color="0.92")
     panels[0][0].set_ylabel("median err_u, mm (dotted: said by the sweeps)")
-    panels[0][0].legend(frameon=False, fontsize=8)
+    panels[0][0].legend(frameon=False, fontsize=8, loc="lower left")
     figure.suptitle("Learning from the energy alone")
     save(figure, path)
 

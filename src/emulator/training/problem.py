@@ -26,7 +26,7 @@ from emulator.training.discrepancy_stage import FEWEST
 from emulator.training.network import NetworkTraining, network_training, scales_of, untrained
 from emulator.training.plan import Plan
 from emulator.training.start import architecture_from, family_on, on_finer, with_network_of
-from emulator.training.sweeps import part_of, runs_of, sweep_box
+from emulator.training.sweeps import Swept, part_of, runs_of, sweep_box
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Problem:
     training : of the network; None without one.
     series : FEM's own, where the emulator's is of what a family's network leaves or on a coarser
         mesh.
-    swept_mm: error bar of the sweeps, where they replace FEM.
+    swept : where the sweeps ended that replace FEM.
     """
 
     plan: Plan
@@ -47,7 +47,7 @@ class Problem:
     runs: Runs
     training: NetworkTraining | None = None
     series: Expansion | None = None
-    swept_mm: float | None = None
+    swept: Swept | None = None
 
     @property
     def architecture(self) -> Architecture | None:
@@ -110,7 +110,7 @@ def prepare(
         runs = runs_of(simulator, swept, _taught(scene, plan))
         if not plan.steps:
             alone = Emulator(scene, polynomial=part_of(simulator, swept))
-            return Problem(plan, alone, runs, swept_mm=swept.left)
+            return Problem(plan, alone, runs, swept=swept)
     else:
         # Rounded as a file stores it: the discrepancy is fitted to the series that is loaded.
         series = expand(simulator, order=plan.order).rounded() if plan.order else None
@@ -138,7 +138,7 @@ def prepare(
     if start is not None:
         emulator = with_network_of(emulator, start)
     training = network_training(emulator, plan, runs, scales)
-    return Problem(plan, emulator, runs, training, swept_mm=swept.left if plan.sweeps else None)
+    return Problem(plan, emulator, runs, training, swept=swept if plan.sweeps else None)
 
 
 def _beginning(

@@ -62,6 +62,7 @@ def fit(values: Values, degree: int, left: float) -> Fitted:
     while degree > 0 and terms(values.position.shape[1], degree) > len(values.position):
         degree -= 1
     degrees = degrees_up_to(values.position.shape[1], degree)
+    left = max(left, np.finfo(float).tiny)  # where every value is the polynomial's own
     weight = (left / (values.error + left))[:, None]
     rows = weight * legendre(values.position, degrees)
     q, r = scipy.linalg.qr(rows, mode="economic")

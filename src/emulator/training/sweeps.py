@@ -56,8 +56,7 @@ _KEPT = 3  # targets a term of the next degree
 _DONE = 1e-10  # of the displacement, that the error bar ends at
 _ROUNDED = 1e-2  # of the error bar, that modes may be left out for
 _WRITE_EVERY = 30.0  # seconds
-_NUMBERS = ("number", "here", "level", "rise", "ago", "left")
-
+_NUMBERS = ("number", "here", "level", "rise", "ago", "left", "worst", "taken")
 
 Map = Callable[[jax.Array], jax.Array]
 
@@ -68,7 +67,8 @@ class Swept:
 
     polynomial : of the free displacements. number : sweeps done, ``here`` of them at this level.
     level, rise : of the loads, and by how much they rise next. before : coefficients at the level
-    ``ago`` below. left : mm, median step at theta not seen before. values : targets kept.
+    ``ago`` below. left, worst : mm, median and largest step at theta not seen before. taken : part
+    of the last sweep's theta at which a step was. values : targets kept.
     """
 
     polynomial: Fitted
@@ -80,6 +80,8 @@ class Swept:
     rise: float = 1.0 / _LEVELS
     ago: float = 1.0
     left: float = np.inf
+    worst: float = np.inf
+    taken: float = 0.0
 
     @property
     def done(self) -> bool:
@@ -123,7 +125,7 @@ def sweep_box(
     InputError
         A load of the scene has no potential, or too few sweeps for the loads to rise from rest.
     SolverError
-        Equilibria were not followed up to the loads.
+        Equilibria were not followed up to the loads, or not over the whole box.
     """
     potential_energy(simulator.scene)  # refuses a scene that has none
     if start is None and sweeps <= _LEVELS:
@@ -149,6 +151,12 @@ def sweep_box(
             f"scene '{simulator.scene.name}': {state.number} sweeps followed the equilibria to "
             f"{100 * state.level:.0f} % of the loads; give more of them, or use a recipe with FEM "
             "runs"
+        )
+    if state.taken < _ENOUGH:
+        raise SolverError(
+            f"scene '{simulator.scene.name}': {state.number} sweeps know no equilibrium at "
+            f"{100 * (1.0 - state.taken):.0f} % of the box; give more of them, or use a recipe "
+            "with FEM runs"
         )
     return state
 
@@ -192,15 +200,16 @@ def _sweep(simulator: Simulator, state: Swept, seed: int) -> tuple[Swept, dict[s
     taken = float(np.mean(usable & (found.fraction >= _TAKEN)))
     told = {"load": f"{level:.2f}", "taken": f"{taken:.2f}"}
     new = Values(position, found.fields, found.error).take(usable)
+    steps = found.step[usable]
     if not usable.any() or (state.rises and taken < _ENOUGH):
         after = _closer(state)
     elif state.rises:
-        after = _risen(state, level, new, float(np.median(found.step[usable])))
+        after = replace(_risen(state, level, new, float(np.median(steps))), worst=steps.max())
     else:
-        after = _learned(state, new, float(np.median(found.step[usable])))
+        after = replace(_learned(state, new, float(np.median(steps))), worst=steps.max())
         told["energy gap"] = f"{np.median(found.gap[usable]):.0e}"
     told |= {"degree": f"{after.polynomial.degree}", "error_mm": f"{after.left:.1e}"}
-    return replace(after, number=state.number + 1), told
+    return replace(after, number=state.number + 1, taken=taken), told
 
 
 def _next_level(state: Swept) -> tuple[float, Fitted]:

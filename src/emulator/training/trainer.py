@@ -162,8 +162,9 @@ def _finish(problem: Problem, state: State, *, progress: bool) -> tuple[Emulator
         loss = require_finite(state)
         emulator = with_weights(emulator, problem.training.finish(state.weights, progress=progress))
     record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
-    if problem.swept_mm is not None:
-        record["sweeps"] = {"number": plan.sweeps, "error_mm": problem.swept_mm}
+    if (swept := problem.swept) is not None:
+        errors = {"error_mm": swept.left, "largest_error_mm": float(swept.worst)}
+        record["sweeps"] = {"number": swept.number, **errors}
     if plan.discrepancy:
         emulator, record["discrepancy"] = add_discrepancy(emulator, problem.runs, problem.series)
     return emulator, record

@@ -154,11 +154,31 @@ def test_too_few_are_told(simulator):
         sweep_box(replace_load(simulator), 16, 0)
 
 
-def replace_load(simulator):
+def test_without_loads_nothing_moves(simulator):
+    swept = sweep_box(replace_load(simulator, 0.0), 16, 0)
+    assert swept.done
+    np.testing.assert_array_equal(swept.polynomial.coefficients, 0.0)
+
+
+def test_a_box_that_is_known_in_part_is_refused(simulator, monkeypatch):
+    """A fifth of the theta without a step: the others' error bar says nothing of those."""
+
+    def lame(*arguments):
+        found = targets(*arguments)
+        found.fraction[::5] = 0.0
+        return found
+
+    monkeypatch.setattr(module, "targets", lame)
+    start = lambda x: simulator(simulator.scene.from_unit(x))
+    with pytest.raises(SolverError, match="8 sweeps know no equilibrium at 2[0-9] % of the box"):
+        sweep_box(simulator, 8, 0, start=start)
+
+
+def replace_load(simulator, factor=1000.0):
     """The beam under a thousand times its weight, which sixteen sweeps do not reach."""
     scene = simulator.scene
     (load,) = scene.loads
-    heavier = replace(load, density=1000.0 * load.density)
+    heavier = replace(load, density=factor * load.density)
     return em.Simulator(replace(scene, loads=(heavier,), origin={}))
 
 

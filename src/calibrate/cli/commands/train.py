@@ -137,7 +137,8 @@ def _told(folder: str, scene: str, record: Mapping[str, Any]) -> str:
     found = record.get("discrepancy") or {}
     error = found.get("held_out_err_u_mm", {}).get(found.get("on"))
     if "sweeps" in record and not plan["steps"]:
-        return f"{text}; about {record['sweeps']['error_mm']:.1g} mm from equilibrium"
+        usual, most = (record["sweeps"][name] for name in ("error_mm", "largest_error_mm"))
+        return f"{text}; {usual:.1g} mm from equilibrium, {most:.1g} mm at most"
     if error is None:
         return f"{text}; its error: calibrate evaluate {folder}"
     return f"{text}; {error:.2g} mm from FEM at held-out runs"
