@@ -47,6 +47,18 @@ class Part(Protocol):
         ...
 
 
+class OfArrays:
+    """What a part is that its arrays are all of: they are its fields."""
+
+    def arrays(self) -> dict[str, Any]:
+        """All fields by name."""
+        return vars(self).copy()
+
+    def to_json(self) -> dict[str, Any]:
+        """Nothing: the arrays are all."""
+        return {}
+
+
 class NodalField(Protocol):
     """Displacement of some nodes as a function of position, not a sum of modes."""
 

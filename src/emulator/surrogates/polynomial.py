@@ -22,11 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.scenes.scene import Scene
-from emulator.surrogates.part import CachedPart, widened
+from emulator.surrogates.part import CachedPart, OfArrays, widened
 
 
 @dataclass(frozen=True, eq=False)
-class Polynomial:
+class Polynomial(OfArrays):
     """Displacement as a polynomial, a part of an emulator.
 
     degrees : (m, p) alpha of each term. weights : (m, r). modes : (r, n, 3) mm.
@@ -48,14 +48,6 @@ class Polynomial:
         """The polynomial over ``nodes`` (k,)."""
         modes = self.modes[:, nodes]
         return CachedPart(np.zeros(modes.shape[1:]), modes, self.coefficients)
-
-    def arrays(self) -> dict[str, Any]:
-        """The three arrays by name."""
-        return vars(self).copy()
-
-    def to_json(self) -> dict[str, Any]:
-        """Nothing: the arrays are all."""
-        return {}
 
     @classmethod
     def restore(

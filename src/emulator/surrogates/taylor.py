@@ -32,13 +32,13 @@ from emulator.errors import InputError, SolverError
 from emulator.fem.simulator import Simulator
 from emulator.fem.system import System
 from emulator.scenes.scene import Scene
-from emulator.surrogates.part import CachedPart, widened
+from emulator.surrogates.part import CachedPart, OfArrays, widened
 
 _MOST_TERMS = 200  # in one order; 18 parameters have 171 of the second and 1140 of the third
 
 
 @dataclass(frozen=True, eq=False)
-class Expansion:
+class Expansion(OfArrays):
     """Taylor series of a scene's equilibrium about one theta, a part of an emulator.
 
     centre : (p,) position in the unit box about which the series is taken.
@@ -69,14 +69,6 @@ class Expansion:
         """The series over ``nodes`` (k,): its derivatives are the modes."""
         offset, modes = np.asarray(self.displacement)[nodes], np.asarray(self.derivatives)[:, nodes]
         return CachedPart(offset, modes, self.monomials)
-
-    def arrays(self) -> dict[str, Any]:
-        """The four arrays by name."""
-        return vars(self).copy()
-
-    def to_json(self) -> dict[str, Any]:
-        """Nothing: the arrays are all."""
-        return {}
 
     @classmethod
     def restore(

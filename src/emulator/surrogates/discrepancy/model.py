@@ -20,7 +20,7 @@ from emulator._precision import require_float64
 from emulator.scenes.scene import Scene
 from emulator.store import inside, named_leaves
 from emulator.surrogates.discrepancy.kernel import Features, mean
-from emulator.surrogates.part import CachedPart, widened
+from emulator.surrogates.part import CachedPart, OfArrays, widened
 from emulator.surrogates.taylor import monomials, rounded
 
 
@@ -48,7 +48,7 @@ class Warp(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Discrepancy:
+class Discrepancy(OfArrays):
     """What to add to a map to meet FEM, a part of an emulator.
 
     warp : features of a position. known : (c, q) those of the runs.
@@ -88,10 +88,6 @@ class Discrepancy:
     def arrays(self) -> dict[str, Any]:
         """All arrays by name, the warp's as ``warp/centre`` and so on."""
         return named_leaves({**vars(self), "warp": self.warp._asdict()})
-
-    def to_json(self) -> dict[str, Any]:
-        """Nothing: the arrays are all."""
-        return {}
 
     @classmethod
     def restore(
