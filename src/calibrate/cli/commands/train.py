@@ -138,7 +138,7 @@ def _told(folder: str, scene: str, record: Mapping[str, Any]) -> str:
     error = found.get("held_out_err_u_mm", {}).get(found.get("on"))
     if "sweeps" in record and not plan["steps"]:
         usual, most = (record["sweeps"][name] for name in ("error_mm", "largest_error_mm"))
-        return f"{text}; {usual:.1g} mm from equilibrium, {most:.1g} mm at most"
+        return f"{text}; {usual:.1g} mm from equilibrium, {most:.1g} mm at the worst theta tried"
     if error is None:
         return f"{text}; its error: calibrate evaluate {folder}"
     return f"{text}; {error:.2g} mm from FEM at held-out runs"
