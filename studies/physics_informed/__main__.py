@@ -186,7 +186,9 @@ def draw(cases: list[Case], path: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(color="0.92")
     panels[0][0].set_ylabel("median err_u, mm (dotted: said by the sweeps)")
-    panels[0][0].legend(frameon=False, fontsize=8, loc="lower left")
+    lines = [line for axes in panels[0] for line in axes.get_legend_handles_labels()[0]]
+    named = {line.get_label(): line for line in lines}
+    panels[0][0].legend(named.values(), named.keys(), frameon=False, fontsize=8, loc="lower left")
     figure.suptitle("Learning from the energy alone")
     save(figure, path)
 
