@@ -34,6 +34,7 @@ from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
 from emulator.fem.energy import potential_energy
 from emulator.progress import counting
+from emulator.scenes.scene import Scene
 from emulator.store import read_arrays, save_arrays
 from emulator.surrogates.polynomial import (
     Polynomial,
@@ -127,11 +128,7 @@ def sweep_box(
     SolverError
         Equilibria were not followed up to the loads, or not over the whole box.
     """
-    potential_energy(simulator.scene)  # refuses a scene that has none
-    if start is None and sweeps <= _LEVELS:
-        raise InputError(
-            f"training: {sweeps} sweeps; the loads rise over {_LEVELS}, give {_LEVELS + 1} or more"
-        )
+    check_sweeps(simulator.scene, sweeps, at_rest=start is None)
     state = _restored(folder) or (_at_rest(simulator) if start is None else _at(simulator, start))
     written = time.perf_counter()
     with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
@@ -159,6 +156,15 @@ def sweep_box(
             "with FEM runs"
         )
     return state
+
+
+def check_sweeps(scene: Scene, sweeps: int, *, at_rest: bool) -> None:
+    """Refuse what cannot be swept, with the :class:`InputError` of :func:`sweep_box`."""
+    potential_energy(scene)  # refuses a scene that has none
+    if at_rest and sweeps <= _LEVELS:
+        raise InputError(
+            f"training: {sweeps} sweeps; the loads rise over {_LEVELS}, give {_LEVELS + 1} or more"
+        )
 
 
 def _at_rest(simulator: Simulator) -> Swept:

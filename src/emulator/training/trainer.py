@@ -29,6 +29,7 @@ from emulator.training.loop import Hook, Steps, require_finite, run
 from emulator.training.plan import Plan, recipe
 from emulator.training.problem import Problem, prepare
 from emulator.training.start import family_on, start_record, with_weights
+from emulator.training.sweeps import check_sweeps
 
 
 def train(
@@ -79,6 +80,7 @@ def train(
         session = replace(session, plan=replace(plan, campaign=digest), start=source)
         (Path(folder) / SWEEPS).unlink(missing_ok=True)
         if plan.sweeps:
+            check_sweeps(scene, plan.sweeps, at_rest=not plan.order and start is None)
             session.announce()
     limit = None if budget is None else Budget(budget, session.began)
     problem = prepare(

@@ -62,7 +62,7 @@ def test_a_scene_that_does_not_match(folder):
         ),
         (
             lambda d: d["parts"].update(magic={}),
-            "part 'magic' is unknown; known: coarse, taylor, network",
+            "part 'magic' is unknown; known: coarse, taylor, polynomial, network",
         ),
         (lambda d: d.update(format=2), "has format 2; this version reads 3: train .* again"),
         (lambda d: d["scene"].update(scene="heart"), "origin names scene 'heart'"),

@@ -192,6 +192,7 @@ def test_a_recipe_without_fem_and_without_a_network(beam, no_fem, tmp_path):
     np.testing.assert_array_equal(again.cache()(theta), emulator.cache()(theta))
 
 
+@pytest.mark.slow
 def test_a_network_that_never_saw_fem_killed_and_resumed(beam, no_fem, tmp_path, monkeypatch):
     """The centre's solution of sweeps and the network; killed among sweeps, the same weights."""
     plan = replace(
