@@ -21,6 +21,7 @@ import calibrate as cal
 from calibrate.certificate import examine
 from calibrate.certificate.check import Check
 from calibrate.certificate.moments import jackknife, moments
+from calibrate.certificate.pool import normalised
 from calibrate.samplers.nuts import NUTSOptions
 
 SHIFT = "shift, less FEM's change"
@@ -40,7 +41,7 @@ def parts_of(check: Check) -> dict[str, np.ndarray]:
     here = check.predictive.constrain(check.pool.z)
     x = np.stack([here[name] for name in names], axis=1)
     p, pool = len(names), check.pool
-    corrected, cheap = pool.corrected, pool.cheap
+    corrected, cheap = pool.corrected, normalised(pool.log_cheap)
     error = jackknife(lambda used: moments(x, corrected * used), len(x))[1][:p]
     change, change_error = jackknife(
         lambda used: moments(x, corrected * used) - moments(x, cheap * used), len(x)

@@ -7,10 +7,10 @@ r"""A check against FEM with a fixed number of solves.
    (:mod:`calibrate.certificate.pool`). Further runs, in rounds, go where the correction is so
    uncertain that FEM may find the data likely after all.
 2. **Test.** The other runs are fresh points :math:`z_j` of the pool, drawn with probabilities
-   :math:`a_j` that mix the corrected posterior, the map's, where FEM may find the data likely, and
-   the whole pool (defensive mixture; Hesterberg 1995). A moment under FEM is the corrected map's
-   over the pool, plus what FEM changes of it at these points (a control variate; Owen and Zhou
-   2000):
+   :math:`a_j` that mix the corrected posterior, the draws' smoothed density, where FEM may find the
+   data likely, what surrounds the draws, and the whole pool (defensive mixture; Hesterberg 1995).
+   A moment under FEM is the corrected map's over the pool, plus what FEM changes of it at these
+   points (a control variate; Owen and Zhou 2000):
 
    .. math:: \hat\theta_\text{FEM} = \hat\theta_\text{pool} +
        \hat\theta\{\pi_\text{FEM} / (q a)\} - \hat\theta\{\pi_\text{corrected} / (q a)\}

@@ -127,11 +127,6 @@ class Pool:
         """Weights (s,) of sum 1 of the posterior with the corrected map."""
         return normalised(self.log_corrected)
 
-    @property
-    def cheap(self) -> np.ndarray:
-        """Weights (s,) of sum 1 of the posterior with the map as it is."""
-        return normalised(self.log_cheap)
-
 
 def widths(dimension: int) -> tuple[float, ...]:
     """Widths of kernels on draws, in their sd; narrow ones are needles in many dimensions."""

@@ -32,6 +32,26 @@ class Trial(NamedTuple):
 Judge = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 """Of a fraction: whether it makes progress, and its potential, mN mm."""
 
+ARMIJO = 1e-4  # textbook value; the energy is hardly ever near this bound
+_ROUND_OFF = 1e-13  # of the energy's parts, in which a decrease near the solution drowns
+
+
+def falls_enough(
+    potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]], descent: jax.Array
+) -> Judge:
+    """Whether the potential falls by a part of the whole step's ``descent``, mN mm (Armijo's rule).
+
+    potential : of a fraction of the step, and the size of its parts.
+    """
+    energy, size = potential(jnp.zeros(()))
+    ceiling = energy + _ROUND_OFF * size
+
+    def judge(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = potential(fraction)[0]
+        return found <= ceiling + fraction * descent, found
+
+    return judge
+
 
 def largest_sound(sound: Callable[[jax.Array], jax.Array], least: float) -> jax.Array:
     """The largest of 1, 1/2, 1/4, ... that is ``sound``; 0 where that is below ``least``."""

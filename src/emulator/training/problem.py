@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from emulator.training.discrepancy_stage import FEWEST
 from emulator.training.network import NetworkTraining, network_training, scales_of, untrained
 from emulator.training.plan import Plan
 from emulator.training.start import architecture_from, family_on, on_finer, with_network_of
-from emulator.training.sweeps import Swept, part_of, runs_of, sweep_box
+from emulator.training.sweeps import part_of, runs_of, sweep_box
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,19 +36,20 @@ class Problem:
 
     plan : with as many simulations as were run.
     emulator : untrained; without a network where the plan has no optimiser step.
-    runs : FEM solutions, or what sweeps say in their place, the centre's first.
+    runs : FEM solutions, or what sweeps say in their place, the centre's first; None where nothing
+        is taught by any.
     training : of the network; None without one.
     series : FEM's own, where the emulator's is of what a family's network leaves or on a coarser
         mesh.
-    swept : where the sweeps ended that replace FEM.
+    record : what an emulator's record tells besides, of sweeps in place of FEM.
     """
 
     plan: Plan
     emulator: Emulator
-    runs: Runs
+    runs: Runs | None
     training: NetworkTraining | None = None
     series: Expansion | None = None
-    swept: Swept | None = None
+    record: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def architecture(self) -> Architecture | None:
@@ -95,7 +97,7 @@ def prepare(
         family = family_on(start, scene, plan)
     elif start is not None:
         architecture = architecture_from(start, scene, plan, architecture)
-    simulator = Simulator(scene)
+    simulator, record = Simulator(scene), dict[str, Any]()
     if plan.sweeps:
         swept = sweep_box(
             simulator,
@@ -107,10 +109,12 @@ def prepare(
             progress=progress,
         )
         plan, series = replace(plan, sweeps=swept.number), None
-        runs = runs_of(simulator, swept, _taught(scene, plan))
+        record["sweeps"] = swept.record
         if not plan.steps:
             alone = Emulator(scene, polynomial=part_of(simulator, swept))
-            return Problem(plan, alone, runs, swept=swept)
+            return Problem(plan, alone, None, record=record)
+        taught = design(scene, plan.simulations, plan.seed)
+        runs = runs_of(simulator, swept, jnp.concatenate([scene.centre[None], taught]))
     else:
         # Rounded as a file stores it: the discrepancy is fitted to the series that is loaded.
         series = expand(simulator, order=plan.order).rounded() if plan.order else None
@@ -138,7 +142,7 @@ def prepare(
     if start is not None:
         emulator = with_network_of(emulator, start)
     training = network_training(emulator, plan, runs, scales)
-    return Problem(plan, emulator, runs, training, swept=swept if plan.sweeps else None)
+    return Problem(plan, emulator, runs, training, record=record)
 
 
 def _beginning(
@@ -150,12 +154,6 @@ def _beginning(
         cached = Emulator(scene, family=family).cache()
         return lambda position: cached(scene.from_unit(position))
     return expand(simulator, order=plan.order) if plan.order else None
-
-
-def _taught(scene: Scene, plan: Plan) -> jax.Array:
-    """Theta (c, p) at which a network is taught the polynomial of sweeps, the centre first."""
-    some = design(scene, plan.simulations, plan.seed) if plan.steps else scene.centre[None][:0]
-    return jnp.concatenate([scene.centre[None], some])
 
 
 def _runs(

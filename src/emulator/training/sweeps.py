@@ -33,6 +33,7 @@ from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
 from emulator.fem.energy import potential_energy
+from emulator.fem.loop import jit
 from emulator.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.store import read_arrays, save_arrays
@@ -88,6 +89,11 @@ class Swept:
     def done(self) -> bool:
         """Whether the error bar is round-off."""
         return self.level == 1.0 and self.left <= _DONE * self._size
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What an emulator's record tells of them."""
+        return {"number": self.number, "error_mm": self.left, "largest_error_mm": float(self.worst)}
 
     @property
     def rises(self) -> bool:
@@ -297,7 +303,7 @@ def runs_of(simulator: Simulator, swept: Swept, thetas: jax.Array) -> Runs:
         u, slopes = at(theta), jax.jacfwd(at)(theta)
         return u, system.potential(u, theta)[0], jnp.moveaxis(slopes, -1, 0)
 
-    displacement, energy, slopes = jax.jit(lambda t: jax.lax.map(each, t))(thetas)
+    displacement, energy, slopes = jit(lambda t: jax.lax.map(each, t))(thetas)
     return Runs(thetas, displacement, energy, slopes)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from emulator.fem import Simulator
 from emulator.fem.campaign.threads import at_once, in_order
-from emulator.fem.halving import largest_good
+from emulator.fem.halving import ARMIJO, falls_enough, largest_good
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
 from emulator.fem.loop import compiled
@@ -31,7 +31,6 @@ _MIDDLES = 3  # of a group, whose tangents are tried
 _STEPS, _TOLERANCE = 4, 1e-8  # of conjugate gradients
 _LEAST_J = 0.05
 _LEAST_FRACTION = 2.0**-7
-_ARMIJO, _ROUND_OFF = 1e-4, 1e-13  # as of Newton's method (fem/newton/line_search)
 
 
 class Targets(NamedTuple):
@@ -132,28 +131,26 @@ def _target(
     def beside(force: jax.Array) -> jax.Array:
         return system.attempt(factor, force)[0]
 
-    def potential(v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return system.potential(on_supports(system, v, level), theta, level)
-
     r, pulled = jax.linearize(residual, v)
     step = conjugate_gradients(pulled, beside, -r, _STEPS, _TOLERANCE).x
     slope = jnp.vdot(r, step)
-    energy, size = potential(v)
+
+    def at(fraction: jax.Array) -> jax.Array:
+        return on_supports(system, v + fraction * step, level)
+
+    def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return system.potential(at(fraction), theta, level)
 
     def sound(fraction: jax.Array) -> jax.Array:
-        u = on_supports(system, v + fraction * step, level)
-        return system.least_volume_ratio(u) > _LEAST_J  # False for NaN
+        return system.least_volume_ratio(at(fraction)) > _LEAST_J  # False for NaN
 
-    def lower(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-        there = potential(v + fraction * step)[0]
-        return there <= energy + _ARMIJO * fraction * slope + _ROUND_OFF * size, there
-
-    trial = largest_good(sound, lower, _LEAST_FRACTION)
+    trial = largest_good(sound, falls_enough(potential, ARMIJO * slope), _LEAST_FRACTION)
     usable = trial.good & (slope <= 0.0)  # False for NaN
     fraction = jnp.where(usable, trial.fraction, 0.0)
     moved = jnp.where(usable, v + fraction * step, v)
     left = residual(moved)
     before, after = jnp.vdot(r, beside(r)), jnp.vdot(left, beside(left))
     contraction = jnp.sqrt(jnp.abs(after) / jnp.where(before > 0.0, before, 1.0))
-    nodes = system.scene.held.shape[0]
-    return moved, jnp.sqrt(jnp.sum(step**2) / nodes), fraction, contraction, -0.5 * slope / size
+    length = jnp.sqrt(jnp.sum(step**2) / system.scene.held.shape[0])
+    size = potential(jnp.zeros(()))[1]
+    return moved, length, fraction, contraction, -0.5 * slope / size

@@ -164,9 +164,8 @@ def _finish(problem: Problem, state: State, *, progress: bool) -> tuple[Emulator
         loss = require_finite(state)
         emulator = with_weights(emulator, problem.training.finish(state.weights, progress=progress))
     record: dict[str, Any] = {"plan": asdict(plan), "final_loss": loss}
-    if (swept := problem.swept) is not None:
-        errors = {"error_mm": swept.left, "largest_error_mm": float(swept.worst)}
-        record["sweeps"] = {"number": swept.number, **errors}
+    record |= problem.record
     if plan.discrepancy:
+        assert problem.runs is not None, "a discrepancy model is fitted to them"
         emulator, record["discrepancy"] = add_discrepancy(emulator, problem.runs, problem.series)
     return emulator, record

@@ -31,6 +31,16 @@ def test_a_value_that_is_far_off_and_says_so_changes_nothing():
     np.testing.assert_allclose(fit(known, 3, 1e-3).at(x), cubic(x), atol=1e-8)
 
 
+def test_the_fit_is_the_weighted_least_squares_solution():
+    known = values(30)
+    known.fields[:] += RNG.normal(size=known.fields.shape)
+    known.error[:] = RNG.uniform(0.01, 1.0, size=30)
+    weight = 1.0 / (known.error + 0.1)[:, None]
+    P = legendre(known.position, degrees_up_to(2, 2))
+    expected = np.linalg.lstsq(weight * P, weight * known.fields)[0]
+    np.testing.assert_allclose(fit(known, 2, 0.1).coefficients, expected, rtol=1e-10)
+
+
 @pytest.mark.parametrize(("now", "best"), [(1, 2), (2, 3), (3, 3)])
 def test_new_values_choose_the_degree(now, best):
     known = values(60)

@@ -94,6 +94,46 @@ def test_a_target_near_equilibrium_is_nearer(simulator, equilibrium):
     assert (found.error < found.step).all()
 
 
+def test_contraction_and_gap_by_dense_algebra(simulator, equilibrium):
+    """In the norm of the inverse of the group's tangent, in the middle; and by potentials."""
+    position, fields = equilibrium
+    away = 1.02 * fields
+    found, system = targets(simulator, away, position, 1.0), simulator.system
+    thetas = simulator.scene.from_unit(jnp.asarray(position))
+    middle = np.argmin(np.sum((position - position.mean(axis=0)) ** 2, axis=1))
+    values = system.tangent(system.extend(away[middle]), thetas[middle])
+    K = np.asarray(system.pattern.product(values, jnp.eye(len(system.free))))
+
+    def size(v, theta):
+        r = np.asarray(system.residual(system.extend(v), theta))
+        return np.sqrt(r @ np.linalg.solve(K, r))
+
+    for k, theta in enumerate(thetas):
+        ratio = size(found.fields[k], theta) / size(away[k], theta)
+        assert found.contraction[k] == pytest.approx(ratio, rel=1e-5)
+        high, scale = system.potential(system.extend(away[k]), theta)
+        low, _ = system.potential(system.extend(fields[k]), theta)
+        assert found.gap[k] == pytest.approx(float((high - low) / scale), rel=0.1)
+
+
+def test_a_target_far_away_lowers_the_potential(simulator, equilibrium):
+    """Three times the way to equilibrium: no whole step but what falls, and nothing is crushed."""
+    position, fields = equilibrium
+    far, system = 3.0 * fields, simulator.system
+    found = targets(simulator, far, position, 1.0)
+    thetas = simulator.scene.from_unit(jnp.asarray(position))
+    moved = found.fraction > 0.0
+    assert moved.any()
+    for k in np.flatnonzero(moved):
+        before, after = (
+            float(system.potential(system.extend(v), thetas[k])[0])
+            for v in (far[k], found.fields[k])
+        )
+        assert after < before
+        assert system.least_volume_ratio(system.extend(found.fields[k])) > 0.05
+    np.testing.assert_array_equal(found.fields[~moved], far[~moved])
+
+
 @pytest.mark.parametrize("wrong", [np.nan, 1e3, 1e300])
 def test_nonsense_gives_no_target(simulator, equilibrium, wrong):
     position, fields = equilibrium

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.balance import balance
-from emulator.fem.halving import Judge, largest_good
+from emulator.fem.halving import ARMIJO, Judge, falls_enough, largest_good
 from emulator.fem.loop import while_loop
 from emulator.fem.newton.direction import Direction
 from emulator.fem.system import System
@@ -27,11 +27,9 @@ _LEAST_FRACTION = 2.0**-19
 # Natural monotonicity fails early: a lower load is cheaper than many short steps
 # (docs/experiments.md, "Mean dilatation from far away").
 _LEAST_NATURAL = 2.0**-6
-_ARMIJO = 1e-4  # textbook value; the energy is hardly ever near this bound
 # Least fraction that is halved because the potential falls further; below, the search has found a
 # valley (docs/experiments.md, "Fewer factorisations from rest").
 _SMALLEST_HALVED = 0.02
-_ROUND_OFF = 1e-13  # of the energy's parts, in which a decrease near the solution drowns
 
 
 class _Valley(NamedTuple):
@@ -111,17 +109,15 @@ def _progress(
     potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
 ) -> Judge:
     """Whether a fraction of the step makes progress, besides crushing no element."""
-    energy, size = potential(jnp.zeros(()))
-    ceiling = energy + _ROUND_OFF * size
-    descent = jnp.where(direction.settled, -_ARMIJO * jnp.abs(direction.slope), jnp.inf)
+    descent = jnp.where(direction.settled, -ARMIJO * jnp.abs(direction.slope), jnp.inf)
+    falls = falls_enough(potential, descent)
 
     def judge(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-        found = potential(fraction)[0]
-        lower = found <= ceiling + fraction * descent
+        lower, found = falls(fraction)
         if system.forces:
             left = balance(system, u + fraction * direction.move, theta, level)[0]
             before = jnp.sum(direction.equations.residual**2)
-            lower |= jnp.sum(left**2) < (1.0 - _ARMIJO * fraction) * before
+            lower |= jnp.sum(left**2) < (1.0 - ARMIJO * fraction) * before
         return lower, found
 
     return judge
