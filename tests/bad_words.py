@@ -51,6 +51,14 @@ COMMANDS = [
     ("verify published", "give the folder of the released data"),
     ("verify patches", "case 'patches' is unknown; known: patch"),
     ("certify /no/where", "run.json does not exist"),
+    (
+        "sensitivity once_clamped_beam --observe reaction:tip:z",
+        "scene 'once_clamped_beam' has no support on 'tip'; it has left",
+    ),
+    (
+        "sensitivity once_clamped_beam --observe reaction:left:w",
+        "direction 'w' of a reaction; give x, y, z or three numbers",
+    ),
     ("sensitivity once_clamped_beam", "give something to observe, or ask for the field"),
     ("sensitivity liver --field --method luck", "invalid choice: 'luck'"),
     ("sensitivity liver --field --seed -1", "sensitivity: seed -1 is below 0"),

@@ -1,5 +1,7 @@
 """What several test modules build with."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from emulator.geometry.bodies.box import box
@@ -26,6 +28,32 @@ def block(
         loads=loads,
         supports=supports,
     )
+
+
+HEIGHT = 4.0  # mm, of the block between plates
+
+
+def between_plates(order=2, dilatation="pointwise", cells=(2, 2, 2), **changes) -> Scene:
+    """A block glued to two plates, of which the upper one is moved: shear along x, stretch."""
+    scene = Scene(
+        name="block between plates",
+        mesh=box((4.0, 4.0, HEIGHT), cells, order),
+        law=find_law("neo_hookean"),
+        parameters=(
+            Parameter("mu", "kPa", 1.0, 10.0, "log"),
+            Parameter("shear", "", -0.5, 0.5),
+            Parameter("stretch", "", -0.2, 0.2),
+        ),
+        constants={"lam": 8.0},
+        supports=(
+            Support("bottom"),
+            Support("top", (HEIGHT, 0.0, 0.0), "x", amount="shear"),
+            Support("top", (0.0, 0.0, HEIGHT), "z", amount="stretch"),
+            Support("top", components="y"),
+        ),
+        dilatation=dilatation,
+    )
+    return replace(scene, **changes)
 
 
 def rotation(seed: int = 0) -> np.ndarray:

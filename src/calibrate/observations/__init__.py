@@ -10,6 +10,7 @@ from calibrate.observations.nodes import NodalDisplacements, nodal_displacements
 from calibrate.observations.parameter import MeasuredParameter
 from calibrate.observations.points import DISPLACEMENT
 from calibrate.observations.protocol import Field, Kind, Labels, Observation
+from calibrate.observations.reaction import Reaction
 from calibrate.observations.registry import (
     OBSERVATIONS,
     observation_from_json,
@@ -41,6 +42,7 @@ __all__ = [
     "NodalDisplacements",
     "Observation",
     "Observations",
+    "Reaction",
     "Scalar",
     "SegmentStrain",
     "Strain",

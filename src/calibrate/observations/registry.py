@@ -13,6 +13,7 @@ from calibrate.observations.nodes import NodalDisplacements
 from calibrate.observations.parameter import MeasuredParameter
 from calibrate.observations.present import ENTRIES, Present
 from calibrate.observations.protocol import Kind, Observation
+from calibrate.observations.reaction import Reaction
 from calibrate.observations.segment_strain import SegmentStrain
 from calibrate.observations.several import Observations
 from calibrate.observations.strain import Strain
@@ -33,6 +34,7 @@ OBSERVATIONS: dict[str, type[Kind]] = {
         SurfacePoints,
         CavityVolume,
         Length,
+        Reaction,
         MeasuredParameter,
     )
 }

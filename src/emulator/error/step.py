@@ -73,13 +73,14 @@ def sound_state(
     is; a theta that is not finite is replaced by the centre of the box, entry by entry.
     """
     fine = jnp.all(jnp.abs(u) < ENDLESS)
-    placed = jnp.where(scene.held, scene.held_displacement, jnp.where(fine, u, centre))
+    theta = jnp.where(jnp.isfinite(theta), theta, scene.centre)
+    placed = scene.on_supports(jnp.where(fine, u, centre), theta)
     fractions = jnp.array(_FRACTIONS)[:, None, None]
     states = jnp.where(fractions == 1.0, placed, centre + fractions * (placed - centre))
     J = jax.vmap(partial(_least_J, scene))(states)
     # The prediction need only have J > 0; a replacement must keep J well above 0.
     sound = (_SHRINK * J[-1] < J).at[0].set(J[0] > 0.0)
-    return states[jnp.argmax(sound)], jnp.where(jnp.isfinite(theta), theta, scene.centre)
+    return states[jnp.argmax(sound)], theta
 
 
 def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:

@@ -66,12 +66,14 @@ def level_balance(
 ) -> tuple[jax.Array, jax.Array]:
     """:func:`balance`, its relative size infinite unless finite and the supports are met."""
     residual, error = balance(system, u, theta, level)
-    return residual, _where_met(system, u, level, error)
+    return residual, _where_met(system, u, theta, level, error)
 
 
 @compiled
-def _where_met(system: System, u: jax.Array, level: jax.Array, error: jax.Array) -> jax.Array:
-    met = system.supports_met(u, level)
+def _where_met(
+    system: System, u: jax.Array, theta: jax.Array, level: jax.Array, error: jax.Array
+) -> jax.Array:
+    met = system.supports_met(u, theta, level)
     return jnp.where(met & jnp.isfinite(error), error, jnp.inf)
 
 

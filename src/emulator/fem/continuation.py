@@ -136,7 +136,7 @@ class LoadingPath:
     @property
     def _last_ramp(self) -> int:
         """Route of the last ramp that is tried; none where there are no ramps."""
-        pulled = self.system.scene.held_displacement.any()
+        pulled = self.system.scene.prescribed.moves
         return (_PULLED if pulled else Route.CLIMB - 1) if self.ramps else 0
 
     @property

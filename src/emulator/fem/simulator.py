@@ -5,6 +5,7 @@ At equilibrium :math:`r(u(\theta), \theta) = 0`, so
 .. math::
     K\, \frac{\partial u}{\partial \theta} = -\frac{\partial r}{\partial \theta}
 
+(where free; the derivative of r has what the supports pull, where theta moves them)
 gives forward derivatives by one more solve with the tangent, and reverse ones by its transpose.
 """
 
@@ -225,15 +226,16 @@ def _moved(
     system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
 ) -> jax.Array:
     """Derivative (n, 3) of the equilibrium ``u`` along ``direction`` (p,) in theta."""
-    _, force = jax.jvp(lambda t: system.residual(u, t), (theta,), (direction,))
-    return system.extend(-system.solve(tangent, force))
+    _, (force, held) = jax.jvp(system.moved_supports(u), (theta,), (direction,))
+    return held + system.extend(-system.solve(tangent, force))
 
 
 @compiled
 def _columns(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Derivatives (p, n, 3) of the equilibrium ``u`` along each entry of theta."""
-    forces = jax.jacfwd(lambda t: system.residual(u, t))(theta)
-    return jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
+    forces, held = jax.jacfwd(system.moved_supports(u))(theta)
+    moved = jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
+    return moved + jnp.moveaxis(held, -1, 0)
 
 
 def _inert(solution: Solution) -> Solution:

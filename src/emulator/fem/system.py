@@ -51,6 +51,8 @@ from emulator.fem.material_point import stress_and_moduli
 from emulator.scenes.local_terms import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
+_LAST_BITS = 1e-15  # of prescribed displacements, which two programs may round differently
+
 
 @dataclass(frozen=True, eq=False)
 class System:
@@ -227,7 +229,7 @@ class System:
         the supports have to the load level ``level``.
         """
         K, scene = self.assemble(bulk, u, theta, stiffening), self.scene
-        offset = self.support_offset(u, level)
+        offset = self.support_offset(u, theta, level)
 
         def pulled() -> jax.Array:
             force = self.scatter(pair_products(bulk, offset[scene.blocks.connectivity]))
@@ -255,17 +257,36 @@ class System:
         """Nonzeros (nnz,) that a solver does not raise on, and whether they are the tangent's."""
         return self.step_equations(u, theta, load, load)[:2]
 
-    def support_offset(self, u: jax.Array, level: jax.Array | float) -> jax.Array:
+    def on_supports(
+        self, u: jax.Array, theta: jax.Array, level: jax.Array | float = 1.0
+    ) -> jax.Array:
+        """``u`` (n, 3) mm, held where the supports of ``theta`` (p,) are at ``level``."""
+        return jnp.where(self.scene.held, level * self.scene.held_at(theta), u)
+
+    def support_offset(self, u: jax.Array, theta: jax.Array, level: jax.Array | float) -> jax.Array:
         """Distance (n, 3) in mm of the held displacements from their values at ``level``."""
-        wanted = level * jnp.asarray(self.scene.held_displacement)
-        # Comparing first: fused multiply-add finds the last bit of the product missing in the
-        # difference (docs/experiments.md, "A fused multiply-add").
-        return jnp.where(self.scene.held & (u != wanted), wanted - u, 0.0)
+        wanted = level * self.scene.held_at(theta)
+        # Fused multiply-add finds the last bits of products missing in the difference
+        # (docs/experiments.md, "A fused multiply-add").
+        apart = jnp.abs(wanted - u) > _LAST_BITS * jnp.max(jnp.abs(wanted))
+        return jnp.where(self.scene.held & apart, wanted - u, 0.0)
 
     @compiled
-    def supports_met(self, u: jax.Array, level: jax.Array) -> jax.Array:
+    def supports_met(self, u: jax.Array, theta: jax.Array, level: jax.Array) -> jax.Array:
         """Whether the held displacements of ``u`` (n, 3) are those of ``level``, shape ()."""
-        return jnp.all(self.support_offset(u, level) == 0.0)
+        return jnp.all(self.support_offset(u, theta, level) == 0.0)
+
+    def moved_supports(self, u: jax.Array) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
+        """Of theta (p,): the residual (f,) in mN of ``u`` (n, 3) mm on its supports, and that u.
+
+        For derivatives along theta at an equilibrium ``u``.
+        """
+
+        def at(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+            v = self.scene.on_supports(u, theta)
+            return self.residual(v, theta), v
+
+        return at
 
     @compiled
     def least_volume_ratio(self, u: jax.Array) -> jax.Array:

@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.directions import of_elements
@@ -130,12 +129,13 @@ def _changed(scene: Scene, **changes: Any) -> Scene | None:
     law = changes.get("law", scene.law)
     loads = changes.get("loads", scene.loads)
     regions = changes.get("regions", scene.regions)
-    if not loads and not np.any(scene.held_displacement):
+    if not loads and not scene.prescribed.moves:
         return None
     for kind, asked in (("fibres", law.fibres), ("sheets", law.sheets)):
         changes.setdefault(kind, getattr(scene, kind))
         changes[kind] = changes[kind] if asked else None
-    takers = set(law.parameters) | {q.name for load in loads for q in load.quantities}
+    parts = (*loads, *changes.get("supports", scene.supports))
+    takers = set(law.parameters) | {q.name for part in parts for q in part.quantities}
     if regions is not None:
         takers |= {name for name in scene.quantities if name.startswith("stiffness_")}
     try:

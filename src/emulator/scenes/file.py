@@ -75,6 +75,43 @@ A ventricle, whose mesh file has groups named base, endocardium and epicardium:
     b_fs = 4.0
     kappa = 50.0
 
+A test that is controlled by displacement: a cube of 10 mm, glued to a plate at the bottom and to
+one that moves, with a weight on one edge:
+
+.. code-block:: toml
+
+    law = "neo_hookean"
+    mesh = "cube.vtu"                        # with node sets bottom, top and front
+
+    [[supports]]
+    node_set = "bottom"
+
+    [[supports]]
+    node_set = "top"
+    displacement = [10.0, 0.0, 0.0]          # mm, times the parameter
+    amount = "shear"                         # that each load state has for itself
+
+    [node_sets.edge]
+    axis = "x"
+    at = 10.0
+    within = "front"                         # only what of that set is on the plane
+
+    [[loads]]
+    kind = "force"                           # on a point, or evenly along an edge
+    node_set = "edge"
+    resultant = [0.0, 0.0, -0.5]             # N; also times a parameter, with amount
+
+    [parameters.shear]
+    range = [-0.4, 0.4]
+
+    [parameters.mu]
+    unit = "kPa"
+    range = [1.0, 10.0]
+    scale = "log"
+
+    [constants]
+    lam = 80.0
+
 Other rules for fibres are ``biventricle`` (``angles``, ``axis``; facet sets lv_endocardium,
 rv_endocardium, epicardium) and ``uniform`` (``direction``). They also give the sheets, for a law
 that takes any, as the transmural direction; ``uniform`` has a key ``sheets`` for them. Gravity also
@@ -91,6 +128,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -233,23 +271,33 @@ def _with_planes(mesh: Mesh, file: SceneFile, source: Source) -> Mesh:
     node_sets, facet_sets = dict(mesh.node_sets), dict(mesh.facet_sets)
     for name, plane in file.node_sets.items():
         with source.at("node_sets", name, "at", table=("node_sets", name)):
-            node_sets[name] = np.flatnonzero(_on_plane(mesh, plane, "node"))
+            node_sets[name] = np.flatnonzero(_on_plane(mesh, node_sets, plane, "node"))
     for name, plane in file.facet_sets.items():
         with source.at("facet_sets", name, "at", table=("facet_sets", name)):
-            on_plane = _on_plane(mesh, plane, "surface triangle")
+            on_plane = _on_plane(mesh, node_sets, plane, "surface triangle")
             facet_sets[name] = mesh.surface[on_plane[mesh.surface].all(axis=1)]
     return replace(mesh, node_sets=node_sets, facet_sets=facet_sets)
 
 
-def _on_plane(mesh: Mesh, plane: Plane, wanted: str) -> np.ndarray:
+def _on_plane(
+    mesh: Mesh, node_sets: Mapping[str, np.ndarray], plane: Plane, wanted: str
+) -> np.ndarray:
     """Which nodes (n,) lie on the plane; some of what is ``wanted`` must."""
     coordinate = mesh.nodes[:, _AXES[plane.axis]]
     on_plane = np.abs(coordinate - plane.at) <= _ON_PLANE * mesh.size
+    if plane.within is not None:
+        if plane.within not in node_sets:
+            raise InputError(
+                f"no node set '{plane.within}' to take a part of; there are "
+                f"{', '.join(sorted(node_sets)) or 'none'}"
+            )
+        on_plane &= np.isin(np.arange(len(mesh.nodes)), node_sets[plane.within])
     there = on_plane if wanted == "node" else on_plane[mesh.surface].all(axis=1)
     if not there.any():
         low, high = coordinate.min(), coordinate.max()
+        inside = f" in '{plane.within}'" if plane.within else ""
         raise InputError(
-            f"no {wanted} at {plane.axis} = {plane.at:g} mm; the body is between {low:g} and "
-            f"{high:g}"
+            f"no {wanted} at {plane.axis} = {plane.at:g} mm{inside}; the body is between {low:g} "
+            f"and {high:g}"
         )
     return on_plane

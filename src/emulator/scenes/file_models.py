@@ -22,6 +22,8 @@ class Plane(Table):
     """the plane's normal."""
     at: float
     """its place on that axis, mm."""
+    within: str | None = None
+    """a node or facet set of which only what is on the plane is taken, such as a face's edge."""
 
 
 class ParameterTable(Table):

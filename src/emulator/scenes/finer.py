@@ -41,7 +41,8 @@ def finer(scene: Scene) -> Finer:
     refinement = refined(scene.mesh)
     children = refinement.children
     fibres, sheets = _directions(scene, refinement)
-    moved = refinement.carry(scene.held_displacement)
+    moved: dict[str | None, np.ndarray] = {None: refinement.carry(scene.held_displacement)}
+    moved |= {n: refinement.carry(per_unit) for n, per_unit in scene.prescribed.per_unit.items()}
     fine = replace(
         scene,
         mesh=refinement.mesh,

@@ -69,7 +69,8 @@ class Identity:
 
 def identity_of(
     mesh: Mesh,
-    prescribed: tuple[np.ndarray, np.ndarray],
+    held: np.ndarray,
+    moved: Mapping[str, np.ndarray],
     directions: Mapping[str, np.ndarray | None],
     regions: np.ndarray | None,
     facet_sets: Collection[str],
@@ -79,12 +80,12 @@ def identity_of(
 
     Parameters
     ----------
-    prescribed : where the displacement is known (n, 3) bool, and its value (n, 3) mm.
+    held : where the displacement is known, (n, 3) bool.
+    moved : what is known of it, (n, 3) mm by name.
     directions : (m, 3) or (m, q, 3) unit vectors by name, or None.
     regions : (m,) labels, or None.
     facet_sets : names of the sets under a load or a support.
     """
-    held, displacement = prescribed
     elements = np.sort(mesh.elements, axis=1)
     order = np.lexsort(elements.T)
     indices = {"elements": elements[order], "held": held}
@@ -92,7 +93,7 @@ def identity_of(
     if regions is not None:
         indices["regions"] = regions[order]
     return Identity(
-        lengths={"nodes": mesh.nodes, "displacement": displacement},
+        lengths={"nodes": mesh.nodes, **moved},
         directions={
             name: _points_in_order(mesh, v)[order]
             for name, v in directions.items()

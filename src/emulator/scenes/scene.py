@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Literal, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
@@ -30,7 +31,7 @@ from emulator.scenes.loads.load import Load
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.regions import Tissue, checked_regions, region_quantities
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
-from emulator.scenes.supports.dirichlet import prescribe
+from emulator.scenes.supports.dirichlet import Prescribed, prescribe
 from emulator.scenes.supports.rigid import check_motions
 from emulator.shown import Shown
 
@@ -108,7 +109,7 @@ class Scene(Shown):
             if name not in takers:
                 raise InputError(
                     f"scene '{self.name}': parameter '{name}' is not one of law "
-                    f"'{self.law.name}' and its loads: {', '.join(takers)}"
+                    f"'{self.law.name}', its loads and moved supports: {', '.join(takers)}"
                 )
             if given.count(name) > 1:
                 raise InputError(f"scene '{self.name}': parameter '{name}' is given twice")
@@ -183,8 +184,9 @@ class Scene(Shown):
         for part in self.parts:
             for name in part.facet_sets:
                 self.mesh.facet_set(name)
+        moved = sum((np.abs(d) for d in self.prescribed.per_unit.values()), self.held_displacement)
         for load in self.loads:
-            load.check(self.mesh, self.held, self.held_displacement)
+            load.check(self.mesh, self.held, moved)
 
     @property
     def parts(self) -> tuple[Load | BoundaryCondition, ...]:
@@ -198,20 +200,22 @@ class Scene(Shown):
 
     @property
     def _takers(self) -> dict[str, tuple[Quantity, str]]:
-        """Quantity of every parameter, by name, and its owner: the law, a region or a load."""
+        """Quantity of every parameter, by name, and its owner: law, region, load or support."""
         takers = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
         if self.regions is not None:
             takers |= {q.name: (q, "a region") for q in region_quantities(self.regions)}
         own = set(takers)
-        for load in self.loads:
-            for quantity in load.quantities:
-                if quantity.name in own:
-                    raise InputError(
-                        f"scene '{self.name}': load {type(load).__name__} and "
-                        f"{takers[quantity.name][1]} both have a parameter '{quantity.name}'; "
-                        "call the load's by another name"
-                    )
-                takers.setdefault(quantity.name, (quantity, f"load {type(load).__name__}"))
+        for what, parts in (("load", self.loads), ("support", self.supports)):
+            for part in parts:
+                owner = f"{what} {type(part).__name__}"
+                for quantity in part.quantities:
+                    if quantity.name in own:
+                        raise InputError(
+                            f"scene '{self.name}': {owner} and {takers[quantity.name][1]} both "
+                            f"have a parameter '{quantity.name}'; call the {what}'s by another name"
+                        )
+                    takers.setdefault(quantity.name, (quantity, owner))
+            own = set(takers)
         return takers
 
     @cached_property
@@ -221,8 +225,8 @@ class Scene(Shown):
 
     @property
     def load_parameters(self) -> tuple[str, ...]:
-        """Parameters that the loads take; the others are the material's."""
-        taken = {quantity.name for load in self.loads for quantity in load.quantities}
+        """Parameters that loads and moved supports take; the others are the material's."""
+        taken = {quantity.name for part in self.parts for quantity in part.quantities}
         return tuple(name for name in self.parameter_names if name in taken)
 
     @property
@@ -254,7 +258,7 @@ class Scene(Shown):
         return self.space.from_unit(position)
 
     def resolve(self, theta: jax.Array) -> dict[str, jax.Array]:
-        """Every parameter of law, loads and regions by name, from theta (p,) and the constants."""
+        """Every parameter of law, loads, supports and regions by name, from theta (p,)."""
         values: dict[str, Any] = dict(self.constants)
         values.update({name: theta[k] for k, name in enumerate(self.parameter_names)})
         return values
@@ -303,19 +307,39 @@ class Scene(Shown):
         return jax.tree.map(self.blocks.gather, self.tissue)
 
     @cached_property
-    def prescribed(self) -> tuple[np.ndarray, np.ndarray]:
-        """``(held, values)``: where the displacement is known, (n, 3) bool; its value, in mm."""
+    def prescribed(self) -> Prescribed:
+        """Where the displacement is known, and its value, in mm."""
         return prescribe(self.mesh, self.supports)
 
     @property
     def held(self) -> np.ndarray:
         """Where the displacement is known, (n, 3) bool."""
-        return self.prescribed[0]
+        return self.prescribed.held
 
     @property
     def held_displacement(self) -> np.ndarray:
-        """Known displacement in mm, zero elsewhere, (n, 3)."""
-        return self.prescribed[1]
+        """Known displacement in mm that no parameter scales, zero elsewhere, (n, 3)."""
+        return self.prescribed.displacement
+
+    def held_at(self, theta: jax.Array, nodes: np.ndarray | None = None) -> jax.Array:
+        """Known displacement in mm at ``theta`` (..., p), zero elsewhere.
+
+        (n, 3), or (k, 3) at ``nodes`` (k,), where no parameter scales it, else (..., n, 3).
+        """
+        _, fixed, per_unit = self.prescribed
+        rows = slice(None) if nodes is None else nodes
+        found = jnp.asarray(fixed[rows])
+        for name, moved in per_unit.items():
+            amount = self.resolve(jnp.moveaxis(jnp.asarray(theta), -1, 0))[name]
+            found = found + jnp.asarray(amount)[..., None, None] * moved[rows]
+        return found
+
+    def on_supports(
+        self, u: jax.Array, theta: jax.Array, nodes: np.ndarray | None = None
+    ) -> jax.Array:
+        """``u`` (..., n, 3) mm, or (..., k, 3) at ``nodes`` (k,), made exact where held."""
+        held = self.held if nodes is None else self.held[nodes]
+        return jnp.where(held, self.held_at(theta, nodes), u)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """Name, mesh, law, loads, supports, theta."""
@@ -346,9 +370,12 @@ class Scene(Shown):
             "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
             "dilatation": self.dilatation,
         }
+        held, fixed, per_unit = self.prescribed
+        moved = {f"displacement per unit of {name}": each for name, each in per_unit.items()}
         return identity_of(
             self.mesh,
-            self.prescribed,
+            held,
+            {"displacement": fixed, **moved},
             {"fibres": self.fibres, "sheets": self.sheets},
             self.regions,
             sorted({name for part in self.parts for name in part.facet_sets}),

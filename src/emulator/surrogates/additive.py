@@ -102,13 +102,6 @@ class Emulator(Shown):
                 digest.update(values.tobytes())
         return digest.hexdigest()[:16]
 
-    def hold(self, free: jax.Array, nodes: np.ndarray | None = None) -> jax.Array:
-        """``free`` (..., k, 3) in mm at ``nodes`` (k,), all by default, but exact where held."""
-        held, values = self.scene.prescribed
-        if nodes is not None:
-            held, values = held[nodes], values[nodes]
-        return jnp.where(held, values, free)
-
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Displacement (n, 3) in mm at ``theta`` (p,), the network's processor included.
 
@@ -118,7 +111,7 @@ class Emulator(Shown):
         free = jnp.zeros(self.scene.held.shape)
         for part in self.parts.values():
             free = free + part(position)
-        return self.hold(free)
+        return self.scene.on_supports(free, theta)
 
     def cache(self, nodes: np.ndarray | None = None) -> CachedEmulator:
         """The forward map over ``nodes`` (all by default); runs the network's processor once."""
@@ -176,7 +169,7 @@ class CachedEmulator:
         for part in self.parts:
             if part.field is not None:
                 free = free + part.field(self.scene.to_unit(theta))
-        return self.emulator.hold(free, self.nodes)
+        return self.scene.on_supports(free, theta, self.nodes)
 
     def evaluate(self, theta: jax.Array) -> Prediction:
         """Displacement and whether ``theta`` is inside the box the emulator was trained on."""

@@ -31,6 +31,7 @@ from emulator.surrogates.protocol import ForwardMap, Prediction, fingerprint_of
 
 def newton_step(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     """``u`` (n, 3) mm after one full Newton step, without a line search."""
+    u = system.on_supports(u, theta)
     tangent = system.pattern.safe_values(system.tangent(u, theta))
     return u - system.extend(system.solve(tangent, system.residual(u, theta)))
 
@@ -80,8 +81,8 @@ class CorrectedForward:
             (theta,), (direction,) = primals, tangents
             u = correct(theta)
             tangent = system.pattern.safe_values(system.tangent(u, theta))
-            _, force = jax.jvp(lambda t: system.residual(u, t), (theta,), (direction,))
-            return u, system.extend(-system.solve(tangent, force))
+            _, (force, held) = jax.jvp(system.moved_supports(u), (theta,), (direction,))
+            return u, held + system.extend(-system.solve(tangent, force))
 
         return correct
 

@@ -172,8 +172,9 @@ def expand_at(simulator: Simulator, u: jax.Array, theta: jax.Array, order: int) 
         if comb(count + degree - 1, degree) > _MOST_TERMS:
             break
         terms = list(combinations_with_replacement(range(count), degree))
-        forces = _forces(system, u, position, terms, found)
+        forces, held = _forces(system, u, position, terms, found)
         moved = jax.vmap(system.extend, in_axes=1)(-jax.jit(system.solve)(tangent, forces.T))
+        moved += held
         if not jnp.isfinite(moved).all():
             raise SolverError(
                 f"scene '{scene.name}': derivatives of order {degree} in theta are not finite"
@@ -196,10 +197,11 @@ def _forces(
     position: jax.Array,
     terms: list[tuple[int, ...]],
     found: dict[tuple[int, ...], jax.Array],
-) -> jax.Array:
+) -> tuple[jax.Array, jax.Array]:
     """Mixed derivative (t, f) of the residual along each term's path, its own term left out.
 
-    Term by term (``lax.map``): the paths of all terms at once would not fit into memory.
+    And (t, n, 3) of the displacement where theta moves supports, (t, 1, 1) of zeros where it moves
+    none. Term by term (``lax.map``): the paths of all terms at once would not fit into memory.
     """
     degree = len(terms[0])
     # The path holds one term for every proper subset of the multi-index.
@@ -208,15 +210,21 @@ def _forces(
     paths = [[places[tuple(term[k] for k in part)] for part in parts] for term in terms]
     known = jnp.stack(list(found.values())) if found else jnp.zeros((0, *u.shape))
 
-    def one(argument: tuple[jax.Array, jax.Array], known: jax.Array) -> jax.Array:
+    moving = bool(system.scene.prescribed.per_unit)
+
+    def one(argument: tuple[jax.Array, jax.Array], known: jax.Array) -> tuple[jax.Array, jax.Array]:
         directions, path = argument
 
-        def along(*steps: jax.Array) -> jax.Array:
+        def along(*steps: jax.Array) -> tuple[jax.Array, jax.Array]:
             v = u
             for part, place in zip(parts, path, strict=True):
                 v = v + prod((steps[k] for k in part), start=jnp.ones(())) * known[place]
             x = position + sum(s * d for s, d in zip(steps, directions, strict=True))
-            return system.residual(v, system.scene.from_unit(x))
+            theta = system.scene.from_unit(x)
+            if not moving:
+                return system.residual(v, theta), jnp.zeros((1, 1))
+            v = system.scene.on_supports(v, theta)
+            return system.residual(v, theta), jnp.where(system.scene.held, v, 0.0)
 
         return _mixed(along, degree)()
 
@@ -227,7 +235,7 @@ def _forces(
     )
 
 
-def _mixed(function: Callable[..., jax.Array], degree: int) -> Callable[[], jax.Array]:
+def _mixed(function: Callable[..., Any], degree: int) -> Callable[[], Any]:
     """The derivative of ``function`` once in each of its ``degree`` scalars, at zero."""
     if degree == 0:
         return function

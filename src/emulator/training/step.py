@@ -43,7 +43,7 @@ def predictor(emulator: Emulator) -> Callable[..., jax.Array]:
             free = network.decode(decoder, kept[0], position)
         else:
             free = network.predict(weights, position)
-        return emulator.hold(free if series is None else series(position) + free)
+        return scene.on_supports(free if series is None else series(position) + free, thetas)
 
     return predict
 

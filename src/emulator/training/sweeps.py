@@ -46,7 +46,7 @@ from emulator.surrogates.polynomial import (
 )
 from emulator.training.checkpoint import SWEEPS
 from emulator.training.regression import MOST_TERMS, Fitted, Values, best_degree, fit
-from emulator.training.targets import on_supports, targets
+from emulator.training.targets import targets
 
 _LEVELS = 15  # of the load, at least
 _TAKEN, _ENOUGH = 0.25, 0.9  # fraction of a step that will do, and part of the steps that have to
@@ -297,7 +297,7 @@ def runs_of(simulator: Simulator, swept: Swept, thetas: jax.Array) -> Runs:
 
     def at(theta: jax.Array) -> jax.Array:
         v = legendre(scene.to_unit(theta), degrees) @ coefficients
-        return on_supports(system, v, 1.0)
+        return system.on_supports(system.extend(v), theta)
 
     def each(theta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         u, slopes = at(theta), jax.jacfwd(at)(theta)

@@ -20,7 +20,7 @@ from emulator.geometry.fibres import (
 from emulator.geometry.io import write_mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes import Parameter, file
-from emulator.scenes.loads import FollowerPressure, Gravity, PublishedPressure, Traction
+from emulator.scenes.loads import FollowerPressure, Force, Gravity, PublishedPressure, Traction
 from emulator.scenes.supports import ElasticSupport
 
 SCENE = """
@@ -259,7 +259,7 @@ def test_importing_the_package_does_not_import_pydantic():
 
 def test_the_examples_of_the_documentation(folder):
     blocks = re.split(r"\.\. code-block:: toml\n", file.__doc__)[1:]
-    for name, text in zip(("block", "ventricle"), blocks, strict=True):
+    for name, text in zip(("block", "ventricle", "cube"), blocks, strict=True):
         kept = [line for line in text.splitlines() if not line or line.startswith("    ")]
         (folder / f"{name}.toml").write_text(textwrap.dedent("\n".join(kept)))
     write_mesh(folder / "ventricle.vtu", human_ventricle(5, 12, 1))
@@ -278,6 +278,16 @@ def test_the_examples_of_the_documentation(folder):
     pressure = FollowerPressure("endocardium", 0.8)
     assert scene.loads == (pressure, Traction("base", (0.0, 0.1, 0.0)))
     assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
+
+    write_mesh(folder / "cube.vtu", box((10.0, 10.0, 10.0), (2, 2, 2)))
+    cube = find_scene(str(folder / "cube.toml"))
+    assert cube.load_parameters == ("shear",)
+    moved = cube.held_at(cube.theta(shear=0.2, mu=3.0))
+    np.testing.assert_array_equal(moved[cube.mesh.node_set("top")], [[2.0, 0.0, 0.0]] * 9)
+    edge = np.flatnonzero((cube.mesh.nodes[:, :2] == [10.0, 0.0]).all(axis=1))
+    np.testing.assert_array_equal(cube.mesh.node_set("edge"), edge)
+    assert cube.loads == (Force("edge", (0.0, 0.0, -0.5)),)
+    assert scene_from_origin(cube.origin).fingerprint == cube.fingerprint
 
 
 def test_pressures_as_parameters_and_other_rules_for_fibres(folder):

@@ -10,7 +10,7 @@ from emulator.mechanics.laws import LAWS
 from emulator.mechanics.laws.identity import law_identity, probed
 from emulator.scenes import Parameter, Support
 from emulator.scenes.identity import _as_set
-from emulator.scenes.loads import LOADS, Gravity, GravityVector, Traction
+from emulator.scenes.loads import LOADS, Force, Gravity, GravityVector, Traction
 from emulator.scenes.supports import SUPPORTS, ElasticSupport
 from scene_support import block
 
@@ -160,14 +160,23 @@ def test_the_released_models_are_told_from_ours(published):
 PARTS = {
     "gravity": (Gravity(), {"density": 1.1, "direction": (0.0, 1.0, 0.0), "acceleration": 3.7}),
     "gravity_vector": (GravityVector(), {"density": 1.1, "parameter": "g"}),
+    "force": (
+        Force("top", (0.0, 0.0, 1e-3)),
+        {"node_set": "left", "resultant": (0.1, 0, 0), "amount": "weight"},
+    ),
     "traction": (Traction("top", (0.0, 0.1, 0.0)), {"facet_set": "left", "traction": (0.1, 0, 0)}),
     **{
         kind: (LOADS[kind]("top"), {"facet_set": "left", "pressure": 0.3, "parameter": "p"})
         for kind in ("cavity_pressure", "follower_pressure", "dead_pressure", "published_pressure")
     },
     "held": (
-        Support("bottom"),
-        {"node_set": "right", "displacement": np.array([0.0, 0.0, 0.1]), "components": "xz"},
+        Support("bottom", np.array([0.1, 0.0, 0.0]), amount="shear"),
+        {
+            "node_set": "right",
+            "displacement": np.array([0.0, 0.0, 0.1]),
+            "components": "xz",
+            "amount": None,
+        },
     ),
     "elastic": (
         ElasticSupport("right", 0.5),

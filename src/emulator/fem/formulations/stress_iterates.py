@@ -129,7 +129,14 @@ class StressIterates:
             # On the way from rest each tangent is unlike the one before.
             full, outcome = self.system.attempt(promised.tangent, -force, near=False)
             move, definite = _promised_step(
-                self.system, state.u, self.level, promised.solvable, force, full, outcome
+                self.system,
+                state.u,
+                self.theta,
+                self.level,
+                promised.solvable,
+                force,
+                full,
+                outcome,
             )
             return _Tried(move, definite, before.tries + 1)
 
@@ -204,6 +211,7 @@ def _promised(
 def _promised_step(
     system: System,
     u: jax.Array,
+    theta: jax.Array,
     level: jax.Array,
     solvable: jax.Array,
     force: jax.Array,
@@ -217,7 +225,7 @@ def _promised_step(
     definite = outcome == Outcome.OK
     if system.forces:  # not symmetric: at least the step goes down
         definite &= jnp.vdot(force, move) <= 0.0
-    move = system.extend(move) + system.support_offset(u, level)
+    move = system.extend(move) + system.support_offset(u, theta, level)
     return jnp.where(solvable, move, jnp.nan), definite
 
 

@@ -51,7 +51,7 @@ def newton_direction(
 
     any_tangent : whether a tangent that is not positive definite will do.
     """
-    settled = system.supports_met(state.u, state.level)
+    settled = system.supports_met(state.u, theta, state.level)
     equations = formulation_of(system).linearise(state, theta)
     force = equations.residual + equations.pull
     full, outcome = system.attempt(equations.tangent, -force)
@@ -61,7 +61,7 @@ def newton_direction(
     saddle = state.iterates is not None
     turns = settled & (not saddle)
     move, slope, singular = _full_step(
-        system, state.u, state.level, equations._replace(eliminated=None), turns, full
+        system, state.u, theta, state.level, equations._replace(eliminated=None), turns, full
     )
     refused = indefinite & ~again
     descends = ~settled | (slope <= 0.0) | saddle
@@ -72,6 +72,7 @@ def newton_direction(
 def _full_step(
     system: System,
     u: jax.Array,
+    theta: jax.Array,
     level: jax.Array,
     equations: Linearised,
     turns: jax.Array,
@@ -85,7 +86,7 @@ def _full_step(
     slope = jnp.vdot(equations.residual, move)
     singular = _is_singular(equations.tangent, move, force)
     move = jnp.where(turns & (slope > 0.0), -move, move)
-    move = system.extend(move) + system.support_offset(u, level)
+    move = system.extend(move) + system.support_offset(u, theta, level)
     solvable = equations.solvable
     return jnp.where(solvable, move, jnp.nan), slope, ~solvable | singular
 

@@ -61,7 +61,7 @@ def take_step(
             lambda: _searched(system, theta, state, direction, options),
             lambda: (jnp.ones(()), jnp.array(False)),
         )
-        u = _moved(system, state.u, direction.move, fraction, state.level)
+        u = _moved(system, state.u, theta, direction.move, fraction, state.level)
         residual, error = level_balance(system, u, theta, state.level)
         J, now = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
         good = search | _good(error, state.error, J, options.shrink, now)
@@ -105,10 +105,14 @@ def _searched(
 
 @compiled
 def _moved(
-    system: System, u: jax.Array, move: jax.Array, fraction: jax.Array, level: jax.Array
+    system: System,
+    u: jax.Array,
+    theta: jax.Array,
+    move: jax.Array,
+    fraction: jax.Array,
+    level: jax.Array,
 ) -> jax.Array:
     """``u`` (n, 3) mm after a fraction of the step."""
-    scene = system.scene
     u = jnp.where(fraction > 0.0, u + fraction * move, u)
     # After a full step the supports are met; setting them avoids the last bit of round-off.
-    return jnp.where(scene.held & (fraction == 1.0), level * scene.held_displacement, u)
+    return jnp.where(fraction == 1.0, system.on_supports(u, theta, level), u)

@@ -5,6 +5,7 @@ A new kind is a frozen dataclass derived from :class:`Load` in a file of its own
 
 from emulator.scenes.loads.dead_pressure import DeadPressure
 from emulator.scenes.loads.follower import FollowerPressure
+from emulator.scenes.loads.force import Force
 from emulator.scenes.loads.gravity import Gravity, GravityVector
 from emulator.scenes.loads.load import Load
 from emulator.scenes.loads.pressure import CavityPressure
@@ -18,6 +19,7 @@ LOADS: dict[str, type[Load]] = {
         Gravity,
         GravityVector,
         Traction,
+        Force,
         CavityPressure,
         FollowerPressure,
         DeadPressure,
@@ -31,6 +33,7 @@ __all__ = [
     "CavityPressure",
     "DeadPressure",
     "FollowerPressure",
+    "Force",
     "Gravity",
     "GravityVector",
     "Load",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
+from emulator.mechanics.quantity import Quantity
 from emulator.scenes.local_terms import LocalTerm
 
 
@@ -16,12 +18,14 @@ class Held(NamedTuple):
     """Prescribed displacements.
 
     where : name for error messages. nodes : (k,). displacement : (k, 3) mm. axes : held ones.
+    amount : parameter that the displacement is multiplied by, or None.
     """
 
     where: str
     nodes: np.ndarray
     displacement: np.ndarray
     axes: list[int]
+    amount: str | None = None
 
 
 class Resisted(NamedTuple):
@@ -45,6 +49,11 @@ class BoundaryCondition(ABC):
         return ()
 
     @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Parameters the support takes from theta or from the scene's constants."""
+        return ()
+
+    @property
     def simpler(self) -> tuple[str, BoundaryCondition | None] | None:
         """An effect that can be left out: its name, and the support without it, None for none."""
         return None
@@ -57,8 +66,12 @@ class BoundaryCondition(ABC):
         """Potential of its springs, or None."""
         return None
 
-    def on_finer(self, mesh: Mesh, moved: np.ndarray) -> BoundaryCondition:
-        """The support on a finer ``mesh``, whose held nodes move by ``moved`` (f, 3) mm."""
+    def on_finer(self, mesh: Mesh, moved: Mapping[str | None, np.ndarray]) -> BoundaryCondition:
+        """The support on a finer ``mesh``.
+
+        ``moved`` : displacement (f, 3) mm of its held nodes, the fixed one under None, and per unit
+        of each amount under the amount's name.
+        """
         del mesh, moved
         return self
 

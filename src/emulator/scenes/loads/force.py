@@ -1,0 +1,105 @@
+r"""A dead force on a point, an edge or a set of nodes.
+
+Potential :math:`-F \cdot \sum_a w_a u_a` with weights that add up to 1: the shares of the nodes in
+the length of the mesh's edges between them, so that a force on an edge is spread evenly along it,
+and equal ones where no two nodes share an edge. Under a point, strains grow without bound as the
+mesh is refined; resultants and displacements elsewhere do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.discretisation import Discretisation
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import EDGES
+from emulator.mechanics.quantity import Quantity, number
+from emulator.scenes.identity import plain_fields
+from emulator.scenes.loads.load import Load
+
+_MN_PER_N = 1e3
+
+
+@dataclass(frozen=True)
+class Force(Load):
+    """A force in N that keeps its direction, spread over a node set.
+
+    Parameters
+    ----------
+    node_set : one node, the nodes of an edge, or any others.
+    resultant : three components in N; with ``amount``, per unit of that parameter.
+    amount : name of a parameter that multiplies the force, ``None`` where it is known. With a
+        range around 1 it is a force known to some percent.
+    """
+
+    kind: ClassVar[str] = "force"
+
+    node_set: str
+    resultant: tuple[float, float, float]
+    amount: str | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.resultant) != 3 or not np.isfinite(self.resultant).all():
+            raise InputError(
+                f"force on '{self.node_set}' is {self.resultant}; give 3 finite numbers in N"
+            )
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """The amount, where it is a parameter; either sign."""
+        return () if self.amount is None else (number(self.amount, -np.inf),)
+
+    @property
+    def simpler(self) -> tuple[str, None]:
+        """No force."""
+        return f"force on '{self.node_set}'", None
+
+    def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
+        """Raise :class:`InputError` where the set is not in the mesh."""
+        del held, displacement
+        mesh.node_set(self.node_set)
+
+    def nodal_force(self, grid: Discretisation) -> np.ndarray | None:
+        """Nodal forces (n, 3) in mN, where the force is known."""
+        return self._spread(grid.mesh) if self.amount is None else None
+
+    def nodal_force_per_unit(self, grid: Discretisation) -> dict[str, np.ndarray]:
+        """Nodal forces (n, 3) in mN per unit of the amount."""
+        return {} if self.amount is None else {self.amount: self._spread(grid.mesh)}
+
+    def _spread(self, mesh: Mesh) -> np.ndarray:
+        return shares(mesh, mesh.node_set(self.node_set))[:, None] * (
+            _MN_PER_N * np.asarray(self.resultant, dtype=float)
+        )
+
+    def to_json(self) -> list[Any]:
+        """Every field."""
+        return plain_fields(self)
+
+
+def shares(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
+    """Weights (n,) of sum 1 on ``nodes`` (k,), by the length of mesh edges between them.
+
+    Of a quadratic edge, Simpson's: a sixth at each end and two thirds in the middle.
+    """
+    among = np.zeros(len(mesh.nodes), dtype=bool)
+    among[nodes] = True
+    quadratic = mesh.order == 2
+    local = [(a, b, 4 + k) if quadratic else (a, b) for k, (a, b) in enumerate(EDGES)]
+    edges = mesh.elements[:, local].reshape(-1, len(local[0]))
+    edges = edges[among[edges].all(axis=1)]
+    edges[:, :2] = np.sort(edges[:, :2], axis=1)
+    edges = np.unique(edges, axis=0)
+    found = np.zeros(len(mesh.nodes))
+    if not len(edges):
+        found[nodes] = 1.0 / len(nodes)
+        return found
+    length = np.linalg.norm(mesh.nodes[edges[:, 1]] - mesh.nodes[edges[:, 0]], axis=1)
+    weights = (1 / 6, 1 / 6, 2 / 3) if quadratic else (0.5, 0.5)
+    for column, weight in zip(edges.T, weights, strict=True):
+        np.add.at(found, column, weight * length)
+    return found / found.sum()
