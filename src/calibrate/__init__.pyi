@@ -4,9 +4,11 @@ from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoi
 from .observations import (
     CavityVolume,
     MeasuredParameter,
+    Reaction,
     landmarks,
     length_between,
     nodal_displacements,
+    rigid_markers,
     segment_strains,
     strains,
     surface_points,
@@ -28,6 +30,7 @@ from .samplers import Density, NUTSOptions, density_of
 from .sensitivity_analysis import sensitivity
 from .statistical_model import Model
 from .statistical_model.build import model
+from .statistical_model.systematic import placement, rigid_motion, with_systematic
 from .um_bridge import serve
 from .workflow import load
 from .workflow.campaigns import campaign
@@ -48,6 +51,7 @@ __all__ = [
     "NUTSOptions",
     "Population",
     "Posterior",
+    "Reaction",
     "StudentTNoise",
     "box_prior",
     "campaign",
@@ -61,8 +65,11 @@ __all__ = [
     "log_normal",
     "model",
     "nodal_displacements",
+    "placement",
     "population_of_fits",
     "reweight",
+    "rigid_markers",
+    "rigid_motion",
     "sample",
     "sbc",
     "segment_strains",
@@ -72,4 +79,5 @@ __all__ = [
     "surface_points",
     "truncated",
     "truncated_normal",
+    "with_systematic",
 ]

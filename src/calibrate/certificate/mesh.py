@@ -92,7 +92,7 @@ def mesh_change(
     error.forget()
     nodes, linear = len(error.finer.scene.mesh.nodes), simulator.scene.mesh.order == 1
     model_error = predictive.model.error
-    widened = model_error is not None and model_error.of_mesh
+    widened = model_error is not None and model_error.with_mesh
     return replace(told, runs=points * states, nodes=nodes, linear=linear, widened=widened)
 
 

@@ -71,6 +71,11 @@ def expected_precision(
     InputError
         The forward map has no answer at any of the draws, or noise has no known sd.
     """
+    if model.error is not None and model.error.of_fem:
+        raise InputError(
+            "identify before measuring: the model's data has errors besides noise, which the data "
+            "drawn here would not have; leave them out, or infer from synthetic data"
+        )
     if any(model.noise_sites.values()):
         raise InputError(
             "identifiability: give every noise a known sd, as in GaussianNoise(sd=...)"

@@ -25,13 +25,14 @@ from jax.flatten_util import ravel_pytree
 from calibrate.noise.information import information_about_means
 from calibrate.observations import Observations
 from calibrate.statistical_model import Model
+from calibrate.statistical_model.systematic import SystematicError
 from emulator.errors import InputError
 
 
 def informations(model: Model, values: np.ndarray, *, log: bool) -> np.ndarray:
     """Fisher information (s, q, q) of the model's data at ``values`` (s, q), valid ones only."""
     sensitivity = sensitivities(model, model.observe, log=log)
-    curvature = jax.jit(partial(information_about_means, model.noise))
+    curvature = jax.jit(partial(_information, model))
     found = []
     for x in np.log(values) if log else values:
         means, J, valid = sensitivity(jnp.asarray(x))
@@ -40,6 +41,14 @@ def informations(model: Model, values: np.ndarray, *, log: bool) -> np.ndarray:
     if not found:
         raise InputError("identifiability: the forward map has no valid answer at any draw")
     return np.stack(found)
+
+
+def _information(model: Model, means: dict[str, jax.Array]) -> jax.Array:
+    """Information (d, d) of the data about its means, less what systematic errors take of it."""
+    found = information_about_means(model.noise, means)
+    if isinstance(model.error, SystematicError):
+        return model.error.information_left(found)
+    return found
 
 
 def sensitivities(

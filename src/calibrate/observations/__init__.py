@@ -17,6 +17,7 @@ from calibrate.observations.registry import (
     observations_from_json,
     parse_observation,
 )
+from calibrate.observations.rigid_markers import RigidMarkers, rigid_markers
 from calibrate.observations.scalar import Scalar
 from calibrate.observations.segment_strain import SegmentStrain, segment_strains
 from calibrate.observations.several import Observations, observations
@@ -43,6 +44,7 @@ __all__ = [
     "Observation",
     "Observations",
     "Reaction",
+    "RigidMarkers",
     "Scalar",
     "SegmentStrain",
     "Strain",
@@ -54,6 +56,7 @@ __all__ = [
     "observations",
     "observations_from_json",
     "parse_observation",
+    "rigid_markers",
     "segment_strains",
     "spread_landmarks",
     "spread_nodes",

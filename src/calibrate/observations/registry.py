@@ -14,6 +14,7 @@ from calibrate.observations.parameter import MeasuredParameter
 from calibrate.observations.present import ENTRIES, Present
 from calibrate.observations.protocol import Kind, Observation
 from calibrate.observations.reaction import Reaction
+from calibrate.observations.rigid_markers import RigidMarkers
 from calibrate.observations.segment_strain import SegmentStrain
 from calibrate.observations.several import Observations
 from calibrate.observations.strain import Strain
@@ -32,6 +33,7 @@ OBSERVATIONS: dict[str, type[Kind]] = {
         Strain,
         SegmentStrain,
         SurfacePoints,
+        RigidMarkers,
         CavityVolume,
         Length,
         Reaction,

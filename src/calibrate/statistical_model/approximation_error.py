@@ -13,14 +13,8 @@ of the noise about its mean, is interpolated between the runs by a Gaussian kern
 :math:`e_j e_j^T / \hat\alpha_{-j}(x_j)^2`, with each run's size predicted from the others, so that
 sizes that are hard to predict make the error larger.
 
-The error is marginalised in closed form. With :math:`G = V^T W V`, made diagonal by the choice of
-V, and :math:`b = V^T W\,(y - g)`, it changes the log likelihood of the residual by
-
-.. math:: \tfrac12 \sum_i \left[\frac{\alpha^2 b_i^2}{1 + \alpha^2 G_{ii}}
-          - \log\left(1 + \alpha^2 G_{ii}\right)\right]
-
-(matrix determinant lemma and Woodbury's identity). The error has no mean: it does not correct the
-map, it says how far to believe it.
+The error is marginalised in closed form (:mod:`calibrate.statistical_model.error_modes`). It has no
+mean: it does not correct the map, it says how far to believe it.
 
 Where the runs were on a finer mesh, the error is the mesh's as well, and FEM on the mesh is allowed
 the same.
@@ -35,15 +29,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
-from emulator.surrogates.protocol import fingerprint_of
+from calibrate.statistical_model.error_modes import ErrorModes
 
 _MODES = 12
 _WIDTHS = np.geomspace(0.05, 2.0, 12)  # of the kernel, in standardised unknowns
-
-Means = Mapping[str, jax.Array]
-"""Data without noise by the observation's name."""
 
 
 class Runs(NamedTuple):
@@ -57,20 +47,14 @@ class Runs(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ApproximationError:
+class ApproximationError(ErrorModes):
     """The map's error as noise; :func:`fit` makes it.
 
-    weights : (r, d), :math:`V^T W`: residual of all data to b.
-    strength : (r,), the diagonal of G.
-    modes : (r, d), :math:`V^T`, for replicated data.
     x, log_sizes, width : runs (n, q), the logarithms of their sizes (n,), and the kernel's width.
     centre, scale : (q,) that standardise the unknowns.
-    of_mesh : whether FEM on the map's mesh has this error, too.
+    of_mesh : whether it was learned on a finer mesh, so that FEM on the map's mesh has it, too.
     """
 
-    weights: np.ndarray
-    strength: np.ndarray
-    modes: np.ndarray
     x: np.ndarray
     log_sizes: np.ndarray
     width: float
@@ -83,17 +67,15 @@ class ApproximationError:
         at = (unknowns - self.centre) / self.scale
         return jnp.exp(_interpolate(at, self.x, self.log_sizes, self.width))
 
-    def log_ratio(self, unknowns: jax.Array, residual: Means) -> jax.Array:
-        """What the error adds to the log likelihood of ``residual``, data less prediction."""
-        flat, _ = ravel_pytree(dict(residual))
-        variance = self.size(unknowns) ** 2
-        b, inflated = self.weights @ flat, 1.0 + variance * self.strength
-        return 0.5 * jnp.sum(variance * b**2 / inflated - jnp.log(inflated))
+    @property
+    def of_fem(self) -> bool:
+        """Where it is the mesh's as well."""
+        return self.of_mesh
 
     @property
-    def fingerprint(self) -> str:
-        """Short hash of all it consists of."""
-        return fingerprint_of(*self.arrays().values())
+    def with_mesh(self) -> bool:
+        """As it was learned."""
+        return self.of_mesh
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All it consists of, by name; ``of_mesh`` where it is."""
@@ -106,12 +88,6 @@ class ApproximationError:
         names = [field.name for field in fields(cls) if field.name != "of_mesh"]
         values: dict[str, Any] = {name: arrays[name] for name in names}
         return cls(**{**values, "width": float(values["width"])}, of_mesh="of_mesh" in arrays)
-
-    def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
-        """Data without noise as FEM might have made it: ``means`` plus a draw of the error."""
-        flat, unravel = ravel_pytree(dict(means))
-        coefficients = jax.random.normal(rng_key, self.strength.shape)
-        return unravel(flat + self.size(unknowns) * (coefficients @ self.modes))
 
 
 def fit(

@@ -29,7 +29,7 @@ from calibrate.observations.present import leave_out_missing, missing_values
 from calibrate.priors import Prior
 from calibrate.priors.joint_prior import Conditional, Dependence
 from calibrate.state_names import split
-from calibrate.statistical_model.approximation_error import ApproximationError
+from calibrate.statistical_model.error_modes import ErrorModes
 from calibrate.statistical_model.load_states import LoadStates
 from calibrate.statistical_model.prior_range import standardised
 from calibrate.whole_numpyro import mend_numpyro
@@ -61,7 +61,8 @@ class Model:
         share its unknown numbers.
     states : where theta comes from in each load state.
     prior : one distribution an unknown of theta.
-    error : the forward map's own error, where the likelihood allows for it.
+    error : what the likelihood allows for besides noise: the forward map's own error, or systematic
+        ones of the measurement.
     prior_cut : unknown to the mass of its prior that was cut off (``prior_range``).
     check_scale : whether :meth:`check_data` refuses data far from every prediction.
     dependence : of the prior of some unknowns of theta, in theta's order.
@@ -74,7 +75,7 @@ class Model:
     noise_names: Mapping[str, str]
     states: LoadStates
     prior: Prior
-    error: ApproximationError | None = None
+    error: ErrorModes | None = None
     prior_cut: Mapping[str, float] = field(default_factory=dict)
     check_scale: bool = True
     dependence: Dependence | None = None
@@ -140,7 +141,7 @@ class Model:
             if observed is None:
                 means = self.error.draw(numpyro.prng_key(), self._stacked(draw), means)
             else:
-                numpyro.factor("approximation_error", self._error_ratio(draw, means, observed))
+                numpyro.factor("error", self._error_ratio(draw, means, observed))
         for name, distribution in self.distributions(means, self.noise_values(draw)).items():
             obs = None if observed is None else observed[name]
             numpyro.sample(f"observed_{name}", distribution, obs=obs)
@@ -193,16 +194,16 @@ class Model:
     def fem_log_likelihood(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
         """Log density of ``data``, (), around FEM's ``means`` at ``draw``.
 
-        Where the likelihood allows for the error of the mesh, FEM on the mesh has it, too.
+        Where the likelihood allows for errors of the mesh or of the measurement, FEM has them, too.
         """
         found = self.log_density(means, self.noise_values(draw), data)
-        if self.error is not None and self.error.of_mesh:
+        if self.error is not None and self.error.of_fem:
             found += self._error_ratio(draw, means, data)
         return found
 
     def fem_means(self, rng_key: jax.Array, draw: Mapping[str, Any], means: Data) -> Data:
-        """FEM's ``means`` at ``draw``, with a draw of the mesh's error where it is allowed for."""
-        if self.error is None or not self.error.of_mesh:
+        """FEM's ``means`` at ``draw``, with a draw of errors that are not the map's alone."""
+        if self.error is None or not self.error.of_fem:
             return means
         return self.error.draw(rng_key, self._stacked(draw), means)
 
@@ -260,8 +261,8 @@ class Model:
             return self, self.check_data(present)
         if self.error is not None:
             raise InputError(
-                "the forward map's error was learned for data without missing values; learn it for "
-                "Model.given's model"
+                "the model's error is for data without missing values; give it to the model that "
+                "Model.given makes"
             )
         reduced = replace(self, observe=observe, noise=at_sites(self.noise, observe))
         return reduced, reduced.check_data(present)

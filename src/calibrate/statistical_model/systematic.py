@@ -1,0 +1,190 @@
+r"""What is unknown of a measurement itself: where a camera stood, how a marker was put.
+
+Such an error is the same in many numbers: a camera that was moved between two loads shifts and
+turns all markers of one state together. Left out, it passes for material. It is a
+:class:`Systematic`, with the unknowns of which it consists in units of their sd, and a change of
+the data for each; :func:`with_systematic` marginalises all of them
+(:mod:`calibrate.statistical_model.error_modes`), so that sampling has no more unknowns than before.
+Small rotations are linear: an angle :math:`\omega` moves a point at x by
+:math:`\omega \times (x - c)`, to second order in the angle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from calibrate.noise.information import information_about_means
+from calibrate.statistical_model.error_modes import ErrorModes, Means, diagonal
+from calibrate.statistical_model.model import Model
+from emulator.errors import InputError
+
+_AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class Systematic:
+    """An error that several numbers share.
+
+    names : of its s unknowns, each a standard normal.
+    modes : by the observation's name, what one sd of each changes of its data, (s, *shape).
+    """
+
+    names: tuple[str, ...]
+    modes: Mapping[str, np.ndarray]
+
+
+def rigid_motion(
+    name: str,
+    positions: Mapping[str, np.ndarray],
+    shift: float | Sequence[float],
+    turn: float | Sequence[float],
+    about: Sequence[float] | None = None,
+) -> Systematic:
+    """A frame that was moved: all points of some observations shifted and turned together.
+
+    Parameters
+    ----------
+    name : begins the names of its unknowns, ``camera shift x`` to ``camera turn z``.
+    positions : by the observation's name, where its points were seen, (d, 3) mm; displacements of
+        these points are what is measured.
+    shift : sd along x, y and z in mm, or one for all.
+    turn : sd about x, y and z in degrees, or one for all.
+    about : (3,) mm, the point that only shifts; by default the mean of all positions.
+
+    Raises
+    ------
+    InputError
+        Positions of another shape, or a negative sd.
+    """
+    points = {key: np.asarray(each, dtype=float) for key, each in positions.items()}
+    for key, each in points.items():
+        if each.ndim != 2 or each.shape[1] != 3 or not np.isfinite(each).all():
+            raise InputError(f"{name}: positions of '{key}' have shape {each.shape}; give (d, 3)")
+    sds = [np.broadcast_to(np.asarray(sd, dtype=float), 3) for sd in (shift, turn)]
+    if not all((sd >= 0.0).all() and np.isfinite(sd).all() for sd in sds):
+        raise InputError(f"{name}: sds {shift} mm and {turn} degrees; they must be 0 or more")
+    centre = np.concatenate(list(points.values())).mean(axis=0) if about is None else about
+    modes = {}
+    for key, each in points.items():
+        shifts = [np.broadcast_to(sds[0][k] * axis, each.shape) for k, axis in enumerate(np.eye(3))]
+        turns = [
+            np.deg2rad(sds[1][k]) * np.cross(axis, each - centre)
+            for k, axis in enumerate(np.eye(3))
+        ]
+        modes[key] = np.stack([*shifts, *turns])
+    names = tuple(f"{name} {what} {axis}" for what in ("shift", "turn") for axis in _AXES)
+    return Systematic(names, modes)
+
+
+def placement(name: str, observed: Sequence[str], sd: np.ndarray) -> Systematic:
+    """Every number has an offset of its own, the same in all observations of ``observed``.
+
+    Such as where a marker was at rest, where displacements are from there.
+
+    Parameters
+    ----------
+    sd : of each offset, of the shape of the data of each of these observations, in its unit.
+    """
+    sd = np.asarray(sd, dtype=float)
+    each = np.diag(sd.ravel()).reshape(-1, *sd.shape)
+    names = tuple(f"{name} {','.join(map(str, index))}" for index in np.ndindex(*sd.shape))
+    return Systematic(names, dict.fromkeys(observed, each))
+
+
+@dataclass(frozen=True, eq=False)
+class SystematicError(ErrorModes):
+    """All systematic errors of a model together; :func:`with_systematic` makes it.
+
+    names : of their s unknowns.
+    mixing : (r, s), what the diagonal modes are made of.
+    """
+
+    names: tuple[str, ...]
+    mixing: np.ndarray
+
+    of_fem: ClassVar[bool] = True
+    with_mesh: ClassVar[bool] = False
+
+    def information_left(self, information: jax.Array) -> jax.Array:
+        """What is left of the noise's ``information`` (d, d) about the means."""
+        return information - (self.weights.T / (1.0 + self.strength)) @ self.weights
+
+    def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (s,) and covariance (s, s) of the unknowns, in their sds, given ``residual``.
+
+        ``residual`` is data less prediction at one draw of the parameters.
+        """
+        flat = np.asarray(ravel_pytree(dict(residual))[0])
+        inflated = 1.0 + self.strength
+        mean = self.mixing.T @ ((self.weights @ flat) / inflated)
+        known = 1.0 - 1.0 / inflated
+        return mean, np.eye(len(self.names)) - (self.mixing.T * known) @ self.mixing
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All it consists of, by name."""
+        names = np.array([*"\n".join(self.names).encode()], dtype=np.uint8)
+        return {
+            "weights": self.weights,
+            "strength": self.strength,
+            "modes": self.modes,
+            "mixing": self.mixing,
+            "systematic": names,
+        }
+
+    @classmethod
+    def restore(cls, arrays: Mapping[str, np.ndarray]) -> SystematicError:
+        """The error with these :meth:`arrays`."""
+        names = tuple(bytes(arrays["systematic"]).decode().split("\n"))
+        weights, strength, modes = (arrays[name] for name in ("weights", "strength", "modes"))
+        return cls(weights, strength, modes, names, arrays["mixing"])
+
+
+def with_systematic(model: Model, *errors: Systematic) -> Model:
+    """``model`` whose data has these errors besides its noise.
+
+    Raises
+    ------
+    InputError
+        Nothing given, an observation that the model does not have or modes of another shape than
+        its data, noise that is not Gaussian or of unknown sd, or a model that has another error.
+    """
+    if not errors:
+        raise InputError("systematic errors: give one or more")
+    if model.error is not None:
+        raise InputError("systematic errors: the model's likelihood has an error already")
+    parts = model.observe.parts
+    for name, noise in model.noise.items():
+        if noise.priors or not noise.gaussian:
+            raise InputError(
+                f"systematic errors: the noise of {name} must be Gaussian and of known sd"
+            )
+    names = tuple(name for error in errors for name in error.names)
+    rows = []
+    for error in errors:
+        for name, modes in error.modes.items():
+            if name not in parts:
+                raise InputError(
+                    f"{error.names[0]}: '{name}' is not observed; observed: {', '.join(parts)}"
+                )
+            if np.shape(modes) != (len(error.names), *parts[name].shape):
+                raise InputError(
+                    f"{error.names[0]}: modes of '{name}' have shape {np.shape(modes)}; expected "
+                    f"{(len(error.names), *parts[name].shape)}"
+                )
+        for k in range(len(error.names)):
+            each = {
+                name: jnp.asarray(error.modes[name][k]) if name in error.modes else jnp.zeros(shape)
+                for name, shape in model.observe.shapes.items()
+            }
+            rows.append(np.asarray(ravel_pytree(each)[0]))
+    means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
+    information = np.asarray(jax.jit(lambda m: information_about_means(model.noise, m))(means))
+    weights, strength, modes, mixing = diagonal(np.stack(rows), information)
+    return replace(model, error=SystematicError(weights, strength, modes, names, mixing))

@@ -1,0 +1,153 @@
+"""Errors of the measurement itself, against dense multivariate normals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
+
+import calibrate as cal
+from calibrate.statistical_model.systematic import Systematic, SystematicError
+from emulator.errors import InputError
+from linear_support import linear_forward
+from scene_support import block
+
+SD = 0.1
+NODES = [3, 11, 20]
+
+
+@pytest.fixture(scope="module")
+def model():
+    scene = block()
+    seen = cal.nodal_displacements(scene, NODES)
+    observe = {"displacement@a": seen, "displacement@b": seen}
+    return cal.model(linear_forward(scene), observe, cal.GaussianNoise(sd=SD))
+
+
+def positions(model):
+    nodes = model.forward.scene.mesh.nodes[NODES]
+    return {"displacement@a": nodes, "displacement@b": nodes + 0.3}
+
+
+@pytest.fixture(scope="module")
+def errors(model):
+    camera = cal.rigid_motion(
+        "camera", {"displacement@b": positions(model)["displacement@b"]}, 0.5, (1.0, 2.0, 0.0)
+    )
+    return camera, cal.placement("pin", tuple(model.observe.parts), np.full((3, 3), 0.2))
+
+
+def dense(model, errors):
+    """Covariance of all data, in the observations' order."""
+    parts = list(model.observe.parts)
+    rows = []
+    for error in errors:
+        for k in range(len(error.names)):
+            zeros = np.zeros((3, 3))
+            rows.append(
+                np.concatenate([np.ravel(error.modes.get(n, [zeros] * 99)[k]) for n in parts])
+            )
+    V = np.array(rows)
+    return SD**2 * np.eye(V.shape[1]) + V.T @ V, V
+
+
+def some_data(model, seed=0):
+    rng = np.random.default_rng(seed)
+    return {name: jnp.asarray(0.3 * rng.normal(size=(3, 3))) for name in model.observe.parts}
+
+
+DRAW = {"mu": jnp.asarray(3.0), "lam": jnp.asarray(4.0)}
+
+
+def test_the_likelihood_is_that_of_the_dense_covariance(model, errors):
+    whole, data = cal.with_systematic(model, *errors), some_data(model)
+    means, _ = model.predict(DRAW)
+    C, _ = dense(model, errors)
+    residual = np.concatenate([np.ravel(data[n] - means[n]) for n in model.observe.parts])
+    expected = multivariate_normal(np.zeros(len(C)), C).logpdf(residual)
+    assert float(whole.map_log_likelihood(DRAW, data)) == pytest.approx(expected, rel=1e-10)
+    # FEM's data has them, too.
+    by_fem = whole.fem_log_likelihood(DRAW, means, data)
+    assert float(by_fem) == pytest.approx(expected, rel=1e-10)
+
+
+def test_its_unknowns_given_the_data_are_conditional_normals(model, errors):
+    whole, data = cal.with_systematic(model, *errors), some_data(model)
+    means, _ = model.predict(DRAW)
+    C, V = dense(model, errors)
+    residual = np.concatenate([np.ravel(data[n] - means[n]) for n in model.observe.parts])
+    mean, covariance = whole.error.unknowns({n: data[n] - means[n] for n in data})
+    np.testing.assert_allclose(mean, V @ np.linalg.solve(C, residual), atol=1e-10)
+    np.testing.assert_allclose(covariance, np.eye(len(V)) - V @ np.linalg.solve(C, V.T), atol=1e-10)
+    assert whole.error.names[:2] == ("camera shift x", "camera shift y")
+    assert whole.error.names[6] == "pin 0,0"
+
+
+def test_replicates_have_its_covariance(model, errors):
+    whole = cal.with_systematic(model, *errors)
+    means, _ = model.predict(DRAW)
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    drawn = jax.vmap(lambda key: whole.fem_means(key, DRAW, means))(keys)
+    flat = np.concatenate(
+        [np.reshape(drawn[n] - means[n], (len(keys), -1)) for n in model.observe.parts], axis=1
+    )
+    C, _ = dense(model, errors)
+    np.testing.assert_allclose(np.cov(flat.T), C - SD**2 * np.eye(len(C)), atol=0.015)
+
+
+def test_information_left_is_the_inverse_of_the_dense_covariance(model, errors):
+    from calibrate.identifiability.fisher import _information
+
+    whole = cal.with_systematic(model, *errors)
+    means, _ = model.predict(DRAW)
+    C, _ = dense(model, errors)
+    np.testing.assert_allclose(_information(whole, means), np.linalg.inv(C), atol=1e-8)
+
+
+def test_a_camera_that_turned_is_told_from_material(model):
+    """Rotated data, exactly: the angle comes out, and the likelihood does not mind."""
+    at = positions(model)
+    centre = at["displacement@b"].mean(axis=0)
+    turn = Rotation.from_rotvec(np.deg2rad([0.0, 1.5, 0.0])).as_matrix()
+    means, _ = model.predict(DRAW)
+    seen = (at["displacement@b"] - centre) @ turn.T + centre
+    data = {**means, "displacement@b": means["displacement@b"] + seen - at["displacement@b"]}
+    camera = cal.rigid_motion("camera", {"displacement@b": at["displacement@b"]}, 0.5, 2.0)
+    quiet = cal.model(model.full, dict(model.observe.parts), cal.GaussianNoise(sd=1e-3))
+    whole = cal.with_systematic(quiet, camera)
+    told, covariance = whole.error.unknowns({n: data[n] - means[n] for n in means})
+    angle = dict(zip(whole.error.names, 2.0 * told, strict=True))
+    assert angle["camera turn y"] == pytest.approx(1.5, abs=0.02)
+    assert abs(angle["camera turn x"]) < 0.02
+    assert np.all(np.diag(covariance) < 0.01)
+
+
+def test_nothing_unknown_changes_nothing(model):
+    still = cal.rigid_motion("camera", positions(model), 0.0, 0.0)
+    whole, data = cal.with_systematic(model, still), some_data(model)
+    expected = float(model.map_log_likelihood(DRAW, data))
+    assert float(whole.map_log_likelihood(DRAW, data)) == pytest.approx(expected, rel=1e-14)
+
+
+def test_kept_in_arrays_it_is_the_same(model, errors):
+    error = cal.with_systematic(model, *errors).error
+    again = SystematicError.restore(error.arrays())
+    assert again.names == error.names
+    assert again.fingerprint == error.fingerprint
+
+
+def test_what_cannot_be(model, errors):
+    with pytest.raises(InputError, match="'volume' is not observed; observed: displacement@a"):
+        cal.with_systematic(model, Systematic(("bias",), {"volume": np.ones((1,))}))
+    with pytest.raises(InputError, match=r"modes of 'displacement@a' have shape \(1, 2\)"):
+        cal.with_systematic(model, Systematic(("bias",), {"displacement@a": np.ones((1, 2))}))
+    with pytest.raises(InputError, match="give one or more"):
+        cal.with_systematic(model)
+    with pytest.raises(InputError, match="has an error already"):
+        cal.with_systematic(cal.with_systematic(model, *errors), *errors)
+    learned = cal.model(model.full, dict(model.observe.parts), cal.GaussianNoise(sd_scale=1.0))
+    with pytest.raises(InputError, match="must be Gaussian and of known sd"):
+        cal.with_systematic(learned, *errors)
+    with pytest.raises(InputError, match="camera: sds -1 mm"):
+        cal.rigid_motion("camera", positions(model), -1, 0.0)
