@@ -27,7 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from calibrate.noise import Noise
 from calibrate.observations import Observation, Observations
 from emulator.errors import InputError
 
@@ -46,22 +45,25 @@ Predict = Callable[[jax.Array], tuple[Mapping[str, jax.Array], jax.Array]]
 def check_magnitudes(
     predict: Predict,
     observe: Observations,
-    noise: Mapping[str, Noise],
+    sd: Mapping[str, float],
     draws: np.ndarray,
     data: Mapping[str, np.ndarray],
 ) -> None:
     """Raise :class:`InputError` where ``data`` is far from every prediction.
 
-    ``draws`` (c, q) of the unknowns' prior, ``PRIOR_DRAWS`` of them or so.
+    Parameters
+    ----------
+    sd : largest plausible one of each observation's noise and other errors, in its unit.
+    draws : (c, q) of the unknowns' prior, ``PRIOR_DRAWS`` of them or so.
     """
     predictions = predict_over_prior(predict, observe, draws)
     for name, part in observe.parts.items():
         about = name, part, data[name]
-        if complaint(*about, predictions[name], noise[name].upper_sd) is None:
+        if complaint(*about, predictions[name], sd[name]) is None:
             continue
         more = _nearer(predict, name, data[name], draws)
         known = np.concatenate([predictions[name], more])
-        found = complaint(*about, known, noise[name].upper_sd)
+        found = complaint(*about, known, sd[name])
         if found is not None:
             raise InputError(found)
 

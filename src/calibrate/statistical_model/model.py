@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 
 from calibrate.data.magnitude import PRIOR_DRAWS, check_magnitudes
@@ -279,8 +280,19 @@ class Model:
         if self.check_scale:
             draws = jax.jit(lambda key: self.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))
             stacked = np.stack([np.asarray(draws[n]) for n in self.states.unknowns], axis=1)
-            check_magnitudes(self._predict_stacked, self.observe, self.noise, stacked, named)
+            check_magnitudes(self._predict_stacked, self.observe, self._sds(), stacked, named)
         return {name: jnp.asarray(values) for name, values in named.items()}
+
+    def _sds(self) -> dict[str, float]:
+        """Largest plausible sd of each observation's noise and what else data has, in its unit."""
+        found = {name: noise.upper_sd for name, noise in self.noise.items()}
+        if self.error is not None and self.error.of_fem:
+            shapes = {name: jnp.zeros(shape) for name, shape in self.observe.shapes.items()}
+            each = jax.vmap(ravel_pytree(shapes)[1])(jnp.asarray(self.error.modes))
+            for name, modes in each.items():
+                most = np.linalg.norm(np.reshape(modes, (len(modes), -1)), 2)
+                found[name] = float(np.hypot(found[name], most))
+        return found
 
     def _fitting(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """``data`` in float64 by name, of the right shapes; NaN where missing.

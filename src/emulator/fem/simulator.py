@@ -102,6 +102,37 @@ class Simulator(Shown):
         theta, start = self._checked(theta, self.rest if start is None else start)
         return self._equilibrium(theta, jax.lax.stop_gradient(start))
 
+    def path(self, thetas: jax.Array) -> Solution:
+        """Equilibria along a path of theta (m, p), such as a loading curve; fields gain an axis m.
+
+        Each is sought from the two before it, continued along their difference, so that a curve of
+        many points costs a few iterations a point. Differentiable as :meth:`solve` is.
+
+        Raises
+        ------
+        InputError
+            ``thetas`` has the wrong shape, or float64 is off.
+        """
+        thetas = jnp.asarray(thetas, dtype=float)
+        if thetas.ndim != 2 or not len(thetas):
+            raise InputError(
+                f"scene '{self.scene.name}': path has shape {thetas.shape}; expected "
+                f"(m, {len(self.scene.parameters)})"
+            )
+        first = self.solve(thetas[0])
+
+        def onwards(
+            before: tuple[jax.Array, jax.Array], theta: jax.Array
+        ) -> tuple[tuple[jax.Array, jax.Array], Solution]:
+            u, earlier = before
+            ahead = self.scene.on_supports(2.0 * u - earlier, theta)
+            found = self.solve(theta, ahead)
+            return (found.displacement, u), found
+
+        start = (first.displacement, first.displacement)
+        others: Solution = jax.lax.scan(onwards, start, thetas[1:])[1]
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
+
     def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Derivatives (p, n, 3) of the equilibrium ``u`` (n, 3) mm in each entry of ``theta`` (p,).
 

@@ -106,16 +106,16 @@ def test_a_body_that_may_be_at_rest_explains_small_data(beam):
 def test_a_second_mode_is_no_other_unit(beam):
     """A narrow hill in the box of the prior: ten times the displacement of all the rest."""
     observe = Observations({"displacement": cal.nodal_displacements(beam, NODES)})
-    noise = {"displacement": cal.GaussianNoise(sd=0.1)}
+    sd = {"displacement": 0.1}
 
     def predict(x):
         hill = jnp.exp(-0.5 * jnp.sum((x - 0.21) ** 2) / 0.06**2)
         return {"displacement": jnp.ones((4, 3)) * (1.0 + 9.0 * hill)}, jnp.array(True)
 
     draws = np.random.default_rng(1).random((PRIOR_DRAWS, 3))
-    check_magnitudes(predict, observe, noise, draws, {"displacement": np.full((4, 3), 10.0)})
+    check_magnitudes(predict, observe, sd, draws, {"displacement": np.full((4, 3), 10.0)})
     with pytest.raises(InputError, match="larger than predicted .* against 1 to 10 mm"):
-        check_magnitudes(predict, observe, noise, draws, {"displacement": np.full((4, 3), 40.0)})
+        check_magnitudes(predict, observe, sd, draws, {"displacement": np.full((4, 3), 40.0)})
 
 
 def test_one_outlier_is_no_wrong_unit(model, exact):

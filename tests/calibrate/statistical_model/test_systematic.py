@@ -123,6 +123,15 @@ def test_a_camera_that_turned_is_told_from_material(model):
     assert np.all(np.diag(covariance) < 0.01)
 
 
+def test_data_may_be_as_far_off_as_its_errors_are(model):
+    """Ten millimetres where the body moves by hundredths: another unit, or a camera that moved."""
+    data = {name: np.full((3, 3), 10.0) for name in model.observe.parts}
+    with pytest.raises(InputError, match="larger than predicted"):
+        model.check_data(data)
+    camera = cal.rigid_motion("camera", positions(model), 10.0, 0.0)
+    assert cal.with_systematic(model, camera).check_data(data).keys() == data.keys()
+
+
 def test_nothing_unknown_changes_nothing(model):
     still = cal.rigid_motion("camera", positions(model), 0.0, 0.0)
     whole, data = cal.with_systematic(model, still), some_data(model)

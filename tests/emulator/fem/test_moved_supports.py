@@ -93,6 +93,38 @@ def test_an_emulators_plates_are_exact(simulator):
     np.testing.assert_allclose(emulator(THETA)[scene.mesh.node_set("top")], cached[0], rtol=1e-14)
 
 
+def curve(simulator, count=6):
+    return jnp.stack([THETA.at[1].set(k) for k in jnp.linspace(0.0, 0.45, count)])
+
+
+def test_a_path_is_its_points(simulator):
+    thetas = curve(simulator)
+    found = simulator.path(thetas)
+    assert found.converged.all()
+    for k, theta in enumerate(thetas):
+        np.testing.assert_allclose(found.displacement[k], simulator(theta), atol=1e-9)
+    cold = [int(simulator.solve(theta).iterations) for theta in thetas]
+    assert int(found.iterations[2:].sum()) < sum(cold[2:])
+
+
+def test_a_curve_of_forces_is_differentiable(simulator):
+    force = SupportForce(simulator.scene, "top", (1.0, 0.0, 0.0))
+
+    def forces(mu):
+        thetas = curve(simulator, 4).at[:, 0].set(mu)
+        u = simulator.path(thetas).displacement
+        return force(u[:, force.nodes], thetas)
+
+    slope = jax.jvp(forces, (jnp.asarray(3.0),), (jnp.asarray(1.0),))[1]
+    by_differences = (forces(3.001) - forces(2.999)) / 0.002
+    np.testing.assert_allclose(slope[1:], by_differences[1:], rtol=1e-6)
+
+
+def test_a_path_that_is_none(simulator):
+    with pytest.raises(InputError, match=r"path has shape \(3,\); expected \(m, 3\)"):
+        simulator.path(THETA)
+
+
 def least_energy(simulator):
     def energy(theta):
         u = simulator(theta)
