@@ -19,7 +19,8 @@ import calibrate.workflow  # noqa: F401 - with all it imports, before warnings a
 import emulator as em
 from emulator.scenes import Scene
 
-PUBLISHED = ROOT.parent / "shared" / "published"
+SHARED = ROOT.parent / "shared"
+PUBLISHED, MEASURED = SHARED / "published", SHARED / "measured"
 
 
 @pytest.fixture(scope="session")
@@ -28,6 +29,14 @@ def published() -> Path:
     if not PUBLISHED.is_dir():
         pytest.skip(f"the released data is not at {PUBLISHED.parent.name}/{PUBLISHED.name}")
     return PUBLISHED
+
+
+@pytest.fixture(scope="session")
+def measured() -> Path:
+    """Folder of measurements of real bodies; the test is skipped where it is absent."""
+    if not MEASURED.is_dir():
+        pytest.skip(f"no measurements at {MEASURED.parent.name}/{MEASURED.name}")
+    return MEASURED
 
 
 @pytest.fixture(scope="session")

@@ -163,6 +163,17 @@ def transfer(results):
     assert scratch["err_u"]["median"] != family["err_u"]["median"]
 
 
+def silicone_beam(results):
+    cases = {case["name"]: case for case in results["cases"]}
+    whole, naive = cases["all unknown"], cases["as if nothing were unknown"]
+    # Upstream's fit of the same recordings, another program's: mu = 88 kPa.
+    assert whole["parameters"]["mu"]["low"] < 88.0 < whole["parameters"]["mu"]["high"]
+    assert naive["status"] == "done"
+    assert naive["verdict"] == "not certified"
+    low, middle, high = cases["prediction"]["markers"]["rig where it was"]
+    assert all(a[2] < b[2] < c[2] for a, b, c in zip(low, middle, high, strict=True))
+
+
 def verification(results):
     (case,) = results["cases"]
     assert case["sets"] == 10
@@ -202,6 +213,7 @@ CHECKS = {
         stability,
         transfer,
         ventricle_family,
+        silicone_beam,
         verification,
     )
 }

@@ -45,6 +45,7 @@ QUICK = {
     "released_networks": "--quick --published PUBLISHED",
     "sbc": "--replicates 20 --only map",
     "sensitivity": "--quick",
+    "silicone_beam": "--data MEASURED/silicone_beam --quick",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half elements_10000_to_1 springs_1e12 twist_360_from_rest laplace_two_modes float32_once_clamped_beam "
     "outside_by_half_once_clamped_beam",
@@ -90,14 +91,21 @@ FULL_ONLY = {
 }
 
 
+def _given(word: str, given: dict[str, str]) -> str:
+    """A word of a command with its first folder put in."""
+    first, slash, rest = word.partition("/")
+    return f"{given.get(first, first)}{slash}{rest}"
+
+
 @pytest.mark.parametrize(
     "name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in QUICK]
 )
 def test_a_few_cases(name, tmp_path, request):
     given = {"ABSENT": str(tmp_path / "absent")}
-    if "PUBLISHED" in QUICK[name]:
-        given["PUBLISHED"] = str(request.getfixturevalue("published"))
-    words = [given.get(word, word) for word in QUICK[name].split()]
+    for folder in ("PUBLISHED", "MEASURED"):
+        if folder in QUICK[name]:
+            given[folder] = str(request.getfixturevalue(folder.lower()))
+    words = [_given(word, given) for word in QUICK[name].split()]
     results = run(name, *words, "--out", tmp_path)
     CHECKS.get(name, lambda _: None)(results)
     drawn = {path.name for path in (STUDIES / name).glob("*.png")} - FULL_ONLY.get(name, set())

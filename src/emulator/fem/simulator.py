@@ -105,8 +105,8 @@ class Simulator(Shown):
     def path(self, thetas: jax.Array) -> Solution:
         """Equilibria along a path of theta (m, p), such as a loading curve; fields gain an axis m.
 
-        Each is sought from the two before it, continued along their difference, so that a curve of
-        many points costs a few iterations a point. Differentiable as :meth:`solve` is.
+        Each is sought from the two before it, the first one from rest, continued along their
+        difference, so that a curve of many points costs a few iterations a point. Differentiable as :meth:`solve` is.
 
         Raises
         ------
@@ -119,7 +119,6 @@ class Simulator(Shown):
                 f"scene '{self.scene.name}': path has shape {thetas.shape}; expected "
                 f"(m, {len(self.scene.parameters)})"
             )
-        first = self.solve(thetas[0])
 
         def onwards(
             before: tuple[jax.Array, jax.Array], theta: jax.Array
@@ -129,9 +128,8 @@ class Simulator(Shown):
             found = self.solve(theta, ahead)
             return (found.displacement, u), found
 
-        start = (first.displacement, first.displacement)
-        others: Solution = jax.lax.scan(onwards, start, thetas[1:])[1]
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
+        found: Solution = jax.lax.scan(onwards, (self.rest, self.rest), thetas)[1]
+        return found
 
     def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Derivatives (p, n, 3) of the equilibrium ``u`` (n, 3) mm in each entry of ``theta`` (p,).
