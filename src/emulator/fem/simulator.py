@@ -105,8 +105,9 @@ class Simulator(Shown):
     def path(self, thetas: jax.Array) -> Solution:
         """Equilibria along a path of theta (m, p), such as a loading curve; fields gain an axis m.
 
-        Each is sought from the two before it, the first one from rest, continued along their
-        difference, so that a curve of many points costs a few iterations a point. Differentiable as :meth:`solve` is.
+        Each is sought from the two before it, continued along their difference, and the first one
+        from rest: a curve of many points costs a few iterations a point. Differentiable as
+        :meth:`solve` is.
 
         Raises
         ------

@@ -52,7 +52,7 @@ A ventricle, whose mesh file has groups named base, endocardium and epicardium:
     [[supports]]
     kind = "elastic"
     facet_set = "epicardium"
-    stiffness = 0.2                          # kPa/mm
+    stiffness = 0.2                          # kPa/mm; without it, it is a parameter
     direction = "normal"                     # or "all", as without it
 
     [[loads]]

@@ -109,7 +109,7 @@ class Scene(Shown):
             if name not in takers:
                 raise InputError(
                     f"scene '{self.name}': parameter '{name}' is not one of law "
-                    f"'{self.law.name}', its loads and moved supports: {', '.join(takers)}"
+                    f"'{self.law.name}', its loads and supports: {', '.join(takers)}"
                 )
             if given.count(name) > 1:
                 raise InputError(f"scene '{self.name}': parameter '{name}' is given twice")
@@ -225,8 +225,9 @@ class Scene(Shown):
 
     @property
     def load_parameters(self) -> tuple[str, ...]:
-        """Parameters that loads and moved supports take; the others are the material's."""
-        taken = {quantity.name for part in self.parts for quantity in part.quantities}
+        """Parameters that loads take, and by which supports move; the others are the body's."""
+        taken = {quantity.name for load in self.loads for quantity in load.quantities}
+        taken |= {amount for support in self.supports for amount in support.amounts}
         return tuple(name for name in self.parameter_names if name in taken)
 
     @property

@@ -179,8 +179,8 @@ PARTS = {
         },
     ),
     "elastic": (
-        ElasticSupport("right", 0.5),
-        {"facet_set": "left", "stiffness": 0.6, "direction": "normal"},
+        ElasticSupport("right"),
+        {"facet_set": "left", "stiffness": 0.6, "direction": "normal", "parameter": "clamp"},
     ),
 }
 

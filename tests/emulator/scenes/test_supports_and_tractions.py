@@ -53,6 +53,24 @@ def test_a_body_on_springs_alone_sinks_by_its_load_over_their_stiffness():
     np.testing.assert_allclose(u[:, 0], 2.0, rtol=1e-4)
 
 
+def test_springs_of_unknown_stiffness_are_those_of_that_stiffness():
+    load = (Traction("right", (0.2, 0.0, 0.1)),)
+    known = block(loads=load, supports=(ElasticSupport("left", 0.7),))
+    scene = replace(
+        known,
+        supports=(ElasticSupport("left"),),
+        parameters=(*known.parameters, em.Parameter("stiffness", "kPa/mm", 0.1, 10.0, "log")),
+    )
+    simulator, theta = em.Simulator(scene), jnp.array([3.0, 4.0, 0.7])
+    u = simulator(theta)
+    np.testing.assert_allclose(u, em.Simulator(known)(theta[:2]), atol=1e-10)
+    h = 1e-5
+    step = jnp.array([0.0, 0.0, h])
+    by_differences = (simulator(theta + step) - simulator(theta - step)) / (2.0 * h)
+    np.testing.assert_allclose(simulator.sensitivities(u, theta)[2], by_differences, atol=1e-6)
+    assert scene.load_parameters == ()  # a clamp is the same in all load states
+
+
 @pytest.mark.slow
 def test_stiff_springs_clamp():
     load = (Traction("right", (0.2, 0.0, 0.1)),)

@@ -57,6 +57,11 @@ class Support(BoundaryCondition):
         """The amount, where it is a parameter; either sign."""
         return () if self.amount is None else (number(self.amount, -np.inf),)
 
+    @property
+    def amounts(self) -> tuple[str, ...]:
+        """The amount, where it is a parameter."""
+        return () if self.amount is None else (self.amount,)
+
     def held(self, mesh: Mesh) -> Held:
         """The nodes of the set, their displacements, and the axes that are held."""
         nodes = mesh.node_set(self.node_set)

@@ -3,7 +3,8 @@ r"""Elastic (Robin) supports: springs spread over a surface.
 .. math:: \Pi_s = \frac{k}{2} \int |u|^2\, dA \quad\text{or}\quad
           \frac{k}{2} \int (u \cdot N)^2\, dA
 
-over the reference surface, with the stiffness ``k`` in kPa/mm and the outward normal ``N``.
+over the reference surface, with the stiffness ``k`` in kPa/mm and the outward normal ``N``. A clamp
+that gives is such a support whose stiffness is inferred.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import area_vectors
 from emulator.geometry.mesh import Mesh
+from emulator.mechanics.quantity import Quantity
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.local_terms import LocalTerm, Values
 from emulator.scenes.supports.boundary_condition import BoundaryCondition, Resisted
@@ -31,18 +33,20 @@ class ElasticSupport(BoundaryCondition):
     Parameters
     ----------
     facet_set : the surface they act on.
-    stiffness : k in kPa/mm, above 0.
+    stiffness : k in kPa/mm, above 0, or ``None`` to make it a parameter of the scene.
     direction : ``all``, or ``normal`` to let the surface slide along itself.
+    parameter : name of that parameter; give each of several supports its own.
     """
 
     kind: ClassVar[str] = "elastic"
 
     facet_set: str
-    stiffness: float
+    stiffness: float | None = None
     direction: Literal["all", "normal"] = "all"
+    parameter: str = "stiffness"
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.stiffness < np.inf:
+        if self.stiffness is not None and not 0.0 < self.stiffness < np.inf:
             raise InputError(
                 f"elastic support on '{self.facet_set}': stiffness is {self.stiffness} kPa/mm; "
                 "it must be above 0"
@@ -59,14 +63,20 @@ class ElasticSupport(BoundaryCondition):
         return (self.facet_set,)
 
     @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """The stiffness, where it is a parameter."""
+        return () if self.stiffness is not None else (Quantity(self.parameter, "kPa/mm"),)
+
+    @property
     def simpler(self) -> tuple[str, None]:
         """No springs."""
         way = "springs on" if self.direction == "all" else "normal springs on"
         return f"{way} '{self.facet_set}'", None
 
     def to_json(self) -> list[Any]:
-        """Every field."""
-        return plain_fields(self)
+        """Every field; without the parameter's name, the last, where the stiffness is known."""
+        every = plain_fields(self)
+        return every if self.stiffness is None else every[:-1]
 
     def term(self, grid: Discretisation) -> LocalTerm:
         """Energy of the springs, facet by facet."""
@@ -77,14 +87,15 @@ class ElasticSupport(BoundaryCondition):
         areas = np.linalg.norm(normals, axis=-1)
         data = (rule.weights * areas, normals / areas[..., None])
 
-        def energy(u: jax.Array, data: Any, _: Values) -> jax.Array:
+        def energy(u: jax.Array, data: Any, values: Values) -> jax.Array:
             weights, normal = data
             at_points = rule.values @ u
             if self.direction == "normal":
                 squared = jnp.sum(at_points * normal, axis=1) ** 2
             else:
                 squared = jnp.sum(at_points**2, axis=1)
-            return 0.5 * self.stiffness * jnp.sum(weights * squared)
+            k = values[self.parameter] if self.stiffness is None else self.stiffness
+            return 0.5 * k * jnp.sum(weights * squared)
 
         return LocalTerm(facets, data, energy)
 
