@@ -23,7 +23,7 @@ class Plane(Table):
     at: float
     """its place on that axis, mm."""
     within: str | None = None
-    """a node or facet set of which only what is on the plane is taken, such as a face's edge."""
+    """a node set of which only what is on the plane is taken, such as a face for its edge."""
 
 
 class ParameterTable(Table):

@@ -83,7 +83,8 @@ class ReducedForward:
         require_float64("a reduced model")
         gap = (self.scene.to_unit(theta) - self.inputs)[None] / self.lengths[:, None]
         coefficients = jnp.sum(self.weights * jnp.exp(-0.5 * jnp.sum(gap**2, axis=-1)), axis=-1)
-        return self.mean + jnp.tensordot(coefficients, self.modes, axes=1)
+        found = self.mean + jnp.tensordot(coefficients, self.modes, axes=1)
+        return self.scene.on_supports(found, theta, self.nodes)
 
     def evaluate(self, theta: jax.Array) -> Prediction:
         """Displacement and whether ``theta`` is inside the box of the FEM runs."""

@@ -9,12 +9,14 @@ import pytest
 
 import emulator as em
 from emulator.errors import InputError
+from emulator.fem.campaign import Runs
 from emulator.fem.support_force import SupportForce
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.finer import finer
+from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.taylor import expand
 from scene_support import HEIGHT, between_plates
 
@@ -91,6 +93,15 @@ def test_an_emulators_plates_are_exact(simulator):
     cached = emulator.cache(scene.mesh.node_set("top"))(theta)
     np.testing.assert_allclose(cached[:, 0, 0], [0.3 * HEIGHT, -0.4 * HEIGHT], rtol=1e-14)
     np.testing.assert_allclose(emulator(THETA)[scene.mesh.node_set("top")], cached[0], rtol=1e-14)
+
+
+def test_a_reduced_models_plates_are_exact(simulator):
+    thetas = curve(simulator, 4)
+    u = simulator.path(thetas).displacement
+    reduced = fit_reduced(simulator.scene, Runs(thetas, u, jnp.zeros(4)))
+    top = simulator.scene.mesh.node_set("top")
+    found = reduced.at(top)(THETA.at[1].set(0.21))
+    np.testing.assert_allclose(found[:, 0], 0.21 * HEIGHT, rtol=1e-14)
 
 
 def curve(simulator, count=6):
