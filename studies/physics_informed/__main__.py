@@ -26,6 +26,7 @@ import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE, GREEN, ORANGE, PINK, VERMILION
 from emulator.error.comparison import case_errors, quantiles
+from emulator.errors import SolverError
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.scenes.ventricle_family import ventricles
@@ -123,7 +124,11 @@ def from_family(shape: dict[str, Any]) -> Case:
         with tempfile.TemporaryDirectory() as folder:
             plan = recipe("family") if not sweeps else replace(recipe("sweeps"), sweeps=sweeps)
             began = time.perf_counter()
-            emulator = train(scene, plan, folder, start=learned)
+            try:
+                emulator = train(scene, plan, folder, start=learned)
+            except SolverError as refusal:  # too few sweeps, and told so
+                rows.append({"sweeps": sweeps, "refused": str(refusal)})
+                continue
             seconds = round(time.perf_counter() - began, 1)
         rows.append({"sweeps": sweeps, "seconds": seconds, "errors": errors_of(emulator, known)})
     jax.clear_caches()
