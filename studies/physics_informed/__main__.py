@@ -186,7 +186,7 @@ def draw(cases: list[Case], path: Path) -> None:
                 0.98, PAPER[body] * 1.3, "the paper's", color="0.4", size=8, ha="right",
                 transform=place,
             )  # fmt: skip
-        axes.set(yscale="log", title=body, xlabel="seconds", xlim=(0.0, None))
+        axes.set(xscale="log", yscale="log", title=body, xlabel="seconds")
         axes.margins(y=0.12)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(color="0.92")

@@ -149,7 +149,12 @@ def sweep_box(
                 written = time.perf_counter()
     if folder is not None:
         _keep(folder, state)
-    if not (state.level == 1.0 and np.isfinite(state.left)):
+    if state.level == 1.0 and not np.isfinite(state.left):
+        raise SolverError(
+            f"scene '{simulator.scene.name}': no step of {state.number} sweeps could be taken from "
+            "where the start says; begin at rest, or use a recipe with FEM runs"
+        )
+    if state.level < 1.0:
         raise SolverError(
             f"scene '{simulator.scene.name}': {state.number} sweeps followed the equilibria to "
             f"{100 * state.level:.0f} % of the loads; give more of them, or use a recipe with FEM "

@@ -271,3 +271,12 @@ def test_what_cannot_be_swept_is_refused(simulator):
         replace(recipe("hybrid"), sweeps=60)
     assert "simulations" in recipe("sweeps").idle
     assert recipe("physics").runs == 0
+
+
+def test_a_start_that_is_nowhere_near_is_said_to_be(simulator):
+    """A beam pushed through itself: no tangent there is positive definite."""
+    through = -3.0 * jnp.asarray(simulator.scene.mesh.nodes)
+    with pytest.raises(
+        SolverError, match="no step of 2 sweeps could be taken from where the start"
+    ):
+        sweep_box(simulator, 2, 0, start=lambda position: through)
