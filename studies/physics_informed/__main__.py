@@ -186,14 +186,14 @@ def draw(cases: list[Case], path: Path) -> None:
                 0.98, PAPER[body] * 1.3, "the paper's", color="0.4", size=8, ha="right",
                 transform=place,
             )  # fmt: skip
-        axes.set(xscale="log", yscale="log", title=body, xlabel="seconds")
+        axes.set(xscale="log", yscale="log", title=body, xlabel="seconds", xlim=(4.0, 3000.0))
         axes.margins(y=0.12)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(color="0.92")
     panels[0][0].set_ylabel("median err_u, mm (dotted: said by the sweeps)")
     lines = [line for axes in panels[0] for line in axes.get_legend_handles_labels()[0]]
     named = {line.get_label(): line for line in lines}
-    panels[0][0].legend(named.values(), named.keys(), frameon=False, fontsize=8, loc="lower left")
+    figure.legend(named.values(), named.keys(), frameon=False, ncols=5, loc="outside lower center")
     figure.suptitle("Learning from the energy alone")
     save(figure, path)
 

@@ -16,7 +16,7 @@ from studies.silicone_beam.experiment import (
 
 import calibrate as cal
 from calibrate.statistical_model import Model
-from calibrate.statistical_model.systematic import Systematic
+from calibrate.statistical_model.systematic import Systematic, SystematicError
 from emulator.geometry.bodies.box import box, toward_ends
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
@@ -128,7 +128,7 @@ def predict(
 
     stayed, moved = [], []
     error = calibrated.error
-    assert error is not None
+    assert isinstance(error, SystematicError)
     for k in range(len(draws["mu"])):
         draw = {name: jnp.asarray(values[k]) for name, values in draws.items()}
         means, _ = calibrated.predict(draw)
