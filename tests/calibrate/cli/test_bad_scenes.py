@@ -24,7 +24,7 @@ def block(tmp_path):
         (
             'node_set = "left"',
             'node_set = "left"\nglue = 1',
-            "unknown key 'glue'; known: components",
+            "unknown key 'glue'; known: amount, components",
         ),
         (
             "[[loads]]",

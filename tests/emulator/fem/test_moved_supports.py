@@ -38,6 +38,7 @@ def test_plates_are_where_theta_puts_them(simulator):
     assert scene.load_parameters == ("shear", "stretch")
 
 
+@pytest.mark.slow
 def test_it_is_the_scene_with_that_displacement_prescribed(simulator):
     """Solved by another description: numbers in place of amounts."""
     moved = (0.3 * HEIGHT, 0.0, -0.1 * HEIGHT)
@@ -144,7 +145,7 @@ def least_energy(simulator):
     return energy
 
 
-@pytest.mark.parametrize("dilatation", ["pointwise", "mean"])
+@pytest.mark.parametrize("dilatation", ["pointwise", pytest.param("mean", marks=pytest.mark.slow)])
 def test_forces_are_derivatives_of_the_least_energy(dilatation):
     """By the plate's own displacement: 4 mm a unit of either amount."""
     simulator = em.Simulator(between_plates(dilatation=dilatation))
@@ -160,6 +161,7 @@ def test_forces_are_derivatives_of_the_least_energy(dilatation):
         assert below(u[below.nodes], THETA) == pytest.approx(-float(found), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_patches_of_linear_elements_have_forces():
     simulator = em.Simulator(between_plates(order=1, dilatation="patch", cells=(3, 3, 3)))
     u = simulator(THETA)
@@ -211,6 +213,7 @@ def test_a_stretch_with_sliding_plates_in_closed_form():
     assert force(u[force.nodes], theta) == pytest.approx(float(P) * 16.0, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_shear_with_the_sides_led_in_closed_form():
     """Simple shear of the whole boundary: F = I + k e_x e_z, force P_xz times the face."""
     mesh = box((4.0, 4.0, HEIGHT), (2, 2, 2), 2)

@@ -54,7 +54,9 @@ def test_nodes_apart_share_alike(scene):
     np.testing.assert_array_equal(found[apart], 0.5)
 
 
-def test_an_amount_multiplies_it(scene):
+def test_an_amount_multiplies_it():
+    plain = block()
+    scene = replace(plain, mesh=with_edge(plain.mesh))
     loaded = replace(
         scene,
         loads=(Force("edge", (0.0, 0.0, -0.01), amount="percent"),),
