@@ -19,7 +19,8 @@ DISPLACEMENT_FIELD = Field(DISPLACEMENT, ("ux", "uy", "uz"))
 class DisplacementPoints:
     """Displacements (d, 3) in mm of points at ``points`` (d, 3) in the reference body.
 
-    At most one such observation fits in a file, and it is called ``displacement`` there.
+    Unless a subclass gives it another name, at most one such observation fits in a file, and it is
+    called ``displacement`` there.
     """
 
     points: np.ndarray
@@ -27,8 +28,12 @@ class DisplacementPoints:
     quantity: ClassVar[str] = DISPLACEMENT
     unit: ClassVar[str] = "mm"
     other_units: ClassVar[Mapping[str, float]] = LENGTH_UNITS
-    names: ClassVar[tuple[str, ...]] = (DISPLACEMENT,)
     default_noise: ClassVar[GaussianNoise] = GaussianNoise(sd=0.2)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """``displacement``."""
+        return (DISPLACEMENT,)
 
     @property
     def shape(self) -> tuple[int, ...]:

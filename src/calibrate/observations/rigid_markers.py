@@ -25,10 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.noise.gaussian import GaussianNoise
-from calibrate.noise.protocol import Sites
-from calibrate.observations.points import check_distinct, check_table, check_values
-from calibrate.observations.protocol import LENGTH_UNITS, Field, Labels
+from calibrate.observations.points import DisplacementPoints, check_distinct, check_table
+from calibrate.observations.protocol import Field
 from emulator.errors import InputError
 from emulator.geometry.discretisation import facet_rule
 from emulator.geometry.facets import nodal_areas
@@ -40,7 +38,7 @@ _FARTHEST = 1.0  # of the body's size: how far from it a marker may stand
 
 
 @dataclass(frozen=True, eq=False)
-class RigidMarkers:
+class RigidMarkers(DisplacementPoints):
     """Displacements (d, 3) in mm of markers that move rigidly with a facet set.
 
     facet_set : the surface's name in the mesh.
@@ -65,24 +63,11 @@ class RigidMarkers:
     kind: ClassVar[str] = "markers"
     usage: ClassVar[str] = "markers:FACETSET (positions from a file)"
     quantity: ClassVar[str] = "marker displacement"
-    unit: ClassVar[str] = "mm"
-    other_units: ClassVar[Mapping[str, float]] = LENGTH_UNITS
-    default_noise: ClassVar[GaussianNoise] = GaussianNoise(sd=0.2)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(d, 3)."""
-        return self.points.shape
 
     @property
     def names(self) -> tuple[str, ...]:
         """``markers:<facet set>``."""
         return (f"{self.kind}:{self.facet_set}",)
-
-    @property
-    def sites(self) -> Sites:
-        """The markers, for each component."""
-        return Sites.of(self.points, 3)
 
     def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Displacements (..., d, 3) in mm."""
@@ -93,19 +78,6 @@ class RigidMarkers:
         turned = _orthonormal(T) @ self.axes
         arms = self.points - self.mean
         return moved[..., None, :] + jnp.einsum("...ij,dj->...di", turned, arms) - arms
-
-    def check(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` unless ``values`` is (d, 3), each finite or missing."""
-        check_values(name, values, self.shape, self.unit)
-
-    def labels(self, name: str) -> Labels:
-        """Markers and components; the positions at rest as a constant."""
-        marker, position = f"marker_{name}", f"position_{name}"
-        return Labels(
-            dims={name: [marker, "component"], position: [marker, "component"]},
-            coords={marker: np.arange(len(self.points)), "component": ["x", "y", "z"]},
-            constants={position: self.points},
-        )
 
     def to_json(self) -> dict[str, Any]:
         """Kind, facet set and positions at rest."""
