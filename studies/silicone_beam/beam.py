@@ -1,6 +1,6 @@
 """The beam as a scene, and what is not known of its measurements."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -23,8 +23,8 @@ from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import Force, Gravity
 from emulator.surrogates.protocol import ForwardMap
 
-MARKERS = "markers:right"
-WEIGHT, LOADED, BASE = f"{MARKERS}@weight", f"{MARKERS}@loaded", "markers:left@loaded"
+TIP = "markers:right"
+WEIGHT, LOADED, BASE = f"{TIP}@weight", f"{TIP}@loaded", "markers:left@loaded"
 KNOWN = {"hung@weight": 0.0, "hung@loaded": FORCE}
 NOISE = {WEIGHT: 0.1, LOADED: 0.3, BASE: 0.3}
 """Sd in mm: repeats differ by 0.05 and 0.4 mm, and the three pins of the tip do not keep their
@@ -64,22 +64,32 @@ def turned(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:
     return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
 
 
+def hand(observed: Iterable[str], seen: Measured) -> Systematic:
+    """Displacements are from where a hand held the tip: its error is the same in all of them."""
+    return cal.rigid_motion("hand", dict.fromkeys(observed, seen.rest), *HAND)
+
+
+def rig(places: Mapping[str, np.ndarray]) -> Systematic:
+    """Camera or clamp, seen at ``places`` (d, 3) mm, have moved since the first experiment."""
+    return cal.rigid_motion("rig", places, *RIG, about=CLAMP.mean(axis=0))
+
+
+def pins(displacements: Mapping[str, np.ndarray], seen: Measured) -> Systematic:
+    """A marker that stands elsewhere by d moves by (R - I) d more where the tip has turned by R."""
+    modes = {
+        name: np.stack([np.tile(PIN * row, (3, 1)) for row in (turned(seen.rest, u) - np.eye(3)).T])
+        for name, u in displacements.items()
+    }
+    return Systematic(tuple(f"pins {axis}" for axis in "xyz"), modes)
+
+
 def unknowns(seen: Measured) -> tuple[Systematic, ...]:
     """What is not known of the measurement besides its noise."""
     tip = {WEIGHT: seen.weight, LOADED: seen.loaded}
-    # Displacements are from where a hand held the tip: its error is the same in both.
-    hand = cal.rigid_motion("hand", dict.fromkeys(tip, seen.rest), *HAND)
-    places = {LOADED: seen.rest + seen.loaded, BASE: CLAMP + seen.clamp}
-    rig = cal.rigid_motion("rig", places, *RIG, about=CLAMP.mean(axis=0))
-    # A marker that stands elsewhere by d moves by (R - I) d more where the tip has turned by R.
-    arms = {
-        name: np.stack([np.tile(PIN * row, (3, 1)) for row in (turned(seen.rest, u) - np.eye(3)).T])
-        for name, u in tip.items()
-    }
-    pins = Systematic(tuple(f"pins {axis}" for axis in "xyz"), arms)
+    moved = rig({LOADED: seen.rest + seen.loaded, BASE: CLAMP + seen.clamp})
     second = LOOSE * np.eye(3)[:, None] * np.array([0.0, 1.0, 0.0])[:, None]
     loose = Systematic(tuple(f"loose {axis}" for axis in "xyz"), {BASE: second})
-    return hand, rig, pins, loose
+    return hand(tip, seen), moved, pins(tip, seen), loose
 
 
 def model(forward: ForwardMap, seen: Measured, *, known_rig: bool = False) -> Model:
@@ -135,17 +145,12 @@ def predict(
         mean, covariance = error.unknowns({n: v - means[n] for n, v in data(seen).items()})
         q = dict(zip(error.names, rng.multivariate_normal(mean, covariance), strict=True))
         u = np.asarray(under(draw["mu"], draw["kappa"]))
-        there = seen.rest + u
-        arms = np.stack(
-            [np.tile(PIN * row, (3, 1)) for row in (turned(seen.rest, u) - np.eye(3)).T]
-        )
-        hand = cal.rigid_motion("hand", {"tip": seen.rest}, *HAND)
-        rig = cal.rigid_motion("rig", {"tip": there}, *RIG, about=CLAMP.mean(axis=0))
-        own = there + _sum(hand, q) + np.tensordot([q[f"pins {a}"] for a in "xyz"], arms, axes=1)
+        moving = rig({TIP: seen.rest + u})
+        own = seen.rest + u + _sum(hand([TIP], seen), q) + _sum(pins({TIP: u}, seen), q)
         own = own + rng.normal(0.0, NOISE[LOADED], own.shape) - seen.shift
-        again = {name: rng.normal() for name in rig.names}
-        stayed.append(own + _sum(rig, q))
-        moved.append(own + _sum(rig, again))
+        again = {name: rng.normal() for name in moving.names}
+        stayed.append(own + _sum(moving, q))
+        moved.append(own + _sum(moving, again))
     return {"rig where it was": np.array(stayed), "rig moved again": np.array(moved)}
 
 

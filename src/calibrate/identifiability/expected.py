@@ -71,9 +71,9 @@ def expected_precision(
     InputError
         The forward map has no answer at any of the draws, or noise has no known sd.
     """
-    if model.error is not None and model.error.of_fem:
+    if model.error is not None:
         raise InputError(
-            "identify before measuring: the model's data has errors besides noise, which the data "
+            "identify before measuring: the model allows for errors besides noise, which the data "
             "drawn here would not have; leave them out, or infer from synthetic data"
         )
     if any(model.noise_sites.values()):

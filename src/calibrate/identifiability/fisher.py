@@ -25,7 +25,6 @@ from jax.flatten_util import ravel_pytree
 from calibrate.noise.information import information_about_means
 from calibrate.observations import Observations
 from calibrate.statistical_model import Model
-from calibrate.statistical_model.systematic import SystematicError
 from emulator.errors import InputError
 
 
@@ -37,18 +36,16 @@ def informations(model: Model, values: np.ndarray, *, log: bool) -> np.ndarray:
     for x in np.log(values) if log else values:
         means, J, valid = sensitivity(jnp.asarray(x))
         if valid:
-            found.append(np.asarray(J.T @ curvature(means) @ J))
+            found.append(np.asarray(J.T @ curvature(means, np.exp(x) if log else x) @ J))
     if not found:
         raise InputError("identifiability: the forward map has no valid answer at any draw")
     return np.stack(found)
 
 
-def _information(model: Model, means: dict[str, jax.Array]) -> jax.Array:
-    """Information (d, d) of the data about its means, less what systematic errors take of it."""
+def _information(model: Model, means: dict[str, jax.Array], unknowns: jax.Array) -> jax.Array:
+    """Information (d, d) of the data about its means, less what errors besides noise take of it."""
     found = information_about_means(model.noise, means)
-    if isinstance(model.error, SystematicError):
-        return model.error.information_left(found)
-    return found
+    return found if model.error is None else model.error.information_left(found, unknowns)
 
 
 def sensitivities(

@@ -14,9 +14,9 @@ from calibrate.noise.protocol import Noise
 from calibrate.observations.scalar import Scalar
 from emulator.errors import InputError
 from emulator.fem.support_force import SupportForce
+from emulator.scenes.loads.force import MN_PER_N
 from emulator.scenes.scene import Scene
 
-_MN_PER_N = 1e3
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -73,7 +73,7 @@ class Reaction(Scalar):
 
     def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Force (...) in N."""
-        return self.force(displacement, theta) / _MN_PER_N
+        return self.force(displacement, theta) / MN_PER_N
 
     def check(self, name: str, values: np.ndarray) -> None:
         """Raise :class:`InputError` unless ``values`` is one finite number, or missing."""

@@ -13,7 +13,11 @@ information W, :math:`G = V^T W V`, made diagonal by the choice of V, and
 
 .. math:: q_i \mid y, x \sim
           N\left(\frac{\alpha^2 b_i}{1 + \alpha^2 G_{ii}},\;
-                 \frac{\alpha^2}{1 + \alpha^2 G_{ii}}\right).
+                 \frac{\alpha^2}{1 + \alpha^2 G_{ii}}\right),
+
+and leave of the information about the means
+
+.. math:: W - W V \left(\alpha^{-2} I + G\right)^{-1} V^T W .
 """
 
 from __future__ import annotations
@@ -57,6 +61,12 @@ class ErrorModes(ABC):
         variance = self.size(unknowns) ** 2
         b, inflated = self.weights @ flat, 1.0 + variance * self.strength
         return 0.5 * jnp.sum(variance * b**2 / inflated - jnp.log(inflated))
+
+    def information_left(self, information: jax.Array, unknowns: jax.Array) -> jax.Array:
+        """What is left of the noise's ``information`` (d, d) about the means at ``unknowns``."""
+        variance = self.size(unknowns) ** 2
+        share = variance / (1.0 + variance * self.strength)
+        return information - (self.weights.T * share) @ self.weights
 
     @property
     @abstractmethod

@@ -112,10 +112,6 @@ class SystematicError(ErrorModes):
     of_fem: ClassVar[bool] = True
     with_mesh: ClassVar[bool] = False
 
-    def information_left(self, information: jax.Array) -> jax.Array:
-        """What is left of the noise's ``information`` (d, d) about the means."""
-        return information - (self.weights.T / (1.0 + self.strength)) @ self.weights
-
     def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
         """Mean (s,) and covariance (s, s) of the unknowns, in their sds, given ``residual``.
 
@@ -128,22 +124,9 @@ class SystematicError(ErrorModes):
         return mean, np.eye(len(self.names)) - (self.mixing.T * known) @ self.mixing
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All it consists of, by name."""
-        names = np.array([*"\n".join(self.names).encode()], dtype=np.uint8)
-        return {
-            "weights": self.weights,
-            "strength": self.strength,
-            "modes": self.modes,
-            "mixing": self.mixing,
-            "systematic": names,
-        }
-
-    @classmethod
-    def restore(cls, arrays: Mapping[str, np.ndarray]) -> SystematicError:
-        """The error with these :meth:`arrays`."""
-        names = tuple(bytes(arrays["systematic"]).decode().split("\n"))
-        weights, strength, modes = (arrays[name] for name in ("weights", "strength", "modes"))
-        return cls(weights, strength, modes, names, arrays["mixing"])
+        """All that changes a likelihood, by name."""
+        names = ("weights", "strength", "modes", "mixing")
+        return {name: getattr(self, name) for name in names}
 
 
 def with_systematic(model: Model, *errors: Systematic) -> Model:

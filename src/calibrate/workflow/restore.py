@@ -14,8 +14,6 @@ from typing import Any
 import xarray as xr
 
 from calibrate.statistical_model.approximation_error import ApproximationError
-from calibrate.statistical_model.error_modes import ErrorModes
-from calibrate.statistical_model.systematic import SystematicError
 from emulator.errors import InputError
 from emulator.store import read_arrays
 from emulator.surrogates.protocol import ForwardMap
@@ -60,8 +58,8 @@ def check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
         )
 
 
-def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ErrorModes:
-    """The error kept in ``file``, with which the posterior was sampled.
+def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ApproximationError:
+    """The forward map's error kept in ``file``, with which the posterior was sampled.
 
     Raises
     ------
@@ -72,8 +70,7 @@ def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ErrorModes:
         raise InputError(f"{file}, the forward map's error of the posterior beside it, is missing")
     arrays, _ = read_arrays(file)
     try:
-        kind = SystematicError if "systematic" in arrays else ApproximationError
-        error = kind.restore(arrays)
+        error = ApproximationError.restore(arrays)
     except KeyError as missing:
         raise InputError(f"{file}: array {missing} is missing; infer again") from missing
     if tree.attrs.get("forward_error") != error.fingerprint:

@@ -257,12 +257,6 @@ class System:
         """Nonzeros (nnz,) that a solver does not raise on, and whether they are the tangent's."""
         return self.step_equations(u, theta, load, load)[:2]
 
-    def on_supports(
-        self, u: jax.Array, theta: jax.Array, level: jax.Array | float = 1.0
-    ) -> jax.Array:
-        """``u`` (n, 3) mm, held where the supports of ``theta`` (p,) are at ``level``."""
-        return jnp.where(self.scene.held, level * self.scene.held_at(theta), u)
-
     def support_offset(self, u: jax.Array, theta: jax.Array, level: jax.Array | float) -> jax.Array:
         """Distance (n, 3) in mm of the held displacements from their values at ``level``."""
         wanted = level * self.scene.held_at(theta)

@@ -21,8 +21,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from emulator.errors import InputError
 from emulator.geometry.discretisation import quadrature_points, shapes_at
-from emulator.geometry.mesh import Mesh
+from emulator.geometry.mesh import Mesh, frozen_array
 
 # Neighbours further off in direction, as across the seam of two walls, say nothing of the slope.
 _ALIKE = np.cos(np.radians(60.0))
@@ -91,3 +92,22 @@ def _summed(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Sums (count, 3, 3) of ``values`` (k, 3, 3) by row."""
     flat = values.reshape(len(values), 9)
     return np.stack([np.bincount(rows, each, count) for each in flat.T], axis=1).reshape(-1, 3, 3)
+
+
+def checked_directions(vectors: np.ndarray, mesh: Mesh, kind: str) -> np.ndarray:
+    """Unit vectors (m, q, 3), or (m, 3), of each element of ``mesh``, frozen.
+
+    Raises
+    ------
+    InputError
+        Another shape, or no unit vectors; ``kind`` says of what.
+    """
+    frozen = frozen_array(vectors)
+    count, points = len(mesh.elements), len(quadrature_points(mesh.order))
+    if frozen.shape not in ((count, 3), (count, points, 3)):
+        at_points = f" or ({count}, {points}, 3)" if points > 1 else ""
+        raise InputError(f"{kind} have shape {frozen.shape}; expected ({count}, 3){at_points}")
+    if not np.allclose(np.linalg.norm(frozen, axis=-1), 1.0, atol=1e-6):
+        raise InputError(f"{kind} are not unit vectors")
+    # Linear elements have one point each: one form, so that their fingerprints agree.
+    return frozen.reshape(-1, 3) if points == 1 else frozen

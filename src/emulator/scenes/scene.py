@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -14,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.geometry.directions import checked_directions
 from emulator.geometry.discretisation import (
     Blocks,
     Discretisation,
     discretise,
     quadrature_points,
 )
-from emulator.geometry.mesh import Mesh, frozen_array
+from emulator.geometry.mesh import Mesh
 from emulator.geometry.patches import patchwise
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
@@ -28,8 +30,9 @@ from emulator.mechanics.quantity import Quantity
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
+from emulator.scenes.owners import Owners, check_given, owners_of
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
-from emulator.scenes.regions import Tissue, checked_regions, region_quantities
+from emulator.scenes.regions import Tissue, checked_regions
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
 from emulator.scenes.supports.dirichlet import Prescribed, prescribe
 from emulator.scenes.supports.rigid import check_motions
@@ -85,8 +88,8 @@ class Scene(Shown):
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "origin", MappingProxyType(dict(self.origin)))
         self._check_regions()
-        self._check_names()
-        self._check_quantities()
+        with self._named():
+            check_given(self._owners, self.law, self.parameters, self.constants)
         self._check_directions()
         self._check_dilatation()
         if not self.parameters:
@@ -94,39 +97,19 @@ class Scene(Shown):
         self._check_supports()
         self._check_loads()
 
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Errors raised inside name the scene."""
+        try:
+            yield
+        except InputError as error:
+            raise InputError(f"scene '{self.name}': {error}") from error
+
     def _check_regions(self) -> None:
         if self.regions is not None:
-            try:
+            with self._named():
                 labels = checked_regions(self.regions, len(self.mesh.elements), self.law)
-            except InputError as error:
-                raise InputError(f"scene '{self.name}': {error}") from error
             object.__setattr__(self, "regions", labels)
-
-    def _check_names(self) -> None:
-        given = [*self.parameter_names, *self.constants]
-        takers = self._takers
-        for name in given:
-            if name not in takers:
-                raise InputError(
-                    f"scene '{self.name}': parameter '{name}' is not one of law "
-                    f"'{self.law.name}', its loads and supports: {', '.join(takers)}"
-                )
-            if given.count(name) > 1:
-                raise InputError(f"scene '{self.name}': parameter '{name}' is given twice")
-        for name, (_, owner) in takers.items():
-            if name not in given:
-                raise InputError(f"scene '{self.name}': {owner} needs '{name}'")
-
-    def _check_quantities(self) -> None:
-        """Units and values of parameters and constants must be admissible to law and loads."""
-        faults = [self._takers[name][0].value_fault(v) for name, v in self.constants.items()]
-        for parameter in self.parameters:
-            quantity, owner = self._takers[parameter.name]
-            faults.append(quantity.unit_fault(parameter.unit, owner))
-            faults.append(quantity.range_fault(parameter.low, parameter.high))
-        for fault in faults:
-            if fault:
-                raise InputError(f"scene '{self.name}': {fault}")
 
     def _check_directions(self) -> None:
         for kind, asked in (("fibres", self.law.fibres), ("sheets", self.law.sheets)):
@@ -137,18 +120,8 @@ class Scene(Shown):
                 continue
             if not asked:
                 raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no {kind}")
-            vectors = frozen_array(given)
-            count, points = len(self.mesh.elements), len(quadrature_points(self.mesh.order))
-            if vectors.shape not in ((count, 3), (count, points, 3)):
-                at_points = f" or ({count}, {points}, 3)" if points > 1 else ""
-                raise InputError(
-                    f"scene '{self.name}': {kind} have shape {vectors.shape}; "
-                    f"expected ({count}, 3){at_points}"
-                )
-            if not np.allclose(np.linalg.norm(vectors, axis=-1), 1.0, atol=1e-6):
-                raise InputError(f"scene '{self.name}': {kind} are not unit vectors")
-            # Linear elements have one point each: one form, so that their fingerprints agree.
-            object.__setattr__(self, kind, vectors.reshape(-1, 3) if points == 1 else vectors)
+            with self._named():
+                object.__setattr__(self, kind, checked_directions(given, self.mesh, kind))
         if self.fibres is not None and self.sheets is not None:
             fibres, sheets = self.fibres_at_points, self._at_points(self.sheets)
             along = np.abs(np.einsum("mqi,mqi->mq", fibres, sheets)).max()
@@ -184,7 +157,8 @@ class Scene(Shown):
         for part in self.parts:
             for name in part.facet_sets:
                 self.mesh.facet_set(name)
-        moved = sum((np.abs(d) for d in self.prescribed.per_unit.values()), self.held_displacement)
+        _, fixed, per_unit = self.prescribed
+        moved = sum((np.abs(each) for each in per_unit.values()), np.abs(fixed))
         for load in self.loads:
             load.check(self.mesh, self.held, moved)
 
@@ -196,27 +170,11 @@ class Scene(Shown):
     @property
     def quantities(self) -> dict[str, Quantity]:
         """Every parameter that law, loads and regions take, by name."""
-        return {name: quantity for name, (quantity, _) in self._takers.items()}
+        return {name: quantity for name, (quantity, _) in self._owners.items()}
 
     @property
-    def _takers(self) -> dict[str, tuple[Quantity, str]]:
-        """Quantity of every parameter, by name, and its owner: law, region, load or support."""
-        takers = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
-        if self.regions is not None:
-            takers |= {q.name: (q, "a region") for q in region_quantities(self.regions)}
-        own = set(takers)
-        for what, parts in (("load", self.loads), ("support", self.supports)):
-            for part in parts:
-                owner = f"{what} {type(part).__name__}"
-                for quantity in part.quantities:
-                    if quantity.name in own:
-                        raise InputError(
-                            f"scene '{self.name}': {owner} and {takers[quantity.name][1]} both "
-                            f"have a parameter '{quantity.name}'; call the {what}'s by another name"
-                        )
-                    takers.setdefault(quantity.name, (quantity, owner))
-            own = set(takers)
-        return takers
+    def _owners(self) -> Owners:
+        return owners_of(self.law, self.regions, self.loads, self.supports)
 
     @cached_property
     def space(self) -> ParameterSpace:
@@ -227,7 +185,7 @@ class Scene(Shown):
     def load_parameters(self) -> tuple[str, ...]:
         """Parameters that loads take, and by which supports move; the others are the body's."""
         taken = {quantity.name for load in self.loads for quantity in load.quantities}
-        taken |= {amount for support in self.supports for amount in support.amounts}
+        taken |= set(self.prescribed.per_unit)
         return tuple(name for name in self.parameter_names if name in taken)
 
     @property
@@ -327,20 +285,23 @@ class Scene(Shown):
 
         (n, 3), or (k, 3) at ``nodes`` (k,), where no parameter scales it, else (..., n, 3).
         """
-        _, fixed, per_unit = self.prescribed
-        rows = slice(None) if nodes is None else nodes
-        found = jnp.asarray(fixed[rows])
-        for name, moved in per_unit.items():
-            amount = self.resolve(jnp.moveaxis(jnp.asarray(theta), -1, 0))[name]
-            found = found + jnp.asarray(amount)[..., None, None] * moved[rows]
-        return found
+        values = self.resolve(jnp.moveaxis(jnp.asarray(theta), -1, 0))
+        return self.prescribed.at(values, slice(None) if nodes is None else nodes)
 
     def on_supports(
-        self, u: jax.Array, theta: jax.Array, nodes: np.ndarray | None = None
+        self,
+        u: jax.Array,
+        theta: jax.Array,
+        nodes: np.ndarray | None = None,
+        *,
+        level: jax.Array | float = 1.0,
     ) -> jax.Array:
-        """``u`` (..., n, 3) mm, or (..., k, 3) at ``nodes`` (k,), made exact where held."""
+        """``u`` (..., n, 3) mm, or (..., k, 3) at ``nodes`` (k,), made exact where held.
+
+        level : fraction of the way that the supports have gone.
+        """
         held = self.held if nodes is None else self.held[nodes]
-        return jnp.where(held, self.held_at(theta, nodes), u)
+        return jnp.where(held, level * self.held_at(theta, nodes), u)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """Name, mesh, law, loads, supports, theta."""

@@ -31,7 +31,7 @@ from emulator.surrogates.protocol import ForwardMap, Prediction, fingerprint_of
 
 def newton_step(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     """``u`` (n, 3) mm after one full Newton step, without a line search."""
-    u = system.on_supports(u, theta)
+    u = system.scene.on_supports(u, theta)
     tangent = system.pattern.safe_values(system.tangent(u, theta))
     return u - system.extend(system.solve(tangent, system.residual(u, theta)))
 

@@ -302,7 +302,7 @@ def runs_of(simulator: Simulator, swept: Swept, thetas: jax.Array) -> Runs:
 
     def at(theta: jax.Array) -> jax.Array:
         v = legendre(scene.to_unit(theta), degrees) @ coefficients
-        return system.on_supports(system.extend(v), theta)
+        return scene.on_supports(system.extend(v), theta)
 
     def each(theta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         u, slopes = at(theta), jax.jacfwd(at)(theta)

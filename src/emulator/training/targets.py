@@ -86,6 +86,11 @@ def targets(
     return Targets(*(column[back] for column in joined))
 
 
+def _placed(system: System, v: jax.Array, theta: jax.Array, level: jax.Array) -> jax.Array:
+    """Displacement (n, 3) with ``v`` (f,) where free, and held by the supports at ``level``."""
+    return system.scene.on_supports(system.extend(v), theta, level=level)
+
+
 def _groups(position: np.ndarray) -> list[np.ndarray]:
     """Rows of eight neighbours each in ``position`` (c, p), those in the middle first."""
     parts = [np.arange(len(position))]
@@ -109,9 +114,7 @@ def _tangent(
     system: System, v: jax.Array, theta: jax.Array, level: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Nonzeros (nnz,) of the tangent at ``v`` (f,), and whether it is positive definite."""
-    values, solvable = system.safe_tangent(
-        system.on_supports(system.extend(v), theta, level), theta, level
-    )
+    values, solvable = system.safe_tangent(_placed(system, v, theta, level), theta, level)
     outcome = system.attempt(values, jnp.zeros_like(v))[1]
     return values, solvable & (outcome == Outcome.OK)
 
@@ -123,7 +126,7 @@ def _target(
     """Of :class:`Targets`, at ``theta`` (p,) from ``v`` (f,), beside the tangent ``factor``."""
 
     def residual(v: jax.Array) -> jax.Array:
-        return system.residual(system.on_supports(system.extend(v), theta, level), theta, level)
+        return system.residual(_placed(system, v, theta, level), theta, level)
 
     def beside(force: jax.Array) -> jax.Array:
         return system.attempt(factor, force)[0]
@@ -133,7 +136,7 @@ def _target(
     slope = jnp.vdot(r, step)
 
     def at(fraction: jax.Array) -> jax.Array:
-        return system.on_supports(system.extend(v + fraction * step), theta, level)
+        return _placed(system, v + fraction * step, theta, level)
 
     def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
         return system.potential(at(fraction), theta, level)

@@ -61,6 +61,16 @@ def test_the_density_is_that_of_the_sum_of_noise_and_error(aware, truth):
     assert float(found) == pytest.approx(wanted + prior, rel=1e-9)
 
 
+def test_what_is_left_of_the_information_is_that_of_the_sum(aware):
+    """Against the inverse of the whole covariance, where the error is as large as it is there."""
+    at = jnp.array([70.0, 81.0])
+    modes, size = aware.error.modes, float(aware.error.size(at))
+    noise = NOISE**2 * np.eye(modes.shape[1])
+    found = aware.error.information_left(jnp.asarray(np.linalg.inv(noise)), at)
+    wanted = np.linalg.inv(noise + size**2 * modes.T @ modes)
+    np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
+
+
 def test_fem_on_the_mesh_shares_the_error_of_the_mesh_only(aware, truth):
     """Against SciPy's normal; the error of the map alone leaves FEM's likelihood as it is."""
     data = aware.check_data(np.asarray(truth.at(NODES)(TRUTH)))

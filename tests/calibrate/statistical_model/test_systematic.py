@@ -8,7 +8,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 import calibrate as cal
-from calibrate.statistical_model.systematic import Systematic, SystematicError
+from calibrate.identifiability.expected import expected_precision
+from calibrate.identifiability.fisher import _information
+from calibrate.statistical_model.systematic import Systematic
 from emulator.errors import InputError
 from linear_support import linear_forward
 from scene_support import block
@@ -97,12 +99,10 @@ def test_replicates_have_its_covariance(model, errors):
 
 
 def test_information_left_is_the_inverse_of_the_dense_covariance(model, errors):
-    from calibrate.identifiability.fisher import _information
-
     whole = cal.with_systematic(model, *errors)
     means, _ = model.predict(DRAW)
     C, _ = dense(model, errors)
-    np.testing.assert_allclose(_information(whole, means), np.linalg.inv(C), atol=1e-8)
+    np.testing.assert_allclose(_information(whole, means, jnp.ones(2)), np.linalg.inv(C), atol=1e-8)
 
 
 def test_a_camera_that_turned_is_told_from_material(model):
@@ -139,11 +139,23 @@ def test_nothing_unknown_changes_nothing(model):
     assert float(whole.map_log_likelihood(DRAW, data)) == pytest.approx(expected, rel=1e-14)
 
 
-def test_kept_in_arrays_it_is_the_same(model, errors):
+def test_a_placement_is_one_offset_a_number_shared_by_states():
+    sd = np.array([[0.1, 0.2, 0.3]])
+    pins = cal.placement("pin", ("a", "b"), sd)
+    assert pins.names == ("pin 0,0", "pin 0,1", "pin 0,2")
+    for modes in pins.modes.values():
+        np.testing.assert_array_equal(modes[:, 0], np.diag(sd[0]))
+
+
+def test_what_changes_the_likelihood_changes_the_fingerprint(model, errors):
     error = cal.with_systematic(model, *errors).error
-    again = SystematicError.restore(error.arrays())
-    assert again.names == error.names
-    assert again.fingerprint == error.fingerprint
+    assert error.fingerprint == cal.with_systematic(model, *errors).error.fingerprint
+    assert error.fingerprint != cal.with_systematic(model, errors[0]).error.fingerprint
+
+
+def test_precision_before_data_is_not_told_of_such_a_model(model, errors):
+    with pytest.raises(InputError, match="identify before measuring: the model allows for errors"):
+        expected_precision(cal.with_systematic(model, *errors))
 
 
 def test_what_cannot_be(model, errors):

@@ -115,4 +115,4 @@ def _moved(
     """``u`` (n, 3) mm after a fraction of the step."""
     u = jnp.where(fraction > 0.0, u + fraction * move, u)
     # After a full step the supports are met; setting them avoids the last bit of round-off.
-    return jnp.where(fraction == 1.0, system.on_supports(u, theta, level), u)
+    return jnp.where(fraction == 1.0, system.scene.on_supports(u, theta, level=level), u)

@@ -21,7 +21,7 @@ from emulator.mechanics.quantity import Quantity, number
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
 
-_MN_PER_N = 1e3
+MN_PER_N = 1e3
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Force(Load):
 
     def _spread(self, mesh: Mesh) -> np.ndarray:
         return shares(mesh, mesh.node_set(self.node_set))[:, None] * (
-            _MN_PER_N * np.asarray(self.resultant, dtype=float)
+            MN_PER_N * np.asarray(self.resultant, dtype=float)
         )
 
     def to_json(self) -> list[Any]:

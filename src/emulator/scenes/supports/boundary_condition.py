@@ -54,11 +54,6 @@ class BoundaryCondition(ABC):
         return ()
 
     @property
-    def amounts(self) -> tuple[str, ...]:
-        """Names of those that each load state has for itself; the others belong to the body."""
-        return ()
-
-    @property
     def simpler(self) -> tuple[str, BoundaryCondition | None] | None:
         """An effect that can be left out: its name, and the support without it, None for none."""
         return None

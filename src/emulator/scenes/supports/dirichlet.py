@@ -13,11 +13,14 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.quantity import Quantity, number
+from emulator.scenes.local_terms import Values
 from emulator.scenes.supports.boundary_condition import BoundaryCondition, Held, Resisted
 
 _AXES = "xyz"
@@ -56,11 +59,6 @@ class Support(BoundaryCondition):
     def quantities(self) -> tuple[Quantity, ...]:
         """The amount, where it is a parameter; either sign."""
         return () if self.amount is None else (number(self.amount, -np.inf),)
-
-    @property
-    def amounts(self) -> tuple[str, ...]:
-        """The amount, where it is a parameter."""
-        return () if self.amount is None else (self.amount,)
 
     def held(self, mesh: Mesh) -> Held:
         """The nodes of the set, their displacements, and the axes that are held."""
@@ -105,6 +103,13 @@ class Prescribed(NamedTuple):
     def moves(self) -> bool:
         """Whether anything is held elsewhere than at rest."""
         return bool(self.displacement.any()) or bool(self.per_unit)
+
+    def at(self, values: Values, rows: slice | np.ndarray = slice(None)) -> jax.Array:
+        """The displacement (..., k, 3) mm of nodes ``rows`` where amounts are ``values`` (...)."""
+        found = jnp.asarray(self.displacement[rows])
+        for name, moved in self.per_unit.items():
+            found = found + jnp.asarray(values[name])[..., None, None] * moved[rows]
+        return found
 
 
 def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:

@@ -1,0 +1,79 @@
+"""Who takes which parameter of a scene: its law, a region, a load or a support."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.mechanics.laws import Law
+from emulator.mechanics.quantity import Quantity
+from emulator.scenes.loads.load import Load
+from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.regions import region_quantities
+from emulator.scenes.supports.boundary_condition import BoundaryCondition
+
+Owners = Mapping[str, tuple[Quantity, str]]
+"""Quantity of every parameter by name, and who takes it, in words."""
+
+
+def owners_of(
+    law: Law,
+    regions: np.ndarray | None,
+    loads: Sequence[Load],
+    supports: Sequence[BoundaryCondition],
+) -> Owners:
+    """Every parameter that these take; loads may share one, and so may supports.
+
+    Raises
+    ------
+    InputError
+        Two of different kinds have a parameter of one name.
+    """
+    owners = {q.name: (q, f"law '{law.name}'") for q in law.quantities}
+    if regions is not None:
+        owners |= {q.name: (q, "a region") for q in region_quantities(regions)}
+    for what, parts in (("load", loads), ("support", supports)):
+        others = set(owners)
+        for part in parts:
+            owner = f"{what} {type(part).__name__}"
+            for quantity in part.quantities:
+                if quantity.name in others:
+                    raise InputError(
+                        f"{owner} and {owners[quantity.name][1]} both have a parameter "
+                        f"'{quantity.name}'; call the {what}'s by another name"
+                    )
+                owners.setdefault(quantity.name, (quantity, owner))
+    return owners
+
+
+def check_given(
+    owners: Owners, law: Law, parameters: Sequence[Parameter], constants: Mapping[str, float]
+) -> None:
+    """Refuse parameters and constants that are not what ``owners`` take, each once.
+
+    Raises
+    ------
+    InputError
+        A name nobody takes, one given twice, one missing, or an inadmissible unit or value.
+    """
+    given = [*(parameter.name for parameter in parameters), *constants]
+    for name in given:
+        if name not in owners:
+            raise InputError(
+                f"parameter '{name}' is not one of law '{law.name}', its loads and supports: "
+                f"{', '.join(owners)}"
+            )
+        if given.count(name) > 1:
+            raise InputError(f"parameter '{name}' is given twice")
+    for name, (_, owner) in owners.items():
+        if name not in given:
+            raise InputError(f"{owner} needs '{name}'")
+    faults = [owners[name][0].value_fault(value) for name, value in constants.items()]
+    for parameter in parameters:
+        quantity, owner = owners[parameter.name]
+        faults.append(quantity.unit_fault(parameter.unit, owner))
+        faults.append(quantity.range_fault(parameter.low, parameter.high))
+    for fault in filter(None, faults):
+        raise InputError(fault)
