@@ -76,16 +76,13 @@ def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = Non
     return energy
 
 
-def at_points(
-    scene: Scene, function: Callable, *fields: jax.Array, tissue: Tissue | None = None
-) -> Any:
+def at_points(function: Callable, tissue: Tissue, *fields: jax.Array) -> Any:
     """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...); leaves (m, q, ...).
 
-    The points are the elements' unless ``tissue`` (m, q, ...) says what is at others.
     All points are one batch: a ``vmap`` in a ``vmap`` takes half as long again to trace.
     """
     shape = fields[0].shape[:2]
-    every = (*fields, scene.tissue if tissue is None else tissue)
+    every = (*fields, tissue)
     flat = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), every)
     found = jax.vmap(function)(*flat)
     return jax.tree.map(lambda array: array.reshape(*shape, *array.shape[1:]), found)
@@ -170,7 +167,7 @@ def energy_of_gradient(
     """``int W dX`` in mN mm from the displacement gradient ``H`` (m, q, 3, 3)."""
     density = point_energy(scene, theta, barriers)
     seen = seen_by_law(scene, H, barriers)
-    values = at_points(scene, density, seen, tissue=scene.block_tissue)
+    values = at_points(density, scene.block_tissue_at(theta), seen)
     return jnp.sum(scene.blocks.weights * values)
 
 

@@ -55,7 +55,8 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
     fields = {"J": mean(J), "cauchy_stress": mean(sigma), "green_lagrange": mean(E)}
     if scene.fibres is not None:
-        fibres = jnp.asarray(scene.fibres_at_points)
+        directions = jnp.asarray(scene.tissue_at(theta).directions)
+        fibres = directions if directions.ndim == 3 else directions[:, :, 0]
         along = jnp.einsum("mqij,mqj->mqi", F, fibres)
         fields["fibres"], fields["deformed_fibres"] = unit(mean(fibres)), unit(mean(along))
         fields["fibre_stretch"] = mean(jnp.linalg.norm(along, axis=-1))
@@ -67,7 +68,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
     """First Piola-Kirchhoff stress (m, q, 3, 3) in kPa, from the strain energy's gradient."""
     if scene.dilatation == "pointwise":
-        return at_points(scene, jax.grad(point_energy(scene, theta)), H)
+        return at_points(jax.grad(point_energy(scene, theta)), scene.tissue_at(theta), H)
     slope = jax.grad(energy_of_gradient, argnums=1)(scene, H, theta)
     return slope / scene.discretisation.weights[..., None, None]
 

@@ -211,7 +211,7 @@ class System:
         scene = self.scene
         H = seen_by_law(scene, displacement_gradient(scene, u))
         law = stress_and_moduli(scene, theta)
-        stress, moduli = at_points(scene, law, H, tissue=scene.block_tissue)
+        stress, moduli = at_points(law, scene.block_tissue_at(theta), H)
         return block_derivatives(scene, u, stress, moduli)[1]
 
     def equations(

@@ -183,6 +183,7 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
         law = find_law(file.law)
     mesh_path = path.parent / file.mesh
     mesh, fibres, sheets = _body(mesh_path, file, law, source)
+    angles = file.fibres.angles_in(mesh) if file.fibres is not None and law.fibres else ()
     with source.at("regions"):
         regions = None if file.regions is None else read_regions(mesh_path, file.regions)
     parameters = _parameters(file, source)
@@ -195,6 +196,7 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
             origin={"scene": "file", "path": str(path.resolve())},
             fibres=fibres,
             fibre_rule=file.fibres,
+            angles=angles,
             sheets=sheets,
             regions=regions,
             parameters=parameters,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.directions import checked_directions
+from emulator.geometry.directions import check_across, checked_directions
 from emulator.geometry.discretisation import (
     Blocks,
     Discretisation,
@@ -23,10 +23,11 @@ from emulator.geometry.discretisation import (
     quadrature_points,
 )
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.patches import patchwise
+from emulator.geometry.patches import check_dilatation, patchwise
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.fibre_angles import FibreAngles, identity_of_angles, turned
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
@@ -68,6 +69,9 @@ class Scene(Shown):
         volumetric part; see :mod:`emulator.scenes.regions`.
     fibre_rule : what made the directions of this mesh, for another mesh of the body
         (:mod:`emulator.scenes.finer`).
+    angles : parameters that turn fibres and sheets (:mod:`emulator.scenes.fibre_angles`), one
+        rotation after the other, as the rule's ``angles_in`` gives them; ``fibres`` and ``sheets``
+        are those at angle zero.
     """
 
     name: str
@@ -83,15 +87,17 @@ class Scene(Shown):
     sheets: np.ndarray | None = None
     regions: np.ndarray | None = None
     fibre_rule: FibreRule | None = None
+    angles: tuple[FibreAngles, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "origin", MappingProxyType(dict(self.origin)))
         self._check_regions()
+        self._check_directions()
         with self._named():
             check_given(self._owners, self.law, self.parameters, self.constants)
-        self._check_directions()
-        self._check_dilatation()
+        with self._named():
+            check_dilatation(self.dilatation, self.mesh)
         if not self.parameters:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
         self._check_supports()
@@ -122,30 +128,14 @@ class Scene(Shown):
                 raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no {kind}")
             with self._named():
                 object.__setattr__(self, kind, checked_directions(given, self.mesh, kind))
+        if self.angles and self.fibres is None:
+            raise InputError(f"scene '{self.name}': fibre angles turn fibres, and it has none")
+        with self._named():
+            checked = tuple(angles.checked(self.mesh) for angles in self.angles)
+            object.__setattr__(self, "angles", checked)
         if self.fibres is not None and self.sheets is not None:
-            fibres, sheets = self.fibres_at_points, self._at_points(self.sheets)
-            along = np.abs(np.einsum("mqi,mqi->mq", fibres, sheets)).max()
-            if not along < 1e-6:
-                raise InputError(
-                    f"scene '{self.name}': sheets are not across the fibres (cosine {along:.2g})"
-                )
-
-    def _check_dilatation(self) -> None:
-        if self.dilatation not in ("pointwise", "mean", "patch"):
-            raise InputError(
-                f"scene '{self.name}': dilatation '{self.dilatation}'; use pointwise or mean, "
-                "or patch on linear tetrahedra"
-            )
-        if self.dilatation == "mean" and self.mesh.order == 1:
-            raise InputError(
-                f"scene '{self.name}': mean dilatation on linear tetrahedra changes nothing, "
-                "they have one point each; make the mesh quadratic, or write dilatation 'patch'"
-            )
-        if self.dilatation == "patch" and self.mesh.order == 2:
-            raise InputError(
-                f"scene '{self.name}': patch dilatation is for linear tetrahedra; on quadratic "
-                "ones write dilatation 'mean'"
-            )
+            with self._named():
+                check_across(self._at_points(self.sheets), self.fibres_at_points)
 
     def _check_supports(self) -> None:
         if not self.supports:
@@ -174,7 +164,7 @@ class Scene(Shown):
 
     @property
     def _owners(self) -> Owners:
-        return owners_of(self.law, self.regions, self.loads, self.supports)
+        return owners_of(self.law, self.regions, self.angles, self.loads, self.supports)
 
     @cached_property
     def space(self) -> ParameterSpace:
@@ -245,9 +235,18 @@ class Scene(Shown):
             raise InputError(f"scene '{self.name}' has no fibres")
         return self._at_points(self.fibres)
 
+    def tissue_at(self, theta: jax.Array) -> Tissue:
+        """Material data at ``theta`` (p,), stacked over elements and points, (m, q, ...)."""
+        return turned(self._tissue, self.angles, self.resolve(theta))
+
+    def block_tissue_at(self, theta: jax.Array) -> Tissue:
+        """The same stacked over :attr:`blocks` and their points, (b, q, ...)."""
+        if not self.angles:
+            return self._block_tissue
+        return jax.tree.map(self.blocks.gather, self.tissue_at(theta))
+
     @cached_property
-    def tissue(self) -> Tissue:
-        """Material data stacked over elements and points, arrays with leading axes (m, q)."""
+    def _tissue(self) -> Tissue:
         directions = region = None
         if self.fibres is not None:
             directions = self.fibres_at_points
@@ -261,9 +260,8 @@ class Scene(Shown):
         return Tissue(cast(Any, directions), cast(Any, region))
 
     @cached_property
-    def block_tissue(self) -> Tissue:
-        """The same stacked over :attr:`blocks` and their points, leading axes (b, q)."""
-        return jax.tree.map(self.blocks.gather, self.tissue)
+    def _block_tissue(self) -> Tissue:
+        return jax.tree.map(self.blocks.gather, self._tissue)
 
     @cached_property
     def prescribed(self) -> Prescribed:
@@ -332,13 +330,14 @@ class Scene(Shown):
             "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
             "dilatation": self.dilatation,
         }
+        turning = identity_of_angles(self.angles)
         held, fixed, per_unit = self.prescribed
         moved = {f"displacement per unit of {name}": each for name, each in per_unit.items()}
         return identity_of(
             self.mesh,
             held,
             {"displacement": fixed, **moved},
-            {"fibres": self.fibres, "sheets": self.sheets},
+            {"fibres": self.fibres, "sheets": self.sheets, **turning},
             self.regions,
             sorted({name for part in self.parts for name in part.facet_sets}),
             description,
