@@ -39,7 +39,7 @@ A ventricle, whose mesh file has groups named base, endocardium and epicardium:
 
     [fibres]                                 # without it, they come from the mesh file
     rule = "helix"
-    angles = [60.0, -60.0]                   # degrees, endocardium and epicardium
+    angles = [60.0, -60.0]    # degrees, endocardium and epicardium, or parameters' names
     endocardium = "endocardium"              # facet sets; these are the defaults
     epicardium = "epicardium"
     axis = [0.0, 0.0, 1.0]                   # from apex to base
