@@ -60,7 +60,9 @@ def calibrated(beam, members, replicates, options, **more):
         draws = {name: values.reshape(-1)[rows] for name, values in found.draws().items()}
         assert set(draws) == set(truth)
         kept = [name for name in truth if "[b" not in name or name == "mu[b0]"]
-        heights = [{LOG_LIKELIHOOD: log_likelihood(model, forward, x, data)} for x in (truth, draws)]
+        heights = [
+            {LOG_LIKELIHOOD: log_likelihood(model, forward, x, data)} for x in (truth, draws)
+        ]
         return Replicate(
             {k: truth[k] for k in kept} | heights[0], {k: draws[k] for k in kept} | heights[1]
         )
@@ -78,7 +80,7 @@ def test_a_population_of_one_parameter_is_calibrated(beam):
 def test_a_population_of_two_correlated_parameters_is_calibrated(beam):
     options = NUTSOptions(warmup=400, draws=500, chains=2, rounds=2)
     found = calibrated(beam, 5, 100, options)
-    print({name: values for name, values in found.coverage().items()})
+    print(found.coverage())
     for name, u in found.ranks.items():
         print(name, "mean rank", u.mean().round(3), "sd", u.std().round(3))
     assert found.passed, found.outside()

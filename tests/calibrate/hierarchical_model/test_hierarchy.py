@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
@@ -142,12 +143,14 @@ def test_a_new_member_is_predicted_through_its_model(found, beam):
     data = found.predict(model, seed=1)["displacement"]
     exact = linear_forward(beam).at(np.array(NODES))
     new = found.new_member()
-    means = np.stack([exact(jnp.array([m, l])) for m, l in zip(new["mu"], new["lam"], strict=True)])
+    means = np.asarray(jax.vmap(exact)(jnp.stack([new["mu"], new["lam"]], axis=1)))
     assert data.shape == (500, 3, 3)
     spread = np.sqrt(means.var(axis=0) + 0.05**2)
     np.testing.assert_allclose(data.mean(axis=0), means.mean(axis=0), atol=0.25 * spread.max())
     np.testing.assert_allclose(data.std(axis=0), spread, rtol=0.25)
-    unknown = cal.model(model.full, model.observe, cal.GaussianNoise(sd_scale=0.1), check_scale=False)
+    unknown = cal.model(
+        model.full, model.observe, cal.GaussianNoise(sd_scale=0.1), check_scale=False
+    )
     assert found.predict(unknown)["displacement"].shape == (500, 3, 3)
 
 
