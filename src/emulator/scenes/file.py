@@ -119,6 +119,10 @@ takes ``acceleration`` in m/s2. A pressure that is a parameter is called ``press
 key ``parameter`` says. ``published_pressure`` is the pressure work of the released code, on linear
 tetrahedra only.
 
+Muscle contracts by a load of the kind ``active_tension``, along the fibres of the file or of a
+rule, whatever the law: ``tension`` in kPa, or a parameter of that name; ``transverse`` is the share
+of it across the fibre.
+
 ``regions = "segment"`` names cell data of the mesh file, a whole number for each tetrahedron, such
 as gmsh's own ``gmsh:physical``. In region 3 the law's energy is then multiplied by the parameter or
 constant ``stiffness_3``, its resistance to volume change excepted.
@@ -141,6 +145,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.line_index import toml_lines
 from emulator.mechanics.laws import Law, find_law
+from emulator.scenes.owners import directions_read
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 
@@ -250,18 +255,16 @@ def _body(mesh_path: Path, file: SceneFile, law: Law, source: Source) -> Parts:
 
 
 def _read(mesh_path: Path, file: SceneFile, law: Law) -> Body:
-    """The mesh file, with the directions the law needs unless a rule gives them."""
-    if not law.fibres or file.fibres is not None:
+    """The mesh file, with the directions that law and loads need unless a rule gives them."""
+    readers = directions_read(law, file.loads)
+    if readers["fibres"] is None or file.fibres is not None:
         mesh = read_mesh(mesh_path)
         return Body(to_quadratic(mesh) if file.order == 2 and mesh.order == 1 else mesh)
     body = read_body(mesh_path, quadratic=file.order == 2)
-    for kind, needed, found in (
-        ("fibres", law.fibres, body.fibres),
-        ("sheets", law.sheets, body.sheets),
-    ):
-        if needed and found is None:
+    for kind, found in (("fibres", body.fibres), ("sheets", body.sheets)):
+        if readers[kind] is not None and found is None:
             raise InputError(
-                f"law '{law.name}' needs {kind}, and mesh file {mesh_path.name} has none; give it "
+                f"{readers[kind]} needs {kind}, and mesh file {mesh_path.name} has none; give it "
                 f"cell or point data '{kind}' of 3 components, or this file a table [fibres]"
             )
     return body

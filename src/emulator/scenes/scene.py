@@ -30,7 +30,7 @@ from emulator.mechanics.quantity import Quantity
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
-from emulator.scenes.owners import Owners, check_given, owners_of
+from emulator.scenes.owners import Owners, check_given, directions_read, owners_of
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.regions import Tissue, checked_regions
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
@@ -51,12 +51,12 @@ class Scene(Shown):
     mesh : geometry in mm.
     law : hyperelastic law.
     parameters : entries of theta, in order.
-    loads : external loads; may be empty, when the supports alone deform the body.
+    loads : what deforms the body; may be empty, when the supports alone deform the body.
     supports : prescribed displacements and springs.
     constants : parameters of the law and the loads that do not vary.
-    fibres : unit fibre directions, for laws that read them: at every quadrature point (m, q, 3),
-        or of each element (m, 3). Constant in an element, they cost a quadratic one most of its
-        accuracy.
+    fibres : unit fibre directions, for laws and loads that read them: at every quadrature
+        point (m, q, 3), or of each element (m, 3). Constant in an element, they cost a quadratic
+        one most of its accuracy.
     origin : how a built-in scene was made: its name and arguments, written to scene files.
     dilatation : ``pointwise``, or ``mean`` to use the mean volume change of each element, which
         keeps quadratic elements from locking when the material is nearly incompressible, or
@@ -112,13 +112,13 @@ class Scene(Shown):
             object.__setattr__(self, "regions", labels)
 
     def _check_directions(self) -> None:
-        for kind, asked in (("fibres", self.law.fibres), ("sheets", self.law.sheets)):
+        for kind, reader in directions_read(self.law, self.loads).items():
             given = getattr(self, kind)
             if given is None:
-                if asked:
-                    raise InputError(f"scene '{self.name}': law '{self.law.name}' needs {kind}")
+                if reader is not None:
+                    raise InputError(f"scene '{self.name}': {reader} needs {kind}")
                 continue
-            if not asked:
+            if reader is None:
                 raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no {kind}")
             with self._named():
                 object.__setattr__(self, kind, checked_directions(given, self.mesh, kind))
@@ -249,7 +249,7 @@ class Scene(Shown):
     def tissue(self) -> Tissue:
         """Material data stacked over elements and points, arrays with leading axes (m, q)."""
         directions = region = None
-        if self.fibres is not None:
+        if self.law.fibres:
             directions = self.fibres_at_points
         if self.fibres is not None and self.sheets is not None:
             directions = np.stack([self.fibres_at_points, self._at_points(self.sheets)], axis=2)
