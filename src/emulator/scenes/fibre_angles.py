@@ -14,7 +14,7 @@ one share of 1. The derivative is exact, as that of any other parameter.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -26,6 +26,7 @@ from emulator.geometry.directions import checked_directions
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.loads.load import Load
 from emulator.scenes.local_terms import Values
 from emulator.scenes.regions import Tissue
 
@@ -87,6 +88,26 @@ class FibreAngles:
         along = jnp.sum(n * given, axis=-1, keepdims=True)
         turned = c * given + s * jnp.cross(n, given) + (1.0 - c) * along * n
         return tissue._replace(directions=turned)
+
+
+def checked_angles(
+    angles: Sequence[FibreAngles], mesh: Mesh, fibres: np.ndarray | None, loads: Sequence[Load]
+) -> tuple[FibreAngles, ...]:
+    """The ``angles`` of a scene, their arrays checked and frozen.
+
+    Raises
+    ------
+    InputError
+        A scene without fibres, arrays that do not fit its mesh, or a load along its fibres.
+    """
+    if angles and fibres is None:
+        raise InputError("fibre angles turn fibres, and it has none")
+    for load in loads:
+        if angles and load.fibres:
+            raise InputError(
+                f"load '{load.kind}' acts along fibres that theta turns; give angles as numbers"
+            )
+    return tuple(each.checked(mesh) for each in angles)
 
 
 def turned(tissue: Tissue, angles: tuple[FibreAngles, ...], values: Values) -> Tissue:

@@ -119,6 +119,10 @@ takes ``acceleration`` in m/s2. A pressure that is a parameter is called ``press
 key ``parameter`` says. ``published_pressure`` is the pressure work of the released code, on linear
 tetrahedra only.
 
+Muscle contracts by a load of the kind ``active_tension``, along the fibres of the file or of a
+rule, whatever the law: ``tension`` in kPa, or a parameter of that name; ``transverse`` is the share
+of it across the fibre.
+
 Several bodies of one material (:mod:`emulator.geometry.side_by_side`), as two cubes of one liver:
 
 .. code-block:: toml
@@ -200,7 +204,7 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
     with source.at("law"):
         law = find_law(file.law)
     mesh, fibres, sheets, regions = _body(path.parent, file, law, source)
-    angles = file.fibres.angles_in(mesh) if file.fibres is not None and law.fibres else ()
+    angles = file.fibres.angles_in(mesh) if file.fibres is not None else ()
     parameters = _parameters(file, source)
     _check_sets(mesh, source)
     try:

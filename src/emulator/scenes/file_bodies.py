@@ -15,6 +15,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.side_by_side import Bodies, check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law
+from emulator.scenes.owners import directions_read
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
     from emulator.scenes.file_models import SceneFile
@@ -78,18 +79,16 @@ def _check_order(path: Path, mesh: Mesh, file: SceneFile, source: Source) -> Non
 
 
 def _read(mesh_path: Path, file: SceneFile, law: Law) -> Body:
-    """The mesh file, with the directions the law needs unless a rule gives them."""
-    if not law.fibres or file.fibres is not None:
+    """The mesh file, with the directions that law and loads need unless a rule gives them."""
+    readers = directions_read(law, file.loads)
+    if readers["fibres"] is None or file.fibres is not None:
         mesh = read_mesh(mesh_path)
         return Body(to_quadratic(mesh) if file.order == 2 and mesh.order == 1 else mesh)
     body = read_body(mesh_path, quadratic=file.order == 2)
-    for kind, needed, found in (
-        ("fibres", law.fibres, body.fibres),
-        ("sheets", law.sheets, body.sheets),
-    ):
-        if needed and found is None:
+    for kind, found in (("fibres", body.fibres), ("sheets", body.sheets)):
+        if readers[kind] is not None and found is None:
             raise InputError(
-                f"law '{law.name}' needs {kind}, and mesh file {mesh_path.name} has none; give it "
+                f"{readers[kind]} needs {kind}, and mesh file {mesh_path.name} has none; give it "
                 f"cell or point data '{kind}' of 3 components, or this file a table [fibres]"
             )
     return body

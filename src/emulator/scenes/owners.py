@@ -50,6 +50,15 @@ def owners_of(
     return owners
 
 
+def directions_read(law: Law, loads: Sequence[Load]) -> dict[str, str | None]:
+    """Who reads ``fibres`` and ``sheets``, in words; None where nobody does."""
+    fibres = f"law '{law.name}'" if law.fibres else None
+    for load in loads:
+        if fibres is None and load.fibres:
+            fibres = f"load '{load.kind}'"
+    return {"fibres": fibres, "sheets": f"law '{law.name}'" if law.sheets else None}
+
+
 def check_given(
     owners: Owners, law: Law, parameters: Sequence[Parameter], constants: Mapping[str, float]
 ) -> None:

@@ -27,11 +27,11 @@ from emulator.geometry.patches import check_dilatation, patchwise
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
-from emulator.scenes.fibre_angles import FibreAngles, identity_of_angles, turned
+from emulator.scenes.fibre_angles import FibreAngles, checked_angles, identity_of_angles, turned
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
-from emulator.scenes.owners import Owners, check_given, owners_of
+from emulator.scenes.owners import Owners, check_given, directions_read, owners_of
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.regions import Tissue, checked_regions
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
@@ -52,12 +52,12 @@ class Scene(Shown):
     mesh : geometry in mm.
     law : hyperelastic law.
     parameters : entries of theta, in order.
-    loads : external loads; may be empty, when the supports alone deform the body.
+    loads : what deforms the body; may be empty, when the supports alone deform the body.
     supports : prescribed displacements and springs.
     constants : parameters of the law and the loads that do not vary.
-    fibres : unit fibre directions, for laws that read them: at every quadrature point (m, q, 3),
-        or of each element (m, 3). Constant in an element, they cost a quadratic one most of its
-        accuracy.
+    fibres : unit fibre directions, for laws and loads that read them: at every quadrature
+        point (m, q, 3), or of each element (m, 3). Constant in an element, they cost a quadratic
+        one most of its accuracy.
     origin : how a built-in scene was made: its name and arguments, written to scene files.
     dilatation : ``pointwise``, or ``mean`` to use the mean volume change of each element, which
         keeps quadratic elements from locking when the material is nearly incompressible, or
@@ -118,23 +118,20 @@ class Scene(Shown):
             object.__setattr__(self, "regions", labels)
 
     def _check_directions(self) -> None:
-        for kind, asked in (("fibres", self.law.fibres), ("sheets", self.law.sheets)):
+        for kind, reader in directions_read(self.law, self.loads).items():
             given = getattr(self, kind)
             if given is None:
-                if asked:
-                    raise InputError(f"scene '{self.name}': law '{self.law.name}' needs {kind}")
+                if reader is not None:
+                    raise InputError(f"scene '{self.name}': {reader} needs {kind}")
                 continue
-            if not asked:
+            if reader is None:
                 raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no {kind}")
             with self._named():
                 object.__setattr__(self, kind, checked_directions(given, self.mesh, kind))
-        if self.angles and self.fibres is None:
-            raise InputError(f"scene '{self.name}': fibre angles turn fibres, and it has none")
         with self._named():
-            checked = tuple(angles.checked(self.mesh) for angles in self.angles)
-            object.__setattr__(self, "angles", checked)
-        if self.fibres is not None and self.sheets is not None:
-            with self._named():
+            angles = checked_angles(self.angles, self.mesh, self.fibres, self.loads)
+            object.__setattr__(self, "angles", angles)
+            if self.fibres is not None and self.sheets is not None:
                 check_across(self._at_points(self.sheets), self.fibres_at_points)
 
     def _check_supports(self) -> None:
@@ -235,6 +232,11 @@ class Scene(Shown):
             raise InputError(f"scene '{self.name}' has no fibres")
         return self._at_points(self.fibres)
 
+    def fibres_at(self, theta: jax.Array) -> jax.Array:
+        """Unit fibre directions (m, q, 3) at ``theta`` (p,); of a scene with fibres."""
+        given = Tissue(jnp.asarray(self.fibres_at_points))
+        return cast(Any, turned(given, self.angles, self.resolve(theta)).directions)
+
     def tissue_at(self, theta: jax.Array) -> Tissue:
         """Material data at ``theta`` (p,), stacked over elements and points, (m, q, ...)."""
         return turned(self._tissue, self.angles, self.resolve(theta))
@@ -248,14 +250,14 @@ class Scene(Shown):
     @cached_property
     def _tissue(self) -> Tissue:
         directions = region = None
-        if self.fibres is not None:
+        if self.law.fibres:
             directions = self.fibres_at_points
         if self.fibres is not None and self.sheets is not None:
             directions = np.stack([self.fibres_at_points, self._at_points(self.sheets)], axis=2)
         if self.regions is not None:
             points = len(quadrature_points(self.mesh.order))
-            index = np.unique(self.regions, return_inverse=True)[1]
-            region = np.broadcast_to(index[:, None], (len(index), points))
+            index = np.unique(self.regions, return_inverse=True)[1][:, None]
+            region = np.broadcast_to(index, (len(index), points))
         # NumPy arrays: JAX arrays made inside jit would be tracers, and this is cached.
         return Tissue(cast(Any, directions), cast(Any, region))
 
@@ -307,8 +309,7 @@ class Scene(Shown):
         order = "linear" if mesh.order == 1 else "quadratic"
         if (mesh.order, self.dilatation) != (1, "pointwise"):
             order = f"{order}, {self.dilatation} dilatation"
-        kinds = (", ".join(part.kind for part in parts) for parts in (self.loads, self.supports))
-        loads, supports = kinds
+        loads, supports = (", ".join(p.kind for p in all_) for all_ in (self.loads, self.supports))
         ranges = [f"{p.name} {p.low:.4g} to {p.high:.4g} {p.unit}".strip() for p in self.parameters]
         return f"Scene '{self.name}'", [
             ("mesh", f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra, {order}"),

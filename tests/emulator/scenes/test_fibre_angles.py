@@ -15,9 +15,11 @@ from emulator.fem.energy import potential_energy
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.effects import effects_of
 from emulator.scenes.fibre_angles import FibreAngles
 from emulator.scenes.fibre_rules import Helix, Uniform
 from emulator.scenes.finer import finer
+from emulator.scenes.loads import ActiveTension
 from scene_file_support import HEART
 
 KNOWN = {"a": 0.3, "b": 2.0, "a_f": 5.0, "b_f": 2.0, "pressure": 0.9}
@@ -150,3 +152,15 @@ def test_from_a_file(tmp_path):
     (tmp_path / "heart.toml").write_text(text)
     with pytest.raises(InputError, match="needs 'inner'"):
         find_scene(str(tmp_path / "heart.toml"))
+
+
+def test_without_fibres_angles_are_left_out(turning):
+    for name, effect in effects_of(turning).items():
+        without = effect.without
+        assert bool(without.angles) == (without.fibres is not None), name
+        assert ("inner" in without.parameter_names) == bool(without.angles), name
+
+
+def test_a_load_along_fibres_that_turn_is_refused(turning):
+    with pytest.raises(InputError, match="'active_tension' acts along fibres that theta turns"):
+        replace(turning, loads=(*turning.loads, ActiveTension(10.0)))

@@ -17,7 +17,14 @@ from emulator.geometry.fibres import (
 )
 from emulator.geometry.io import write_mesh
 from emulator.scenes import Parameter, file
-from emulator.scenes.loads import FollowerPressure, Force, Gravity, PublishedPressure, Traction
+from emulator.scenes.loads import (
+    ActiveTension,
+    FollowerPressure,
+    Force,
+    Gravity,
+    PublishedPressure,
+    Traction,
+)
 from emulator.scenes.supports import ElasticSupport
 from scene_file_support import HEART, SCENE
 
@@ -105,6 +112,16 @@ def test_a_scene_from_a_file(folder):
             "[constants]",
             "[fibres]\nrule = 'uniform'\ndirection = [1, 0, 0]\n[constants]",
             "law 'neo_hookean' takes no fibres",
+        ),
+        (
+            "[constants]",
+            "[[loads]]\nkind = 'active_tension'\ntension = 5.0\n[constants]",
+            "load 'active_tension' needs fibres, and mesh file block.vtu has none; give it cell",
+        ),
+        (
+            "[constants]",
+            "[[loads]]\nkind = 'active_tension'\ntension = -5.0\n[constants]",
+            "tension is -5.0 kPa; it must be 0 or more",
         ),
         (
             "[constants]",
@@ -264,6 +281,20 @@ def test_pressures_as_parameters_and_other_rules_for_fibres(folder):
         else:
             expected = biventricular_directions(scene.mesh, (60.0, -60.0)).fibres
             np.testing.assert_allclose(scene.fibres, expected)
+
+
+def test_muscle_of_a_law_without_fibres(folder):
+    text = (folder / "scene.toml").read_text()
+    active = "[[loads]]\nkind = 'active_tension'\nparameter = 'contractility'\ntransverse = 0.1\n"
+    varied = "[parameters.contractility]\nunit = 'kPa'\nrange = [0.0, 60.0]\n"
+    rule = "[fibres]\nrule = 'uniform'\ndirection = [0, 0, 2]\n"
+    file = folder / "muscle.toml"
+    file.write_text(text.replace("[constants]", active + varied + rule + "[constants]"))
+    scene = find_scene(str(file))
+    assert scene.loads[-1] == ActiveTension(parameter="contractility", transverse=0.1)
+    assert scene.load_parameters == ("contractility",)
+    np.testing.assert_array_equal(scene.fibres_at_points[..., 2], 1.0)
+    assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
 
 
 def test_unknown_names(tmp_path):
