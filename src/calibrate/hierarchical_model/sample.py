@@ -130,15 +130,13 @@ def _information(
     data: Mapping[str, Data],
 ) -> Information:
     """What each member's data says, from its posterior alone and its prior."""
-    rows = []
-    for i, (member, own) in enumerate(model.members.items()):
+    rows, priors = [], {}
+    for member, own in model.members.items():
         draws = _on_scales(model, alone[member])
-        if member in data:
-            key = jax.random.fold_in(jax.random.key(i), _OF_PRIOR)
-            prior = _on_scales(model, own.prior_draws(key, _PRIOR_DRAWS))
-        else:
-            prior = draws
-        rows.append(information_of(draws, prior))
+        if member in data and id(own) not in priors:
+            key = jax.random.fold_in(jax.random.key(0), _OF_PRIOR)
+            priors[id(own)] = _on_scales(model, own.prior_draws(key, _PRIOR_DRAWS))
+        rows.append(information_of(draws, priors[id(own)] if member in data else draws))
     return Information(*(jnp.stack(column) for column in zip(*rows, strict=True)))
 
 
