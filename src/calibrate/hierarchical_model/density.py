@@ -48,10 +48,12 @@ class HierarchicalDensity(NamedTuple):
     """A log density on real coordinates; see :class:`calibrate.samplers.density.Target`.
 
     constrain : (z (s, p), information) -> population, scores (s, n, k), own unknowns by site (s,).
+    values : (*population (s, ...), scores (s, ..., k)) -> shared unknowns by name (s, ...).
     """
 
     log_density: Callable[[jax.Array, Observed], jax.Array]
     constrain: Callable[[jax.Array, Information], tuple[Population, jax.Array, dict[str, Any]]]
+    values: Callable[..., dict[str, jax.Array]]
     dimension: int
     at_once: int
 
@@ -104,6 +106,7 @@ def density_of_hierarchy(model: HierarchicalModel) -> HierarchicalDensity:
     return HierarchicalDensity(
         log_density,
         jax.jit(jax.vmap(constrain, in_axes=(0, None))),
+        jax.jit(jax.vmap(model.shared_values)),
         int(np.size(flat)),
         min(threads_for(member.forward) for member in model.members.values()),
     )

@@ -31,7 +31,7 @@ proportional to :math:`\det(R)^{\eta - 1}`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -147,7 +147,7 @@ def _log_likelihoods(
 def hierarchical_model(
     members: Mapping[str, Model],
     *,
-    shared: tuple[str, ...] | None = None,
+    shared: Sequence[str] | None = None,
     median: Mapping[str, dist.Distribution] | None = None,
     spread: Mapping[str, dist.Distribution | float] | None = None,
     eta: float = 2.0,

@@ -24,7 +24,7 @@ from emulator.store import write_netcdf
 
 
 class Shrinkage(NamedTuple):
-    """A member's unknown by its own data alone and among the others: mean and sd of each."""
+    """Mean and sd of a member's unknown: alone, under its model's prior, and with the others."""
 
     alone_mean: float
     alone_sd: float

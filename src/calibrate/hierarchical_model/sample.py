@@ -21,12 +21,15 @@ from calibrate.hierarchical_model.tree import ALONE, make_tree, tree_of_alone
 from calibrate.posterior import sample
 from calibrate.posterior.posterior import describe_distribution
 from calibrate.provenance import versions
-from calibrate.samplers import NUTSOptions
+from calibrate.samplers import NUTSOptions, check_options
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
 
 _PRIOR_DRAWS = 2000
+# The spread of few members reaches towards 0, where steps have to be short (docs/experiments.md,
+# "Members of one population").
+_TARGET_ACCEPT = 0.98
 _NEW, _OF_PRIOR = 0x9E3779B9, 0x85EBCA6B  # keep these keys apart from the sampler's
 
 Members = Mapping[str, tuple[Model, Any]]
@@ -56,21 +59,22 @@ def hierarchy(
     spread : prior of the population's sd, of the logarithm where the scene's scale is logarithmic;
         a number is the scale of a half-normal.
     eta : of the prior of correlations; 1 is uniform, more prefers none.
-    options : of NUTS, for all members together.
+    options : of NUTS, for all members together; by default its own, with target_accept 0.98.
     alone : sampler of each member alone, for comparison and for good coordinates; ``laplace`` is
         cheap and as good for the latter.
 
     Raises
     ------
     InputError
-        Members that do not fit each other, or data that does not fit a member.
+        Members that do not fit each other, data that does not fit a member, an unknown sampler or
+        the options of another.
     """
     fitting = {
         m: (model, None) if y is None else model.given(y) for m, (model, y) in members.items()
     }
     model = hierarchical_model(
         {member: model for member, (model, _) in fitting.items()},
-        shared=None if shared is None else tuple(shared),
+        shared=shared,
         median=median,
         spread=spread,
         eta=eta,
@@ -89,7 +93,7 @@ def sample_hierarchy(
     progress: bool = False,
 ) -> Hierarchy:
     """The posterior of ``model`` given ``data`` by member, checked before."""
-    options = NUTSOptions() if options is None else options
+    options = check_options(NUTS, options or NUTSOptions(target_accept=_TARGET_ACCEPT))
     by_member = _alone(model, data, alone, seed, progress=progress)
     information = _information(model, by_member, data)
     density = density_of_hierarchy(model)
@@ -130,15 +134,13 @@ def _information(
     data: Mapping[str, Data],
 ) -> Information:
     """What each member's data says, from its posterior alone and its prior."""
-    rows = []
-    for i, (member, own) in enumerate(model.members.items()):
+    rows, priors = [], {}
+    for member, own in model.members.items():
         draws = _on_scales(model, alone[member])
-        if member in data:
-            key = jax.random.fold_in(jax.random.key(i), _OF_PRIOR)
-            prior = _on_scales(model, own.prior_draws(key, _PRIOR_DRAWS))
-        else:
-            prior = draws
-        rows.append(information_of(draws, prior))
+        if member in data and id(own) not in priors:
+            key = jax.random.fold_in(jax.random.key(0), _OF_PRIOR)
+            priors[id(own)] = _on_scales(model, own.prior_draws(key, _PRIOR_DRAWS))
+        rows.append(information_of(draws, priors[id(own)] if member in data else draws))
     return Information(*(jnp.stack(column) for column in zip(*rows, strict=True)))
 
 

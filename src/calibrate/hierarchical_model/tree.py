@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from calibrate.arviz import base
-from calibrate.hierarchical_model.density import Population
+from calibrate.hierarchical_model.density import Population, density_of_hierarchy
 from calibrate.hierarchical_model.model import MEDIAN, SD, HierarchicalModel
 
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
@@ -31,7 +31,7 @@ def make_tree(
     """
     population, scores, own = drawn
     new = jax.random.normal(rng_key, (len(scores), scores.shape[-1]))
-    values = jax.jit(jax.vmap(model.shared_values))
+    values = density_of_hierarchy(model).values
     correlation = np.einsum("...ik,...jk->...ij", population.factor, population.factor)
     posterior = {
         MEDIAN: population.median,

@@ -71,8 +71,8 @@ def calibrated(beam, members, replicates, options, **more):
 
 
 def test_a_population_of_one_parameter_is_calibrated(beam):
-    options = NUTSOptions(warmup=200, draws=200, chains=2, rounds=1)
-    found = calibrated(beam, 3, 20, options, known={"lam": 75.0})
+    options = NUTSOptions(warmup=150, draws=150, chains=2, rounds=1)
+    found = calibrated(beam, 2, 20, options, known={"lam": 75.0})
     assert found.passed, found.outside()
 
 

@@ -170,6 +170,14 @@ def test_it_is_kept_in_a_file(found, tmp_path):
     assert again.shrinkage() == found.shrinkage()
 
 
+def test_its_figure_has_a_panel_a_parameter(found, tmp_path):
+    pytest.importorskip("matplotlib", reason="figures need matplotlib")
+    from calibrate.figures import shrinkage
+
+    shrinkage.draw(found, tmp_path / "members.png")
+    assert (tmp_path / "members.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_a_file_of_something_else_is_refused(tmp_path, beam):
     model = model_of(beam)
     options = NUTSOptions(warmup=20, draws=20, chains=1, rounds=1)
@@ -184,6 +192,9 @@ def test_a_file_of_something_else_is_refused(tmp_path, beam):
     [
         ({"shared": ("mu", "a_f")}, "member 'one' does not infer 'a_f'; it infers mu, lam"),
         ({"shared": ()}, "shared is (); give one or more names, each once"),
+        ({"shared": "mu"}, "shared is 'mu'; give one or more names, each once"),
+        ({"alone": "luck"}, "sampler 'luck' is unknown"),
+        ({"options": 3}, "sampler 'nuts' takes NUTSOptions, not int"),
         ({"eta": 0.0}, "eta is 0.0; it must be above 0"),
         ({"spread": {"mu": -1.0}}, "spread of 'mu' is -1.0; give a number above 0"),
         ({"spread": {"kappa": 1.0}}, "spread of 'kappa'; shared: mu, lam"),
