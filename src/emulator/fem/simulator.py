@@ -1,18 +1,12 @@
-r"""The FEM simulator: theta to displacement, differentiable through the equilibrium it solves.
+"""The FEM simulator: theta to displacement, differentiable through the equilibrium it solves.
 
-At equilibrium :math:`r(u(\theta), \theta) = 0`, so
-
-.. math::
-    K\, \frac{\partial u}{\partial \theta} = -\frac{\partial r}{\partial \theta}
-
-(where free; the derivative of r has what the supports pull, where theta moves them)
-gives forward derivatives by one more solve with the tangent, and reverse ones by its transpose.
+Derivatives are those of the equilibrium (:mod:`emulator.fem.implicit`), not of the iterations.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +14,8 @@ import numpy as np
 
 from emulator._precision import require_float64
 from emulator.errors import InputError, SolverError
-from emulator.fem.continuation import find_equilibrium
+from emulator.fem.implicit import Found, derivatives, differentiable
 from emulator.fem.linear import Outcome, find_solver
-from emulator.fem.loop import compiled, jit, one_by_one
 from emulator.fem.options import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
@@ -145,7 +138,7 @@ class Simulator(Shown):
             The tangent is singular.
         """
         theta, u = self._checked(theta, u, "displacement")
-        found = _columns(self.system, self.tangent(u, theta), u, theta)
+        found = derivatives(self.system, self.tangent(u, theta), u, theta)
         if not isinstance(found, jax.core.Tracer) and not np.isfinite(found).all():
             raise SolverError(
                 f"scene '{self.scene.name}': the equilibrium has no derivatives: singular tangent"
@@ -225,59 +218,8 @@ class Simulator(Shown):
         return solution.require_converged().displacement
 
     @cached_property
-    def _equilibrium(self):  # noqa: ANN202 - closures, private
-        find = partial(find_equilibrium, self.system, self.options)
-        alone = one_by_one(find)
-
-        @jit
-        def closed(theta: jax.Array, start: jax.Array) -> Solution:
-            return alone(theta, start)
-
-        @jax.custom_jvp
-        def equilibrium(theta: jax.Array, start: jax.Array) -> Solution:
-            traced = any(isinstance(x, jax.core.Tracer) for x in (theta, start))
-            stepwise = self.system.stepwise and not traced
-            found = (find if stepwise else closed)(theta, start)
-            return found if traced else jax.block_until_ready(found)
-
-        @equilibrium.defjvp
-        def derivative(primals, tangents):  # noqa: ANN001, ANN202
-            theta, start = primals
-            solution = equilibrium(theta, start)
-            u = solution.displacement
-            moved = _moved(self.system, self.tangent(u, theta), u, theta, tangents[0])
-            return solution, _inert(solution)._replace(displacement=moved)
-
-        return equilibrium
-
-
-@compiled
-def _moved(
-    system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
-) -> jax.Array:
-    """Derivative (n, 3) of the equilibrium ``u`` along ``direction`` (p,) in theta."""
-    _, (force, held) = jax.jvp(system.moved_supports(u), (theta,), (direction,))
-    return held + system.extend(-system.solve(tangent, force))
-
-
-@compiled
-def _columns(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array) -> jax.Array:
-    """Derivatives (p, n, 3) of the equilibrium ``u`` along each entry of theta."""
-    forces, held = jax.jacfwd(system.moved_supports(u))(theta)
-    moved = jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
-    return moved + jnp.moveaxis(held, -1, 0)
-
-
-def _inert(solution: Solution) -> Solution:
-    """Zero tangents of a solution: float0 for its integers."""
-    return jax.tree.map(
-        lambda x: (
-            jnp.zeros_like(x)
-            if jnp.issubdtype(x.dtype, jnp.floating)
-            else jnp.zeros(x.shape, dtype=jax.dtypes.float0)
-        ),
-        solution,
-    )
+    def _equilibrium(self) -> Found:
+        return differentiable(self.system, self.options)
 
 
 @jax.jit

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -63,6 +64,8 @@ class System:
 
     scene: Scene
     factorisation: str = "suitesparse"
+
+    inverse: ClassVar[bool] = False  # whether the mesh is the loaded shape, and rest is sought
 
     @property
     def direct(self) -> Direct:
