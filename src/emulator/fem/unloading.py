@@ -10,10 +10,8 @@ in theta, whichever method found it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +22,7 @@ from emulator.errors import InputError, SolverError, look_up
 from emulator.fem.balance import relative_residual
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.fixed_point import find_by_loading
-from emulator.fem.implicit import Found, derivatives, differentiable
+from emulator.fem.implicit import Find, Found, derivatives, differentiable
 from emulator.fem.inverse import InverseSystem
 from emulator.fem.linear import find_solver
 from emulator.fem.loop import compiled
@@ -102,8 +100,8 @@ class Unloader:
     Parameters
     ----------
     scene : its mesh, and the directions of its tissue, are those under load.
-    method : ``inverse`` or ``fixed_point``. Where ``inverse`` fails, and theta is numbers,
-        ``fixed_point`` is tried.
+    method : ``inverse`` or ``fixed_point``; by default the former, which needs a tenth of the
+        factorisations and finds every shape that the other does (docs/experiments.md, "Unloading").
     options : controls of Newton's method.
     factorisation : as for a :class:`~emulator.fem.simulator.Simulator`.
 
@@ -118,11 +116,9 @@ class Unloader:
     options: NewtonOptions = field(default_factory=NewtonOptions)
     factorisation: str = "suitesparse"
 
-    METHODS: ClassVar[tuple[str, ...]] = ("inverse", "fixed_point")
-
     def __post_init__(self) -> None:
         find_solver(self.factorisation)
-        look_up(dict.fromkeys(self.METHODS), self.method, "method of unloading")
+        look_up(METHODS, self.method, "method of unloading")
         if self.scene.prescribed.moves:
             raise InputError(
                 f"scene '{self.scene.name}': a support moves the body, so that its mesh is not "
@@ -156,12 +152,7 @@ class Unloader:
                 f"{(len(self.scene.parameters),)}"
             )
         nowhere = jnp.zeros(self.scene.held.shape)
-        found = self._by(self.method)(theta, nowhere)
-        fails = not isinstance(found.status, jax.core.Tracer) and not bool(found.converged)
-        if fails and self.method != "fixed_point" and np.isfinite(theta).all():
-            again = self._by("fixed_point")(theta, nowhere)
-            found = again if bool(again.converged) else found
-        return Unloaded(*found, loaded=self.scene)
+        return Unloaded(*self._found(theta, nowhere), loaded=self.scene)
 
     def sensitivities(self, unloaded: Unloaded, theta: jax.Array) -> jax.Array:
         """Derivatives (p, n, 3) of ``unloaded.displacement`` in each entry of ``theta`` (p,).
@@ -183,14 +174,8 @@ class Unloader:
         return found
 
     @cached_property
-    def _found(self) -> dict[str, Found]:
-        return {}
-
-    def _by(self, method: str) -> Found:
-        if method not in self._found:
-            find = _by_inverse_motion if method == "inverse" else _by_loading
-            self._found[method] = differentiable(self.system, self.options, find)
-        return self._found[method]
+    def _found(self) -> Found:
+        return differentiable(self.system, self.options, METHODS[self.method])
 
 
 def unload(
@@ -243,6 +228,10 @@ def _upright(system: System, found: Solution) -> Solution:
     wrong = (found.status == Status.CONVERGED) & ~(least > 0.0)
     status = jnp.where(wrong, Status.INVERTED_ELEMENT, found.status)
     return found._replace(status=status.astype(found.status.dtype))
+
+
+METHODS: dict[str, Find] = {"inverse": _by_inverse_motion, "fixed_point": _by_loading}
+"""Ways to the stress-free shape, by name."""
 
 
 @compiled
