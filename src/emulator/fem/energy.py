@@ -39,6 +39,15 @@ from emulator.scenes.scene import Scene
 Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
 
+def require_rest(scene: Scene) -> None:
+    """Raise :class:`InputError` for a scene whose mesh is the shape under load."""
+    if scene.loaded_by:
+        raise InputError(
+            f"scene '{scene.name}' is known under load (loaded_by), and this needs a scene at "
+            "rest: use FEM's displacements, or unload the scene"
+        )
+
+
 def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
     """``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
     local = u[scene.discretisation.connectivity]
@@ -54,6 +63,7 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
 
 def strain_law(scene: Scene, theta: jax.Array) -> Callable:
     """``W(strain, tissue)`` in kPa, from the strain at one point, at ``theta`` (p,)."""
+    require_rest(scene)
     values, law = scene.resolve(theta), scene.law
     scale = factors(scene.regions, values)
 
@@ -249,6 +259,7 @@ def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
     InputError
         A load of the scene has no potential.
     """
+    require_rest(scene)
     for load in scene.loads:
         if not load.has_potential:
             raise InputError(

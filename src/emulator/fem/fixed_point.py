@@ -41,7 +41,7 @@ class _State(NamedTuple):
     """Where the iteration stands.
 
     w, u : (n, 3) mm; u loads x + w. missed : R, (n, 3) mm, of the last correction. relaxation : (),
-    its beta. count : corrections. iterations, factorisations : of the solves. status : a
+    its beta. corrections : so far. iterations, factorisations : of the solves. status : a
     :class:`Status`.
     """
 
@@ -49,7 +49,7 @@ class _State(NamedTuple):
     u: jax.Array
     missed: jax.Array
     relaxation: jax.Array
-    count: jax.Array
+    corrections: jax.Array
     iterations: jax.Array
     factorisations: jax.Array
     status: jax.Array
@@ -76,7 +76,7 @@ def find_by_loading(
             lambda part: floor < system.least_volume_ratio(state.w + part * move), _SHORTEST
         )
         met = jnp.max(jnp.abs(missed)) <= enough
-        status = jnp.where(state.count + 1 >= _MOST, Status.ITERATION_LIMIT, Status.RUNNING)
+        status = jnp.where(state.corrections + 1 >= _MOST, Status.ITERATION_LIMIT, Status.RUNNING)
         status = jnp.where(fraction > 0.0, status, Status.INVERTED_ELEMENT)
         status = jnp.where(met, Status.CONVERGED, status)
         status = jnp.where(solved, status, loaded.status)
@@ -86,7 +86,7 @@ def find_by_loading(
             u=loaded.displacement,
             missed=missed,
             relaxation=relaxation,
-            count=state.count + 1,
+            corrections=state.corrections + 1,
             iterations=state.iterations + loaded.iterations,
             factorisations=state.factorisations + loaded.factorisations,
             status=jnp.asarray(status, dtype=jnp.int64),
@@ -115,4 +115,4 @@ def _aitken(state: _State, missed: jax.Array) -> jax.Array:
     change = missed - state.missed
     size = jnp.sum(change**2)
     found = -state.relaxation * jnp.vdot(state.missed, change) / jnp.where(size > 0.0, size, 1.0)
-    return jnp.where(state.count > 0, jnp.clip(found, *_RELAXATION), 1.0)
+    return jnp.where(state.corrections > 0, jnp.clip(found, *_RELAXATION), 1.0)

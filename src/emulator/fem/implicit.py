@@ -56,7 +56,7 @@ def differentiable(
         u = solution.displacement
         tangent = system.safe_tangent(u, theta, 1.0)[0]
         moved = _moved(system, tangent, u, theta, tangents[0])
-        return solution, _inert(solution)._replace(displacement=moved)
+        return solution, inert(solution)._replace(displacement=moved)
 
     return solution_at
 
@@ -78,7 +78,7 @@ def derivatives(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Arr
     return moved + jnp.moveaxis(held, -1, 0)
 
 
-def _inert(solution: Solution) -> Solution:
+def inert(solution: Solution) -> Solution:
     """Zero tangents of a solution: float0 for its integers."""
     return jax.tree.map(
         lambda x: (

@@ -11,8 +11,8 @@ Directions m of the loaded tissue are carried back as material lines, :math:`f_0
 Sheets are carried back likewise and then turned to be orthogonal to the fibres, in the plane of
 both: laws are written for orthogonal ones.
 
-A law is a function of strain measures, :math:`W = \varphi(\xi)` (:mod:`emulator.mechanics.measures`),
-so with :math:`B_k = (\partial\xi_k/\partial F)\, F^T`
+A law is a function of strain measures, :math:`W = \varphi(\xi)`
+(:mod:`emulator.mechanics.measures`), so with :math:`B_k = (\partial\xi_k/\partial F)\, F^T`
 
 .. math::
     \tau = \sum_k s_k B_k, \quad s = \varphi'(\xi), \qquad
@@ -34,7 +34,6 @@ from emulator.fem.energy import point_energy, with_volume_change
 from emulator.fem.material_point import MaterialPoint
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.mechanics.measures import measures_read
-from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
 
 Seen = Callable[..., tuple[jax.Array, jax.Array | None]]

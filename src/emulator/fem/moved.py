@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -86,8 +87,8 @@ def moved_system(system: System, w: jax.Array) -> System:
     return there
 
 
-def _at(blocks: Blocks, h: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Gradients (b, q, a, 3) and weights (b, q) at x + w, ``h`` (b, q, 3, 3)."""
+def _at(blocks: Blocks, h: jax.Array) -> tuple[Any, Any]:
+    """Gradients (b, q, a, 3) and weights (b, q) at x + w, ``h`` (b, q, 3, 3); traced arrays."""
     f = h + jnp.eye(3, dtype=h.dtype)
     det = jax.vmap(jax.vmap(determinant))(f)
     inverse_transposed = jax.vmap(jax.vmap(cofactor))(f) / det[..., None, None]

@@ -16,6 +16,7 @@ from emulator._precision import require_float64
 from emulator.errors import InputError, SolverError
 from emulator.fem.implicit import Found, derivatives, differentiable
 from emulator.fem.linear import Outcome, find_solver
+from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.options import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
@@ -47,6 +48,8 @@ class Simulator(Shown):
 
     def __post_init__(self) -> None:
         find_solver(self.factorisation)
+        if self.scene.loaded_by:
+            self._loaded.unloader  # noqa: B018 - what cannot be unloaded is named first
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """What it simulates and how."""
@@ -63,6 +66,15 @@ class Simulator(Shown):
     @cached_property
     def _balanced(self) -> System:
         return System(balanced(self.scene))
+
+    @cached_property
+    def _loaded(self) -> LoadedEquilibrium:
+        return LoadedEquilibrium(self.scene, self.options, self.factorisation)
+
+    @property
+    def stepwise(self) -> bool:
+        """Whether solves are better taken step by step from Python."""
+        return not self.scene.loaded_by and self.system.stepwise
 
     @property
     def rest(self) -> jax.Array:
@@ -83,6 +95,9 @@ class Simulator(Shown):
         elsewhere with other load steps. ``NewtonOptions.load_steps`` follows the path in small
         steps, whatever the start.
 
+        Of a scene whose mesh is loaded, the displacement is that from the mesh, and rest the
+        unloaded shape, which is found first (:mod:`emulator.fem.loaded`).
+
         The displacement is differentiable in ``theta``. Never raises on a hard case: read
         ``status``. ``vmap`` solves one theta after the other.
 
@@ -92,6 +107,9 @@ class Simulator(Shown):
             ``theta`` or ``start`` has the wrong shape, or float64 is off.
         """
         require_float64("FEM")
+        if self.scene.loaded_by:
+            theta, place = self._checked(theta, self.rest if start is None else start)
+            return self._loaded.solve(theta, None if start is None else place)
         theta, start = self._checked(theta, self.rest if start is None else start)
         return self._equilibrium(theta, jax.lax.stop_gradient(start))
 
@@ -138,7 +156,10 @@ class Simulator(Shown):
             The tangent is singular.
         """
         theta, u = self._checked(theta, u, "displacement")
-        found = derivatives(self.system, self.tangent(u, theta), u, theta)
+        if self.scene.loaded_by:
+            found = self._loaded.sensitivities(u, theta)
+        else:
+            found = derivatives(self.system, self.tangent(u, theta), u, theta)
         if not isinstance(found, jax.core.Tracer) and not np.isfinite(found).all():
             raise SolverError(
                 f"scene '{self.scene.name}': the equilibrium has no derivatives: singular tangent"

@@ -32,6 +32,7 @@ from emulator.fem.energy import (
     local_forces,
     local_terms,
     pair_products,
+    require_rest,
     seen_by_law,
     spring_terms,
     strain_energy,
@@ -66,6 +67,9 @@ class System:
     factorisation: str = "suitesparse"
 
     inverse: ClassVar[bool] = False  # whether the mesh is the loaded shape, and rest is sought
+
+    def __post_init__(self) -> None:
+        require_rest(self.scene)
 
     @property
     def direct(self) -> Direct:

@@ -21,6 +21,7 @@ from emulator._precision import require_float64
 from emulator.errors import InputError, SolverError, look_up
 from emulator.fem.balance import relative_residual
 from emulator.fem.continuation import find_equilibrium
+from emulator.fem.energy import require_rest
 from emulator.fem.fixed_point import find_by_loading
 from emulator.fem.implicit import Find, Found, derivatives, differentiable
 from emulator.fem.inverse import InverseSystem
@@ -32,8 +33,6 @@ from emulator.fem.solution import Solution, Status
 from emulator.fem.system import System
 from emulator.mechanics.kinematics import determinant
 from emulator.scenes.scene import Scene
-
-
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +118,7 @@ class Unloader:
     def __post_init__(self) -> None:
         find_solver(self.factorisation)
         look_up(METHODS, self.method, "method of unloading")
+        require_rest(self.scene)
         if self.scene.prescribed.moves:
             raise InputError(
                 f"scene '{self.scene.name}': a support moves the body, so that its mesh is not "

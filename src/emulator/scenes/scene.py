@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -27,10 +27,11 @@ from emulator.geometry.patches import patchwise
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.dilatation import Dilatation, check_dilatation
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
-from emulator.scenes.owners import Owners, check_given, owners_of
+from emulator.scenes.owners import Owners, check_given, check_image, owners_of
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.regions import Tissue, checked_regions
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
@@ -68,6 +69,10 @@ class Scene(Shown):
         volumetric part; see :mod:`emulator.scenes.regions`.
     fibre_rule : what made the directions of this mesh, for another mesh of the body
         (:mod:`emulator.scenes.finer`).
+    loaded_by : empty where the mesh is at rest. Where it is the loaded shape of an image: for every
+        load parameter of theta the name of the parameter or constant that holds its value there,
+        ``{"pressure": "imaged"}``. A simulator then unloads and loads
+        (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
     """
 
     name: str
@@ -79,19 +84,22 @@ class Scene(Shown):
     constants: Mapping[str, float] = field(default_factory=dict)
     fibres: np.ndarray | None = None
     origin: Mapping[str, Any] = field(default_factory=dict)
-    dilatation: Literal["pointwise", "mean", "patch"] = "pointwise"
+    dilatation: Dilatation = "pointwise"
     sheets: np.ndarray | None = None
     regions: np.ndarray | None = None
     fibre_rule: FibreRule | None = None
+    loaded_by: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "origin", MappingProxyType(dict(self.origin)))
+        object.__setattr__(self, "loaded_by", MappingProxyType(dict(self.loaded_by)))
         self._check_regions()
         with self._named():
             check_given(self._owners, self.law, self.parameters, self.constants)
         self._check_directions()
-        self._check_dilatation()
+        with self._named():
+            check_dilatation(self.dilatation, self.mesh.order)
         if not self.parameters:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
         self._check_supports()
@@ -130,23 +138,6 @@ class Scene(Shown):
                     f"scene '{self.name}': sheets are not across the fibres (cosine {along:.2g})"
                 )
 
-    def _check_dilatation(self) -> None:
-        if self.dilatation not in ("pointwise", "mean", "patch"):
-            raise InputError(
-                f"scene '{self.name}': dilatation '{self.dilatation}'; use pointwise or mean, "
-                "or patch on linear tetrahedra"
-            )
-        if self.dilatation == "mean" and self.mesh.order == 1:
-            raise InputError(
-                f"scene '{self.name}': mean dilatation on linear tetrahedra changes nothing, "
-                "they have one point each; make the mesh quadratic, or write dilatation 'patch'"
-            )
-        if self.dilatation == "patch" and self.mesh.order == 2:
-            raise InputError(
-                f"scene '{self.name}': patch dilatation is for linear tetrahedra; on quadratic "
-                "ones write dilatation 'mean'"
-            )
-
     def _check_supports(self) -> None:
         if not self.supports:
             raise InputError(f"scene '{self.name}': no support, the body could move freely")
@@ -161,6 +152,8 @@ class Scene(Shown):
         moved = sum((np.abs(each) for each in per_unit.values()), np.abs(fixed))
         for load in self.loads:
             load.check(self.mesh, self.held, moved)
+        with self._named():
+            check_image(self.loaded_by, self.load_parameters)
 
     @property
     def parts(self) -> tuple[Load | BoundaryCondition, ...]:
@@ -174,7 +167,7 @@ class Scene(Shown):
 
     @property
     def _owners(self) -> Owners:
-        return owners_of(self.law, self.regions, self.loads, self.supports)
+        return owners_of(self.law, self.regions, self.loads, self.supports, self.loaded_by)
 
     @cached_property
     def space(self) -> ParameterSpace:
@@ -332,6 +325,8 @@ class Scene(Shown):
             "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
             "dilatation": self.dilatation,
         }
+        if self.loaded_by:  # fingerprints of scenes at rest are older
+            description["loaded_by"] = dict(self.loaded_by)
         held, fixed, per_unit = self.prescribed
         moved = {f"displacement per unit of {name}": each for name, each in per_unit.items()}
         return identity_of(

@@ -71,7 +71,9 @@ def ventricle(law="holzapfel_ogden", order=1, dilatation="pointwise"):
         name="ventricle",
         mesh=mesh,
         law=law,
-        parameters=(em.Parameter(name, law.quantities[0].unit, 0.5 * values[name], 2 * values[name]),),
+        parameters=(
+            em.Parameter(name, law.quantities[0].unit, 0.5 * values[name], 2 * values[name]),
+        ),
         constants={**{k: v for k, v in values.items() if k != name}, "pressure": 1.0},
         loads=(CavityPressure("endocardium"),),
         supports=(em.Support("base"),),

@@ -127,7 +127,7 @@ PART = jnp.array([0.3, -0.2, 0.5, 0.1, -0.4])  # of theta, a direction
 
 def test_derivatives_are_those_of_the_shape(unloader, ventricle):
     theta = ventricle.centre
-    way = lambda theta: unloader.solve(theta).displacement  # noqa: E731
+    way = lambda theta: unloader.solve(theta).displacement
     difference, size = differences(way, theta, PART * theta)
     along = jax.jvp(way, (theta,), (PART * theta,))[1]
     np.testing.assert_allclose(along, difference, atol=1e-6 * size)
@@ -153,7 +153,7 @@ def test_derivatives_with_mean_dilatation_and_of_the_fixed_point():
     theta = scene.centre
     for method, close in (("inverse", 1e-6), ("fixed_point", 1e-4)):
         unloader = em.Unloader(scene, method)
-        way = lambda theta: unloader.solve(theta).displacement  # noqa: B023, E731
+        way = lambda theta: unloader.solve(theta).displacement  # noqa: B023
         difference, size = differences(way, theta, PART * theta)
         along = jax.jvp(way, (theta,), (PART * theta,))[1]
         np.testing.assert_allclose(along, difference, atol=close * size)

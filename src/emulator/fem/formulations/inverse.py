@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.formulations.protocol import Linearised, Nearer
-from emulator.fem.inverse import Condensed, Volumes, advance, carried, consistent, linearise
+from emulator.fem.inverse_blocks import Couplings, Volumes, advance, carried, consistent, linearise
 from emulator.fem.loop import compiled, cond
 from emulator.fem.state import NewtonState
 from emulator.fem.system import System
@@ -64,7 +64,8 @@ class Inverse:
         condensed = linearise(system.scene, u, volumes, theta)
         residual = system.scatter(condensed.force) + system.others(u, theta, level)
         tangent, solvable, pull = system.equations(condensed.tangent, u, theta, level, level)
-        return Linearised(tangent, solvable, system.restrict(residual), pull, condensed)
+        at = condensed.couplings
+        return Linearised(tangent, solvable, system.restrict(residual), pull, at)
 
     def nearer(
         self, state: NewtonState, theta: jax.Array, equations: Linearised, move: jax.Array
@@ -89,12 +90,14 @@ class Inverse:
         force = system.scatter(carried(system.scene, there, after, theta, at))
         force = system.restrict(force + system.others(there, theta, level))
         left = system.extend(system.solve(equations.tangent, -force))
-        kept_open = jnp.all(after.change > -1.0) if after else jnp.array(True)
+        kept_open = jnp.array(True)
+        if isinstance(after, Volumes):
+            kept_open = jnp.all(after.change > -1.0)
         return kept_open & (_size(left) <= (1.0 - 0.25 * fraction) * _size(move))
 
     @compiled
     def advance(
-        self, iterates: Iterates, eliminated: Condensed, move: jax.Array, fraction: jax.Array
+        self, iterates: Iterates, eliminated: Couplings | None, move: jax.Array, fraction: jax.Array
     ) -> Iterates:
         """Volumes and pressures after ``fraction`` of the step by ``move`` (n, 3) mm."""
         return advance(self.system.scene, iterates, eliminated, move, fraction)

@@ -71,7 +71,7 @@ class Gravity(Load):
 
     def on_loaded(self, grid: Discretisation) -> LocalForce:
         """The weight of the volume at rest."""
-        return _weight_at_rest(grid, lambda values: self.body_force)
+        return _weight_at_rest(grid, lambda _: self.body_force)
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ class ElasticSupport(BoundaryCondition):
         return LocalTerm(facets, normals, self._energy(rule))
 
     def on_loaded(self, grid: Discretisation) -> LocalForce:
-        """Force of springs that are at rest where the body is, by the surface at rest, ``x + w``."""
+        """Force of springs that are at rest with the body, by the surface at rest, ``x + w``."""
         mesh = grid.mesh
         facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 2 * mesh.order)
         energy = self._energy(rule)
