@@ -8,6 +8,7 @@ from .fem.campaign.reference import fem_reference
 from .fem.campaign.stored_runs import read_runs
 from .fem.energy import potential_energy, strain_energy
 from .fem.fields import element_fields
+from .fem.unloading import Unloaded, Unloader, unload
 from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
 from .geometry.mesh import Mesh
 from .geometry.side_by_side import Bodies, side_by_side
@@ -43,6 +44,8 @@ __all__ = [
     "SolverError",
     "Status",
     "Support",
+    "Unloaded",
+    "Unloader",
     "corrected",
     "element_fields",
     "evaluate",
@@ -68,6 +71,7 @@ __all__ = [
     "side_by_side",
     "strain_energy",
     "train",
+    "unload",
     "write_mesh",
     "write_solution",
 ]

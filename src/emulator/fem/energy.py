@@ -39,6 +39,15 @@ from emulator.scenes.scene import Scene
 Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
 
+def require_rest(scene: Scene) -> None:
+    """Raise :class:`InputError` for a scene whose mesh is the shape under load."""
+    if scene.loaded_by:
+        raise InputError(
+            f"scene '{scene.name}' is known under load (loaded_by), and this needs a scene at "
+            "rest: use FEM's displacements, or unload the scene"
+        )
+
+
 def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
     """``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
     local = u[scene.discretisation.connectivity]
@@ -54,6 +63,7 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
 
 def strain_law(scene: Scene, theta: jax.Array) -> Callable:
     """``W(strain, tissue)`` in kPa, from the strain at one point, at ``theta`` (p,)."""
+    require_rest(scene)
     values, law = scene.resolve(theta), scene.law
     scale = factors(scene.regions, values)
 
@@ -113,15 +123,18 @@ def nodal_vectors(blocks: Blocks, P: jax.Array) -> jax.Array:
 _CHUNK = 128  # elements whose products of gradients stay in a processor's cache
 
 
-def pair_matrices(blocks: Blocks, A: jax.Array) -> jax.Array:
-    r"""Second ones (b, pairs, 3, 3) of each pair of nodes once, ``A`` (b, q, 3, 3, 3, 3) symmetric.
+def pair_matrices(
+    blocks: Blocks, A: jax.Array, pairs: tuple[np.ndarray, np.ndarray] | None = None
+) -> jax.Array:
+    r"""Second ones (b, pairs, 3, 3) of pairs of nodes, from ``A`` (b, q, 3, 3, 3, 3).
 
-    Pairs are those of ``np.triu_indices``. With the products of gradients at the points,
+    Pairs are by default those of ``np.triu_indices``: each once, for a symmetric ``A``. With the
+    products of gradients at the points,
     :math:`G_{ab,kl} = w N_{a,k} N_{b,l}`, one matrix product an element gives all of them,
     :math:`K_{ab} = \sum_{q,kl} G_{ab,kl} A_{kl}`. Made for a few elements at a time, the products
     stay in the cache.
     """
-    one, other = np.triu_indices(blocks.gradients.shape[2])
+    one, other = np.triu_indices(blocks.gradients.shape[2]) if pairs is None else pairs
     count, points = A.shape[:2]
     chunks = -(-count // _CHUNK)
     size = -(-count // chunks)
@@ -227,7 +240,7 @@ def dead_force(scene: Scene) -> DeadForce | None:
             per_unit[name] = per_unit.get(name, 0.0) + force
     if not constant and not per_unit:
         return None
-    return DeadForce(np.sum(constant, axis=0) if constant else np.zeros(scene.held.shape), per_unit)
+    return DeadForce(sum(constant, np.zeros(scene.held.shape)), per_unit)
 
 
 def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
@@ -244,6 +257,7 @@ def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
     InputError
         A load of the scene has no potential.
     """
+    require_rest(scene)
     for load in scene.loads:
         if not load.has_potential:
             raise InputError(

@@ -68,8 +68,10 @@ def with_arrays[R](function: Callable[..., R], arguments: Any, named: Any) -> Ca
     """The program of :func:`jit` for arguments like these: of the arrays, and of their leaves."""
     traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments, **named)
     form = jax.tree.structure(shapes)
-    with jax.ensure_compile_time_eval():
-        arrays = jax.device_put(traced.consts)  # as jnp.asarray, without a program for each shape
+    arrays = traced.consts
+    if not any(isinstance(array, jax.core.Tracer) for array in arrays):
+        with jax.ensure_compile_time_eval():
+            arrays = jax.device_put(arrays)  # as jnp.asarray, without a program for each shape
 
     def evaluate(arrays: list[jax.Array], leaves: list[jax.Array]) -> Any:
         return jax.tree.unflatten(form, jax.core.eval_jaxpr(traced.jaxpr, arrays, *leaves))

@@ -1,18 +1,12 @@
-r"""The FEM simulator: theta to displacement, differentiable through the equilibrium it solves.
+"""The FEM simulator: theta to displacement, differentiable through the equilibrium it solves.
 
-At equilibrium :math:`r(u(\theta), \theta) = 0`, so
-
-.. math::
-    K\, \frac{\partial u}{\partial \theta} = -\frac{\partial r}{\partial \theta}
-
-(where free; the derivative of r has what the supports pull, where theta moves them)
-gives forward derivatives by one more solve with the tangent, and reverse ones by its transpose.
+Derivatives are those of the equilibrium (:mod:`emulator.fem.implicit`), not of the iterations.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +14,9 @@ import numpy as np
 
 from emulator._precision import require_float64
 from emulator.errors import InputError, SolverError
-from emulator.fem.continuation import find_equilibrium
+from emulator.fem.implicit import Found, derivatives, differentiable
 from emulator.fem.linear import Outcome, find_solver
-from emulator.fem.loop import compiled, jit, one_by_one
+from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.options import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
@@ -54,6 +48,8 @@ class Simulator(Shown):
 
     def __post_init__(self) -> None:
         find_solver(self.factorisation)
+        if self.scene.loaded_by:
+            self._loaded.unloader  # noqa: B018 - what cannot be unloaded is named first
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         """What it simulates and how."""
@@ -70,6 +66,15 @@ class Simulator(Shown):
     @cached_property
     def _balanced(self) -> System:
         return System(balanced(self.scene))
+
+    @cached_property
+    def _loaded(self) -> LoadedEquilibrium:
+        return LoadedEquilibrium(self.scene, self.options, self.factorisation)
+
+    @property
+    def stepwise(self) -> bool:
+        """Whether solves are better taken step by step from Python."""
+        return not self.scene.loaded_by and self.system.stepwise
 
     @property
     def rest(self) -> jax.Array:
@@ -90,6 +95,9 @@ class Simulator(Shown):
         elsewhere with other load steps. ``NewtonOptions.load_steps`` follows the path in small
         steps, whatever the start.
 
+        Of a scene whose mesh is loaded, the displacement is that from the mesh, and rest the
+        unloaded shape, which is found first (:mod:`emulator.fem.loaded`).
+
         The displacement is differentiable in ``theta``. Never raises on a hard case: read
         ``status``. ``vmap`` solves one theta after the other.
 
@@ -99,6 +107,9 @@ class Simulator(Shown):
             ``theta`` or ``start`` has the wrong shape, or float64 is off.
         """
         require_float64("FEM")
+        if self.scene.loaded_by:
+            theta, place = self._checked(theta, self.rest if start is None else start)
+            return self._loaded.solve(theta, None if start is None else place)
         theta, start = self._checked(theta, self.rest if start is None else start)
         return self._equilibrium(theta, jax.lax.stop_gradient(start))
 
@@ -145,7 +156,10 @@ class Simulator(Shown):
             The tangent is singular.
         """
         theta, u = self._checked(theta, u, "displacement")
-        found = _columns(self.system, self.tangent(u, theta), u, theta)
+        if self.scene.loaded_by:
+            found = self._loaded.sensitivities(u, theta)
+        else:
+            found = derivatives(self.system, self.tangent(u, theta), u, theta)
         if not isinstance(found, jax.core.Tracer) and not np.isfinite(found).all():
             raise SolverError(
                 f"scene '{self.scene.name}': the equilibrium has no derivatives: singular tangent"
@@ -225,59 +239,8 @@ class Simulator(Shown):
         return solution.require_converged().displacement
 
     @cached_property
-    def _equilibrium(self):  # noqa: ANN202 - closures, private
-        find = partial(find_equilibrium, self.system, self.options)
-        alone = one_by_one(find)
-
-        @jit
-        def closed(theta: jax.Array, start: jax.Array) -> Solution:
-            return alone(theta, start)
-
-        @jax.custom_jvp
-        def equilibrium(theta: jax.Array, start: jax.Array) -> Solution:
-            traced = any(isinstance(x, jax.core.Tracer) for x in (theta, start))
-            stepwise = self.system.stepwise and not traced
-            found = (find if stepwise else closed)(theta, start)
-            return found if traced else jax.block_until_ready(found)
-
-        @equilibrium.defjvp
-        def derivative(primals, tangents):  # noqa: ANN001, ANN202
-            theta, start = primals
-            solution = equilibrium(theta, start)
-            u = solution.displacement
-            moved = _moved(self.system, self.tangent(u, theta), u, theta, tangents[0])
-            return solution, _inert(solution)._replace(displacement=moved)
-
-        return equilibrium
-
-
-@compiled
-def _moved(
-    system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
-) -> jax.Array:
-    """Derivative (n, 3) of the equilibrium ``u`` along ``direction`` (p,) in theta."""
-    _, (force, held) = jax.jvp(system.moved_supports(u), (theta,), (direction,))
-    return held + system.extend(-system.solve(tangent, force))
-
-
-@compiled
-def _columns(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array) -> jax.Array:
-    """Derivatives (p, n, 3) of the equilibrium ``u`` along each entry of theta."""
-    forces, held = jax.jacfwd(system.moved_supports(u))(theta)
-    moved = jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
-    return moved + jnp.moveaxis(held, -1, 0)
-
-
-def _inert(solution: Solution) -> Solution:
-    """Zero tangents of a solution: float0 for its integers."""
-    return jax.tree.map(
-        lambda x: (
-            jnp.zeros_like(x)
-            if jnp.issubdtype(x.dtype, jnp.floating)
-            else jnp.zeros(x.shape, dtype=jax.dtypes.float0)
-        ),
-        solution,
-    )
+    def _equilibrium(self) -> Found:
+        return differentiable(self.system, self.options)
 
 
 @jax.jit

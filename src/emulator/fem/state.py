@@ -75,6 +75,11 @@ class NewtonState(NamedTuple):
         """Whether the iteration has not ended."""
         return self.status == Status.RUNNING
 
+    @property
+    def alone(self) -> bool:
+        """Whether the displacement is all that is iterated."""
+        return not jax.tree.leaves(self.iterates)
+
     def solution(self) -> Solution:
         """The result the iteration ended with."""
         converged = self.status == Status.CONVERGED

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from emulator.fem.energy import (
     local_forces,
     local_terms,
     pair_products,
+    require_rest,
     seen_by_law,
     spring_terms,
     strain_energy,
@@ -63,6 +65,11 @@ class System:
 
     scene: Scene
     factorisation: str = "suitesparse"
+
+    inverse: ClassVar[bool] = False  # whether the mesh is the loaded shape, and rest is sought
+
+    def __post_init__(self) -> None:
+        require_rest(self.scene)
 
     @property
     def direct(self) -> Direct:

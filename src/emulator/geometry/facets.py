@@ -29,15 +29,18 @@ def area_vectors[A: (jax.Array, np.ndarray)](x: A, rule: FacetRule) -> A:
     return xp.cross(along[..., 0, :], along[..., 1, :])
 
 
-def nodal_areas(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
-    """Integral of each shape function over the facets ``corners`` (k, a, 3), (k, a) in mm2."""
-    area = np.linalg.norm(area_vectors(corners, rule), axis=-1)
-    return np.einsum("q,kq,qa->ka", rule.weights, area, rule.values)
+def nodal_areas[A: (jax.Array, np.ndarray)](corners: A, rule: FacetRule) -> A:
+    """Integral of each shape function over the facets ``corners`` (..., a, 3), (..., a) in mm2."""
+    xp = corners.__array_namespace__()
+    area = xp.sqrt(xp.sum(area_vectors(corners, rule) ** 2, axis=-1))
+    return xp.einsum("q,...q,qa->...a", rule.weights, area, rule.values)
 
 
-def nodal_area_vectors(corners: np.ndarray, rule: FacetRule) -> np.ndarray:
-    """Integral of each shape function times the normal over ``corners`` (k, a, 3), (k, a, 3)."""
-    return np.einsum("q,kqi,qa->kai", rule.weights, area_vectors(corners, rule), rule.values)
+def nodal_area_vectors[A: (jax.Array, np.ndarray)](corners: A, rule: FacetRule) -> A:
+    """Integral of each shape function times the normal over ``corners`` (..., a, 3), likewise."""
+    xp = corners.__array_namespace__()
+    normals = area_vectors(corners, rule)
+    return xp.einsum("q,...qi,qa->...ai", rule.weights, normals, rule.values)
 
 
 def cone_volume[A: (jax.Array, np.ndarray)](x: A) -> A:

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from emulator.errors import InputError
 from emulator.geometry.discretisation import Blocks, Discretisation
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.geometry.tetrahedra import FACES
@@ -46,29 +45,6 @@ class Patches(Blocks):
     def gather[A: (jax.Array, np.ndarray)](self, field: A) -> A:
         """Values (b, q, ...) at the patches' points of a ``field`` (m, 1, ...)."""
         return field[self.members, 0]
-
-
-def check_dilatation(kind: str, mesh: Mesh) -> None:
-    """Refuse a dilatation that the elements of ``mesh`` cannot have.
-
-    Raises
-    ------
-    InputError
-        Another word than pointwise, mean and patch; mean on linear elements, patch on quadratic.
-    """
-    if kind not in ("pointwise", "mean", "patch"):
-        raise InputError(
-            f"dilatation '{kind}'; use pointwise or mean, or patch on linear tetrahedra"
-        )
-    if kind == "mean" and mesh.order == 1:
-        raise InputError(
-            "mean dilatation on linear tetrahedra changes nothing, "
-            "they have one point each; make the mesh quadratic, or write dilatation 'patch'"
-        )
-    if kind == "patch" and mesh.order == 2:
-        raise InputError(
-            "patch dilatation is for linear tetrahedra; on quadratic ones write dilatation 'mean'"
-        )
 
 
 def patchwise(grid: Discretisation, size: int = _SIZE) -> Patches:

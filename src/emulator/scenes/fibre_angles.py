@@ -117,7 +117,7 @@ def turned(tissue: Tissue, angles: tuple[FibreAngles, ...], values: Values) -> T
     return tissue
 
 
-def identity_of_angles(angles: tuple[FibreAngles, ...]) -> dict[str, np.ndarray]:
+def identity_of_angles(angles: Sequence[FibreAngles]) -> dict[str, np.ndarray]:
     """What solutions depend on, (m, q, 3) and (m, q, 1), by name."""
     found = {f"axis of rotation {k}": each.axis for k, each in enumerate(angles)}
     for k, each in enumerate(angles):

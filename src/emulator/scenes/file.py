@@ -141,6 +141,10 @@ Several bodies of one material (:mod:`emulator.geometry.side_by_side`), as two c
     at = 30.0
     within = "cube2"                         # the surface of a body
 
+``loaded_by = {pressure = "imaged"}`` says that the mesh is the body under load, as in an image: the
+parameter or constant ``imaged``, in the unit of the pressure, is what ``pressure`` was then. FEM
+unloads the body before it loads it; displacements are those from the mesh (docs/unloading.md).
+
 ``regions = "segment"`` names cell data of the mesh file, a whole number for each tetrahedron, such
 as gmsh's own ``gmsh:physical``. In region 3 the law's energy is then multiplied by the parameter or
 constant ``stiffness_3``, its resistance to volume change excepted. ``regions = "body"`` numbers
@@ -223,6 +227,7 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
             supports=file.supports,
             constants=file.constants,
             dilatation=file.dilatation,
+            loaded_by=file.loaded_by,
         )
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error

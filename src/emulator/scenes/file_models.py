@@ -75,6 +75,9 @@ class SceneFile(Table):
     several bodies also body: 1, 2, ... in their order."""
     fibres: Annotated[FibreRule, OneOf("rule", FIBRE_RULES)] | None = None
     """a rule for fibres and sheets; without it they come from the mesh file."""
+    loaded_by: dict[str, str] = Field(default_factory=dict)
+    """where the mesh is the shape under load, as of an image: for each load's parameter the name of
+    the parameter or constant that holds its value there."""
     node_sets: dict[str, Plane] = Field(default_factory=dict)
     """node sets beside those of the mesh file."""
     facet_sets: dict[str, Plane] = Field(default_factory=dict)

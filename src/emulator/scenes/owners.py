@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,13 +26,16 @@ def owners_of(
     angles: Sequence[FibreAngles],
     loads: Sequence[Load],
     supports: Sequence[BoundaryCondition],
+    loaded_by: Mapping[str, str],
 ) -> Owners:
     """Every parameter that these take; loads may share one, and so may supports.
+
+    loaded_by : what holds the value that a load's parameter had when the mesh was taken.
 
     Raises
     ------
     InputError
-        Two of different kinds have a parameter of one name.
+        Two of different kinds have a parameter of one name; ``loaded_by`` names no load's.
     """
     owners = {q.name: (q, f"law '{law.name}'") for q in law.quantities}
     if regions is not None:
@@ -47,6 +51,14 @@ def owners_of(
                         f"'{quantity.name}'; call the {what}'s by another name"
                     )
                 owners.setdefault(quantity.name, (quantity, owner))
+    taken = {quantity.name: quantity for load in loads for quantity in load.quantities}
+    for load, held_by in loaded_by.items():
+        if load not in taken:
+            raise InputError(
+                f"loaded_by: '{load}' is no parameter of a load; there are "
+                f"{', '.join(taken) or 'none'}"
+            )
+        owners.setdefault(held_by, (replace(taken[load], name=held_by), f"'{load}' in the image"))
     return owners
 
 
@@ -88,3 +100,19 @@ def check_given(
         faults.append(quantity.range_fault(parameter.low, parameter.high))
     for fault in filter(None, faults):
         raise InputError(fault)
+
+
+def check_image(loaded_by: Mapping[str, str], load_parameters: Sequence[str]) -> None:
+    """Refuse loads of theta of whose value in the image nothing is said, and loads of no theta."""
+    for name in load_parameters if loaded_by else ():
+        if name not in loaded_by:
+            raise InputError(
+                f"loaded_by says nothing of '{name}'; name the parameter or constant that holds "
+                "its value in the image"
+            )
+    for name in loaded_by:
+        if name not in load_parameters:
+            raise InputError(
+                f"loaded_by: '{name}' is a constant, so the mesh is loaded by it anyway; leave it "
+                "out, or make it a parameter"
+            )

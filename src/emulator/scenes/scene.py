@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -23,17 +23,18 @@ from emulator.geometry.discretisation import (
     quadrature_points,
 )
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.patches import check_dilatation, patchwise
+from emulator.geometry.patches import patchwise
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.dilatation import Dilatation, check_dilatation
 from emulator.scenes.fibre_angles import FibreAngles, checked_angles, identity_of_angles, turned
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
-from emulator.scenes.owners import Owners, check_given, directions_read, owners_of
+from emulator.scenes.owners import Owners, check_given, check_image, directions_read, owners_of
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
-from emulator.scenes.regions import Tissue, checked_regions
+from emulator.scenes.regions import Tissue, checked_regions, tissue_of
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
 from emulator.scenes.supports.dirichlet import Prescribed, prescribe
 from emulator.scenes.supports.rigid import check_motions
@@ -72,6 +73,10 @@ class Scene(Shown):
     angles : parameters that turn fibres and sheets (:mod:`emulator.scenes.fibre_angles`), one
         rotation after the other, as the rule's ``angles_in`` gives them; ``fibres`` and ``sheets``
         are those at angle zero.
+    loaded_by : empty where the mesh is at rest. Where it is the loaded shape of an image: for every
+        load parameter of theta the name of the parameter or constant that holds its value there,
+        ``{"pressure": "imaged"}``. A simulator then unloads and loads
+        (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
     """
 
     name: str
@@ -83,21 +88,23 @@ class Scene(Shown):
     constants: Mapping[str, float] = field(default_factory=dict)
     fibres: np.ndarray | None = None
     origin: Mapping[str, Any] = field(default_factory=dict)
-    dilatation: Literal["pointwise", "mean", "patch"] = "pointwise"
+    dilatation: Dilatation = "pointwise"
     sheets: np.ndarray | None = None
     regions: np.ndarray | None = None
     fibre_rule: FibreRule | None = None
     angles: tuple[FibreAngles, ...] = ()
+    loaded_by: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
         object.__setattr__(self, "origin", MappingProxyType(dict(self.origin)))
+        object.__setattr__(self, "loaded_by", MappingProxyType(dict(self.loaded_by)))
         self._check_regions()
         self._check_directions()
         with self._named():
             check_given(self._owners, self.law, self.parameters, self.constants)
         with self._named():
-            check_dilatation(self.dilatation, self.mesh)
+            check_dilatation(self.dilatation, self.mesh.order)
         if not self.parameters:
             raise InputError(f"scene '{self.name}': no parameter varies, nothing to calibrate")
         self._check_supports()
@@ -148,6 +155,8 @@ class Scene(Shown):
         moved = sum((np.abs(each) for each in per_unit.values()), np.abs(fixed))
         for load in self.loads:
             load.check(self.mesh, self.held, moved)
+        with self._named():
+            check_image(self.loaded_by, self.load_parameters)
 
     @property
     def parts(self) -> tuple[Load | BoundaryCondition, ...]:
@@ -161,7 +170,9 @@ class Scene(Shown):
 
     @property
     def _owners(self) -> Owners:
-        return owners_of(self.law, self.regions, self.angles, self.loads, self.supports)
+        return owners_of(
+            self.law, self.regions, self.angles, self.loads, self.supports, self.loaded_by
+        )
 
     @cached_property
     def space(self) -> ParameterSpace:
@@ -249,17 +260,9 @@ class Scene(Shown):
 
     @cached_property
     def _tissue(self) -> Tissue:
-        directions = region = None
-        if self.law.fibres:
-            directions = self.fibres_at_points
-        if self.fibres is not None and self.sheets is not None:
-            directions = np.stack([self.fibres_at_points, self._at_points(self.sheets)], axis=2)
-        if self.regions is not None:
-            points = len(quadrature_points(self.mesh.order))
-            index = np.unique(self.regions, return_inverse=True)[1][:, None]
-            region = np.broadcast_to(index, (len(index), points))
-        # NumPy arrays: JAX arrays made inside jit would be tracers, and this is cached.
-        return Tissue(cast(Any, directions), cast(Any, region))
+        fibres = self.fibres_at_points if self.law.fibres else None
+        sheets = None if self.sheets is None else self._at_points(self.sheets)
+        return tissue_of(fibres, sheets, self.regions, len(quadrature_points(self.mesh.order)))
 
     @cached_property
     def _block_tissue(self) -> Tissue:
@@ -332,6 +335,8 @@ class Scene(Shown):
             "dilatation": self.dilatation,
         }
         turning = identity_of_angles(self.angles)
+        if self.loaded_by:  # fingerprints of selfs at rest are older
+            description["loaded_by"] = dict(self.loaded_by)
         held, fixed, per_unit = self.prescribed
         moved = {f"displacement per unit of {name}": each for name, each in per_unit.items()}
         return identity_of(

@@ -59,6 +59,26 @@ def test_simulate(capsys, block, tmp_path):
 
 
 @pytest.mark.slow
+def test_unload(capsys, block, tmp_path):
+    out = tmp_path / "rest"
+    code, result = answer(capsys, "unload", block, "--theta", "mu=7", "--out", out)
+    assert code == 0
+    assert result["status"] == result["reloaded"]["status"] == "converged"
+    assert result["reloaded"]["missed"] < 1e-8
+    assert result["largest_displacement"] > 0.0
+    # The mesh that was written, loaded, is the one that was read.
+    text = block.read_text().replace("block.vtu", str(out / "unloaded.vtu"))
+    (tmp_path / "again.toml").write_text(text)
+    _, again = answer(capsys, "simulate", tmp_path / "again.toml", "--theta", "mu=7")
+    assert again["max_displacement"] == pytest.approx(result["largest_displacement"], rel=1e-9)
+    written = meshio.read(out / "loaded.vtu")
+    places = written.points + written.point_data["displacement"]
+    np.testing.assert_allclose(places, meshio.read(tmp_path / "block.vtu").points, atol=1e-8)
+    assert main(["unload", str(block)]) == 0
+    assert "loaded again from rest: converged" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_simulate_under_a_pressure_without_a_potential(capsys, block):
     push = 'kind = "follower_pressure"\nfacet_set = "end"\npressure = 0.1\n'
     plane = '[facet_sets.end]\naxis = "x"\nat = 20.0\n'

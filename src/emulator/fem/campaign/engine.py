@@ -71,7 +71,12 @@ class Solver:
             return solution._replace(status=jnp.asarray(Status.SINGULAR_TANGENT)), missing
 
     def _start(self, starts: Sequence[Any], theta: jax.Array) -> jax.Array | None:
-        """The start with the smallest residual; None for rest."""
+        """The start with the smallest residual; None for rest.
+
+        The last one where the shape at rest, and so the residual, is not known yet.
+        """
+        if self.simulator.scene.loaded_by:
+            starts = starts[-1:]
         if len(starts) > 1:
             return self._best(jnp.stack([jnp.asarray(start) for start in starts]), theta)
         return jnp.asarray(starts[0]) if starts else None

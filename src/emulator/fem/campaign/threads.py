@@ -28,7 +28,7 @@ def at_once(simulator: Simulator, nodes: int | None = None) -> int:
 
     nodes : of the mesh that is solved on; the simulator's by default.
     """  # noqa: D205
-    if not isinstance(simulator, Simulator) or simulator.system.stepwise:
+    if not isinstance(simulator, Simulator) or simulator.stepwise:
         return 1
     each = _BYTES_A_NODE * (nodes or len(simulator.scene.mesh.nodes))
     return max(1, int(min(cores(), _SHARE * memory() / each)))

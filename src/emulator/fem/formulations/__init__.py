@@ -4,11 +4,13 @@ At equilibrium it is one of :data:`FORMULATIONS`; on the way there, :mod:`.stres
 """
 
 from emulator.fem.formulations.displacement import Displacement
+from emulator.fem.formulations.inverse import Inverse
 from emulator.fem.formulations.mean_dilatation import MeanDilatation
 from emulator.fem.formulations.protocol import Formulation, Linearised
 from emulator.fem.system import System
 
-FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation]] = {
+FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation] | type[Inverse]] = {
+    "inverse motion": Inverse,
     "mean dilatation": MeanDilatation,
     "displacement alone": Displacement,
 }
@@ -17,7 +19,7 @@ FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation]] = {
 
 def formulation_of(system: System) -> Formulation:
     """How Newton's method solves the equations of ``system``."""
-    serving = (each for each in FORMULATIONS.values() if each.serves(system.scene))
+    serving = (each for each in FORMULATIONS.values() if each.serves(system))
     return next(serving)(system)
 
 

@@ -16,7 +16,6 @@ from emulator.fem.formulations.protocol import Linearised
 from emulator.fem.loop import cond
 from emulator.fem.state import UNBALANCED, NewtonState
 from emulator.fem.system import System
-from emulator.scenes.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +25,9 @@ class Displacement:
     system: System
 
     @staticmethod
-    def serves(scene: Scene) -> bool:
+    def serves(system: System) -> bool:
         """Any scene whose points have volume ratios of their own."""
-        return scene.dilatation == "pointwise"
+        return system.scene.dilatation == "pointwise"
 
     def begin(self, u: jax.Array, theta: jax.Array) -> None:
         """Nothing else is iterated."""

@@ -36,7 +36,6 @@ from emulator.fem.formulations.protocol import Linearised, Nearer
 from emulator.fem.loop import compiled
 from emulator.fem.state import NewtonState
 from emulator.fem.system import System
-from emulator.scenes.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +45,9 @@ class MeanDilatation:
     system: System
 
     @staticmethod
-    def serves(scene: Scene) -> bool:
+    def serves(system: System) -> bool:
         """A scene whose elements, or patches of them, share a volume ratio."""
-        return scene.dilatation != "pointwise"
+        return system.scene.dilatation != "pointwise"
 
     @property
     def programs(self) -> dict[Callable, Callable]:

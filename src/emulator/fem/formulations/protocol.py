@@ -9,7 +9,6 @@ import jax
 
 from emulator.fem.state import NewtonState
 from emulator.fem.system import System
-from emulator.scenes.scene import Scene
 
 
 class Linearised(NamedTuple):
@@ -34,13 +33,14 @@ Nearer = Callable[[jax.Array], jax.Array]
 class Formulation(Protocol):
     """How Newton's method solves for the displacement, and what else it iterates on.
 
-    ``iterates`` are a tree of arrays besides the displacement, or None. With them the point sought
-    is a saddle, and :meth:`nearer` judges a step; without, the potential energy does.
+    ``iterates`` are a tree of arrays besides the displacement, or None. With them, were the tree
+    empty, the point sought is no minimum, and :meth:`nearer` judges a step; without, the potential
+    energy does.
     """
 
     @staticmethod
-    def serves(scene: Scene) -> bool:
-        """Whether it can solve ``scene``."""
+    def serves(system: System) -> bool:
+        """Whether it can solve the equations of ``system``."""
 
     @property
     def system(self) -> System:

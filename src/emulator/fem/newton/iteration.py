@@ -22,7 +22,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from emulator.fem.balance import forces_at, level_balance
 from emulator.fem.formulations import formulation_of
@@ -77,10 +76,10 @@ class Newton:
         with. On a slender body, or beside stiff springs, such a residual may still matter, so the
         step that Newton's method takes for it must be short as well.
         """
-        X = np.asarray(self.system.scene.mesh.nodes)
-        stretched = forces_at(self.system, jnp.asarray(_STRETCH * X), self.theta, 0.0)
+        X = jnp.asarray(self.system.scene.mesh.nodes)
+        stretched = forces_at(self.system, _STRETCH * X, self.theta, 0.0)
         size = _ROUND_OFF / _STRETCH * stretched.internal
-        extent = np.ptp(X, axis=0).max()
+        extent = jnp.ptp(X, axis=0).max()
         return Negligible(jnp.where(jnp.isfinite(size), size, 0.0), _STILL * extent)
 
     def step(self, state: NewtonState, any_tangent: jax.Array | bool = True) -> NewtonState:

@@ -141,7 +141,7 @@ def _keeps_tangent(state: NewtonState, outcome: Outcome, options: NewtonOptions)
     """Whether the next step may use this tangent again: most of its cost is the factorisation."""
     good = (outcome.fraction == 1.0) & jnp.isfinite(outcome.error)
     good &= outcome.error <= options.keep_tangent * state.error
-    return good & (state.iterates is None)
+    return good & state.alone
 
 
 def _quiet(state: NewtonState, options: NewtonOptions) -> jax.Array:

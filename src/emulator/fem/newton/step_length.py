@@ -52,7 +52,7 @@ def take_step(
     A kept tangent is worth a full step or nothing: its direction is not searched along.
     """
     none = Outcome(state.u, state.residual, state.error, jnp.zeros(()), jnp.array(False))
-    near = _near(direction.settled, state.error) & (state.iterates is None)
+    near = _near(direction.settled, state.error) & state.alone
 
     def attempt(before: _Tried) -> _Tried:
         search = before.searched | ~near

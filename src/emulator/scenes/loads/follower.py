@@ -54,3 +54,12 @@ class FollowerPressure(SurfacePressure):
             )
 
         return LocalForce(facets, mesh.nodes[facets], force)
+
+    def on_loaded(self, grid: Discretisation) -> LocalForce:
+        """The force on the known surface, whatever the shape at rest."""
+        following = self.force(grid)
+
+        def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
+            return following.force(jnp.zeros_like(w), corners, values)
+
+        return LocalForce(following.nodes, following.data, force)

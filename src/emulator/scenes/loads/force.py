@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 
 from emulator.errors import InputError
@@ -20,6 +21,7 @@ from emulator.geometry.tetrahedra import EDGES
 from emulator.mechanics.quantity import Quantity, number
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
+from emulator.scenes.local_terms import LocalForce, Values
 
 MN_PER_N = 1e3
 
@@ -71,6 +73,23 @@ class Force(Load):
         """Nodal forces (n, 3) in mN per unit of the amount."""
         return {} if self.amount is None else {self.amount: self._spread(grid.mesh)}
 
+    def on_loaded(self, grid: Discretisation) -> LocalForce:
+        """The force, wherever its nodes are."""
+        mesh, amount = grid.mesh, self.amount
+        nodes = mesh.node_set(self.node_set)
+        if len(edges_between(mesh, nodes)):
+            raise InputError(
+                f"force on '{self.node_set}' is spread along an edge by its length at rest, which "
+                "is what unloading looks for; give the force to nodes that no edge joins"
+            )
+        share = self._spread(mesh)[nodes][:, None]
+
+        def force(w: jax.Array, share: jax.Array, values: Values) -> jax.Array:
+            del w
+            return share if amount is None else values[amount] * share
+
+        return LocalForce(nodes[:, None], share, force)
+
     def _spread(self, mesh: Mesh) -> np.ndarray:
         return shares(mesh, mesh.node_set(self.node_set))[:, None] * (
             MN_PER_N * np.asarray(self.resultant, dtype=float)
@@ -81,11 +100,8 @@ class Force(Load):
         return plain_fields(self)
 
 
-def shares(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
-    """Weights (n,) of sum 1 on ``nodes`` (k,), by the length of mesh edges between them.
-
-    Of a quadratic edge, Simpson's: a sixth at each end and two thirds in the middle.
-    """
+def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
+    """Edges (e, 2) of the mesh whose nodes are all among ``nodes`` (k,); (e, 3) quadratic."""
     among = np.zeros(len(mesh.nodes), dtype=bool)
     among[nodes] = True
     quadratic = mesh.order == 2
@@ -93,13 +109,21 @@ def shares(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
     edges = mesh.elements[:, local].reshape(-1, len(local[0]))
     edges = edges[among[edges].all(axis=1)]
     edges[:, :2] = np.sort(edges[:, :2], axis=1)
-    edges = np.unique(edges, axis=0)
+    return np.unique(edges, axis=0)
+
+
+def shares(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
+    """Weights (n,) of sum 1 on ``nodes`` (k,), by the length of mesh edges between them.
+
+    Of a quadratic edge, Simpson's: a sixth at each end and two thirds in the middle.
+    """
+    edges = edges_between(mesh, nodes)
     found = np.zeros(len(mesh.nodes))
     if not len(edges):
         found[nodes] = 1.0 / len(nodes)
         return found
     length = np.linalg.norm(mesh.nodes[edges[:, 1]] - mesh.nodes[edges[:, 0]], axis=1)
-    weights = (1 / 6, 1 / 6, 2 / 3) if quadratic else (0.5, 0.5)
+    weights = (1 / 6, 1 / 6, 2 / 3) if mesh.order == 2 else (0.5, 0.5)
     for column, weight in zip(edges.T, weights, strict=True):
         np.add.at(found, column, weight * length)
     return found / found.sum()

@@ -6,15 +6,20 @@ in :math:`g`, so a body that is turned between measurements needs one force fiel
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
+from emulator.mechanics.kinematics import determinant
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.loads.load import Load, nodal_sums
+from emulator.scenes.local_terms import LocalForce, Values
 
 # (1 g/cm3)(1 m/s2) = 1e-6 kg/mm3 m/s2 = 1e-6 N/mm3 = 1e-3 mN/mm3, and 1 mN/mm2 = 1 kPa.
 _KPA_PER_MM = 1.0e-3
@@ -64,6 +69,10 @@ class Gravity(Load):
         """Consistent nodal forces, (n, 3) in mN."""
         return _nodal_volumes(grid)[:, None] * self.body_force
 
+    def on_loaded(self, grid: Discretisation) -> LocalForce:
+        """The weight of the volume at rest."""
+        return _weight_at_rest(grid, lambda _: self.body_force)
+
 
 @dataclass(frozen=True)
 class GravityVector(Load):
@@ -101,12 +110,35 @@ class GravityVector(Load):
             for quantity, axis in zip(self.quantities, np.eye(3), strict=True)
         }
 
+    def on_loaded(self, grid: Discretisation) -> LocalForce:
+        """The weight of the volume at rest."""
+        weight = self.density * _KPA_PER_MM
+
+        def body_force(values: Values) -> jax.Array:
+            return weight * jnp.stack([values[quantity.name] for quantity in self.quantities])
+
+        return _weight_at_rest(grid, body_force)
+
 
 def _check_density(kind: str, density: float) -> None:
     if not np.isfinite(density) or density < 0.0:
         raise InputError(f"{kind}: density is {density} g/cm3; it must be 0 or more")
 
 
+def _weight_at_rest(
+    grid: Discretisation, body_force: Callable[[Values], jax.Array | np.ndarray]
+) -> LocalForce:
+    r"""``body_force`` in kPa/mm of the volume at rest, :math:`\int N_a b \det f\, dx`."""
+
+    def force(w: jax.Array, data: tuple[jax.Array, jax.Array], values: Values) -> jax.Array:
+        gradients, weights = data
+        f = jnp.einsum("ai,qaj->qij", w, gradients) + jnp.eye(3, dtype=w.dtype)
+        volumes = (weights * jax.vmap(determinant)(f)) @ grid.values
+        return volumes[:, None] * body_force(values)
+
+    return LocalForce(grid.connectivity, (grid.gradients, grid.weights), force)
+
+
 def _nodal_volumes(grid: Discretisation) -> np.ndarray:
-    volume = np.einsum("mq,qa->ma", grid.weights, grid.values)
+    volume = grid.weights @ grid.values
     return nodal_sums(grid.mesh, grid.connectivity, volume)

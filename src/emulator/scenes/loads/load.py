@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
+from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.quantity import Quantity
@@ -95,11 +96,26 @@ class Load(ABC):
         """Stress (m, q, 3, 3) in kPa that it adds to the law's, where F (m, q, 3, 3); or None."""
         return None
 
+    def on_loaded(self, grid: Discretisation) -> LocalForce:
+        """Its force on the body whose *loaded* shape is the mesh, of w from there to rest.
+
+        What is given per volume or area at rest depends on w; what follows the surface does not.
+        Its local displacements are those of w (:mod:`emulator.fem.inverse`).
+
+        Raises
+        ------
+        InputError
+            A kind, or a case of it, that bodies cannot be unloaded from.
+        """
+        raise InputError(f"a body cannot be unloaded from a load of kind '{self.kind}'")
+
     def to_json(self) -> list[Any]:
         """Plain JSON that differs between loads with different effects: every field."""
         return plain_fields(self)
 
 
-def nodal_sums(mesh: Mesh, nodes: np.ndarray, amounts: np.ndarray) -> np.ndarray:
+def nodal_sums[A: (jax.Array, np.ndarray)](mesh: Mesh, nodes: np.ndarray, amounts: A) -> A:
     """Sum of ``amounts`` (k, a) at each of their ``nodes`` (k, a), shape (n,)."""
-    return np.bincount(nodes.ravel(), amounts.ravel(), minlength=len(mesh.nodes))
+    if isinstance(amounts, np.ndarray):
+        return np.bincount(nodes.ravel(), amounts.ravel(), minlength=len(mesh.nodes))
+    return jax.ops.segment_sum(amounts.ravel(), nodes.ravel(), len(mesh.nodes))

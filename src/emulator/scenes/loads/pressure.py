@@ -26,7 +26,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.scenes.loads.dead_pressure import DeadPressure, at_rest
 from emulator.scenes.loads.follower import FollowerPressure
 from emulator.scenes.loads.surface_pressure import SurfacePressure
-from emulator.scenes.local_terms import LocalTerm, Values
+from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
 
 
 @dataclass(frozen=True)
@@ -67,3 +67,7 @@ class CavityPressure(SurfacePressure):
             return -self.value(values) * (cone_volume(corners) - cone_volume(corners + u))
 
         return LocalTerm(facets, grid.mesh.nodes[facets], energy)
+
+    def on_loaded(self, grid: Discretisation) -> LocalForce:
+        """The force on the known wall, whatever the shape at rest."""
+        return self.at_held_nodes.on_loaded(grid)

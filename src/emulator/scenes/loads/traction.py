@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import jax
 import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import nodal_areas
 from emulator.scenes.loads.load import Load, nodal_sums
+from emulator.scenes.local_terms import LocalForce, Values
 
 
 @dataclass(frozen=True)
@@ -46,3 +48,14 @@ class Traction(Load):
         rule = facet_rule(mesh.order, 4)
         area = nodal_areas(mesh.nodes[facets], rule)
         return nodal_sums(mesh, facets, area)[:, None] * np.asarray(self.traction, dtype=float)
+
+    def on_loaded(self, grid: Discretisation) -> LocalForce:
+        """The force by the surface at rest, ``x + w``."""
+        mesh = grid.mesh
+        facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 4)
+
+        def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
+            del values
+            return nodal_areas(corners + w, rule)[:, None] * np.asarray(self.traction, dtype=float)
+
+        return LocalForce(facets, mesh.nodes[facets], force)

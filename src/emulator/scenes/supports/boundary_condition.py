@@ -11,7 +11,7 @@ import numpy as np
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.quantity import Quantity
-from emulator.scenes.local_terms import LocalTerm
+from emulator.scenes.local_terms import LocalForce, LocalTerm
 
 
 class Held(NamedTuple):
@@ -64,6 +64,13 @@ class BoundaryCondition(ABC):
 
     def term(self, grid: Discretisation) -> LocalTerm | None:
         """Potential of its springs, or None."""
+        return None
+
+    def on_loaded(self, grid: Discretisation) -> LocalForce | None:
+        """Force of its springs on the body whose *loaded* shape is the mesh, of w to rest; or None.
+
+        See :meth:`emulator.scenes.loads.load.Load.on_loaded`.
+        """
         return None
 
     def on_finer(self, mesh: Mesh, moved: Mapping[str | None, np.ndarray]) -> BoundaryCondition:

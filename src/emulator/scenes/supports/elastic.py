@@ -9,6 +9,7 @@ that gives is such a support whose stiffness is inferred.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -17,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.discretisation import Discretisation, facet_rule
+from emulator.geometry.discretisation import Discretisation, FacetRule, facet_rule
 from emulator.geometry.facets import area_vectors
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.identity import plain_fields
-from emulator.scenes.local_terms import LocalTerm, Values
+from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
 from emulator.scenes.supports.boundary_condition import BoundaryCondition, Resisted
 
 
@@ -84,20 +85,33 @@ class ElasticSupport(BoundaryCondition):
         facets = mesh.facet_set(self.facet_set)
         rule = facet_rule(mesh.order, 2 * mesh.order)  # the degree of |u|^2
         normals = area_vectors(mesh.nodes[facets], rule)  # (k, q, 3)
-        areas = np.linalg.norm(normals, axis=-1)
-        data = (rule.weights * areas, normals / areas[..., None])
+        return LocalTerm(facets, normals, self._energy(rule))
 
-        def energy(u: jax.Array, data: Any, values: Values) -> jax.Array:
-            weights, normal = data
+    def on_loaded(self, grid: Discretisation) -> LocalForce:
+        """Force of springs that are at rest with the body, by the surface at rest, ``x + w``."""
+        mesh = grid.mesh
+        facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 2 * mesh.order)
+        energy = self._energy(rule)
+
+        def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
+            return -jax.grad(energy)(-w, area_vectors(corners + w, rule), values)
+
+        return LocalForce(facets, mesh.nodes[facets], force)
+
+    def _energy(self, rule: FacetRule) -> Callable[[jax.Array, jax.Array, Values], jax.Array]:
+        """Energy () in mN mm of a facet with area vectors (q, 3) at rest."""
+
+        def energy(u: jax.Array, normals: jax.Array, values: Values) -> jax.Array:
+            areas = jnp.sqrt(jnp.sum(normals**2, axis=1))
             at_points = rule.values @ u
             if self.direction == "normal":
-                squared = jnp.sum(at_points * normal, axis=1) ** 2
+                squared = (jnp.sum(at_points * normals, axis=1) / areas) ** 2
             else:
                 squared = jnp.sum(at_points**2, axis=1)
             k = values[self.parameter] if self.stiffness is None else self.stiffness
-            return 0.5 * k * jnp.sum(weights * squared)
+            return 0.5 * k * jnp.sum(rule.weights * areas * squared)
 
-        return LocalTerm(facets, data, energy)
+        return energy
 
     def resisted(self, mesh: Mesh) -> Resisted:
         """The corners of every facet, along all axes or along its normal."""
