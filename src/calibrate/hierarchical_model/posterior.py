@@ -104,7 +104,7 @@ class Hierarchy(Shown):
         return {n: np.asarray(self.tree[NEW][n]).reshape(-1) for n in self.shared}
 
     def predict(self, model: Model, *, seed: int = 0) -> dict[str, np.ndarray]:
-        """Data that a member not seen would give, noise included: (s, *shape) by observation.
+        """Data that a member not seen would give, noise included: ``(s, *shape)`` by observation.
 
         At about 500 draws. What ``model`` has besides the shared unknowns is drawn from its prior.
 
