@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from studies.sheep_myocardium import cube, curves, experiment, inference
+from studies.sheep_myocardium import campaign, cube, curves, experiment, inference
 
 from emulator.errors import InputError
 
@@ -85,8 +85,8 @@ def position(**values):
 def test_formula_of_an_isotropic_cube():
     r"""Simple shear of W(I1): :math:`F = A\, a\, \gamma\, e^{b \gamma^2}`."""
     x = position(a=1.2, b=6.0, in_plane=7.0, out_of_plane=-3.0)
-    amounts = jnp.array([[0.2], [0.2], [0.1]])
-    along_y, along_z, stretched = cube.formula(1, x, amounts, jnp.asarray(90.0))
+    H, C = (jnp.asarray(a)[None] for a in cube.homogeneous(np.array([[0.2], [0.2], [0.1]])))
+    along_y, along_z, stretched = cube.formula(x[None], H, C, jnp.array([90.0]))[0]
     expected = 1e-3 * 90.0 * 1.2 * 0.2 * np.exp(6.0 * 0.04)
     assert float(along_y) == pytest.approx(expected, rel=2e-3)
     assert float(along_z) == pytest.approx(expected, rel=2e-3)
@@ -121,22 +121,35 @@ def test_the_process_covariances_are_the_kernels_derivatives():
     np.testing.assert_allclose(between[1:, 1:], cross, atol=1e-14)
 
 
-@pytest.mark.slow
 def test_the_emulator_goes_through_its_runs(tmp_path):
     """Forces made of the formula and a smooth factor, in place of FEM's."""
     (heart,) = experiment.hearts(write_heart(tmp_path / "TSL9").parent)
-    body = curves.Cube(0, heart.sizes[0], heart.of_cube(0), cells=1)
+    bodies = curves.cubes(heart, cells=1)
+    H, C = (jnp.asarray(a)[None] for a in cube.homogeneous(bodies[0].amounts))
+    area = jnp.array([bodies[0].area])
 
     def made(x):
-        formula = cube.formula(0, x, jnp.asarray(body.amounts), jnp.asarray(body.area))
-        return formula * jnp.exp(0.3 * jnp.sin(x[0]) + 0.2 * x[1] * x[8])
+        formula = cube.formula(x[None], H, C, area)[0]
+        return formula * jnp.exp(0.3 * jnp.sin(x[0]) + 0.2 * x[1] * x[3])
 
-    x = jax.random.uniform(jax.random.key(1), (8, body.unknowns), minval=-0.5, maxval=0.5)
+    x = jax.random.uniform(jax.random.key(1), (6, 10), minval=-0.5, maxval=0.5)
+    # At angles zero the cut is the frame, so that only the first cube is like this formula.
     force, slopes = jax.jit(jax.vmap(made))(x), jax.jit(jax.vmap(jax.jacfwd(made)))(x)
     runs = curves.Runs(*(np.asarray(a) for a in (x, force, slopes, force)))
-    emulated = curves.fit(body, runs)
-    again = jax.jit(jax.vmap(lambda x: curves.forces(0, emulated, x)))(x)
+    emulated = curves.fit(bodies[:1], [runs])
+    again = jax.jit(jax.vmap(lambda x: curves.forces(emulated, x[None])[0]))(x)
     np.testing.assert_allclose(again, force, rtol=1e-4)
+
+
+def test_a_meshs_error_is_taken_off_by_its_order():
+    """Forces that are too large by 0.2 h^1.6, on 3 and on 5 cells."""
+    right = np.full((2, 4), 2.0)
+    by = {n: right * (1.0 + 0.2 * n**-1.6) for n in (3, 5)}
+    empty = np.zeros((2, 10))
+    tests, fine = ([curves.Runs(empty, by[n], empty, empty)] for n in (3, 5))
+    arrays = {name: jnp.zeros(1) for name in curves.Emulated._fields}
+    found = campaign.without_mesh(curves.Emulated(**arrays), tests, fine)
+    np.testing.assert_allclose(by[3][0] * found.finer[0], right[0], rtol=1e-3)
 
 
 def test_a_law_leaves_out_moduli_and_their_exponents():
@@ -147,5 +160,5 @@ def test_a_law_leaves_out_moduli_and_their_exponents():
 def test_half_of_what_a_mode_is_off_is_the_same_along_its_curve():
     amounts = jnp.linspace(-0.3, 0.3, 10)
     covariance = np.asarray(inference.covariances(amounts, jnp.ones(10), jnp.asarray(0.2)))
-    assert covariance[0, 0] == pytest.approx(0.04 + inference.CELL**2)
+    assert covariance[0, 0] == pytest.approx(0.04 + inference.POINT**2 + inference.CELL**2)
     assert 0.02 < covariance[0, -1] < 0.025
