@@ -142,9 +142,9 @@ def test_the_emulator_goes_through_its_runs(tmp_path):
 
 
 def test_a_meshs_error_is_taken_off_by_its_order():
-    """Forces that are too large by 0.2 h^1.6, on 3 and on 5 cells."""
+    """Forces that are too large by 0.2 h^1.2, on 3 and on 5 cells."""
     right = np.full((2, 4), 2.0)
-    by = {n: right * (1.0 + 0.2 * n**-1.6) for n in (3, 5)}
+    by = {n: right * (1.0 + 0.2 * n**-1.2) for n in (3, 5)}
     empty = np.zeros((2, 10))
     tests, fine = ([curves.Runs(empty, by[n], empty, empty)] for n in (3, 5))
     arrays = {name: jnp.zeros(1) for name in curves.Emulated._fields}

@@ -78,6 +78,7 @@ def scene(cube: int, sizes: np.ndarray, cells: int = CELLS) -> Scene:
         fibres=f,
         sheets=s,
         angles=(FibreAngles(across, {"in_plane": one}), FibreAngles(along, {"out_of_plane": one})),
+        dilatation="mean",
     )
 
 

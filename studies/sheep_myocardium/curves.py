@@ -244,13 +244,17 @@ def _fitted(
     formula, rising = (np.stack(part) for part in zip(*told, strict=True))
     ratio = runs.force / formula
     sound = (np.isfinite(ratio) & (ratio > 0.0)).all(axis=1)
-    if not sound.all():
+    if not sound.sum() > 0.5 * len(sound):
         raise SolverError(f"{(~sound).sum()} of {len(sound)} runs of cube {k + 1} failed")
-    q = np.log(ratio)
-    slopes = runs.slopes / runs.force[..., None] - rising / formula[..., None]
+    q = np.log(ratio[sound])
+    slopes = (runs.slopes / runs.force[..., None] - rising / formula[..., None])[sound]
     known = np.concatenate([(q - q.mean(axis=0))[:, None], np.swapaxes(slopes, 1, 2)], axis=1)
     count = known.shape[0] * known.shape[1]
-    blocks = jax.vmap(lambda a: jax.vmap(lambda b: _between_runs(a, b))(runs.x))(runs.x)
+    x = runs.x[sound]
+    blocks = jax.vmap(lambda a: jax.vmap(lambda b: _between_runs(a, b))(x))(x)
     gram = np.asarray(blocks).transpose(0, 2, 1, 3).reshape(count, count)
     solved = np.linalg.solve(gram + _NUGGET * np.eye(count), known.reshape(count, -1))
-    return runs.x, q.mean(axis=0), solved.reshape(known.shape)
+    # A run that failed keeps its place, with no weight: programs are of a number of runs.
+    weights = np.zeros((len(sound), *known.shape[1:]))
+    weights[sound] = solved.reshape(known.shape)
+    return runs.x, q.mean(axis=0), weights

@@ -58,7 +58,7 @@ _KEPT = 3  # targets a term of the next degree
 _DONE = 1e-10  # of the displacement, that the error bar ends at
 _ROUNDED = 1e-2  # of the error bar, that modes may be left out for
 _WRITE_EVERY = 30.0  # seconds
-_NUMBERS = ("number", "here", "level", "rise", "ago", "left", "worst", "taken")
+_NUMBERS = ("number", "here", "level", "rise", "ago", "left", "worst", "taken", "lost")
 
 Map = Callable[[jax.Array], jax.Array]
 
@@ -70,7 +70,8 @@ class Swept:
     polynomial : of the free displacements. number : sweeps done, ``here`` of them at this level.
     level, rise : of the loads, and by how much they rise next. before : coefficients at the level
     ``ago`` below. left, worst : mm, median and largest step at theta not seen before. taken : part
-    of the last sweep's theta at which a step was. values : targets kept.
+    of the last sweep's theta at which a step was. values : targets kept. lost : whether no step
+    could be taken from where a start said, so that they went on from rest.
     """
 
     polynomial: Fitted
@@ -84,6 +85,7 @@ class Swept:
     left: float = np.inf
     worst: float = np.inf
     taken: float = 0.0
+    lost: bool = False
 
     @property
     def done(self) -> bool:
@@ -93,7 +95,8 @@ class Swept:
     @property
     def record(self) -> dict[str, Any]:
         """What an emulator's record tells of them."""
-        return {"number": self.number, "error_mm": self.left, "largest_error_mm": float(self.worst)}
+        told = {"number": self.number, "error_mm": self.left, "largest_error_mm": float(self.worst)}
+        return told | ({"start": "left for rest"} if self.lost else {})
 
     @property
     def rises(self) -> bool:
@@ -123,7 +126,8 @@ def sweep_box(
     ----------
     sweeps : altogether; fewer where the error bar is round-off before. seed : of the theta.
     start : position (p,) to displacement (n, 3) mm under the whole load, as another map has it; by
-        default they begin at the body at rest.
+        default they begin at the body at rest, and they do, too, where no step can be taken from
+        there: where no tangent is positive definite.
     folder : where the state is kept, and taken up again.
     deadline : value of ``time.perf_counter`` after which none begins, once the loads are there.
 
@@ -142,6 +146,8 @@ def sweep_box(
             if time.perf_counter() > deadline and state.level == 1.0:
                 break
             state, told = _sweep(simulator, state, seed)
+            if start is not None and state.level == 1.0 and not np.isfinite(state.left):
+                state = replace(_at_rest(simulator), number=state.number, lost=True)
             bar.set_postfix(told)
             bar.update()
             if folder is not None and time.perf_counter() - written > _WRITE_EVERY:
@@ -149,16 +155,12 @@ def sweep_box(
                 written = time.perf_counter()
     if folder is not None:
         _keep(folder, state)
-    if state.level == 1.0 and not np.isfinite(state.left):
-        raise SolverError(
-            f"scene '{simulator.scene.name}': no step of {state.number} sweeps could be taken from "
-            "where the start says; begin at rest, or use a recipe with FEM runs"
-        )
     if state.level < 1.0:
+        lost = "no step could be taken from where the start says, and from rest " * state.lost
         raise SolverError(
-            f"scene '{simulator.scene.name}': {state.number} sweeps followed the equilibria to "
-            f"{100 * state.level:.0f} % of the loads; give more of them, or use a recipe with FEM "
-            "runs"
+            f"scene '{simulator.scene.name}': {lost}{state.number} sweeps followed the equilibria "
+            f"to {100 * state.level:.0f} % of the loads; give more of them, or use a recipe with "
+            "FEM runs"
         )
     if state.taken < _ENOUGH:
         raise SolverError(
@@ -194,6 +196,8 @@ def _at(simulator: Simulator, start: Map) -> Swept:
         degree += 1
     position = np.random.default_rng(0).random((2 * terms(parameters, degree), parameters))
     there = jax.lax.map(lambda x: simulator.system.restrict(start(x)), jnp.asarray(position))
+    if not np.isfinite(there).all():
+        return replace(rest, lost=True)
     fitted = fit(Values(position, np.asarray(there), np.zeros(len(position))), degree, 1.0)
     return replace(rest, polynomial=fitted, before=0.0 * fitted.coefficients, level=1.0)
 

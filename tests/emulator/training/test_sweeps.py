@@ -273,10 +273,15 @@ def test_what_cannot_be_swept_is_refused(simulator):
     assert recipe("physics").runs == 0
 
 
-def test_a_start_that_is_nowhere_near_is_said_to_be(simulator):
+@pytest.mark.parametrize("factor", [-3.0, np.nan])
+def test_from_a_start_that_is_nowhere_near_they_go_on_from_rest(simulator, swept, factor):
     """A beam pushed through itself: no tangent there is positive definite."""
-    through = -3.0 * jnp.asarray(simulator.scene.mesh.nodes)
-    with pytest.raises(
-        SolverError, match="no step of 2 sweeps could be taken from where the start"
-    ):
+    through = factor * jnp.asarray(simulator.scene.mesh.nodes)
+    found = sweep_box(simulator, 34, 0, start=lambda position: through)
+    assert found.record["start"] == "left for rest"
+    assert "start" not in swept.record
+    middle = jnp.full((1, 2), 0.5)
+    there, right = found.polynomial.at(middle), swept.polynomial.at(middle)
+    np.testing.assert_allclose(there, right, atol=1e-5 * np.abs(right).max())
+    with pytest.raises(SolverError, match="where the start says, and from rest 2 sweeps followed"):
         sweep_box(simulator, 2, 0, start=lambda position: through)
