@@ -48,7 +48,7 @@ class Plan:
     """
 
     wide: int = 12
-    rounds: int = 8
+    rounds: int = 6
     each: int = 7
     tests: int = 6
     meshes: int = 2

@@ -63,7 +63,8 @@ class InverseSystem(System):
     def forces(self) -> list[LocalForce]:
         """Loads on the loaded shape."""
         grid = self.scene.discretisation
-        return [load.on_loaded(grid) for load in self.scene.loads]
+        fibres = None if self.scene.fibres is None else self.scene.fibres_at_points
+        return [load.on_loaded(grid, fibres) for load in self.scene.loads]
 
     @cached_property
     def resistances(self) -> list[LocalForce]:

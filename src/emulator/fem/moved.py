@@ -66,6 +66,8 @@ def moved(scene: Scene, w: jax.Array, theta: jax.Array) -> Scene:
     It lives as long as the function that makes it. Nothing is checked.
     """
     grid, tissue = scene.discretisation, tissue_at_rest(scene, w, theta)
+    directions = tissue.directions
+    fibres = directions if directions is None or directions.ndim == 3 else directions[:, :, 0]
     mesh = copy.copy(scene.mesh)
     object.__setattr__(mesh, "nodes", scene.mesh.nodes + w)
     h = displacement_gradient(scene, w)
@@ -80,6 +82,7 @@ def moved(scene: Scene, w: jax.Array, theta: jax.Array) -> Scene:
         ("mesh", mesh),
         ("discretisation", there),
         ("blocks", blocks),
+        ("fibres", fibres),
         ("angles", ()),
         ("_tissue", tissue),
         ("_block_tissue", jax.tree.map(blocks.gather, tissue)),

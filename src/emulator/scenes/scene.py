@@ -233,8 +233,9 @@ class Scene(Shown):
     def _at_points(self, of_elements: np.ndarray) -> np.ndarray:
         """Directions (m, 3) or (m, q, 3) at every quadrature point, (m, q, 3)."""
         points = len(quadrature_points(self.mesh.order))
-        wide = of_elements if of_elements.ndim == 3 else of_elements[:, None]
-        return np.broadcast_to(wide, (len(wide), points, 3))
+        if of_elements.shape[1:] == (points, 3):
+            return of_elements
+        return np.broadcast_to(of_elements[:, None], (len(of_elements), points, 3))
 
     @property
     def fibres_at_points(self) -> np.ndarray:

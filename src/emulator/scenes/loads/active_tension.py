@@ -28,6 +28,13 @@ springs of stiffness :math:`-T_a k_{ab}` between the nodes a < b of an element, 
           \qquad D = X_b - X_a, \quad \Delta = u_b - u_a .
 
 k is positive semidefinite: the tangent is constant, and tension stiffens.
+
+On a body whose loaded shape x is known, with w from there to rest and :math:`f = I + \partial
+w/\partial x = F^{-1}`, fibres m of the loaded tissue are :math:`f_0 = f m / |f m|` at rest, and the
+force on node a is
+
+.. math:: -\int \sigma \nabla_x N_a\, dx, \qquad \sigma = \det f\; T_a \left[(1 - \eta)\,
+          \frac{m \otimes m}{|f m|^2} + \eta\, (f^T f)^{-1}\right].
 """
 
 from __future__ import annotations
@@ -41,10 +48,11 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
+from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
-from emulator.scenes.local_terms import LocalTerm, Values
+from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
 
 
 @dataclass(frozen=True)
@@ -103,7 +111,7 @@ class ActiveTension(Load):
         along = jnp.einsum("mqij,mqj,mqk->mqik", F, fibres, fibres)
         return self.value(values) * (along + self.transverse * (F - along))
 
-    def term(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalTerm:
+    def term(self, grid: Discretisation, fibres: Any = None) -> LocalTerm:
         """The springs between nodes."""
         assert fibres is not None, "a scene with this load has fibres"
         pairs, stiffness = _springs(grid, fibres, self.transverse)
@@ -117,20 +125,45 @@ class ActiveTension(Load):
 
         return LocalTerm(pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), energy, convex=True)
 
+    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+        """The force of the stress on each element's nodes."""
+        assert fibres is not None, "a scene with this load has fibres"
 
-def _springs(
-    grid: Discretisation, fibres: np.ndarray, transverse: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (k, 2) and stiffness ``-k_ab`` (k,) in mm of each spring, for a tension of 1."""
-    along = np.einsum("mqai,mqi->mqa", grid.gradients, fibres)
-    stiffness = (1.0 - transverse) * np.einsum("mq,mqa,mqb->mab", grid.weights, along, along)
+        def at_point(
+            w: jax.Array, gradients: jax.Array, weight: jax.Array, m: jax.Array
+        ) -> jax.Array:
+            f = jnp.eye(3) + w.T @ gradients
+            det, along = determinant(f), f @ m
+            stress = (1.0 - self.transverse) * jnp.outer(m, m) / jnp.vdot(along, along)
+            if self.transverse:
+                F = cofactor(f).T / det
+                stress += self.transverse * F @ F.T
+            return -weight * det * gradients @ stress
+
+        def force(w: jax.Array, element: Any, values: Values) -> jax.Array:
+            return self.value(values) * jax.vmap(at_point, (None, 0, 0, 0))(w, *element).sum(0)
+
+        return LocalForce(grid.connectivity, (grid.gradients, grid.weights, fibres), force)
+
+
+def _springs(grid: Discretisation, fibres: Any, transverse: float) -> tuple[np.ndarray, Any]:
+    """Nodes (k, 2) and stiffness ``-k_ab`` (k,) in mm of each spring, for a tension of 1.
+
+    The stiffness is traced where the grid is, and NumPy's where it is not.
+    """
+    gradients, weights = grid.gradients, grid.weights
+    traced = any(isinstance(a, jax.core.Tracer) for a in (gradients, weights, fibres))
+    xp: Any = jnp if traced else np
+    along = xp.einsum("mqai,mqi->mqa", gradients, fibres)
+    stiffness = (1.0 - transverse) * xp.einsum("mq,mqa,mqb->mab", weights, along, along)
     if transverse:
-        gradients = grid.gradients
-        stiffness += transverse * np.einsum(
-            "mq,mqai,mqbi->mab", grid.weights, gradients, gradients, optimize=True
+        stiffness += transverse * xp.einsum(
+            "mq,mqai,mqbi->mab", weights, gradients, gradients, optimize=True
         )
     one, other = np.triu_indices(grid.connectivity.shape[1], 1)
     ends = np.sort(grid.connectivity[:, np.stack([one, other], axis=1)], axis=2).reshape(-1, 2)
     pairs, which = np.unique(ends, axis=0, return_inverse=True)
     amounts = stiffness[:, one, other].ravel()
+    if traced:
+        return pairs, -jax.ops.segment_sum(amounts, which.ravel(), len(pairs))
     return pairs, -np.bincount(which.ravel(), amounts, minlength=len(pairs))

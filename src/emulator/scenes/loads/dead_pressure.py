@@ -35,7 +35,7 @@ class DeadPressure(SurfacePressure):
         """Consistent nodal forces (n, 3) in mN for 1 kPa of a pressure that is a parameter."""
         return {} if self.pressure is not None else {self.parameter: self._per_kpa(grid)}
 
-    def on_loaded(self, grid: Discretisation) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
         """The force by the surface at rest, ``x + w``."""
         mesh = grid.mesh
         facets, rule = mesh.facet_set(self.facet_set), self._rule(mesh.order)

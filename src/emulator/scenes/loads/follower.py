@@ -55,7 +55,7 @@ class FollowerPressure(SurfacePressure):
 
         return LocalForce(facets, mesh.nodes[facets], force)
 
-    def on_loaded(self, grid: Discretisation) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
         """The force on the known surface, whatever the shape at rest."""
         following = self.force(grid)
 

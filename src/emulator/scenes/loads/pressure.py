@@ -68,6 +68,6 @@ class CavityPressure(SurfacePressure):
 
         return LocalTerm(facets, grid.mesh.nodes[facets], energy)
 
-    def on_loaded(self, grid: Discretisation) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
         """The force on the known wall, whatever the shape at rest."""
         return self.at_held_nodes.on_loaded(grid)

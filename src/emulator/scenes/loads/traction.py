@@ -49,7 +49,7 @@ class Traction(Load):
         area = nodal_areas(mesh.nodes[facets], rule)
         return nodal_sums(mesh, facets, area)[:, None] * np.asarray(self.traction, dtype=float)
 
-    def on_loaded(self, grid: Discretisation) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
         """The force by the surface at rest, ``x + w``."""
         mesh = grid.mesh
         facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 4)
