@@ -37,6 +37,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from calibrate.noise.protocol import Noise
 from calibrate.observations.scalar import Scalar
@@ -53,8 +54,6 @@ _A, _B = 27.78 * KPA_PER_MMHG, 2.76
 _UNLOADED, _SLOPE = 0.6, 0.006 / KPA_PER_MMHG  # V_0 / V_m at rest, and its fall with P_m in 1/kPa
 _LARGEST = 40.0 * KPA_PER_MMHG  # of the pressures the relation was compared at
 
-Number = jax.Array | np.ndarray | float
-
 
 class PowerLaw(NamedTuple):
     """``P = alpha V**beta``: alpha in kPa / mL**beta, beta without unit, V in mL."""
@@ -62,16 +61,16 @@ class PowerLaw(NamedTuple):
     alpha: jax.Array
     beta: jax.Array
 
-    def pressure(self, volume: Number) -> jax.Array:
+    def pressure(self, volume: ArrayLike) -> jax.Array:
         """Pressure (...) in kPa at ``volume`` (...) in mL."""
         return self.alpha * jnp.asarray(volume) ** self.beta
 
-    def volume(self, pressure: Number) -> jax.Array:
+    def volume(self, pressure: ArrayLike) -> jax.Array:
         """Volume (...) in mL at ``pressure`` (...) in kPa."""
         return (jnp.asarray(pressure) / self.alpha) ** (1.0 / self.beta)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Klotz:
     """The relation through one point; differentiable in it.
 
@@ -86,38 +85,44 @@ class Klotz:
         A number outside these ranges; numbers that JAX traces are not looked at.
     """
 
-    measured_volume: Number
-    measured_pressure: Number
+    measured_volume: ArrayLike
+    measured_pressure: ArrayLike
 
     def __post_init__(self) -> None:
-        if not isinstance(self.measured_volume, jax.core.Tracer):
-            volumes = np.asarray(self.measured_volume, dtype=float)
-            if not ((volumes > 0.0) & np.isfinite(volumes)).all():
-                raise InputError(
-                    f"klotz: the measured volume is {self.measured_volume} mL; it must be above 0"
-                )
-        if not isinstance(self.measured_pressure, jax.core.Tracer):
-            _check_pressure("klotz", self.measured_pressure)
+        volume, pressure = self.measured_volume, self.measured_pressure
+        if not isinstance(volume, jax.core.Tracer):
+            values = np.asarray(volume, dtype=float)
+            if not ((values > 0.0) & np.isfinite(values)).all():
+                raise InputError(f"klotz: the measured volume is {volume} mL; it must be above 0")
+        if not isinstance(pressure, jax.core.Tracer):
+            _check_pressure("klotz", pressure)
 
     @property
-    def unloaded(self) -> Number:
+    def _point(self) -> tuple[jax.Array, jax.Array]:
+        return jnp.asarray(self.measured_volume, float), jnp.asarray(self.measured_pressure, float)
+
+    @property
+    def unloaded(self) -> jax.Array:
         """V_0 in mL, without pressure."""
-        return self.measured_volume * (_UNLOADED - _SLOPE * self.measured_pressure)
+        volume, pressure = self._point
+        return volume * (_UNLOADED - _SLOPE * pressure)
 
     @property
-    def at_30_mmhg(self) -> Number:
+    def at_30_mmhg(self) -> jax.Array:
         """V_30 in mL: where the normalised curve reaches 27.78 mmHg and the power law 30."""
-        filled = self.measured_volume - self.unloaded
-        return self.unloaded + filled * (self.measured_pressure / _A) ** (-1.0 / _B)
+        volume, pressure = self._point
+        return self.unloaded + (volume - self.unloaded) * (pressure / _A) ** (-1.0 / _B)
 
-    def volume(self, pressure: Number) -> jax.Array:
+    def volume(self, pressure: ArrayLike) -> jax.Array:
         """Volume (...) in mL at ``pressure`` (...) in kPa; V_0 where that is 0 or less."""
-        return self.measured_volume * _ratio(pressure, self.measured_pressure)
+        volume, measured = self._point
+        return volume * _ratio(pressure, measured)
 
-    def pressure(self, volume: Number) -> jax.Array:
+    def pressure(self, volume: ArrayLike) -> jax.Array:
         """Pressure (...) in kPa at ``volume`` (...) in mL; 0 below V_0."""
+        measured, pressure = self._point
         filled = jnp.maximum(jnp.asarray(volume) - self.unloaded, 0.0)
-        return self.measured_pressure * (filled / (self.measured_volume - self.unloaded)) ** _B
+        return pressure * (filled / (measured - self.unloaded)) ** _B
 
     @property
     def power_law(self) -> PowerLaw:
@@ -126,36 +131,36 @@ class Klotz:
         Above 22 mmHg, where these two are close, V_15 = V_0 + 0.8 (V_30 - V_0) at 15 mmHg is in the
         place of V_30.
         """
-        mmhg = jnp.asarray(self.measured_pressure) / KPA_PER_MMHG
+        measured, pressure = self._point
+        mmhg = pressure / KPA_PER_MMHG
         low = mmhg <= 22.0
         at_15 = self.unloaded + 0.8 * (self.at_30_mmhg - self.unloaded)
-        pressure, volume = jnp.where(low, 30.0, 15.0), jnp.where(low, self.at_30_mmhg, at_15)
-        beta = jnp.log(mmhg / pressure) / jnp.log(self.measured_volume / volume)
-        alpha = self.measured_pressure * jnp.exp(-beta * jnp.log(self.measured_volume))
-        return PowerLaw(alpha, beta)
+        other, volume = jnp.where(low, 30.0, 15.0), jnp.where(low, self.at_30_mmhg, at_15)
+        beta = jnp.log(mmhg / other) / jnp.log(measured / volume)
+        return PowerLaw(pressure * jnp.exp(-beta * jnp.log(measured)), beta)
 
-    def sd(self, pressure: Number, scatter: float = PRESSURE_SCATTER) -> jax.Array:
+    def sd(self, pressure: ArrayLike, scatter: float = PRESSURE_SCATTER) -> jax.Array:
         """Sd (...) in mL of :class:`KlotzVolume` at ``pressure`` (...) in kPa, above 0.
 
         What a ``scatter`` of pressure in kPa means for it, to first order:
         scatter dV/dP / k, with dV/dP = (V - V_0) / (B_n P). The default is an upper bound.
         """
-        k = _ratio(pressure, self.measured_pressure)
         slope = (self.volume(pressure) - self.unloaded) / (_B * jnp.asarray(pressure))
-        return scatter * slope / k
+        return scatter * slope / _ratio(pressure, self._point[1])
 
 
-def _ratio(pressure: Number, measured: Number) -> jax.Array:
+def _ratio(pressure: ArrayLike, measured: ArrayLike) -> jax.Array:
     """k, the volume at ``pressure`` over that at ``measured``, both in kPa.
 
     Its slope at no pressure is infinite, and 0 is given.
     """
-    rest, above = _UNLOADED - _SLOPE * measured, jnp.asarray(pressure) > 0.0
-    filled = (jnp.where(above, pressure, measured) / measured) ** (1.0 / _B)
+    p, m = jnp.asarray(pressure, float), jnp.asarray(measured, float)
+    rest, above = _UNLOADED - _SLOPE * m, p > 0.0
+    filled = (jnp.where(above, p, m) / m) ** (1.0 / _B)
     return rest + (1.0 - rest) * jnp.where(above, filled, 0.0)
 
 
-def _check_pressure(name: str, pressure: Number) -> None:
+def _check_pressure(name: str, pressure: ArrayLike) -> None:
     values = np.asarray(pressure, dtype=float)
     if not ((values > 0.0) & (values <= _LARGEST)).all():
         raise InputError(

@@ -51,6 +51,7 @@ def klotz_band(
     band: float = PRESSURE_SCATTER,
     count: int = DRAWS,
     seed: int = 0,
+    state: str | None = None,
 ) -> KlotzBand:
     """Where ``count`` curves of the prior lie.
 
@@ -60,12 +61,14 @@ def klotz_band(
         pressure.
     band : half-width in kPa; by default 3 mmHg, which the published root mean square errors of the
         relation stay below.
+    state : whose parameters a curve has, but for the pressure, in a model with several load states;
+        by default the last. Muscle must be at rest there.
 
     Raises
     ------
     InputError
         A scene without a cavity whose pressure is a parameter, a band or count that is not above 0,
-        pressures beyond the relation's, or no valid curve.
+        pressures beyond the relation's, an unknown state, or no valid curve.
     """
     if not band > 0.0 or count < 1:
         raise InputError(f"klotz: band {band} kPa and {count} draws; both must be above 0")
@@ -84,9 +87,17 @@ def klotz_band(
         through = Klotz(volumes[-1], pressures[-1]) if point is None else point
         return jnp.max(jnp.abs(through.pressure(volumes) - pressures))
 
-    thetas = model.states.thetas(model.prior_draws(jax.random.key(seed), count))[:, -1]
+    row = _row(model.states.states, state)
+    thetas = model.states.thetas(model.prior_draws(jax.random.key(seed), count))[:, row]
     found = np.asarray(jax.jit(partial(jax.lax.map, apart))(thetas))
     valid = found[np.isfinite(found)]
     if not valid.size:
         raise InputError(f"klotz: the forward map has no answer at any of {count} draws")
     return KlotzBand(valid, band, count - valid.size)
+
+
+def _row(states: tuple[str, ...], state: str | None) -> int:
+    if state is not None and state not in states:
+        known = ", ".join(filter(None, states)) or "none"
+        raise InputError(f"klotz: load state '{state}' is unknown; known: {known}")
+    return -1 if state is None else states.index(state)

@@ -9,9 +9,11 @@ from scipy.optimize import brentq
 import calibrate as cal
 from calibrate.data import read_data
 from calibrate.observations import observations_from_json, parse_observation
+from calibrate.samplers.laplace import LaplaceOptions
 from calibrate.workflow import Run
 from emulator.errors import InputError
 from emulator.scenes.loads import KPA_PER_MMHG
+from klotz_support import PRIOR, lengthening, model_of
 from linear_support import linear_forward
 
 A, B = 27.78, 2.76  # mmHg, 1
@@ -146,3 +148,29 @@ def test_what_is_refused(ventricle, make, message):
 def test_a_body_without_a_cavity(beam):
     with pytest.raises(InputError, match="klotz:1.3: scene .* has no cavity whose pressure is a"):
         parse_observation(beam, "klotz:1.3")
+
+
+@pytest.mark.slow  # compiles a sampler
+def test_the_relation_tells_the_shape_of_the_curve(ventricle):
+    """One volume tells one of two unknowns; with the relation the posterior is the linear one."""
+    forward = lengthening(ventricle)
+    sds = {"volume@ED": 1.0, "klotz:1.3@low": 2.0, "klotz:1.3@middle": 2.0}
+    at = {"pressure@ED": 1.3, "pressure@low": 0.6, "pressure@middle": 0.9}
+    model = model_of(forward, PRIOR, sds, **at)
+    posterior = cal.sample(
+        model, dict.fromkeys(sds, 130.0), sampler="laplace", options=LaplaceOptions(400, 2, 4)
+    )
+    draws = np.stack([np.ravel(posterior.tree["posterior"][n]) for n in ("a", "b")], axis=1)
+    # 130 mL at 1.3 kPa on Klotz's curve: a = 10 and b = 1, with the spread of the linear model.
+    x, weights = jnp.array([10.0, 1.0]), 1.0 / np.array(list(sds.values()))
+
+    def numbers(x):
+        means, _ = model.predict({"a": x[0], "b": x[1]})
+        return jnp.stack([means[name] for name in sds])
+
+    np.testing.assert_allclose(numbers(x), 130.0, rtol=1e-9)
+    slopes = weights[:, None] * np.asarray(jax.jacfwd(numbers)(x))
+    covariance = np.linalg.inv(slopes.T @ slopes)
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose((draws.mean(axis=0) - x) / sd, 0.0, atol=0.3)
+    np.testing.assert_allclose(draws.std(axis=0), sd, rtol=0.15)
