@@ -20,7 +20,8 @@ and, put into the curve, :math:`A_n` cancels:
 
 :math:`k` is a number that no volume enters. So the curves through all volumes at :math:`P_m` cover
 the plane once, and a body of volume V at the pressure P lies on that of :math:`V_m = V / k`: this
-is what :class:`KlotzVolume` predicts and a measured volume is compared with.
+is what :class:`KlotzVolume` predicts and a measured volume is compared with. Points of one curve
+have curves of their own: V_0 changes with the pressure that is measured.
 
 Scatter: over 0 to 40 mmHg, pressures of the predicted curve were less than 3 mmHg (root mean
 square) from measured ones in every group of hearts of the 2006 paper. It holds for groups of hearts

@@ -15,22 +15,31 @@ def larger(ventricle):
     return model_of(lengthening(ventricle), {"a": PRIOR["a"]}, b=1.0, pressure=1.0)
 
 
-def test_curves_of_the_right_shape(larger):
-    own = cal.klotz_band(larger, count=20, band=1e-6)
-    assert (own.fraction, own.left_out, own.apart.shape) == (1.0, 0, (20,))
-    # Through one measured point, by the printed relation: volumes of all pressures are too large
-    # by one share, and the pressures that it gives for them by hand.
-    mmhg, band = 0.133322, 0.3
-    found = cal.klotz_band(larger, cal.Klotz(VOLUME, PRESSURE), band=band, count=40, seed=3)
+def printed(volumes, volume, pressure):
+    """Pressures in kPa of the relation through a point, as printed, with A_n that cancels."""
+    mmhg = pressure / 0.133322
+    rest = volume * (0.6 - 0.006 * mmhg)
+    at_30 = rest + (volume - rest) / (mmhg / 27.78) ** (1.0 / 2.76)
+    return 0.133322 * 27.78 * ((volumes - rest) / (at_30 - rest)) ** 2.76
+
+
+def test_how_far_curves_are_apart_is_what_the_printed_relation_says(larger):
+    band, parameter = 0.3, larger.forward.scene.parameters[-1]
     a = np.asarray(larger.prior_draws(jax.random.key(3), 40)["a"])
-    low, high = larger.forward.scene.parameters[-1].low, larger.forward.scene.parameters[-1].high
-    p = np.linspace(low, high, 12)
-    rest = 0.6 - 0.006 * PRESSURE / mmhg
-    share = rest + (1.0 - rest) * (p / PRESSURE) ** (1.0 / 2.76)
-    volumes = (VOLUME + a)[:, None] * share
-    expected = PRESSURE * ((volumes / VOLUME - rest) / (1.0 - rest)) ** 2.76 - p
-    np.testing.assert_allclose(found.apart, expected.max(axis=1), rtol=1e-9)
-    assert 0.0 < found.fraction == np.mean(expected.max(axis=1) <= band) < 1.0
+    p = np.linspace(parameter.low, parameter.high, 12)
+    rest = 0.6 - 0.006 * PRESSURE / 0.133322
+    volumes = (VOLUME + a)[:, None] * (rest + (1.0 - rest) * (p / PRESSURE) ** (1.0 / 2.76))
+    # Through one measured point: volumes of all pressures are too large by one share.
+    found = cal.klotz_band(larger, cal.Klotz(VOLUME, PRESSURE), band=band, count=40, seed=3)
+    expected = np.abs(printed(volumes, VOLUME, PRESSURE) - p).max(axis=1)
+    np.testing.assert_allclose(found.apart, expected, rtol=1e-8)
+    assert 0.0 < found.fraction == np.mean(expected <= band) < 1.0
+    # Through each curve's own last point, beside the one that its volumes were made with.
+    own = cal.klotz_band(larger, count=40, seed=3)
+    expected = np.abs(printed(volumes, volumes[:, -1:], p[-1]) - p).max(axis=1)
+    np.testing.assert_allclose(own.apart, expected, rtol=1e-6)
+    assert expected.max() < 2e-3
+    assert (own.fraction, own.left_out) == (1.0, 0)
 
 
 def test_curves_of_another_shape(ventricle):

@@ -205,8 +205,8 @@ def run_prior(arguments: argparse.Namespace) -> int:
     if (band := _klotz(model, arguments.seed)) is not None:
         result["klotz"] = {"fraction": band.fraction, "band_kpa": band.band}
         text += (
-            f"\n{100.0 * band.fraction:.0f} % of {band.apart.size} pressure-volume curves lie within "
-            f"{in_mmhg(band.band)} of Klotz's relation through their own last point"
+            f"\n{100.0 * band.fraction:.0f} % of {band.apart.size} pressure-volume curves lie "
+            f"within {in_mmhg(band.band)} of Klotz's relation through their own last point"
         )
     text += f"\nwritten to {folder}"
     emit(result, as_json=arguments.json, text=text)
