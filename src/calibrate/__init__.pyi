@@ -4,6 +4,8 @@ from .identifiability import identify
 from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from .observations import (
     CavityVolume,
+    Klotz,
+    KlotzVolume,
     MeasuredParameter,
     Reaction,
     landmarks,
@@ -16,6 +18,7 @@ from .observations import (
 )
 from .posterior import Posterior, sample
 from .posterior.comparison import compare
+from .posterior.klotz_band import klotz_band
 from .posterior.simulation_based import sbc
 from .priors import (
     Dependence,
@@ -48,6 +51,8 @@ __all__ = [
     "GaussianNoise",
     "Hierarchy",
     "JointPrior",
+    "Klotz",
+    "KlotzVolume",
     "MeasuredParameter",
     "Model",
     "NUTSOptions",
@@ -62,6 +67,7 @@ __all__ = [
     "density_of",
     "hierarchy",
     "identify",
+    "klotz_band",
     "landmarks",
     "length_between",
     "load",

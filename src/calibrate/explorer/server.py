@@ -16,6 +16,7 @@ import numpy as np
 from plotly.offline import get_plotlyjs
 
 from calibrate.local_server import Handler, Server, listen
+from calibrate.observations.klotz import klotz_of
 from calibrate.observations.pressure_volume import PressureVolume, pressure_volume
 from emulator.error.estimate import error_bar
 from emulator.errors import InputError
@@ -94,14 +95,21 @@ class Explorer:
         return both.tobytes()
 
     def curve(self, position: Mapping[str, str]) -> dict[str, Any]:
-        """Volume of a cavity over the range of its pressure, all else at ``position``."""
+        """Volume of a cavity over the range of its pressure, all else at ``position``.
+
+        ``klotz`` is the relation through the volume at ``position`` (:class:`Klotz`), or None.
+        """
         if self._curve is None:
             raise InputError(f"scene '{self.scene.name}' has no cavity whose pressure varies")
-        volumes = self._volumes(self.theta(position))
+        theta, pressures = self.theta(position), self._curve.pressures
+        volumes = np.asarray(self._volumes(theta))
+        here = float(theta[self.scene.parameter_names.index(self._curve.parameter.name)])
+        klotz = klotz_of(self.scene, np.interp(here, pressures, volumes), here)
         return {
-            "pressure": self._curve.pressures.tolist(),
-            "volume": np.asarray(volumes).tolist(),
+            "pressure": pressures.tolist(),
+            "volume": volumes.tolist(),
             "rest": self._curve.rest,
+            "klotz": None if klotz is None else np.asarray(klotz.volume(pressures)).tolist(),
         }
 
     def error(self, position: Mapping[str, str]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ Each stands for one measurement; :class:`Observations` holds those made at once,
 are listed in :data:`OBSERVATIONS`.
 """
 
+from calibrate.observations.klotz import Klotz, KlotzVolume
 from calibrate.observations.landmarks import Landmarks, landmarks, spread_landmarks
 from calibrate.observations.length import Length, length_between
 from calibrate.observations.nodes import NodalDisplacements, nodal_displacements, spread_nodes
@@ -36,6 +37,8 @@ __all__ = [
     "CavityVolume",
     "Field",
     "Kind",
+    "Klotz",
+    "KlotzVolume",
     "Labels",
     "Landmarks",
     "Length",

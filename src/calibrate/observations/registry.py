@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calibrate.observations.klotz import KlotzVolume
 from calibrate.observations.landmarks import Landmarks
 from calibrate.observations.length import Length
 from calibrate.observations.nodes import NodalDisplacements
@@ -35,6 +36,7 @@ OBSERVATIONS: dict[str, type[Kind]] = {
         SurfacePoints,
         RigidMarkers,
         CavityVolume,
+        KlotzVolume,
         Length,
         Reaction,
         MeasuredParameter,

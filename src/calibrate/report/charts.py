@@ -14,7 +14,8 @@ from scipy.stats import rankdata
 from calibrate.figures.palette import BLUE, COLOURS, VERMILION
 from calibrate.identifiability.stress import stress_band
 from calibrate.observations import Observation
-from calibrate.observations.pressure_volume import in_mmhg, pressure_volume
+from calibrate.observations.klotz import klotz_of
+from calibrate.observations.pressure_volume import PressureVolume, in_mmhg, pressure_volume
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
 from emulator.scenes.loads import KPA_PER_MMHG
@@ -25,6 +26,9 @@ _MOST_TRACED = 500  # draws of a chain in a trace
 _MOST_PAIRED = 800  # draws in a pair plot
 _CURVES = 60  # draws of a pressure-volume band
 _VOLUMES = 400  # draws of volumes
+_CLOSER_AT_REST = (
+    3  # power by which pressures of Klotz's curve, which rises from 0, lie closer there
+)
 
 
 def names_with_units(posterior: Posterior) -> dict[str, str]:
@@ -199,7 +203,9 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
     volumes = jax.jit(lambda t: jax.lax.map(curve.volumes, t))(thetas[rows])
     low, middle, high = np.nanquantile(np.asarray(volumes), [0.05, 0.5, 0.95], axis=0)
     p, name = curve.pressures, curve.parameter.name
+    measured = _measured_volumes(posterior, curve)
     figure = go.Figure()
+    _add_klotz(figure, curve, middle, measured)
     figure.add_scatter(
         x=[*low, *high[::-1]], y=[*p, *p[::-1]], fill="toself", fillcolor=_BAND, line_width=0,
         name="90 % of the posterior", hoverinfo="skip",
@@ -213,9 +219,8 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
         marker={"color": BLUE, "size": 8, "symbol": "circle-open"}, mode="lines+markers",
         name="without load, as the mesh is",
     )  # fmt: skip
-    for seen, part in model.observe.parts.items():
-        if part.to_json() == curve.volume.to_json():
-            _add_measured(figure, posterior, seen, name)
+    for seen, (volume, pressures) in measured.items():
+        _add_measured(figure, seen, volume, pressures)
     figure.update_layout(
         xaxis_title="cavity volume (mL)",
         yaxis_title=f"{name} (kPa; 1 kPa is {1.0 / KPA_PER_MMHG:.1f} mmHg)",
@@ -238,14 +243,46 @@ def state_volumes(posterior: Posterior) -> dict[str, np.ndarray]:
     }
 
 
-def _add_measured(figure: go.Figure, posterior: Posterior, seen: str, pressure: str) -> None:
+def _measured_volumes(
+    posterior: Posterior, curve: PressureVolume
+) -> dict[str, tuple[float, np.ndarray]]:
+    """By the observation's name, the cavity's measured volume in mL, and its pressure at draws."""
+    found, model = {}, posterior.model
+    column = model.forward.scene.parameter_names.index(curve.parameter.name)
+    for seen, part in model.observe.parts.items():
+        if part.to_json() == curve.volume.to_json():
+            pressures = np.asarray(posterior.thetas(split(seen)[1])[:, column])
+            found[seen] = float(posterior.data[seen]), pressures
+    return found
+
+
+def _add_measured(figure: go.Figure, seen: str, volume: float, pressures: np.ndarray) -> None:
     """The measured volume at the pressure of its load state, inferred or known."""
-    state = split(seen)[1]
-    column = posterior.model.forward.scene.parameter_names.index(pressure)
-    values = np.asarray(posterior.thetas(state)[:, column])
     figure.add_scatter(
-        x=[float(posterior.data[seen])], y=[float(values.mean())], mode="markers",
+        x=[volume], y=[float(pressures.mean())], mode="markers",
         marker={"color": VERMILION, "size": 11, "symbol": "x"},
-        error_y={"type": "data", "array": [float(values.std())]},
-        name=f"{seen} measured; pressure {'known' if values.std() == 0.0 else 'inferred'}",
+        error_y={"type": "data", "array": [float(pressures.std())]},
+        name=f"{seen} measured; pressure {'known' if pressures.std() == 0.0 else 'inferred'}",
+    )  # fmt: skip
+
+
+def _add_klotz(
+    figure: go.Figure,
+    curve: PressureVolume,
+    median: np.ndarray,
+    measured: dict[str, tuple[float, np.ndarray]],
+) -> None:
+    """Klotz's curve through the volume measured at the highest pressure, else the median there."""
+    points = [(float(pressures.mean()), volume) for volume, pressures in measured.values()]
+    pressure, volume = max(points, default=(curve.pressures[-1], median[-1]))
+    klotz = klotz_of(curve.volume.scene, volume, pressure)
+    if klotz is None:
+        return
+    top = max(pressure, curve.pressures[-1])
+    p = top * np.linspace(0.0, 1.0, 60) ** _CLOSER_AT_REST
+    through = "measured volume" if points else "median"
+    figure.add_scatter(
+        x=np.asarray(klotz.volume(p)), y=p, mode="lines", line={"color": "gray", "dash": "dash"},
+        name=f"left ventricles (Klotz et al. 2006), through the {through} at {in_mmhg(pressure)}",
+        text=[in_mmhg(each) for each in p], hovertemplate="%{x:.1f} mL at %{text}",
     )  # fmt: skip

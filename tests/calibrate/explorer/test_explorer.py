@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+import calibrate as cal
 import emulator as em
 from browser_support import opened
 from calibrate.cli import main
@@ -67,6 +68,8 @@ def test_displacement_and_volume_are_the_emulators(emulator, explorer, address):
     at = np.interp(float(theta[4]), curve["pressure"], curve["volume"])
     assert found[-1] == pytest.approx(at, rel=2e-3)
     assert (np.diff(curve["volume"]) > 0.0).all()
+    klotz = cal.Klotz(at, float(theta[4])).volume(np.array(curve["pressure"]))
+    np.testing.assert_allclose(curve["klotz"], klotz, rtol=1e-6)
 
 
 def test_it_is_fast_enough_to_follow_a_slider(address):

@@ -134,13 +134,15 @@ def test_charts_say_what_was_drawn(ventricle_posterior):
     assert set(named) == {"displacement", "volume"}
     assert len(named["displacement"].data[1].x) == 18
     curve = charts.volume_band(ventricle_posterior)
-    median = curve.data[1]
+    klotz, _, median, unloaded, seen = curve.data
     assert (np.diff(median.x) > 0.0).all()  # a stiffer pressure, a larger cavity
-    unloaded = curve.data[2]
     assert (unloaded.x[0], unloaded.y[0]) == (curve_rest(ventricle_posterior), 0.0)
     assert unloaded.x[1] == median.x[0] > unloaded.x[0]
     assert median.text[-1].endswith(f"({median.y[-1] / 0.133322:.3g} mmHg)")
-    assert curve.data[3].x[0] == pytest.approx(float(ventricle_posterior.data["volume"]))
+    assert seen.x[0] == pytest.approx(float(ventricle_posterior.data["volume"]))
+    # Klotz's curve lies behind, through what was measured.
+    assert np.interp(seen.y[0], klotz.y, klotz.x) == pytest.approx(seen.x[0], rel=1e-3)
+    assert klotz.x[0] == pytest.approx(seen.x[0] * (0.6 - 0.006 * seen.y[0] / 0.133322), rel=1e-6)
     ranks = [
         t for t in charts.traces(ventricle_posterior).data if t.type == "scatter" and t.line.shape
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import (
     DONE,
@@ -24,6 +24,10 @@ from calibrate.cli.common import (
 from calibrate.cli.model_words import add_model, model_of
 from calibrate.cli.noise_words import noise_words
 from emulator.errors import InputError
+
+if TYPE_CHECKING:
+    from calibrate.posterior.klotz_band import KlotzBand
+    from calibrate.statistical_model import Model
 
 
 def register(commands: Any) -> None:
@@ -179,6 +183,7 @@ def run_prior(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from calibrate.figures.calibration import draw_prior_predictive
+    from calibrate.observations.pressure_volume import in_mmhg
     from calibrate.posterior.predictions import prior_replicates
     from calibrate.workflow import Run, model_before_data
     from emulator.store import check_folder, save_arrays
@@ -191,11 +196,35 @@ def run_prior(arguments: argparse.Namespace) -> int:
     save_arrays(folder / "prior_predictive.safetensors", {**found.draws, **found.data})
     title = f"{run.scene}: what the prior predicts"
     draw_prior_predictive(found.data, units, title, folder / "prior_predictive.png")
-    result = {
+    result: dict[str, Any] = {
         name: dict(zip(("5 %", "50 %", "95 %"), np.quantile(v, [0.05, 0.5, 0.95]), strict=True))
         for name, v in found.data.items()
     }
     rows = [(f"{name} ({units[name]})", *by.values()) for name, by in result.items()]
-    text = f"{table(('observation', '5 %', '50 %', '95 %'), rows)}\nwritten to {folder}"
+    text = table(("observation", "5 %", "50 %", "95 %"), rows)
+    if (band := _klotz(model, arguments.seed)) is not None:
+        result["klotz"] = {"fraction": band.fraction, "band_kpa": band.band}
+        text += (
+            f"\n{100.0 * band.fraction:.0f} % of {band.apart.size} pressure-volume curves lie "
+            f"within {in_mmhg(band.band)} of Klotz's relation through their own last point"
+        )
+    text += f"\nwritten to {folder}"
     emit(result, as_json=arguments.json, text=text)
     return DONE
+
+
+def _klotz(model: Model, seed: int) -> KlotzBand | None:
+    """The prior's curves in Klotz's band; None without a resting cavity whose pressure varies.
+
+    Nor where the forward map solves: it would be some thousand solves.
+    """
+    from calibrate.observations.klotz import klotz_of
+    from calibrate.observations.pressure_volume import pressure_volume
+    from calibrate.posterior.klotz_band import klotz_band
+    from emulator.surrogates.protocol import SolvingMap
+
+    if isinstance(model.forward, SolvingMap) or (curve := pressure_volume(model.full)) is None:
+        return None
+    if klotz_of(model.forward.scene, curve.rest, curve.pressures[-1]) is None:
+        return None
+    return klotz_band(model, seed=seed)
