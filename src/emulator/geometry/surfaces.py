@@ -25,6 +25,8 @@ from emulator.errors import InputError
 from emulator.geometry.facets import enclosed_volume, openings
 from emulator.geometry.io import read_cells
 
+UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+"""Millimetres in a unit of length."""
 _MERGE = 1e-6  # of the surface's extent: points nearer than this are one
 _SNAP = 1e-4  # of the extent: points this near a plane lie in it, so that no slivers are cut off
 # Taubin's filter: halves what repeats every five edges and keeps what repeats every twenty.

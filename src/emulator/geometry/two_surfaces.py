@@ -18,14 +18,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from emulator.errors import InputError
+from emulator.errors import InputError, look_up
 from emulator.geometry.cavity import MM3_PER_ML, Cavity
+from emulator.geometry.discretisation import discretise
 from emulator.geometry.flattening import Flattened
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.mesher import tetrahedralise, triangulate
 from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.quality import MeshQuality, mesh_quality
 from emulator.geometry.surfaces import (
+    UNITS,
     Surface,
     cut,
     inside,
@@ -34,10 +36,8 @@ from emulator.geometry.surfaces import (
     read_surface,
     smoothed,
 )
-from emulator.geometry.tetrahedra import orient, signed_volumes
+from emulator.geometry.tetrahedra import orient
 
-UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-"""Millimetres in a unit of length."""
 _LEAST = 4.0  # mm; nobody's heart is smaller, a mouse's being 7 mm long
 _MOST_CUT = 0.2  # of the epicardium's height: rims that stand further apart are no base
 _SIZE = 0.7  # of the median thickness: some 5000 quadratic nodes for a human ventricle
@@ -128,7 +128,7 @@ def mesh_wall(
     base_point : a point (3,) mm of the plane instead.
     smooth : times of Taubin's filter on both surfaces; 10 to 30 take the steps off surfaces of
         voxels.
-    unit : of the files, a key of :data:`UNITS`; axis, size and base are in mm.
+    unit : of the files, a key of :data:`~emulator.geometry.surfaces.UNITS`; axis, size and base are in mm.
 
     Raises
     ------
@@ -139,8 +139,7 @@ def mesh_wall(
     """
     if order not in (1, 2):
         raise InputError(f"order {order}: expected 1 or 2")
-    if unit not in UNITS:
-        raise InputError(f"unit '{unit}' is unknown; known: {', '.join(UNITS)}")
+    look_up(UNITS, unit, "unit")
     if smooth < 0:
         raise InputError(f"smooth {smooth}: expected 0 times or more")
     whole = [
@@ -163,9 +162,7 @@ def mesh_wall(
         )
     mesh = _mesh([Flattened(each) for each in within], size, order, normal, point)
     cavity, outer = (each.volume / MM3_PER_ML for each in below)
-    own = signed_volumes(mesh.nodes, mesh.elements).sum() / MM3_PER_ML
-    if order == 2:
-        own = _wall_volume(mesh)
+    own = float(discretise(mesh).weights.sum()) / MM3_PER_ML
     rim = below[0].points[np.unique(one_rim(below[0]))]
     return Wall(
         mesh=mesh,
@@ -182,13 +179,6 @@ def mesh_wall(
         ),
         quality=mesh_quality(mesh),
     )
-
-
-def _wall_volume(mesh: Mesh) -> float:
-    """Of curved elements, mL."""
-    from emulator.geometry.discretisation import discretise
-
-    return float(discretise(mesh).weights.sum()) / MM3_PER_ML
 
 
 def _surface(given: str | Path | Surface, name: str, unit: str) -> Surface:
@@ -291,7 +281,8 @@ def _mesh(
     across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     across /= np.linalg.norm(across)
     frame = np.stack([across, np.cross(normal, across)])
-    loops = [each.points[: len(_rim_points(each))] for each in (outer, inner)]
+    # Points of a rim come first, in its order.
+    loops = [each.points[: len(one_rim(each))] for each in (outer, inner)]
     flat, annulus = triangulate([(loop - point) @ frame.T for loop in loops], size)
     outer_rim, inner_rim = map(len, loops)
     count = len(inner.points)
@@ -329,10 +320,6 @@ def _mesh(
         return middle
 
     return to_quadratic(mesh, midpoints)
-
-
-def _rim_points(given: Surface) -> np.ndarray:
-    return np.unique(one_rim(given))
 
 
 def _among(edges: np.ndarray, triangles: np.ndarray, count: int) -> np.ndarray:
