@@ -7,9 +7,9 @@ The rim goes to the circle by its arc length. Every other point lies at the mean
 
 with the angles at :math:`x_i` on both sides of the edge: mean value coordinates (Floater 2003, Mean
 value coordinates, Computer Aided Geometric Design 20). The weights are positive and the disc is
-convex, so that no triangle turns over, whatever its shape (Tutte 1963). The map is nearly conformal:
-triangles that are even in the disc, with edges :math:`h / s` where lengths on the surface are
-:math:`s` times those in the disc, are even on the surface.
+convex, so that no triangle turns over, whatever its shape (Tutte 1963). They come close to those of
+a conformal map, so triangles with edges :math:`h / s`, even in the disc, are even on the surface,
+where lengths are :math:`s` times those in the disc.
 """
 
 from __future__ import annotations

@@ -174,7 +174,8 @@ def read_cells(path: Path) -> meshio.Mesh:
     said = io.StringIO()
     try:
         # meshio's readers raise exceptions of many types, or print a reason and exit.
-        with redirect_stdout(said), redirect_stderr(said):
+        # In a text file of STL it takes letters for a number of triangles, which overflows.
+        with redirect_stdout(said), redirect_stderr(said), np.errstate(over="ignore"):
             return meshio.read(path)
     except (Exception, SystemExit) as error:
         reason = said.getvalue() if isinstance(error, SystemExit) else str(error)

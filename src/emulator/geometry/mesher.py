@@ -123,9 +123,7 @@ def _gmsh() -> Any:
     except ModuleNotFoundError as error:
         if error.name != "gmsh":
             raise
-        raise InputError(
-            "meshing needs gmsh: pip install 'soft-tissue-calibrate[gmsh]'"
-        ) from error
+        raise InputError("meshing needs gmsh: pip install 'soft-tissue-calibrate[gmsh]'") from error
     except OSError as error:  # ctypes, of a library that is not on this machine
         raise InputError(
             f"gmsh is installed but does not load ({error}): it needs the system's OpenGL and X11 "

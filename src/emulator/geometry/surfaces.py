@@ -101,6 +101,8 @@ def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
     points = np.asarray(points, dtype=float)
     if not np.isfinite(points).all():
         raise InputError(f"{name}: a coordinate is not finite")
+    if not len(triangles):
+        raise InputError(f"{name}: it has no triangles")
     points, triangles = _merged(points, np.asarray(triangles, dtype=np.int64))
     if len(triangles) < 4:
         raise InputError(f"{name}: {len(triangles)} triangles with an area; expected a surface")
@@ -161,8 +163,8 @@ def _one_sided(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarr
 
 
 def place_of(point: np.ndarray) -> str:
-    """A point (3,) in words."""
-    return "(" + ", ".join(f"{x:.4g}" for x in point) + ")"
+    """A point or a direction (3,) in words."""
+    return "(" + ", ".join(f"{x:.4g}" for x in np.round(point, 6) + 0.0) + ")"
 
 
 def cut(given: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
@@ -280,9 +282,7 @@ def inside(given: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
     p = at[point]
 
     def area(u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return (v[:, 0] - u[:, 0]) * (w[:, 1] - u[:, 1]) - (v[:, 1] - u[:, 1]) * (
-            w[:, 0] - u[:, 0]
-        )
+        return (v[:, 0] - u[:, 0]) * (w[:, 1] - u[:, 1]) - (v[:, 1] - u[:, 1]) * (w[:, 0] - u[:, 0])
 
     parts = np.stack([area(b, c, p), area(c, a, p), area(a, b, p)], axis=1)
     met = (parts >= 0.0).all(axis=1) | (parts <= 0.0).all(axis=1)

@@ -2,10 +2,10 @@ r"""The wall of a left ventricle, meshed between two surfaces: endocardium and e
 
 Both are cut by the base plane, laid out in the disc and meshed anew with even triangles
 (:mod:`emulator.geometry.flattening`); a flat annulus joins their rims, and Gmsh fills what they
-enclose. The long axis is the base plane's normal, from apex to base. Where it is not given it is the
-area vector of the rims, :math:`\frac12 \sum_\text{edges} x_a \times x_b`, and the plane lies as low
-as the lowest point of a rim, so that rims which are not flat, or not at one height, are cut off; by
-how much is told.
+enclose. The long axis is the base plane's normal, from apex to base. Where it is not given it is
+the area vector of the rims, :math:`\frac12 \sum_\text{edges} x_a \times x_b`, and the plane lies
+as low as the lowest point of a rim, so that rims which are not flat, or not at one height, are cut
+off; by how much is told.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class Wall:
     axis : (3,) from apex to base, of length 1. base : (3,) mm, the middle of the cavity's rim.
     size : edge length aimed at, mm. thickness : of the wall.
     cavity, wall : volumes in mL, of the mesh and of the surfaces below the base plane.
-    cut_off : height of what was cut off above the base plane, mm. moved : by smoothing, at most, mm.
+    cut_off : height of what was cut off above the base plane, mm; 0 for closed surfaces.
+    moved : by smoothing, at most, mm.
     """
 
     mesh: Mesh
@@ -88,9 +89,8 @@ class Wall:
             f"{len(self.mesh.nodes)} nodes, {len(self.mesh.elements)} tetrahedra of order "
             f"{self.mesh.order}, edges of {self.size:.3g} mm",
             f"long axis {place_of(self.axis)}, base at {place_of(self.base)} mm",
-            "wall {:.3g} to {:.3g} mm thick, median {:.3g}".format(
-                self.thickness.least, self.thickness.most, self.thickness.median
-            ),
+            f"wall {self.thickness.least:.3g} to {self.thickness.most:.3g} mm thick, "
+            f"median {self.thickness.median:.3g}",
             f"cavity {cavity:.4g} mL, the surface's own {own:.4g} ({100 * (cavity / own - 1):+.2f} "
             f"%); wall {self.wall[0]:.4g} mL, {self.wall[1]:.4g}",
         ]
@@ -128,7 +128,7 @@ def mesh_wall(
     base_point : a point (3,) mm of the plane instead.
     smooth : times of Taubin's filter on both surfaces; 10 to 30 take the steps off surfaces of
         voxels.
-    unit : of the files, a key of :data:`~emulator.geometry.surfaces.UNITS`; axis, size and base are in mm.
+    unit : of the files, ``mm``, ``cm`` or ``m``; size and base plane are in mm.
 
     Raises
     ------
