@@ -127,6 +127,6 @@ def _gmsh() -> Any:
     except OSError as error:  # ctypes, of a library that is not on this machine
         raise InputError(
             f"gmsh is installed but does not load ({error}): it needs the system's OpenGL and X11 "
-            "libraries, without a display; on Debian apt install libglu1-mesa libxcursor1 "
-            "libxinerama1 libxft2"
+            "libraries, without a display; on Debian apt install libgl1 libglu1-mesa libxcursor1 "
+            "libxinerama1 libxft2 libgomp1"
         ) from error

@@ -152,8 +152,8 @@ def mesh_wall(
     closed = any(not each.rims for each in whole)
     cut_off = 0.0 if closed else max(heights)
     within = [smoothed(each, smooth) if smooth else each for each in below]
-    _check_nested(*within, normal)
-    thickness = _thickness(*within)
+    _check_nested(within[0], within[1], normal)
+    thickness = _thickness(within[0], within[1])
     size = _SIZE * thickness.median if size is None else size
     if not 0.0 < size < whole[1].extent / 4.0:
         raise InputError(
@@ -162,7 +162,13 @@ def mesh_wall(
         )
     mesh = _mesh([Flattened(each) for each in within], size, order, normal, point)
     cavity, outer = (each.volume / MM3_PER_ML for each in below)
-    own = float(discretise(mesh).weights.sum()) / MM3_PER_ML
+    try:
+        own = float(discretise(mesh).weights.sum()) / MM3_PER_ML
+    except InputError as error:
+        raise InputError(
+            f"edges of {size:.3g} mm are too long for such curved surfaces ({error}): choose a "
+            "smaller size, or order 1"
+        ) from error
     rim = below[0].points[np.unique(one_rim(below[0]))]
     return Wall(
         mesh=mesh,
@@ -208,10 +214,9 @@ def _plane(
                 "long axis: give it, from apex to base; it is found only where both surfaces are "
                 "open at the base"
             )
-        normal = sum(
-            np.cross(each.points[edges[:, 0]], each.points[edges[:, 1]]).sum(axis=0)
-            for each, edges in rims
-        )
+        normal = np.zeros(3)
+        for each, edges in rims:
+            normal += np.cross(each.points[edges[:, 0]], each.points[edges[:, 1]]).sum(axis=0)
     else:
         normal = np.asarray(axis, dtype=float)
     if normal.shape != (3,) or not np.isfinite(normal).all() or not normal.any():

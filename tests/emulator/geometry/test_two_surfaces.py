@@ -115,11 +115,17 @@ def test_fibres_by_rule_follow_the_axis_that_the_base_tells(made, tmp_path):
     assert np.quantile(between, 0.02) > 0.999
 
 
+def test_edges_too_long_for_the_curvature_are_refused(rough):
+    pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
+    with pytest.raises(InputError, match="edges of 14 mm are too long for such curved surfaces"):
+        mesh_wall(*rough, axis=(0, 0, 1), base_height=HUMAN.base, size=14.0, smooth=5)
+
+
 @pytest.mark.slow
 def test_the_command_draws_and_what_it_wrote_is_solved(rough, tmp_path, capsys):
     pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
     out, picture = tmp_path / "lv.vtu", tmp_path / "lv.png"
-    words = ("--axis", 0, 0, 1, "--base-height", HUMAN.base, "--size", 14, "--smooth", 5)
+    words = ("--axis", 0, 0, 1, "--base-height", HUMAN.base, "--size", 11, "--smooth", 5)
     code, told = answer(
         capsys, "mesh", "--endocardium", rough[0], "--epicardium", rough[1], *words,
         "--out", out, "--picture", picture,
