@@ -12,6 +12,7 @@ from .fem.unloading import Unloaded, Unloader, unload
 from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
 from .geometry.mesh import Mesh
 from .geometry.side_by_side import Bodies, side_by_side
+from .geometry.two_surfaces import mesh_wall
 from .mechanics.laws import find_law
 from .scenes import Parameter, Scene, Support
 from .scenes.finer import finer
@@ -58,6 +59,7 @@ __all__ = [
     "fit_reduced",
     "load",
     "mesh_error",
+    "mesh_wall",
     "potential_energy",
     "read_body",
     "read_mesh",

@@ -10,6 +10,7 @@ import numpy as np
 from calibrate.figures.drawing import pyplot, save
 from emulator.error.comparison import UNITS, Errors, log_density, quantiles
 from emulator.geometry.facets import flat_triangles
+from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 
@@ -38,7 +39,7 @@ def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
             scene, evaluated.inside, evaluated.outside, title
         ),
         "error_on_surface.png": surface_figure(
-            scene, evaluated.inside.fields["err_u"].mean(axis=0), title
+            scene.mesh, evaluated.inside.fields["err_u"].mean(axis=0), title
         ),
     }
     for name, figure in figures.items():
@@ -186,28 +187,28 @@ def _plain(axis: Any, digits: tuple[float, ...]) -> None:
 
 
 def surface_figure(
-    scene: Scene,
-    error: np.ndarray,
+    mesh: Mesh,
+    values: np.ndarray,
     title: str,
     label: str = f"mean err_u of the cases ({UNITS['err_u']})",
 ) -> Any:
-    """The undeformed body's surface coloured by ``error`` (n,) mm at its nodes, from two sides."""
+    """The undeformed body's surface coloured by ``values`` (n,) at its nodes, from two sides."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator, NullFormatter
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     plt = pyplot()
-    nodes, triangles = scene.mesh.nodes, flat_triangles(scene.mesh.surface)
-    values = error[triangles].mean(axis=1)
-    colour = ScalarMappable(Normalize(0.0, max(float(values.max()), 1e-17)), "viridis")
+    nodes, triangles = mesh.nodes, flat_triangles(mesh.surface)
+    shades = values[triangles].mean(axis=1)
+    colour = ScalarMappable(Normalize(0.0, max(float(shades.max()), 1e-17)), "viridis")
     extent = np.ptp(nodes, axis=0)
     figure = plt.figure(figsize=(11.0, 5.2), layout="constrained")
     panels = []
     for column, (azimuth, elevation) in enumerate(((-60.0, 15.0), (120.0, 40.0)), 1):
         axes = figure.add_subplot(1, 2, column, projection="3d", azim=azimuth, elev=elevation)
         axes.add_collection3d(
-            Poly3DCollection(nodes[triangles], facecolors=colour.to_rgba(values), lw=0.0)
+            Poly3DCollection(nodes[triangles], facecolors=colour.to_rgba(shades), lw=0.0)
         )
         thin = extent < 0.25 * extent.max()
         for k, name in enumerate("xyz"):

@@ -53,6 +53,13 @@ def cone_volume[A: (jax.Array, np.ndarray)](x: A) -> A:
     return height @ rule.weights / 3.0
 
 
+def mean_normal(corners: np.ndarray) -> np.ndarray:
+    """Unit normal (3,) of facets ``corners`` (k, 3 or 6, 3) together, by their corners' areas."""
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(u, v).sum(axis=0)
+    return normal / np.linalg.norm(normal)
+
+
 def flat_triangles(facets: np.ndarray) -> np.ndarray:
     """Facets (k, 3 or 6) as flat triangles (k', 3), four for each quadratic one."""
     return facets if facets.shape[1] == 3 else facets[:, _QUARTERS].reshape(-1, 3)

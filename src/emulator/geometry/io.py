@@ -83,7 +83,7 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
 
 def read_regions(path: str | Path, name: str) -> np.ndarray:
     """Whole number (m,) of each element from cell data ``name``; :class:`InputError` if none."""
-    found = _load(Path(path))
+    found = read_cells(Path(path))
     if name not in found.cell_data:
         there = ", ".join(f"'{key}'" for key in found.cell_data) or "none"
         raise InputError(f"mesh file {path}: it has no cell data '{name}' for regions; has {there}")
@@ -164,7 +164,8 @@ def _write_vtu(path: str | Path, mesh: Mesh, **data: Any) -> None:
         meshio.write(temporary, output, file_format="vtu")
 
 
-def _load(path: Path) -> meshio.Mesh:
+def read_cells(path: Path) -> meshio.Mesh:
+    """Whatever meshio finds in a file; :class:`InputError` in one line where it cannot."""
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "does not exist"
         raise InputError(f"mesh file {path} {what}")
@@ -173,7 +174,8 @@ def _load(path: Path) -> meshio.Mesh:
     said = io.StringIO()
     try:
         # meshio's readers raise exceptions of many types, or print a reason and exit.
-        with redirect_stdout(said), redirect_stderr(said):
+        # In a text file of STL it takes letters for a number of triangles, which overflows.
+        with redirect_stdout(said), redirect_stderr(said), np.errstate(over="ignore"):
             return meshio.read(path)
     except (Exception, SystemExit) as error:
         reason = said.getvalue() if isinstance(error, SystemExit) else str(error)
@@ -183,7 +185,7 @@ def _load(path: Path) -> meshio.Mesh:
 
 def _convert(source: str | Path | Any, *, directions: bool, quadratic: bool = False) -> Body:
     is_file = isinstance(source, str | Path)
-    found = _load(Path(source)) if is_file else as_meshio(source)
+    found = read_cells(Path(source)) if is_file else as_meshio(source)
     try:
         mesh, used = _mesh(found)
         if not directions:

@@ -17,6 +17,7 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.cavity import MM3_PER_ML, Cavity
+from emulator.geometry.facets import mean_normal
 from emulator.geometry.fibres import nodal_depth
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import signed_volumes
@@ -93,9 +94,7 @@ def ventricle(mesh: Mesh, endocardium: str, held: np.ndarray) -> Ventricle:
     outer &= ~inner
     if not outer.any():
         raise InputError("its surface is all cavity and base; expected an outside")
-    corners = mesh.nodes[surface[base]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
-    axis = normals / np.linalg.norm(normals)
+    axis = mean_normal(mesh.nodes[surface[base]])
     volumes = signed_volumes(mesh.nodes, mesh.elements)
     nodal = np.zeros(len(mesh.nodes))
     np.add.at(nodal, mesh.elements, volumes[:, None] / 4.0)

@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from emulator.errors import InputError, look_up
+from emulator.geometry.facets import mean_normal
 from emulator.geometry.io import Body, read_body, write_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quality import mesh_quality
+from emulator.geometry.surfaces import UNITS
 from emulator.geometry.tetrahedra import EDGES
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.quantity import Quantity
@@ -24,10 +26,10 @@ from emulator.scenes.file import read_scene
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load
 from emulator.scenes.scene import Scene
 
-UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 _METRES = 0.6  # a body smaller than this in all directions is not in mm
 _SMALL = 25.0  # one smaller than this might be in cm
 _HELD = ("base", "fix", "clamp", "held", "hold", "support", "ligament", "left", "bottom")
+_BASE = ("base",)
 _INSIDE = ("endo", "cavity", "lumen", "inner", "inside")
 _OUTSIDE = ("epi", "outer", "outside", "pericard")
 # Ranges of known parameters: the paper's, textbook form.
@@ -68,7 +70,7 @@ def draft(
 
     Parameters
     ----------
-    unit : of the file's coordinates, a key of :data:`UNITS`; guessed from the size by default. A
+    unit : of the file's coordinates, ``mm``, ``cm`` or ``m``; guessed from the size by default. A
         mesh that is not in mm is written again in mm, beside the scene file.
     law : its name; Holzapfel-Ogden where the mesh has fibres or names that fibres can be laid by,
         else Neo-Hookean.
@@ -163,6 +165,16 @@ def _helix(mesh: Mesh) -> tuple[str, str] | None:
     return (inner, outer) if inner and outer else None
 
 
+def _axis(mesh: Mesh) -> str:
+    """The line of the long axis: the base's normal, where there is a base."""
+    base = _named(mesh.facet_sets, _BASE)
+    if base is None:
+        return "axis = [0.0, 0.0, 1.0]   # CHANGE: from apex to base"
+    # Rounded, so that a base which is level to round-off gives a level axis; no -0.
+    normal = (np.round(mean_normal(mesh.nodes[mesh.facet_set(base)]), 6) + 0.0).tolist()
+    return f"axis = {normal}   # from apex to base, across '{base}'"
+
+
 def _loads(mesh: Mesh) -> list[tuple[Load, str, str]]:
     """Loads to try, each with its lines and a note on it."""
     found: list[tuple[Load, str, str]] = []
@@ -236,7 +248,7 @@ def _text(
                 "angles = [60.0, -60.0]   # degrees, inside and outside",
                 f'endocardium = "{walls[0]}"',
                 f'epicardium = "{walls[1]}"',
-                "axis = [0.0, 0.0, 1.0]   # CHANGE: from apex to base",
+                _axis(mesh),
                 "",
             ]
     parts += [support, load[1]]

@@ -61,7 +61,7 @@ def test_errors_that_are_all_zero_or_one_value_can_be_drawn():
     for found in (nothing, one):
         density_figure(found, None, "").canvas.draw()
         parameter_figure(scene, found, None, "").canvas.draw()
-    surface_figure(scene, nothing.fields["err_u"].mean(axis=0), "").canvas.draw()
+    surface_figure(scene.mesh, nothing.fields["err_u"].mean(axis=0), "").canvas.draw()
 
 
 def test_a_map_of_two_parameters_and_panels_of_more():
@@ -90,7 +90,7 @@ def test_the_surface_is_whole_and_coloured_by_its_nodes(order):
     edges = corners[:, 1:] - corners[:, :1]
     area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()
     assert area == pytest.approx(2.0 * (2.0 * 3.0 + 3.0 * 4.0 + 4.0 * 2.0))
-    figure = surface_figure(scene, X[:, 0], "")  # an error that grows along x
+    figure = surface_figure(scene.mesh, X[:, 0], "")  # an error that grows along x
     value = corners[:, :, 0].mean(axis=1)
     expected = colormaps["viridis"](value / value.max())
     for axes in figure.axes[:2]:

@@ -94,6 +94,15 @@ def test_a_measured_pressure_is_data(ventricle):
     assert float(means["parameter:pressure@high"]) == 1.2
 
 
+def test_volumes_and_pressures_of_frames_are_one_file(ventricle, tmp_path):
+    text = "state,volume,parameter:pressure\nf1,110.2,0.61\nf2,124.9,1.18\n"
+    (tmp_path / "frames.csv").write_text(text)
+    observe, values = read_data(ventricle, tmp_path / "frames.csv")
+    expected = {"volume@f1": 110.2, "parameter:pressure@f1": 0.61, "volume@f2": 124.9, "parameter:pressure@f2": 1.18}  # fmt: skip
+    assert {name: float(value) for name, value in values.items()} == expected
+    assert set(observe.parts) == set(expected)
+
+
 def test_alone_it_conditions_on_the_parameter(beam):
     model = cal.model(
         linear_forward(beam), parse_observation(beam, "parameter:mu"), cal.GaussianNoise(sd=1.0)

@@ -128,7 +128,7 @@ def run_mesh(arguments: argparse.Namespace) -> int:
         title = f"{scene.name}: error of a mesh of {result['nodes']} nodes"
         label = "displacement less that on a finer mesh (mm)"
         error = np.asarray(told.err_u)
-        save(surface_figure(scene, error, title, label), folder / "mesh_error.png")
+        save(surface_figure(scene.mesh, error, title, label), folder / "mesh_error.png")
         text += f"\nwritten to {folder}"
     emit(result, as_json=arguments.json, text=text)
     return DONE

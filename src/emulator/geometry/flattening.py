@@ -1,0 +1,165 @@
+r"""A cup-like surface as a map of the unit disc, and new triangles of one size on it.
+
+The rim goes to the circle by its arc length. Every other point lies at the mean of its neighbours,
+
+.. math:: \sum_j w_{ij} (u_j - u_i) = 0, \qquad
+          w_{ij} = \frac{\tan(\alpha_{ij}/2) + \tan(\beta_{ij}/2)}{|x_j - x_i|},
+
+with the angles at :math:`x_i` on both sides of the edge: mean value coordinates (Floater 2003, Mean
+value coordinates, Computer Aided Geometric Design 20). The weights are positive and the disc is
+convex, so that no triangle turns over, whatever its shape (Tutte 1963). They come close to those of
+a conformal map, so triangles with edges :math:`h / s`, even in the disc, are even on the surface,
+where lengths are :math:`s` times those in the disc.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from emulator.geometry.mesher import triangulate
+from emulator.geometry.surfaces import Surface, one_rim
+
+_HALVINGS = 30  # of an interval, until the middle of an edge is known to round-off
+
+
+class Flattened:
+    """The map from the unit disc to a surface with one rim.
+
+    Parameters
+    ----------
+    surface : in mm.
+
+    Attributes
+    ----------
+    places : (n, 2) of the surface's points in the disc.
+
+    Raises
+    ------
+    InputError
+        A surface with another number of openings than one.
+    """
+
+    def __init__(self, surface: Surface) -> None:
+        self.surface = surface
+        edges = one_rim(surface)
+        after = dict(edges.tolist())
+        loop = [int(edges[0, 0])]
+        while (next_one := after[loop[-1]]) != loop[0]:
+            loop.append(next_one)
+        closed = surface.points[[*loop, loop[0]]]
+        self._along = np.concatenate([[0.0], np.cumsum(_lengths(closed))])
+        self._rim = closed
+        self.length = float(self._along[-1])
+        turn = 2.0 * np.pi * self._along[:-1] / self.length
+        weights = _mean_value_weights(surface)
+        self.places = np.zeros((len(surface.points), 2))
+        self.places[loop] = np.column_stack([np.cos(turn), np.sin(turn)])
+        free = np.setdiff1d(np.arange(len(surface.points)), loop)
+        rows = (diags_array(weights.sum(axis=1)) - weights).tocsr()[free]
+        self.places[free] = spsolve(rows[:, free].tocsc(), -(rows[:, loop] @ self.places[loop]))
+
+    @cached_property
+    def _inside(self) -> LinearNDInterpolator:
+        return LinearNDInterpolator(self.places, self.surface.points)
+
+    def rim_at(self, turn: np.ndarray) -> np.ndarray:
+        """Points (..., 3) mm of the rim at angles ``turn`` (...) of the circle."""
+        along = np.mod(turn / (2.0 * np.pi), 1.0) * self.length
+        return np.stack([np.interp(along, self._along, x) for x in self._rim.T], axis=-1)
+
+    def at(self, places: np.ndarray) -> np.ndarray:
+        """Points (k, 3) mm of the surface at ``places`` (k, 2) in the disc; off it, of the rim."""
+        found = self._inside(places)
+        off = np.isnan(found).any(axis=1)
+        found[off] = self.rim_at(np.arctan2(places[off, 1], places[off, 0]))
+        return found
+
+    def remeshed(self, size: float) -> tuple[Surface, np.ndarray]:
+        """Triangles with edges of about ``size`` mm, and the places (n, 2) of their points.
+
+        Points of the rim come first, in its order.
+        """
+        count = max(6, round(self.length / size))
+        turn = 2.0 * np.pi * np.arange(count) / count
+        polygon = np.column_stack([np.cos(turn), np.sin(turn)])
+        near, stretch = cKDTree(self.places, balanced_tree=False), self._stretch()
+        places, rows = triangulate([polygon], lambda x, y: size / stretch[near.query((x, y))[1]])
+        points = self.at(places)
+        points[:count] = self.rim_at(turn)
+        facing = np.sign(np.sum(_signed(places[rows])))
+        kept = np.sign(np.sum(_signed(self._corners)))
+        return Surface(self.surface.name, points, rows if facing == kept else rows[:, ::-1]), places
+
+    def _stretch(self) -> np.ndarray:
+        """Lengths on the surface over those in the disc, (n,), from areas around each point."""
+        rows = self.surface.triangles
+        areas = [
+            np.bincount(rows.ravel(), np.repeat(each, 3), len(self.places))
+            for each in (_areas(self.surface.points[rows]), np.abs(_signed(self._corners)))
+        ]
+        # Of two rings of neighbours: a rough surface has some triangles that stand upright.
+        around = [np.bincount(rows.ravel(), each[rows].sum(1).repeat(3)) for each in areas]
+        return np.sqrt(around[0] / np.maximum(around[1], 1e-30))
+
+    @property
+    def _corners(self) -> np.ndarray:
+        return self.places[self.surface.triangles]
+
+    def middles(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Points (k, 3) mm on the surface, each as far from one place (k, 2) as from the other.
+
+        Along the straight line between them in the disc; between two places on the circle, along
+        the rim.
+        """
+        first, last = self.at(one), self.at(other)
+        low, high = np.zeros(len(one)), np.ones(len(one))
+        found = first
+        for _ in range(_HALVINGS):
+            share = 0.5 * (low + high)
+            found = self.at(one + share[:, None] * (other - one))
+            nearer = np.sum((found - first) ** 2 - (found - last) ** 2, axis=1) < 0.0
+            low, high = np.where(nearer, share, low), np.where(nearer, high, share)
+        on_rim = np.all([np.linalg.norm(p, axis=1) > 1.0 - 1e-9 for p in (one, other)], axis=0)
+        x, y = (one + other)[on_rim].T
+        found[on_rim] = self.rim_at(np.arctan2(y, x))
+        return found
+
+
+def _mean_value_weights(surface: Surface) -> coo_array:
+    """Weights (n, n) of each point's neighbours."""
+    x, rows = surface.points, surface.triangles
+    first, last, values = [], [], []
+    for k in range(3):
+        a, b, c = rows[:, k], rows[:, (k + 1) % 3], rows[:, (k + 2) % 3]
+        u, v = x[b] - x[a], x[c] - x[a]
+        p, q = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
+        # tan(angle / 2) = |u x v| / (|u| |v| + u . v), kept above zero in slivers
+        half = np.linalg.norm(np.cross(u, v), axis=1) / (p * q + np.einsum("ti,ti->t", u, v))
+        half = np.clip(half, 1e-3, 1e3)
+        first += [a, a]
+        last += [b, c]
+        values += [half / p, half / q]
+    places = (np.concatenate(first), np.concatenate(last))
+    return coo_array((np.concatenate(values), places), shape=(len(x), len(x))).tocsr()
+
+
+def _lengths(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.diff(points, axis=0), axis=1)
+
+
+def _areas(corners: np.ndarray) -> np.ndarray:
+    """Areas (t,) of triangles (t, 3, 3)."""
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return 0.5 * np.linalg.norm(np.cross(u, v), axis=1)
+
+
+def _signed(corners: np.ndarray) -> np.ndarray:
+    """Areas (t,) of triangles (t, 3, 2) in the plane, positive anticlockwise."""
+    (ux, uy), (vx, vy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    return 0.5 * (ux * vy - uy * vx)

@@ -1,0 +1,294 @@
+r"""Surfaces of triangles from files: read, checked, cut by a plane, smoothed, asked what is inside.
+
+A surface is closed, or open with one rim. What a segmentation gives is rough: Taubin's filter moves
+each point to the mean of its neighbours by a fraction :math:`\lambda` and back by :math:`\mu`,
+
+.. math:: x \leftarrow (1 + \mu L)(1 + \lambda L)\, x, \qquad \lambda > 0 > \mu, \quad
+          |\mu| > \lambda,
+
+with ``L x`` the neighbours' mean less ``x``, so that steps of voxels go and the volume stays
+(Taubin 1995, A signal processing approach to fair surface design).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from emulator.errors import InputError
+from emulator.geometry.facets import enclosed_volume, openings
+from emulator.geometry.io import read_cells
+
+UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+"""Millimetres in a unit of length."""
+_MERGE = 1e-6  # of the surface's extent: points nearer than this are one
+_SNAP = 1e-4  # of the extent: points this near a plane lie in it, so that no slivers are cut off
+# Taubin's filter: halves what repeats every five edges and keeps what repeats every twenty.
+_LAMBDA, _MU = 0.5, -0.53
+_TILT = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles with consistent normals.
+
+    name : for messages. points : (n, 3) mm. triangles : (t, 3), normals out of what they enclose.
+    """
+
+    name: str
+    points: np.ndarray
+    triangles: np.ndarray
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the bounding box, mm."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @property
+    def rims(self) -> list[np.ndarray]:
+        """Edges (e, 2) of each opening."""
+        return openings(self.triangles)
+
+    @property
+    def volume(self) -> float:
+        """Enclosed with flat lids, mm3."""
+        middle = self.points - self.points.mean(axis=0)
+        volume: Callable[[np.ndarray], np.ndarray] = enclosed_volume(self.triangles)
+        return float(volume(middle))
+
+
+def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
+    """A surface from STL, PLY, OBJ or another file of triangles that meshio reads.
+
+    Parameters
+    ----------
+    name : of the surface, for messages.
+    scale : mm in one unit of the file.
+
+    Raises
+    ------
+    InputError
+        As :func:`surface`; or a file that cannot be read or has other cells than triangles.
+    """
+    found = read_cells(Path(path))
+    kinds = sorted({block.type for block in found.cells if len(block.data)})
+    if "triangle" not in kinds or set(kinds) - {"triangle", "line", "vertex"}:
+        raise InputError(
+            f"{name} {path}: it has {', '.join(kinds) or 'no cells'}; expected triangles only, "
+            "as in STL or PLY"
+        )
+    rows = np.concatenate([block.data for block in found.cells if block.type == "triangle"])
+    return surface(name, scale * np.asarray(found.points, dtype=float), rows)
+
+
+def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
+    """The surface of ``triangles`` (t, 3) between ``points`` (n, 3) mm, in any sense.
+
+    Points at one place are merged, triangles without area dropped, and the others turned to face
+    out.
+
+    Raises
+    ------
+    InputError
+        Several parts, three triangles at an edge, a Moebius strip, no volume, or NaN.
+    """
+    points = np.asarray(points, dtype=float)
+    if not np.isfinite(points).all():
+        raise InputError(f"{name}: a coordinate is not finite")
+    if not len(triangles):
+        raise InputError(f"{name}: it has no triangles")
+    points, triangles = _merged(points, np.asarray(triangles, dtype=np.int64))
+    if len(triangles) < 4:
+        raise InputError(f"{name}: {len(triangles)} triangles with an area; expected a surface")
+    triangles = _one_sided(name, points, triangles)
+    made = Surface(name, points, triangles)
+    volume = made.volume
+    if abs(volume) < 1e-6 * made.extent**3:
+        raise InputError(f"{name}: it encloses no volume; expected a closed or cup-like surface")
+    return made if volume > 0.0 else Surface(name, points, triangles[:, ::-1].copy())
+
+
+def _merged(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One point at each place that triangles use, and the triangles whose corners differ."""
+    near = _MERGE * np.linalg.norm(np.ptp(points, axis=0))
+    pairs = cKDTree(points, balanced_tree=False).query_pairs(near, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
+    triangles = connected_components(graph, directed=False)[1][triangles]
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    label = connected_components(graph, directed=False)[1]
+    _, first = np.unique(label, return_index=True)
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    return points[first[used]], renumbered.reshape(-1, 3)
+
+
+def _one_sided(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The triangles turned so that neighbours list a common edge in opposite senses."""
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    order = np.lexsort((high, low))
+    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
+    if (same[1:] & same[:-1]).any():
+        k = order[1:-1][same[1:] & same[:-1]][0]
+        place = place_of(points[edges[k]].mean(axis=0))
+        raise InputError(
+            f"{name}: more than two triangles meet at the edge at {place}; repair the surface"
+        )
+    one, other = order[:-1][same], order[1:][same]
+    agree = edges[one, 0] != edges[other, 0]
+    # Two copies of each triangle, one turned: neighbours that disagree join unlike copies.
+    count = len(triangles)
+    turned = np.where(agree, 0, count)
+    first = np.concatenate([owner[one], owner[one] + count])
+    second = np.concatenate([owner[other] + turned, owner[other] + count - turned])
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(2 * count,) * 2)
+    parts, label = connected_components(graph, directed=False)
+    if parts == 1:
+        raise InputError(f"{name}: it has one side only; expected an inside and an outside")
+    if parts > 2:
+        sizes = np.sort(np.bincount(label))[::-2]
+        raise InputError(
+            f"{name}: it has {parts // 2} separate parts, the largest of {sizes[0]} triangles and "
+            f"the next of {sizes[1]}; expected one: keep the largest"
+        )
+    flipped = label[:count] != label[0]
+    return np.where(flipped[:, None], triangles[:, ::-1], triangles)
+
+
+def place_of(point: np.ndarray) -> str:
+    """A point or a direction (3,) in words."""
+    return "(" + ", ".join(f"{x:.4g}" for x in np.round(point, 6) + 0.0) + ")"
+
+
+def cut(given: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
+    """What lies below the plane through ``point`` (3,) mm, on the side ``normal`` (3,) leaves.
+
+    Raises
+    ------
+    InputError
+        A plane that does not cut the surface, or leaves another number of openings than one.
+    """
+    height = (given.points - point) @ normal
+    height[np.abs(height) < _SNAP * given.extent] = 0.0
+    if not (height.min() < 0.0 <= height.max()):
+        where = "above" if height.min() >= 0.0 else "below"
+        raise InputError(
+            f"{given.name}: all of it is {where} the base plane through {place_of(point)}, its "
+            f"heights {height.min():.4g} to {height.max():.4g} mm; expected a plane that cuts it"
+        )
+    points = np.where(
+        (height == 0.0)[:, None],
+        given.points - np.outer((given.points - point) @ normal, normal),
+        given.points,
+    )
+    sign = np.sign(height).astype(int)[given.triangles]
+    below = (sign <= 0).all(axis=1) & (sign < 0).any(axis=1)
+    pieces = [given.triangles[below]]
+    made: list[np.ndarray] = []
+    numbers: dict[tuple[int, int], int] = {}
+
+    def between(a: int, b: int) -> int:
+        key = (min(a, b), max(a, b))
+        if key not in numbers:
+            low, high = key
+            share = height[low] / (height[low] - height[high])
+            numbers[key] = len(points) + len(made)
+            made.append(points[low] + share * (points[high] - points[low]))
+        return numbers[key]
+
+    new: list[tuple[int, int, int]] = []
+    for row in given.triangles[(sign < 0).any(axis=1) & (sign > 0).any(axis=1)].tolist():
+        polygon: list[int] = []
+        for a, b in zip(row, [*row[1:], row[0]], strict=True):
+            if height[a] <= 0.0:
+                polygon.append(a)
+            if height[a] * height[b] < 0.0:
+                polygon.append(between(a, b))
+        new += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
+    pieces.append(np.array(new, dtype=np.int64).reshape(-1, 3))
+    rows = np.concatenate(pieces)
+    used, numbered = np.unique(rows, return_inverse=True)
+    places = np.concatenate([points, np.array(made).reshape(-1, 3)])[used]
+    below_it = Surface(given.name, places, numbered.reshape(-1, 3))
+    one_rim(below_it)
+    return below_it
+
+
+def one_rim(given: Surface) -> np.ndarray:
+    """The edges (e, 2) of the only opening; :class:`InputError` names the others by place."""
+    rims = sorted(given.rims, key=len)
+    if len(rims) == 1:
+        return rims[0]
+    if not rims:
+        raise InputError(
+            f"{given.name}: it is closed; give the base plane, a height along the long axis or a "
+            "point and a normal"
+        )
+    small = given.points[np.unique(rims[0])].mean(axis=0)
+    raise InputError(
+        f"{given.name}: it has {len(rims)} openings, the smallest of {len(rims[0])} edges at "
+        f"{place_of(small)}; expected the base's alone: fill the others"
+    )
+
+
+def smoothed(given: Surface, times: int) -> Surface:
+    """``given`` after ``times`` of Taubin's filter; a rim is smoothed along itself.
+
+    A flat rim stays in its plane.
+    """
+    count, rows = len(given.points), given.triangles
+    edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]], rows[:, [2, 0]]])
+    on_rim = np.zeros(count, dtype=bool)
+    rims = given.rims
+    for rim in rims:
+        on_rim[rim] = True
+    kept = edges[~on_rim[edges[:, 0]]], edges[~on_rim[edges[:, 1]]][:, ::-1], *rims
+    pairs = np.concatenate([*kept, *(rim[:, ::-1] for rim in rims)])
+    graph = (coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)) > 0).astype(float)
+    mean = diags_array(1.0 / graph.sum(axis=1)) @ graph
+    x = given.points
+    for factor in (_LAMBDA, _MU) * times:
+        x = x + factor * (mean @ x - x)
+    return Surface(given.name, x, rows)
+
+
+def inside(given: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Which ``points`` (k, 3) mm are enclosed, (k,) bool, for a surface whose lid is above them.
+
+    A ray from an enclosed point against ``axis`` (3,), away from the lid, crosses the surface an
+    odd number of times.
+    """
+    # Tilted as no grid is, so that rays meet edges only by chance.
+    up = axis + _TILT * np.array([0.618, 0.733, 0.285])
+    up /= np.linalg.norm(up)
+    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    across /= np.linalg.norm(across)
+    frame = np.stack([across, np.cross(up, across), up], axis=1)
+    corners, at = given.points[given.triangles] @ frame, points @ frame
+    flat = corners[..., :2]
+    middle = flat.mean(axis=1)
+    reach = np.linalg.norm(flat - middle[:, None], axis=-1).max()
+    found = cKDTree(middle, balanced_tree=False).query_ball_point(at[:, :2], 1.000001 * reach)
+    point = np.repeat(np.arange(len(at)), [len(near) for near in found])
+    row = np.concatenate([np.asarray(near, dtype=np.int64) for near in found])
+    a, b, c = (corners[row, k] for k in range(3))
+    p = at[point]
+
+    def area(u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return (v[:, 0] - u[:, 0]) * (w[:, 1] - u[:, 1]) - (v[:, 1] - u[:, 1]) * (w[:, 0] - u[:, 0])
+
+    parts = np.stack([area(b, c, p), area(c, a, p), area(a, b, p)], axis=1)
+    met = (parts >= 0.0).all(axis=1) | (parts <= 0.0).all(axis=1)
+    total = parts.sum(axis=1)
+    met &= total != 0.0
+    weights = parts[met] / total[met, None]
+    height = np.einsum("ka,ka->k", weights, corners[row[met], :, 2])
+    below = height < p[met, 2]
+    return np.bincount(point[met][below], minlength=len(at)) % 2 == 1

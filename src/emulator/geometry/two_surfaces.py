@@ -1,0 +1,333 @@
+r"""The wall of a left ventricle, meshed between two surfaces: endocardium and epicardium.
+
+Both are cut by the base plane, laid out in the disc and meshed anew with even triangles
+(:mod:`emulator.geometry.flattening`); a flat annulus joins their rims, and Gmsh fills what they
+enclose. The long axis is the base plane's normal, from apex to base. Where it is not given it is
+the area vector of the rims, :math:`\frac12 \sum_\text{edges} x_a \times x_b`, and the plane lies
+as low as the lowest point of a rim, so that rims which are not flat, or not at one height, are cut
+off; by how much is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from emulator.errors import InputError, look_up
+from emulator.geometry.cavity import MM3_PER_ML, Cavity
+from emulator.geometry.discretisation import discretise
+from emulator.geometry.flattening import Flattened
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.mesher import tetrahedralise, triangulate
+from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.quality import MeshQuality, mesh_quality
+from emulator.geometry.surfaces import (
+    UNITS,
+    Surface,
+    cut,
+    inside,
+    one_rim,
+    place_of,
+    read_surface,
+    smoothed,
+)
+from emulator.geometry.tetrahedra import orient
+
+_LEAST = 4.0  # mm; nobody's heart is smaller, a mouse's being 7 mm long
+_MOST_CUT = 0.2  # of the epicardium's height: rims that stand further apart are no base
+_SIZE = 0.7  # of the median thickness: some 5000 quadratic nodes for a human ventricle
+_SAME = 1e-3  # of the extent: rims this flat are not cut
+
+
+class Thickness(NamedTuple):
+    """Distance from the endocardium's points to the epicardium, mm."""
+
+    least: float
+    median: float
+    most: float
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """A meshed wall, and what was found on the way.
+
+    mesh : facet and node sets endocardium, epicardium and base, and the node sets
+        apex_endocardium and apex_epicardium of one node each; at the surfaces' own place.
+    axis : (3,) from apex to base, of length 1. base : (3,) mm, the middle of the cavity's rim.
+    size : edge length aimed at, mm. thickness : of the wall.
+    cavity, wall : volumes in mL, of the mesh and of the surfaces below the base plane.
+    cut_off : height of what was cut off above the base plane, mm; 0 for closed surfaces.
+    moved : by smoothing, at most, mm.
+    """
+
+    mesh: Mesh
+    axis: np.ndarray
+    base: np.ndarray
+    size: float
+    thickness: Thickness
+    cavity: tuple[float, float]
+    wall: tuple[float, float]
+    cut_off: float
+    moved: float
+    quality: MeshQuality
+
+    def local_thickness(self) -> np.ndarray:
+        """Distance to the endocardium plus that to the epicardium, (n,) mm at the nodes."""
+        nodes = self.mesh.nodes
+        walls = (nodes[self.mesh.node_set(name)] for name in ("endocardium", "epicardium"))
+        return sum(cKDTree(each, balanced_tree=False).query(nodes)[0] for each in walls)
+
+    def sentences(self) -> list[str]:
+        """What was found, a line each."""
+        cavity, own = self.cavity
+        lines = [
+            f"{len(self.mesh.nodes)} nodes, {len(self.mesh.elements)} tetrahedra of order "
+            f"{self.mesh.order}, edges of {self.size:.3g} mm",
+            f"long axis {place_of(self.axis)}, base at {place_of(self.base)} mm",
+            f"wall {self.thickness.least:.3g} to {self.thickness.most:.3g} mm thick, "
+            f"median {self.thickness.median:.3g}",
+            f"cavity {cavity:.4g} mL, the surface's own {own:.4g} ({100 * (cavity / own - 1):+.2f} "
+            f"%); wall {self.wall[0]:.4g} mL, {self.wall[1]:.4g}",
+        ]
+        if self.cut_off > 0.0:
+            lines.append(f"cut off {self.cut_off:.3g} mm above the base plane")
+        if self.moved > 0.0:
+            lines.append(f"smoothing moved points by {self.moved:.3g} mm at most")
+        if abs(cavity / own - 1.0) > 0.01:
+            lines.append("the cavity is more than 1 % off: choose a smaller size, or order 2")
+        return [*lines, self.quality.sentence()]
+
+
+def mesh_wall(
+    endocardium: str | Path | Surface,
+    epicardium: str | Path | Surface,
+    *,
+    size: float | None = None,
+    order: int = 2,
+    axis: Sequence[float] | None = None,
+    base_height: float | None = None,
+    base_point: Sequence[float] | None = None,
+    smooth: int = 0,
+    unit: str = "mm",
+) -> Wall:
+    """Tetrahedra between two surfaces, closed or open at the base.
+
+    Parameters
+    ----------
+    endocardium, epicardium : files of triangles (STL, PLY, OBJ), or surfaces in mm.
+    size : edge length in mm; 0.7 of the median thickness by default.
+    order : 2 for quadratic elements with curved edges on both surfaces, or 1.
+    axis : the base plane's normal, from apex to base, of any length; found from the rims by
+        default. Closed surfaces need it.
+    base_height : of the base plane, mm along ``axis`` from the origin of the coordinates.
+    base_point : a point (3,) mm of the plane instead.
+    smooth : times of Taubin's filter on both surfaces; 10 to 30 take the steps off surfaces of
+        voxels.
+    unit : of the files, ``mm``, ``cm`` or ``m``; size and base plane are in mm.
+
+    Raises
+    ------
+    InputError
+        A surface that :func:`~emulator.geometry.surfaces.surface` refuses, with holes, or closed
+        without a base plane; surfaces that are swapped, apart, or cross; lengths that are not in
+        mm; no Gmsh; or a wall too thin for ``size``.
+    """
+    if order not in (1, 2):
+        raise InputError(f"order {order}: expected 1 or 2")
+    look_up(UNITS, unit, "unit")
+    if smooth < 0:
+        raise InputError(f"smooth {smooth}: expected 0 times or more")
+    whole = [
+        _surface(given, name, unit)
+        for given, name in ((endocardium, "endocardium"), (epicardium, "epicardium"))
+    ]
+    normal, point = _plane(whole, axis, base_height, base_point)
+    below = [cut(each, point, normal) for each in whole]
+    heights = [((each.points - point) @ normal).max() for each in whole]
+    closed = any(not each.rims for each in whole)
+    cut_off = 0.0 if closed else max(heights)
+    within = [smoothed(each, smooth) if smooth else each for each in below]
+    _check_nested(within[0], within[1], normal)
+    thickness = _thickness(within[0], within[1])
+    size = _SIZE * thickness.median if size is None else size
+    if not 0.0 < size < whole[1].extent / 4.0:
+        raise InputError(
+            f"size {size} mm: expected edges above 0 and below a quarter of the epicardium's "
+            f"extent, {whole[1].extent:.4g} mm"
+        )
+    mesh = _mesh([Flattened(each) for each in within], size, order, normal, point)
+    cavity, outer = (each.volume / MM3_PER_ML for each in below)
+    try:
+        own = float(discretise(mesh).weights.sum()) / MM3_PER_ML
+    except InputError as error:
+        raise InputError(
+            f"edges of {size:.3g} mm are too long for such curved surfaces ({error}): choose a "
+            "smaller size, or order 1"
+        ) from error
+    rim = below[0].points[np.unique(one_rim(below[0]))]
+    return Wall(
+        mesh=mesh,
+        axis=normal,
+        base=rim.mean(axis=0),
+        size=float(size),
+        thickness=thickness,
+        cavity=(Cavity(mesh, "endocardium").rest, cavity),
+        wall=(own, outer - cavity),
+        cut_off=float(cut_off) if cut_off > _SAME * whole[1].extent else 0.0,
+        moved=max(
+            float(np.linalg.norm(one.points - other.points, axis=1).max())
+            for one, other in zip(within, below, strict=True)
+        ),
+        quality=mesh_quality(mesh),
+    )
+
+
+def _surface(given: str | Path | Surface, name: str, unit: str) -> Surface:
+    found = given if isinstance(given, Surface) else read_surface(given, name, UNITS[unit])
+    if found.extent < _LEAST:
+        raise InputError(
+            f"{name}: it is {found.extent:.3g} mm from corner to corner; lengths are taken as mm: "
+            "give the unit m or cm"
+        )
+    return found
+
+
+def _plane(
+    surfaces: Sequence[Surface],
+    axis: Sequence[float] | None,
+    height: float | None,
+    point: Sequence[float] | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal (3,) and a point (3,) of the base plane."""
+    if height is not None and point is not None:
+        raise InputError("base plane: give a height or a point, not both")
+    given = height is not None or point is not None
+    rims = [(each, one_rim(each)) for each in surfaces if each.rims or not given]
+    if axis is None:
+        if len(rims) < len(surfaces):
+            raise InputError(
+                "long axis: give it, from apex to base; it is found only where both surfaces are "
+                "open at the base"
+            )
+        normal = np.zeros(3)
+        for each, edges in rims:
+            normal += np.cross(each.points[edges[:, 0]], each.points[edges[:, 1]]).sum(axis=0)
+    else:
+        normal = np.asarray(axis, dtype=float)
+    if normal.shape != (3,) or not np.isfinite(normal).all() or not normal.any():
+        raise InputError(f"long axis {axis}: expected three numbers, not all zero")
+    normal = normal / np.linalg.norm(normal)
+    if axis is None:
+        middle = np.mean([each.points[edges].mean(axis=(0, 1)) for each, edges in rims], axis=0)
+        normal = normal * np.sign((middle - surfaces[1].points.mean(axis=0)) @ normal)
+    if point is not None:
+        return normal, np.asarray(point, dtype=float)
+    if height is not None:
+        return normal, height * normal
+    levels = np.concatenate([each.points[np.unique(edges)] @ normal for each, edges in rims])
+    tall = np.ptp(surfaces[1].points @ normal)
+    if np.ptp(levels) > _MOST_CUT * tall:
+        raise InputError(
+            f"base: the rims lie {np.ptp(levels):.4g} mm apart along the long axis, of {tall:.4g} "
+            "mm in all; give the base plane, or the axis"
+        )
+    flat = np.ptp(levels) < _SAME * surfaces[1].extent
+    return normal, (levels.mean() if flat else levels.min()) * normal
+
+
+def _check_nested(endocardium: Surface, epicardium: Surface, axis: np.ndarray) -> None:
+    """Raise :class:`InputError` unless the first lies within the second."""
+    within = inside(epicardium, endocardium.points, axis)
+    outer = inside(endocardium, epicardium.points, axis)
+    if within.all() and not outer.any():
+        return
+    if outer.mean() > 0.5:
+        raise InputError(
+            "endocardium and epicardium are swapped: the epicardium lies within the endocardium"
+        )
+    if not within.any():
+        raise InputError(
+            "the endocardium lies outside of the epicardium: its middle is at "
+            f"{place_of(endocardium.points.mean(axis=0))}, the other's at "
+            f"{place_of(epicardium.points.mean(axis=0))}"
+        )
+    bad = endocardium.points[~within] if not within.all() else epicardium.points[outer]
+    raise InputError(
+        f"the surfaces cross: {int((~within).sum())} of the endocardium's {len(within)} points lie "
+        f"outside of the epicardium, {int(outer.sum())} of the epicardium's inside, around "
+        f"{place_of(bad.mean(axis=0))}; repair them there"
+    )
+
+
+def _thickness(endocardium: Surface, epicardium: Surface) -> Thickness:
+    corners = epicardium.points[epicardium.triangles]
+    middles = 0.5 * (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3)
+    points = np.vstack([epicardium.points, corners.mean(axis=1), middles])
+    found = cKDTree(points, balanced_tree=False).query(endocardium.points)[0]
+    return Thickness(float(found.min()), float(np.median(found)), float(found.max()))
+
+
+def _mesh(
+    maps: Sequence[Flattened], size: float, order: int, normal: np.ndarray, point: np.ndarray
+) -> Mesh:
+    """The wall between two surfaces, the inner one first, with flat rims in one plane."""
+    (inner, in_disc), (outer, out_disc) = (each.remeshed(size) for each in maps)
+    within = inside(outer, inner.points, normal)
+    if not within.all():
+        raise InputError(
+            f"the wall is too thin for edges of {size:.3g} mm at "
+            f"{place_of(inner.points[~within][0])}: choose a smaller size"
+        )
+    across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    across /= np.linalg.norm(across)
+    frame = np.stack([across, np.cross(normal, across)])
+    # Points of a rim come first, in its order.
+    loops = [each.points[: len(one_rim(each))] for each in (outer, inner)]
+    flat, annulus = triangulate([(loop - point) @ frame.T for loop in loops], size)
+    outer_rim, inner_rim = map(len, loops)
+    count = len(inner.points)
+    new = point + flat[outer_rim + inner_rim :] @ frame
+    points = np.vstack([inner.points, outer.points, new])
+    number = np.concatenate(
+        [
+            count + np.arange(outer_rim),
+            np.arange(inner_rim),
+            count + len(outer.points) + np.arange(len(new)),
+        ]
+    )
+    facets = {
+        "endocardium": inner.triangles,
+        "epicardium": count + outer.triangles,
+        "base": number[annulus],
+    }
+    nodes, elements = tetrahedralise(points, np.concatenate([*facets.values()]), size)
+    sets = {name: np.unique(rows) for name, rows in facets.items()}
+    for name in ("endocardium", "epicardium"):
+        sets[f"apex_{name}"] = sets[name][[np.argmin(nodes[sets[name]] @ normal)]]
+    mesh = Mesh(nodes, orient(nodes, elements), sets, facets)
+    if order == 1:
+        return mesh
+
+    def midpoints(edges: np.ndarray) -> np.ndarray:
+        middle = mesh.nodes[edges].mean(axis=1)
+        for which, disc, each, first in (
+            (inner, in_disc, maps[0], 0),
+            (outer, out_disc, maps[1], count),
+        ):
+            on = _among(edges, which.triangles + first, len(mesh.nodes))
+            one, other = (edges[on] - first).T
+            middle[on] = each.middles(disc[one], disc[other])
+        return middle
+
+    return to_quadratic(mesh, midpoints)
+
+
+def _among(edges: np.ndarray, triangles: np.ndarray, count: int) -> np.ndarray:
+    """Which ``edges`` (e, 2), lower node first, are sides of the ``triangles``, (e,) bool."""
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return np.isin(edges @ [count, 1], sides @ [count, 1])
