@@ -117,7 +117,7 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
     """The runs of a heart. Those in the folder ``kept`` are not solved again."""
     began = perf_counter()
     bodies = cubes(heart)
-    rng = np.random.default_rng(seed)
+    size = {"draws": plan.draws, "warmup": plan.draws, "chains": 1}
     unknowns = bodies[0].unknowns
     boxes = [qmc.Sobol(unknowns, seed=seed + k).random_base2(4) for k in range(3)]
     wide = [2.0 * box[: plan.wide] - 1.0 for box in boxes]
@@ -125,42 +125,60 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
         _kept(kept, f"{heart.name}_{k}_wide", body, x)
         for k, (body, x) in enumerate(zip(bodies, wide, strict=True))
     ]
-    for number in range(plan.rounds + 1):
-        last = number == plan.rounds
-        fitted = fit(bodies, runs)
-        law = "fibres" if number == 1 and not last else ORTHOTROPIC
-        size = {"draws": plan.draws, "warmup": plan.draws, "chains": 1}
-        found = sample(heart, fitted, seed + number, law, **size)
-        rows = rng.choice(len(found.positions), plan.tests if last else plan.each, replace=False)
-        name = "tests" if last else f"round{number}"
-        new = [
-            _kept(kept, f"{heart.name}_{k}_{name}", body, found.positions[rows, k])
-            for k, body in enumerate(bodies)
-        ]
-        if not last:
-            runs = [joined(pair) for pair in zip(runs, new, strict=True)]
+    for number in range(plan.rounds):
+        law = "fibres" if number == 1 else ORTHOTROPIC
+        name = f"round{number}"
+        known = [_known(kept, f"{heart.name}_{k}_{name}") for k in range(3)]
+        if all(known):
+            new = [each for each in known if each]
+        else:
+            found = sample(heart, fit(bodies, runs), seed + number, law, **size)
+            x = _some(found, plan.each, seed + number)
+            new = [
+                _kept(kept, f"{heart.name}_{k}_{name}", body, x[:, k])
+                for k, body in enumerate(bodies)
+            ]
+        runs = [joined(pair) for pair in zip(runs, new, strict=True)]
+    fitted = fit(bodies, runs)
+    found = sample(heart, fitted, seed + plan.rounds, **size)
+    x = _some(found, plan.tests, seed + plan.rounds)
+    tests = [_kept(kept, f"{heart.name}_{k}_tests", b, x[:, k]) for k, b in enumerate(bodies)]
     omega = float(found.draws["omega"].mean())
     fine = [
         _kept(
             kept, f"{heart.name}_{k}_finer", replace(body, cells=FINER), x.x[: plan.meshes],
             slopes=False,
         )
-        for k, (body, x) in enumerate(zip(bodies, new, strict=True))
+        for k, (body, x) in enumerate(zip(bodies, tests, strict=True))
     ]  # fmt: skip
-    cubes_there = without_mesh(fitted, new, fine)
-    return Campaign(heart, fitted, cubes_there, tuple(new), omega, perf_counter() - began)
+    cubes_there = without_mesh(fitted, tests, fine)
+    return Campaign(heart, fitted, cubes_there, tuple(tests), omega, perf_counter() - began)
+
+
+def _some(found: Found, count: int, seed: int) -> np.ndarray:
+    """Positions (count, 3, p) of a posterior's draws."""
+    rows = np.random.default_rng(seed).choice(len(found.positions), count, replace=False)
+    return found.positions[rows]
+
+
+def _known(folder: Path | None, name: str) -> Runs | None:
+    """What a file kept of a run before this one."""
+    path = None if folder is None else folder / f"{name}.npz"
+    if path is None or not path.is_file():
+        return None
+    with np.load(path, allow_pickle=False) as arrays:
+        return Runs(*(arrays[field] for field in Runs._fields))
 
 
 def _kept(
     folder: Path | None, name: str, body: Cube, x: np.ndarray, *, slopes: bool = True
 ) -> Runs:
     """FEM at positions (r, p), or what a file kept of a run before this one."""
-    path = None if folder is None else folder / f"{name}.npz"
-    if path is not None and path.is_file():
-        with np.load(path, allow_pickle=False) as arrays:
-            return Runs(*(arrays[field] for field in Runs._fields))
+    if (known := _known(folder, name)) is not None:
+        return known
     found = body.runs(x, slopes=slopes)
-    if path is not None:
+    if folder is not None:
+        path = folder / f"{name}.npz"
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **found._asdict())

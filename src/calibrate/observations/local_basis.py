@@ -1,7 +1,8 @@
 r"""Local directions in which strains are measured.
 
 In a ventricle's wall the transmural direction :math:`n` (:mod:`emulator.geometry.fibres`) and the
-axis :math:`k` from apex to base give
+axis :math:`k` from apex to base, that of the scene's fibre rule or else the normal of the facet set
+``base`` or else z, give
 
 .. math:: r = n, \qquad c = k \times n / |k \times n|, \qquad l = n \times c ,
 
@@ -17,12 +18,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from emulator.errors import InputError
+from emulator.geometry.directions import unit
+from emulator.geometry.facets import mean_normal
 from emulator.geometry.fibres import circumferential, depth
 from emulator.scenes.cavities import ENDOCARDIUM
 from emulator.scenes.scene import Scene
 
 EPICARDIUM = "epicardium"
-AXIS = np.array([0.0, 0.0, 1.0])  # from apex to base, as in the built-in ventricles
+BASE = "base"
 
 COMPONENTS = {
     "fibre": "E_fibre",
@@ -63,6 +66,16 @@ def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
     return np.stack([basis[name] for name in components], axis=2)
 
 
+def _axis(scene: Scene) -> np.ndarray:
+    """From apex to base, (3,)."""
+    mesh = scene.mesh
+    if (axis := getattr(scene.fibre_rule, "axis", None)) is not None:
+        return unit(np.asarray(axis, dtype=float))
+    if BASE in mesh.facet_sets:
+        return mean_normal(mesh.nodes[mesh.facet_set(BASE)])
+    return np.array([0.0, 0.0, 1.0])
+
+
 def _basis(scene: Scene) -> dict[str, np.ndarray]:
     """Every direction that the scene has, (m, q, 3) each."""
     for name in (ENDOCARDIUM, EPICARDIUM):
@@ -74,7 +87,7 @@ def _basis(scene: Scene) -> dict[str, np.ndarray]:
             )
     normal = depth(scene.mesh, (ENDOCARDIUM,), (EPICARDIUM,)).normal
     n = normal.reshape((*scene.discretisation.weights.shape, 3))
-    c = circumferential(n, AXIS)
+    c = circumferential(n, _axis(scene))
     basis = {"circumferential": c, "longitudinal": np.cross(n, c), "radial": n}
     if scene.fibres is not None:
         across = np.cross(n, scene.fibres_at_points)

@@ -1,6 +1,7 @@
 """Strains against E = (F^T F - I)/2 of homogeneous deformations, by NumPy."""
 
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -104,6 +105,19 @@ def test_the_basis_is_orthonormal_and_points_where_its_names_say(scene):
     assert e["longitudinal"][wall, 2].min() > 0.7
     around = np.cross([0.0, 0.0, 1.0], outward)
     assert np.sum(e["circumferential"] * around, axis=1)[wall].min() > 0.9
+
+
+@pytest.mark.parametrize("told", ["rule", "base"])
+def test_the_basis_turns_with_the_body(scene, told):
+    """Its axis is the fibre rule's, or the normal of the base where fibres are given."""
+    R = rotation()
+    mesh = replace(scene.mesh, nodes=scene.mesh.nodes @ R.T)
+    fibres = scene.fibres_at_points @ R.T
+    rule = replace(scene.fibre_rule, axis=tuple(2.0 * R[:, 2])) if told == "rule" else None
+    assert rule is not None or "base" in mesh.facet_sets
+    turned = replace(scene, mesh=mesh, fibres=fibres, fibre_rule=rule, origin={})
+    found = local_directions(turned, EVERY)
+    np.testing.assert_allclose(found, local_directions(scene, EVERY) @ R.T, atol=1e-6)
 
 
 def test_strains_agree_with_the_fields_of_fem(ventricle):

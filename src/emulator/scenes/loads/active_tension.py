@@ -125,7 +125,7 @@ class ActiveTension(Load):
 
         return LocalTerm(pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), energy, convex=True)
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """The force of the stress on each element's nodes."""
         assert fibres is not None, "a scene with this load has fibres"
 

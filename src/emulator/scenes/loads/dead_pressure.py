@@ -9,7 +9,7 @@ to first order in the displacement, and needs no facet while solving.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -35,8 +35,9 @@ class DeadPressure(SurfacePressure):
         """Consistent nodal forces (n, 3) in mN for 1 kPa of a pressure that is a parameter."""
         return {} if self.pressure is not None else {self.parameter: self._per_kpa(grid)}
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """The force by the surface at rest, ``x + w``."""
+        del fibres
         mesh = grid.mesh
         facets, rule = mesh.facet_set(self.facet_set), self._rule(mesh.order)
 

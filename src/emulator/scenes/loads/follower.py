@@ -12,7 +12,7 @@ is not symmetric, and a scene with one can be simulated but has no energy to tra
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -55,8 +55,9 @@ class FollowerPressure(SurfacePressure):
 
         return LocalForce(facets, mesh.nodes[facets], force)
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """The force on the known surface, whatever the shape at rest."""
+        del fibres
         following = self.force(grid)
 
         def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:

@@ -73,8 +73,9 @@ class Force(Load):
         """Nodal forces (n, 3) in mN per unit of the amount."""
         return {} if self.amount is None else {self.amount: self._spread(grid.mesh)}
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """The force, wherever its nodes are."""
+        del fibres
         mesh, amount = grid.mesh, self.amount
         nodes = mesh.node_set(self.node_set)
         if len(edges_between(mesh, nodes)):

@@ -69,8 +69,9 @@ class Gravity(Load):
         """Consistent nodal forces, (n, 3) in mN."""
         return _nodal_volumes(grid)[:, None] * self.body_force
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """The weight of the volume at rest."""
+        del fibres
         return _weight_at_rest(grid, lambda _: self.body_force)
 
 
@@ -110,8 +111,9 @@ class GravityVector(Load):
             for quantity, axis in zip(self.quantities, np.eye(3), strict=True)
         }
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """The weight of the volume at rest."""
+        del fibres
         weight = self.density * _KPA_PER_MM
 
         def body_force(values: Values) -> jax.Array:

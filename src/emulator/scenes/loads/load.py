@@ -97,7 +97,7 @@ class Load(ABC):
         """Stress (m, q, 3, 3) in kPa that it adds to the law's, where F (m, q, 3, 3); or None."""
         return None
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """Its force on the body whose *loaded* shape is the mesh, of w from there to rest.
 
         What is given per volume or area at rest depends on w; what follows the surface does not.

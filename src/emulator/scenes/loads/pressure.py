@@ -14,7 +14,7 @@ potential: see :mod:`emulator.scenes.loads.follower`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -68,6 +68,7 @@ class CavityPressure(SurfacePressure):
 
         return LocalTerm(facets, grid.mesh.nodes[facets], energy)
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """The force on the known wall, whatever the shape at rest."""
+        del fibres
         return self.at_held_nodes.on_loaded(grid)

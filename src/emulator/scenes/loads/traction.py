@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -49,8 +49,9 @@ class Traction(Load):
         area = nodal_areas(mesh.nodes[facets], rule)
         return nodal_sums(mesh, facets, area)[:, None] * np.asarray(self.traction, dtype=float)
 
-    def on_loaded(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
         """The force by the surface at rest, ``x + w``."""
+        del fibres
         mesh = grid.mesh
         facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 4)
 
