@@ -56,3 +56,15 @@ def test_the_quick_start_runs(capsys):
     (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     exec(compile(code, "quickstart.md", "exec"), {})
     assert "accepted" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_examples_of_populations_run():
+    text = (ROOT / "docs" / "populations.md").read_text(encoding="utf-8")
+    names = {}
+    for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
+        exec(compile(code, "populations.md", "exec"), names)
+    assert names["solution"].converged
+    found = names["found"]
+    assert abs(found.summary()["median[mu]"]["mean"] - 70.0) < 7.0
+    assert found.summary()["median[mu]"]["r_hat"] < 1.02

@@ -1,4 +1,5 @@
 from .certificate import Certificate, certify, reweight
+from .hierarchical_model import Hierarchy, hierarchy, read_hierarchy
 from .identifiability import identify
 from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from .observations import (
@@ -45,6 +46,7 @@ __all__ = [
     "Dependence",
     "DiscrepancyNoise",
     "GaussianNoise",
+    "Hierarchy",
     "JointPrior",
     "MeasuredParameter",
     "Model",
@@ -58,6 +60,7 @@ __all__ = [
     "certify",
     "compare",
     "density_of",
+    "hierarchy",
     "identify",
     "landmarks",
     "length_between",
@@ -67,6 +70,7 @@ __all__ = [
     "nodal_displacements",
     "placement",
     "population_of_fits",
+    "read_hierarchy",
     "reweight",
     "rigid_markers",
     "rigid_motion",

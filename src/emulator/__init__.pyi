@@ -11,6 +11,7 @@ from .fem.fields import element_fields
 from .fem.unloading import Unloaded, Unloader, unload
 from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
 from .geometry.mesh import Mesh
+from .geometry.side_by_side import Bodies, side_by_side
 from .mechanics.laws import find_law
 from .scenes import Parameter, Scene, Support
 from .scenes.finer import finer
@@ -25,6 +26,7 @@ from .training import Plan, recipe, train
 __version__: str
 
 __all__ = [
+    "Bodies",
     "Body",
     "Emulator",
     "FEMForward",
@@ -66,6 +68,7 @@ __all__ = [
     "save_emulator",
     "scenes",
     "shipped",
+    "side_by_side",
     "strain_energy",
     "train",
     "unload",

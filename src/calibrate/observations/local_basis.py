@@ -50,6 +50,11 @@ def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
             raise InputError(f"strain along '{name}' is observed twice; once is enough")
         if "fibre" in name and scene.fibres is None:
             raise InputError(f"strain along '{name}': scene '{scene.name}' has no fibres")
+        if "fibre" in name and scene.angles:
+            raise InputError(
+                f"strain along '{name}': theta turns the fibres of scene '{scene.name}'; observe "
+                "strains along circumferential, longitudinal or radial"
+            )
     if not components:
         raise InputError(f"strain: name one component or more of {', '.join(COMPONENTS)}")
     if tuple(components) == ("fibre",):  # needs no wall

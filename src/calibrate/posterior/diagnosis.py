@@ -15,6 +15,7 @@ _LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
 _MANY = 100.0
 _MARKED = 0.5  # of a standard deviation
+_NAMED = 3  # parameters at most, those where divergences are farthest off
 
 
 def diagnose(
@@ -47,7 +48,8 @@ def _divergences(draws: Mapping[str, np.ndarray], diverging: np.ndarray | None) 
         return ""
     diverging = np.asarray(diverging, bool)
     count, share = int(diverging.sum()), 100.0 * diverging.mean()
-    places = [where for name, v in draws.items() if (where := _where(name, v, diverging))]
+    found = [place for name, v in draws.items() if (place := _where(name, v, diverging))]
+    places = [words for _, words in sorted(found, reverse=True)[:_NAMED]]
     return (
         f"{count} divergent transitions of {diverging.size} ({share:.2g} %)"
         + (f", mostly at {' and '.join(places)}" if places else ", spread over the whole posterior")
@@ -57,14 +59,14 @@ def _divergences(draws: Mapping[str, np.ndarray], diverging: np.ndarray | None) 
     )
 
 
-def _where(name: str, values: np.ndarray, diverging: np.ndarray) -> str:
-    """``low mu (51.2 to 53.4)`` where divergences gather at one side of a parameter."""
+def _where(name: str, values: np.ndarray, diverging: np.ndarray) -> tuple[float, str] | None:
+    """How far, and ``low mu (51.2 to 53.4)``, where they gather at one side of a parameter."""
     values, inside = np.asarray(values), np.asarray(values)[diverging]
     shift = (np.median(inside) - np.median(values)) / max(float(values.std()), 1e-300)
     if abs(shift) < _MARKED:
-        return ""
+        return None
     low, high = np.quantile(inside, [0.05, 0.95])
-    return f"{'low' if shift < 0 else 'high'} {name} ({low:.4g} to {high:.4g})"
+    return abs(shift), f"{'low' if shift < 0 else 'high'} {name} ({low:.4g} to {high:.4g})"
 
 
 def _disagreement(summary: Mapping[str, Mapping[str, float]]) -> str:

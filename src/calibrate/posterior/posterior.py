@@ -14,15 +14,15 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
-from calibrate.arviz import stats
 from calibrate.observations import Observation
 from calibrate.observations.present import missing_values
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.posterior.fit import misfits
 from calibrate.posterior.predictions import predicted
+from calibrate.posterior.summary import summary_of
 from calibrate.posterior.tree import make_tree
 from calibrate.provenance import versions
-from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws, r_hat
+from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws
 from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.modes import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
@@ -108,22 +108,8 @@ class Posterior(Shown):
 
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
         """Per parameter: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
-        draws = self.tree["posterior"].to_dataset()
-        bulk, tail = stats.ess(draws, method="bulk"), stats.ess(draws, method="tail")
-        edge = 0.5 * (1.0 - probability)
-        table = {}
-        for name, values in self.draws().items():
-            low, high = np.quantile(values, [edge, 1.0 - edge])
-            table[name] = {
-                "mean": float(values.mean()),
-                "sd": float(values.std(ddof=1)),
-                "low": float(low),
-                "high": float(high),
-                "r_hat": r_hat(np.asarray(draws[name])),
-                "ess_bulk": float(bulk[name]),
-                "ess_tail": float(tail[name]),
-            }
-        return table
+        draws = self.tree["posterior"]
+        return summary_of({n: np.asarray(draws[n]) for n in self.model.names}, probability)
 
     @property
     def divergences(self) -> int:

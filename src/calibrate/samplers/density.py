@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,30 @@ from emulator.fem.campaign import at_once
 from emulator.machine import cores
 from emulator.surrogates.fem import FEMForward
 from emulator.surrogates.protocol import ForwardMap
+
+
+class Target(Protocol):
+    """What Markov chains need of a density.
+
+    log_density : (z (p,), data) -> ().
+    dimension : number of coordinates, p.
+    piloted : whether a pilot run straightens it (:mod:`calibrate.samplers.transport`).
+    at_once : threads that may ask for it at the same time.
+    """
+
+    @property
+    def log_density(self) -> Callable[[jax.Array, Any], jax.Array]: ...  # noqa: D102
+
+    @property
+    def dimension(self) -> int: ...  # noqa: D102
+
+    @property
+    def piloted(self) -> bool: ...  # noqa: D102
+
+    @property
+    def at_once(self) -> int: ...  # noqa: D102
+
+    def __hash__(self) -> int: ...
 
 
 class Density(NamedTuple):
@@ -51,6 +75,11 @@ class Density(NamedTuple):
     def dimension(self) -> int:
         """Number of coordinates, p."""
         return len(self.names)
+
+    @property
+    def piloted(self) -> bool:
+        """Whether a pilot run straightens it: a single coordinate has no other to depend on."""
+        return self.dimension > 1
 
 
 @lru_cache(maxsize=4)
@@ -93,12 +122,12 @@ def density_of(model: Model) -> Density:
         jax.jit(jax.vmap(draw)),
         unconstrain,
         names,
-        _at_once(model.forward),
+        threads_for(model.forward),
     )
 
 
-def _at_once(forward: ForwardMap) -> int:
-    """One evaluation a core; FEM's need memory, too."""
+def threads_for(forward: ForwardMap) -> int:
+    """Evaluations at once: one a core; FEM's need memory, too."""
     return at_once(forward.simulator) if isinstance(forward, FEMForward) else cores()
 
 

@@ -1,7 +1,8 @@
 """Markov chains of any kernel: starting points, warm-up, pilot, rounds, progress, checkpoint.
 
 A pilot run straightens the posterior (:mod:`calibrate.samplers.transport`); the draws returned are
-from a second run with fresh starting points. Both use the same compiled program.
+from a second run with fresh starting points. Both use the same compiled program. A density that
+wants no pilot gets the second run alone.
 
 That program is one chain's, and as many chains run at once as there are cores. Vectorised, every
 transition of all chains would take as many gradients as the longest trajectory among them
@@ -23,12 +24,11 @@ from tqdm import tqdm
 
 from calibrate.samplers import transport
 from calibrate.samplers.checkpoint import Checkpoint
-from calibrate.samplers.density import Density
+from calibrate.samplers.density import Target
 from calibrate.samplers.options import PATHFINDER, ChainOptions
 from calibrate.samplers.pathfinder import pathfinder_start
 from calibrate.samplers.protocol import Context, Draws, Kernel
 from calibrate.samplers.stopping import converged
-from calibrate.statistical_model import Data
 from emulator.errors import SolverError
 from emulator.progress import counting
 
@@ -56,8 +56,8 @@ class ChainSampler:
 
     def sample(
         self,
-        density: Density,
-        data: Data,
+        density: Target,
+        data: Any,
         options: Any,
         seed: int,
         context: Context = Context(),
@@ -102,7 +102,7 @@ class Programs:
         self._compiled: dict[Any, Callable[..., Any]] = {}
 
     def start(
-        self, keys: jax.Array, data: Data, map_: transport.StandardMap
+        self, keys: jax.Array, data: Any, map_: transport.StandardMap
     ) -> tuple[tuple[Any, ...], np.ndarray]:
         """States of chains, by ``keys`` (c,), and their log densities (c,)."""
         begun = self._of_all("start", self._start, tuple(keys), data, map_)
@@ -110,7 +110,7 @@ class Programs:
         return states, np.array(heights)
 
     def advance(
-        self, states: tuple[Any, ...], data: Data, map_: transport.StandardMap, count: int
+        self, states: tuple[Any, ...], data: Any, map_: transport.StandardMap, count: int
     ) -> tuple[tuple[Any, ...], Draws]:
         """``count`` iterations of all chains: their states, and draws (c, count, ...)."""
         advance = partial(self._advance, count=count)
@@ -119,7 +119,7 @@ class Programs:
         return states, jax.tree.map(lambda *chains: np.stack(chains), *draws)
 
     def shapes(
-        self, chains: int, data: Data, map_: transport.StandardMap
+        self, chains: int, data: Any, map_: transport.StandardMap
     ) -> tuple[tuple[Any, ...], Draws]:
         """States and draws (c, 1, ...), as far as structure and types are concerned."""
         state, _ = jax.eval_shape(self._start, jax.random.key(0), data, map_)
@@ -145,15 +145,15 @@ class Programs:
 
 
 @lru_cache(maxsize=4)
-def compile_chains(sampler: ChainSampler, density: Density, options: ChainOptions) -> Programs:
+def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions) -> Programs:
     """The programs of one density in straightened coordinates; data and map are arguments."""
 
-    def log_density(w: jax.Array, data: Data, map_: transport.StandardMap) -> jax.Array:
+    def log_density(w: jax.Array, data: Any, map_: transport.StandardMap) -> jax.Array:
         return density.log_density(transport.apply_standard(map_, w), data)
 
     kernel = sampler.kernel(log_density, options)
 
-    def start(key: jax.Array, data: Data, map_: transport.StandardMap) -> Any:
+    def start(key: jax.Array, data: Any, map_: transport.StandardMap) -> Any:
         here, onwards = jax.random.split(key)
         shape = (_CANDIDATES, density.dimension)
         candidates = jax.random.uniform(here, shape, float, -2.0, 2.0)
@@ -168,7 +168,7 @@ def compile_chains(sampler: ChainSampler, density: Density, options: ChainOption
         first = jnp.argmax(jnp.isfinite(heights))
         return kernel.init(onwards, candidates[first], data, map_), heights[first]
 
-    def advance(state: Any, data: Data, map_: transport.StandardMap, count: int) -> Any:
+    def advance(state: Any, data: Any, map_: transport.StandardMap, count: int) -> Any:
         def step(state: Any, _: None) -> Any:
             state, w, statistics = kernel.step(state, data, map_)
             return state, Draws(transport.apply_standard(map_, w), statistics)
@@ -194,8 +194,8 @@ class Chains:
     def __init__(
         self,
         sampler: ChainSampler,
-        density: Density,
-        data: Data,
+        density: Target,
+        data: Any,
         options: ChainOptions,
         checkpoint: Checkpoint,
         bar: tqdm,
@@ -210,16 +210,12 @@ class Chains:
         self._pilot = min(options.draws, -(-wanted // (options.chains * _CHUNK)) * _CHUNK)
 
     def start_straightened(self, pilot_key: jax.Array, key: jax.Array) -> None:
-        """A pilot run, and the start of the final one.
-
-        A single coordinate has no other one to depend on: no pilot.
-        """
-        identity = transport.standard_identity(self.density.dimension)
-        if self.density.dimension == 1:
-            self._start(_FINAL, identity, key)
-        else:
-            self._start(_PILOT, identity, pilot_key)
+        """A pilot run, if the density wants one, and the start of the final one."""
+        if self.density.piloted:
+            self._start(_PILOT, self._identity(), pilot_key)
             self.straighten(key)
+        else:
+            self._start(_FINAL, self._identity(), key)
 
     def straighten(self, key: jax.Array) -> None:
         """The rest of the pilot run, and the start of the final one."""
@@ -246,7 +242,7 @@ class Chains:
         self.run, self.warmed = int(state.run), int(state.warmed)
         self.map_, self.states = state.map_, state.states
         self._parts, self._kept = [state.draws], state.draws.z.shape[1]
-        if self.run == _FINAL and self.density.dimension > 1:
+        if self.run == _FINAL and self.density.piloted:
             self._show(self._warmup + self._pilot)
         self._show(self.warmed + self._kept)
         return True
@@ -266,7 +262,7 @@ class Chains:
         return draws, count
 
     def _show(self, count: int) -> None:
-        pilot = 0 if self.density.dimension == 1 else self._warmup + self._pilot
+        pilot = self._warmup + self._pilot if self.density.piloted else 0
         planned = pilot + self._warmup + self.options.draws
         self.bar.total = max(self.bar.total, planned, self.bar.n + count)
         self.bar.update(count)
@@ -276,9 +272,12 @@ class Chains:
         draws = join(self._parts) if self._parts else jax.tree.map(_none, self._template().draws)
         return _State(self.run, self.warmed, self.map_, self.states, draws)
 
+    def _identity(self) -> transport.StandardMap:
+        return transport.standard_identity(self.density.dimension, bends=self.density.piloted)
+
     def _template(self) -> _State:
         number = jax.ShapeDtypeStruct((), int)
-        map_ = transport.standard_identity(self.density.dimension)
+        map_ = self._identity()
         states, draws = self.programs.shapes(self.options.chains, self.data, map_)
         return _State(number, number, map_, states, draws)
 

@@ -78,6 +78,8 @@ def identity(dimension: int) -> TransportMap:
 
 def apply(map_: TransportMap, zeta: jax.Array) -> jax.Array:
     """``z`` (p,) from ``zeta`` (p,)."""
+    if not map_.coefficients.size:
+        return zeta
     ordered = zeta[map_.order]
     squashed = jax.nn.sigmoid(ordered)
     columns = [ordered[0]]
@@ -138,9 +140,12 @@ def fit(draws: np.ndarray) -> TransportMap:
     return TransportMap(jnp.asarray(order), jnp.asarray(coefficients))
 
 
-def standard_identity(dimension: int) -> StandardMap:
-    """The map that changes nothing."""
-    return StandardMap(identity(dimension), jnp.zeros(dimension), jnp.ones(dimension))
+def standard_identity(dimension: int, *, bends: bool = True) -> StandardMap:
+    """The map that changes nothing; without ``bends`` it has no coefficients at all."""
+    bend = identity(dimension)
+    if not bends:
+        bend = TransportMap(bend.order, jnp.zeros((dimension, 0)))
+    return StandardMap(bend, jnp.zeros(dimension), jnp.ones(dimension))
 
 
 def apply_standard(map_: StandardMap, w: jax.Array) -> jax.Array:

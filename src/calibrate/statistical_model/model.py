@@ -131,7 +131,7 @@ class Model:
         """
         draw: dict[str, jax.Array] = {}
         for name, prior in self.sampled_priors.items():
-            draw[name] = numpyro.sample(name, self._given_earlier(name, prior, draw))
+            draw[name] = numpyro.sample(name, self.given_earlier(name, prior, draw))
         thetas = self.states.thetas(draw)
         prediction = self.evaluate(thetas) if prediction is None else prediction
         # Where the forward map has no answer, the density is zero, not NaN.
@@ -147,7 +147,7 @@ class Model:
             obs = None if observed is None else observed[name]
             numpyro.sample(f"observed_{name}", distribution, obs=obs)
 
-    def _given_earlier(
+    def given_earlier(
         self, name: str, prior: dist.Distribution, draw: Mapping[str, jax.Array]
     ) -> dist.Distribution:
         """``prior`` of ``name``, given the unknowns before it that it depends on."""
@@ -233,7 +233,7 @@ class Model:
         keys = jax.random.split(key, len(self.states.unknowns))
         found: dict[str, jax.Array] = {}
         for name, k in zip(self.states.unknowns, keys, strict=True):
-            prior = self._given_earlier(name, self.prior[name], found)
+            prior = self.given_earlier(name, self.prior[name], found)
             found[name] = prior.sample(k, (count,))
         return found
 
@@ -241,7 +241,7 @@ class Model:
         """Log density of the prior of theta's unknowns, (); ``values`` are numbers by name."""
         found = jnp.zeros(())
         for name in self.states.unknowns:
-            prior = self._given_earlier(name, self.prior[name], values)
+            prior = self.given_earlier(name, self.prior[name], values)
             found += prior.log_prob(values[name])
         return found
 

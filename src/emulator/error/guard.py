@@ -76,7 +76,7 @@ class Guard(NamedTuple):
 def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
     """Guard from theta (p,) and the prediction ``u`` (n, 3) mm alone; nothing is factorised."""
     finite = jnp.all(jnp.abs(u) < ENDLESS) & jnp.all(jnp.isfinite(theta))
-    J, I1, I4f = invariants(scene, jnp.where(finite, u, 0.0))
+    J, I1, I4f = invariants(scene, jnp.where(finite, u, 0.0), theta)
     limits = Barriers()
     active = jnp.any(limits.J_start > J) | jnp.any(limits.I1_start < I1)
     no = jnp.array(False)
@@ -100,7 +100,9 @@ def outside_box(scene: Scene, theta: jax.Array) -> jax.Array:
     return ~scene.space.contains(each)
 
 
-def invariants(scene: Scene, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def invariants(
+    scene: Scene, u: jax.Array, theta: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """``J``, ``I1`` and ``I4f`` at every point, (m, q); the last two or their isochoric parts.
 
     The larger of each pair is returned, as laws use either. Isochoric parts of inverted points are
@@ -117,5 +119,5 @@ def invariants(scene: Scene, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
         isochoric = 1.0 + strain.isochoric_I4f_minus_1
         return J, I1, jnp.fmax(jnp.vdot(stretched, stretched), isochoric)
 
-    J, I1, I4f = at_points(scene, measures, displacement_gradient(scene, u))
+    J, I1, I4f = at_points(measures, scene.tissue_at(theta), displacement_gradient(scene, u))
     return J, I1, I4f

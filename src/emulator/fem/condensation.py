@@ -48,6 +48,7 @@ from emulator.fem.energy import (
 )
 from emulator.fem.material_point import stress_and_moduli
 from emulator.mechanics.kinematics import Strain
+from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
 
 
@@ -101,7 +102,7 @@ def block_derivatives(
     change = _mean_change(scene, H)
 
     def condensed(stress: jax.Array) -> Condensed:
-        slope = _at_points(scene, _first, H, change, stress)[1]
+        slope = _at_points(_first, H, change, stress)[1]
         volumes = Volumes(change, _integral(scene, slope) / V)
         return _condensed(scene, H, volumes, stress, moduli)
 
@@ -121,7 +122,7 @@ def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) ->
     """Force and tangent of every block at ``u`` (n, 3) and ``volumes``."""
     H, law = _gradient(scene, u), stress_and_moduli(scene, theta)
     seen = lambda H, change, at: law(with_volume_change(H, change), at)  # noqa: E731
-    stress, moduli = at_points(scene, seen, H, _wide(H, volumes.change), tissue=scene.block_tissue)
+    stress, moduli = at_points(seen, scene.block_tissue_at(theta), H, _wide(H, volumes.change))
     return _condensed(scene, H, volumes, stress, moduli)
 
 
@@ -154,7 +155,7 @@ def _condensed(
 ) -> Condensed:
     """The linearisation, from the law's derivatives in the gradients that it sees."""
     grid, V = scene.blocks, _volume(scene)
-    P, slope, A, coupling, curvature = _at_points(scene, _second, H, volumes.change, stress, moduli)
+    P, slope, A, coupling, curvature = _at_points(_second, H, volumes.change, stress, moduli)
     r = _residuals(scene, H, volumes, P, slope)
     p = volumes.pressure[:, None, None, None, None, None]
     A = A + p * _over_points(jax.hessian(_volume_change), H)
@@ -205,9 +206,8 @@ def _slopes(
     """Derivatives (b, q, 3, 3) and (b, q) of the density in ``H`` and ``change``, in kPa."""
     energy = point_energy(scene, theta)
     density = lambda H, change, at: energy(with_volume_change(H, change), at)  # noqa: E731
-    return at_points(
-        scene, jax.grad(density, (0, 1)), H, _wide(H, change), tissue=scene.block_tissue
-    )
+    tissue = scene.block_tissue_at(theta)
+    return at_points(jax.grad(density, (0, 1)), tissue, H, _wide(H, change))
 
 
 def _residuals(
@@ -232,12 +232,9 @@ def _eliminated(
     return r.force + along_g[:, None, None] * g + along_b[:, None, None] * b
 
 
-def _at_points(scene: Scene, function, H: jax.Array, change: jax.Array, *fields: jax.Array):  # noqa: ANN001, ANN202
+def _at_points(function, H: jax.Array, change: jax.Array, *fields: jax.Array):  # noqa: ANN001, ANN202
     """``function`` of each point, with the ``change`` (b,) of its block."""
-    return at_points(
-        scene, lambda *of: function(*of[:-1]), H, _wide(H, change), *fields,
-        tissue=scene.block_tissue,
-    )  # fmt: skip
+    return at_points(lambda *of: function(*of[:-1]), Tissue(), H, _wide(H, change), *fields)
 
 
 def _wide(H: jax.Array, change: jax.Array) -> jax.Array:

@@ -86,16 +86,13 @@ def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = Non
     return energy
 
 
-def at_points(
-    scene: Scene, function: Callable, *fields: jax.Array, tissue: Tissue | None = None
-) -> Any:
+def at_points(function: Callable, tissue: Tissue, *fields: jax.Array) -> Any:
     """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...); leaves (m, q, ...).
 
-    The points are the elements' unless ``tissue`` (m, q, ...) says what is at others.
     All points are one batch: a ``vmap`` in a ``vmap`` takes half as long again to trace.
     """
     shape = fields[0].shape[:2]
-    every = (*fields, scene.tissue if tissue is None else tissue)
+    every = (*fields, tissue)
     flat = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), every)
     found = jax.vmap(function)(*flat)
     return jax.tree.map(lambda array: array.reshape(*shape, *array.shape[1:]), found)
@@ -183,7 +180,7 @@ def energy_of_gradient(
     """``int W dX`` in mN mm from the displacement gradient ``H`` (m, q, 3, 3)."""
     density = point_energy(scene, theta, barriers)
     seen = seen_by_law(scene, H, barriers)
-    values = at_points(scene, density, seen, tissue=scene.block_tissue)
+    values = at_points(density, scene.block_tissue_at(theta), seen)
     return jnp.sum(scene.blocks.weights * values)
 
 
@@ -203,7 +200,8 @@ def spring_terms(scene: Scene) -> list[LocalTerm]:
 
 def local_terms(scene: Scene) -> list[LocalTerm]:
     """Potentials of the loads that follow the deformation."""
-    terms = (load.term(scene.discretisation) for load in scene.loads)
+    fibres = None if scene.fibres is None else scene.fibres_at_points
+    terms = (load.term(scene.discretisation, fibres) for load in scene.loads)
     return [term for term in terms if term is not None]
 
 

@@ -1,7 +1,9 @@
 r"""Stress, strain and fibre stretch of each element, for pictures and tables.
 
 .. math::
-    P = \partial W / \partial F, \quad \sigma = P F^T / J, \quad E = (F^T F - I)/2
+    P = \partial W / \partial F + P_a, \quad \sigma = P F^T / J, \quad E = (F^T F - I)/2
+
+with :math:`P_a` the stress of active tension.
 """
 
 from __future__ import annotations
@@ -44,6 +46,10 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     F = H + jnp.eye(3, dtype=H.dtype)
     J = jax.vmap(jax.vmap(determinant))(F)
     P = _first_piola(scene, H, theta)
+    if scene.fibres is not None:
+        values, directions = scene.resolve(theta), scene.fibres_at(theta)
+        active = (load.first_piola(F, directions, values) for load in scene.loads)
+        P = sum((stress for stress in active if stress is not None), P)
     # Round-off leaves sigma slightly asymmetric; eigenvalue routines need it symmetric.
     sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]
     E = _symmetric(H + 0.5 * jnp.swapaxes(H, -1, -2) @ H)
@@ -55,7 +61,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
     fields = {"J": mean(J), "cauchy_stress": mean(sigma), "green_lagrange": mean(E)}
     if scene.fibres is not None:
-        fibres = jnp.asarray(scene.fibres_at_points)
+        fibres = scene.fibres_at(theta)
         along = jnp.einsum("mqij,mqj->mqi", F, fibres)
         fields["fibres"], fields["deformed_fibres"] = unit(mean(fibres)), unit(mean(along))
         fields["fibre_stretch"] = mean(jnp.linalg.norm(along, axis=-1))
@@ -67,7 +73,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
     """First Piola-Kirchhoff stress (m, q, 3, 3) in kPa, from the strain energy's gradient."""
     if scene.dilatation == "pointwise":
-        return at_points(scene, jax.grad(point_energy(scene, theta)), H)
+        return at_points(jax.grad(point_energy(scene, theta)), scene.tissue_at(theta), H)
     slope = jax.grad(energy_of_gradient, argnums=1)(scene, H, theta)
     return slope / scene.discretisation.weights[..., None, None]
 

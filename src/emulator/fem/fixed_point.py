@@ -65,7 +65,7 @@ def find_by_loading(
     enough = _MET * system.scene.mesh.size
 
     def correct(state: _State) -> _State:
-        there = moved_system(system, state.w)
+        there = moved_system(system, state.w, theta)
         loaded = find_equilibrium(there, options, theta, state.u)
         solved = loaded.status == Status.CONVERGED
         missed = state.w + loaded.displacement

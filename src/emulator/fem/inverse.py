@@ -101,12 +101,18 @@ class InverseSystem(System):
         return linearise(self.scene, u, volumes, theta).tangent
 
     def assemble(
-        self, bulk: jax.Array, u: jax.Array, theta: jax.Array, load: jax.Array | float
+        self,
+        bulk: jax.Array,
+        u: jax.Array,
+        theta: jax.Array,
+        stiffening: jax.Array | float,
+        level: jax.Array | float,
     ) -> jax.Array:
         """Nonzeros (nnz,) of the tangent from that of the blocks ``bulk``, springs and loads."""
+        del level
         values = self.scene.resolve(theta)
         blocks = [bulk, *(part.tangents(u, values) for part in self.resistances)]
-        blocks += [load * part.tangents(u, values) for part in self.forces]
+        blocks += [stiffening * part.tangents(u, values) for part in self.forces]
         return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
 
     def equations(
@@ -118,6 +124,5 @@ class InverseSystem(System):
         level: jax.Array | float,
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """As a :class:`~emulator.fem.system.System`'s; supports that stay pull nothing."""
-        del level
-        K = self.assemble(bulk, u, theta, stiffening)
+        K = self.assemble(bulk, u, theta, stiffening, level)
         return self.pattern.safe_values(K), self.pattern.solvable(K), jnp.zeros(len(self.free))

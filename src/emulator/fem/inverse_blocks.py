@@ -91,7 +91,7 @@ def block_forces(scene: Scene, w: jax.Array, theta: jax.Array) -> jax.Array:
     if isinstance(volumes, Volumes):
         return _mean_forces(scene, h, volumes, theta)[0]
     law = kirchhoff(scene, theta, seen_pointwise)
-    tau = at_points(scene, law, h, tissue=scene.block_tissue)
+    tau = at_points(law, scene.block_tissue_at(theta), h)
     return nodal_vectors(scene.blocks, _det(h)[..., None, None] * tau)
 
 
@@ -119,7 +119,7 @@ def linearise(
         det, change = jax.value_and_grad(_det_of)(h)
         return det * tau, det * slope + tau[:, :, None, None] * change
 
-    stress, moduli = at_points(scene, point, h, tissue=scene.block_tissue)
+    stress, moduli = at_points(point, scene.block_tissue_at(theta), h)
     return Condensed(nodal_vectors(scene.blocks, stress), _matrices(scene, moduli))
 
 
@@ -166,7 +166,7 @@ def _condensed(scene: Scene, h: jax.Array, volumes: Volumes, theta: jax.Array) -
         return det * tau, in_h, det * in_change, slope
 
     tau, in_h, in_change, cof = at_points(
-        scene, point, h, _wide(h, volumes.change), tissue=scene.block_tissue
+        point, scene.block_tissue_at(theta), h, _wide(h, volumes.change)
     )
     trace_h = jnp.einsum("bqiikl->bqkl", in_h)
     K = _matrices(scene, in_h - jnp.einsum("ij,bqkl->bqijkl", jnp.eye(3) / 3.0, trace_h))
@@ -203,7 +203,7 @@ def _eliminated(force: jax.Array, at: Couplings) -> jax.Array:
 def _stress(scene: Scene, h: jax.Array, change: jax.Array, theta: jax.Array) -> jax.Array:
     """The law's Kirchhoff stress (b, q, 3, 3) in kPa where blocks share their volume change."""
     law = kirchhoff(scene, theta, seen_with_volume)
-    return at_points(scene, law, h, _wide(h, change), tissue=scene.block_tissue)
+    return at_points(law, scene.block_tissue_at(theta), h, _wide(h, change))
 
 
 def _pressure(scene: Scene, h: jax.Array, tau: jax.Array) -> jax.Array:

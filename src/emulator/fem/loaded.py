@@ -112,7 +112,7 @@ class LoadedEquilibrium:
         return {}
 
     def _residual(self, u: jax.Array, theta: jax.Array, w: jax.Array) -> jax.Array:
-        return moved_system(self.system, w).residual(u, theta)
+        return moved_system(self.system, w, theta).residual(u, theta)
 
     @cached_property
     def _load(self) -> Callable[[jax.Array, jax.Array, jax.Array], Solution]:
@@ -120,7 +120,7 @@ class LoadedEquilibrium:
         system, residual = self.system, self._residual
 
         def find(theta: jax.Array, w: jax.Array, start: jax.Array) -> Solution:
-            return find_equilibrium(moved_system(system, w), self.options, theta, start)
+            return find_equilibrium(moved_system(system, w, theta), self.options, theta, start)
 
         closed = jit(one_by_one(find))
 
@@ -129,7 +129,7 @@ class LoadedEquilibrium:
             u: jax.Array, theta: jax.Array, w: jax.Array, *directions: jax.Array
         ) -> jax.Array:
             force = jax.jvp(partial(residual, u), (theta, w), directions)[1]
-            tangent = moved_system(system, w).safe_tangent(u, theta)[0]
+            tangent = moved_system(system, w, theta).safe_tangent(u, theta)[0]
             return system.extend(-system.solve(tangent, force))
 
         @jax.custom_jvp
@@ -156,7 +156,7 @@ class LoadedEquilibrium:
                 lambda *directions: jax.jvp(partial(residual, u), (theta, w), directions)[1]
             )
             forces = along(jnp.eye(len(theta)), ways)
-            tangent = moved_system(system, w).safe_tangent(u, theta)[0]
+            tangent = moved_system(system, w, theta).safe_tangent(u, theta)[0]
             return ways + jax.vmap(system.extend, 1)(-system.solve(tangent, forces.T))
 
         return columns

@@ -15,20 +15,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.errors import InputError
 from emulator.fem.energy import displacement_gradient
 from emulator.fem.loaded_point import carried_back
 from emulator.fem.system import System
 from emulator.geometry.discretisation import Blocks
 from emulator.mechanics.kinematics import cofactor, determinant
+from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
 
 
-def directions_at_rest(scene: Scene, w: jax.Array) -> jax.Array | None:
-    """Directions (m, q, 3) or (m, q, 2, 3) on the mesh x + w; None without any."""
-    if scene.tissue.directions is None:
-        return None
+def tissue_at_rest(scene: Scene, w: jax.Array, theta: jax.Array) -> Tissue:
+    """Material data (m, q, ...) on the mesh x + w, directions carried back."""
+    tissue = scene.tissue_at(theta)
+    if tissue.directions is None:
+        return tissue
     h = displacement_gradient(scene, w)
-    return jax.vmap(jax.vmap(carried_back))(h, jnp.asarray(scene.tissue.directions))
+    found = jax.vmap(jax.vmap(carried_back))(h, jnp.asarray(tissue.directions))
+    return tissue._replace(directions=found)
 
 
 def at_rest(scene: Scene, w: jax.Array) -> Scene:
@@ -37,9 +41,14 @@ def at_rest(scene: Scene, w: jax.Array) -> Scene:
     Raises
     ------
     InputError
-        An element is folded or inverted there.
+        An element is folded or inverted there, or theta turns the fibres.
     """
-    directions = directions_at_rest(scene, w)
+    if scene.angles:
+        raise InputError(
+            f"scene '{scene.name}': theta turns its fibres, so the unloaded body is no scene of "
+            "its own; give their angles as numbers"
+        )
+    directions = tissue_at_rest(scene, w, scene.centre).directions
     fibres = sheets = None
     if directions is not None:
         made = np.asarray(directions)
@@ -49,20 +58,19 @@ def at_rest(scene: Scene, w: jax.Array) -> Scene:
     return replace(scene, mesh=mesh, fibres=fibres, sheets=sheets, fibre_rule=None, origin={})
 
 
-def moved(scene: Scene, w: jax.Array) -> Scene:
-    """:func:`at_rest` for a ``w`` (n, 3) that may be traced: programs of it take any w.
+def moved(scene: Scene, w: jax.Array, theta: jax.Array) -> Scene:
+    """:func:`at_rest` for ``w`` (n, 3) and ``theta`` (p,) that may be traced.
+
+    Fibres are those of ``theta``, and turn no more.
 
     It lives as long as the function that makes it. Nothing is checked.
     """
-    grid, tissue = scene.discretisation, scene.tissue
+    grid, tissue = scene.discretisation, tissue_at_rest(scene, w, theta)
     mesh = copy.copy(scene.mesh)
     object.__setattr__(mesh, "nodes", scene.mesh.nodes + w)
     h = displacement_gradient(scene, w)
     gradients, weights = _at(grid, h)
     there = replace(grid, mesh=mesh, gradients=gradients, weights=weights)
-    directions = directions_at_rest(scene, w)
-    if directions is not None:
-        tissue = tissue._replace(directions=directions)
     blocks: Blocks = there
     if scene.dilatation == "patch":
         gradients, weights = _at(scene.blocks, scene.blocks.gather(h))
@@ -72,16 +80,17 @@ def moved(scene: Scene, w: jax.Array) -> Scene:
         ("mesh", mesh),
         ("discretisation", there),
         ("blocks", blocks),
-        ("tissue", tissue),
-        ("block_tissue", jax.tree.map(blocks.gather, tissue)),
+        ("angles", ()),
+        ("_tissue", tissue),
+        ("_block_tissue", jax.tree.map(blocks.gather, tissue)),
     ):
         object.__setattr__(view, name, value)
     return view
 
 
-def moved_system(system: System, w: jax.Array) -> System:
-    """The equations of ``system``'s scene on the mesh x + w, for a ``w`` that may be traced."""
-    there = System(moved(system.scene, w), system.factorisation)
+def moved_system(system: System, w: jax.Array, theta: jax.Array) -> System:
+    """The equations of ``system``'s scene on the mesh x + w, for arrays that may be traced."""
+    there = System(moved(system.scene, w, theta), system.factorisation)
     # What is made of the moved mesh is made here, lest a part of a program keep what is its own.
     _ = there.springs, there.terms, there.forces, there.dead
     return there

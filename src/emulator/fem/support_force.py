@@ -163,8 +163,8 @@ class SupportForce:
         H = jnp.einsum("bai,bqaj->bqij", u[blocks.connectivity], blocks.gradients)
         if scene.dilatation != "pointwise":
             H = jax.vmap(with_mean_dilatation)(H, jnp.asarray(blocks.weights))
-        tissue = jax.tree.map(lambda array: array[self._near], scene.block_tissue)
-        density = at_points(scene, point_energy(scene, theta), H, tissue=tissue)
+        tissue = jax.tree.map(lambda array: array[self._near], scene.block_tissue_at(theta))
+        density = at_points(point_energy(scene, theta), tissue, H)
         return jnp.sum(blocks.weights * density)
 
     @cached_property

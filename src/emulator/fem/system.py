@@ -198,19 +198,41 @@ class System:
         springs = jax.grad(lambda w: sum((s.total(w, values) for s in self.springs), 0.0))(u)
         return springs - load * self.external_force(u, theta)
 
+    def _stiffening_others(
+        self,
+        u: jax.Array,
+        theta: jax.Array,
+        stiffening: jax.Array | float,
+        level: jax.Array | float,
+    ) -> jax.Array:
+        """Force (n, 3) in mN whose derivative :meth:`assemble` adds to the tangent of the bulk."""
+        force, values = self.others(u, theta, stiffening), self.scene.resolve(theta)
+        for term in (term for term in self.terms if term.convex):
+            force = force + (level - stiffening) * jax.grad(term.total)(u, values)
+        return force
+
     def tangent(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
         """Nonzeros (nnz,) of the tangent over the free degrees of freedom, mN/mm."""
-        return self.assemble(self.bulk(u, theta), u, theta, load)
+        return self.assemble(self.bulk(u, theta), u, theta, load, load)
 
     def assemble(
-        self, bulk: jax.Array, u: jax.Array, theta: jax.Array, load: jax.Array | float
+        self,
+        bulk: jax.Array,
+        u: jax.Array,
+        theta: jax.Array,
+        stiffening: jax.Array | float,
+        level: jax.Array | float,
     ) -> jax.Array:
-        """Nonzeros (nnz,) of the tangent from that of the blocks ``bulk``, springs and loads."""
+        """Nonzeros (nnz,) of the tangent from that of the blocks ``bulk``, springs and loads.
+
+        stiffening : level of the loads there, ``level`` : of those with convex potentials.
+        """
         values = self.scene.resolve(theta)
         blocks = [bulk]
         blocks += [spring.tangents(u, values) for spring in self.springs]
-        loads: list[LocalTerm | LocalForce] = [*self.terms, *self.forces]
-        blocks += [load * part.tangents(u, values) for part in loads]
+        for term in self.terms:
+            blocks.append((level if term.convex else stiffening) * term.tangents(u, values))
+        blocks += [stiffening * force.tangents(u, values) for force in self.forces]
         return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
 
     def bulk(self, u: jax.Array, theta: jax.Array) -> jax.Array:
@@ -218,7 +240,7 @@ class System:
         scene = self.scene
         H = seen_by_law(scene, displacement_gradient(scene, u))
         law = stress_and_moduli(scene, theta)
-        stress, moduli = at_points(scene, law, H, tissue=scene.block_tissue)
+        stress, moduli = at_points(law, scene.block_tissue_at(theta), H)
         return block_derivatives(scene, u, stress, moduli)[1]
 
     def equations(
@@ -235,13 +257,13 @@ class System:
         stiffness is in the tangent. The pull (f,) in mN is what the tangent makes of the way that
         the supports have to the load level ``level``.
         """
-        K, scene = self.assemble(bulk, u, theta, stiffening), self.scene
+        K, scene = self.assemble(bulk, u, theta, stiffening, level), self.scene
         offset = self.support_offset(u, theta, level)
 
         def pulled() -> jax.Array:
             force = self.scatter(pair_products(bulk, offset[scene.blocks.connectivity]))
-            others = jax.jvp(lambda v: self.others(v, theta, stiffening), (u,), (offset,))[1]
-            return self.restrict(force + others)
+            others = lambda v: self._stiffening_others(v, theta, stiffening, level)  # noqa: E731
+            return self.restrict(force + jax.jvp(others, (u,), (offset,))[1])
 
         nothing = jnp.zeros(len(self.free))
         pull = jax.lax.cond(jnp.any(offset != 0.0), pulled, lambda: nothing)

@@ -94,6 +94,13 @@ def _summed(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     return np.stack([np.bincount(rows, each, count) for each in flat.T], axis=1).reshape(-1, 3, 3)
 
 
+def check_across(sheets: np.ndarray, fibres: np.ndarray) -> None:
+    """:class:`InputError` unless ``sheets`` (m, q, 3) are orthogonal to ``fibres`` (m, q, 3)."""
+    along = np.abs(np.einsum("mqi,mqi->mq", fibres, sheets)).max()
+    if not along < 1e-6:
+        raise InputError(f"sheets are not across the fibres (cosine {along:.2g})")
+
+
 def checked_directions(vectors: np.ndarray, mesh: Mesh, kind: str) -> np.ndarray:
     """Unit vectors (m, q, 3), or (m, 3), of each element of ``mesh``, frozen.
 

@@ -82,13 +82,17 @@ def rule_based_fibres(
 def biventricular_directions(
     mesh: Mesh, angles: Angles = (90.0, -90.0), axis: Axis = (0.0, 0.0, 1.0)
 ) -> Directions:
-    """The rule for two ventricles; the left one's governs the septum.
+    """The rule for two ventricles; directions jump where the walls meet."""
+    return turned(biventricular_depth(mesh), angles, axis)
+
+
+def biventricular_depth(mesh: Mesh) -> Depth:
+    """Depth in the walls of two ventricles; the left one's governs the septum.
 
     Three harmonic fields, each 1 on one of lv_endocardium, rv_endocardium, epicardium and 0 on
     the other two, add up to one. Where the field of lv_endocardium is the smallest of the three,
     the point lies in the right ventricle's free wall and depth runs from rv_endocardium to the
     other two surfaces; elsewhere depth runs from lv_endocardium to the other two.
-    The directions jump where the walls meet.
     """
     surfaces = ("lv_endocardium", "rv_endocardium", "epicardium")
     left, right = (
@@ -98,11 +102,10 @@ def biventricular_directions(
     touch_left, touch_right = 1.0 - left.value, 1.0 - right.value
     touch_outside = 1.0 - touch_left - touch_right
     free = touch_left < np.minimum(touch_right, touch_outside)
-    wall = Depth(
+    return Depth(
         np.where(free, right.value, left.value),
         np.where(free[..., None], right.normal, left.normal),
     )
-    return turned(wall, angles, axis)
 
 
 def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Depth:

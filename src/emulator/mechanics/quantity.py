@@ -16,6 +16,7 @@ class Quantity:
     unit : of its values; empty when dimensionless.
     low, high : values lie between these, both excluded.
     hint : added to the message that refuses a wrong unit.
+    low_admitted : whether a value may be ``low`` itself.
     """
 
     name: str
@@ -23,6 +24,7 @@ class Quantity:
     low: float = 0.0
     high: float = math.inf
     hint: str = ""
+    low_admitted: bool = False
 
     def unit_fault(self, unit: str, owner: str) -> str | None:
         """Message if ``owner`` cannot take a value in ``unit``, else ``None``."""
@@ -35,8 +37,9 @@ class Quantity:
 
     def range_fault(self, low: float, high: float) -> str | None:
         """Message if the range from ``low`` to ``high`` is not admissible, else ``None``."""
-        if not low > self.low:
-            return f"{self._with_unit('ranges down to', low)}; it must stay above {self.low:g}"
+        if not self._high_enough(low):
+            least = "not go below" if self.low_admitted else "stay above"
+            return f"{self._with_unit('ranges down to', low)}; it must {least} {self.low:g}"
         if not high < self.high:
             return f"{self._with_unit('ranges up to', high)}; it must stay below {self.high:g}"
         return None
@@ -45,11 +48,15 @@ class Quantity:
         """Message if ``value`` is not admissible, else ``None``."""
         if not math.isfinite(value):
             return f"{self._with_unit('is', value)}; it must be finite"
-        if not value > self.low:
-            return f"{self._with_unit('is', value)}; it must be above {self.low:g}"
+        if not self._high_enough(value):
+            least = f"{self.low:g} or more" if self.low_admitted else f"above {self.low:g}"
+            return f"{self._with_unit('is', value)}; it must be {least}"
         if not value < self.high:
             return f"{self._with_unit('is', value)}; it must be below {self.high:g}"
         return None
+
+    def _high_enough(self, value: float) -> bool:
+        return value >= self.low if self.low_admitted else value > self.low
 
     def _with_unit(self, verb: str, value: float) -> str:
         return f"parameter '{self.name}' {verb} {value:g} {self.unit}".rstrip()

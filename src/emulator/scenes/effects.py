@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from emulator.errors import InputError
 from emulator.geometry.directions import of_elements
 from emulator.geometry.quadratic import corner_parents, to_linear
+from emulator.scenes.owners import directions_read
 from emulator.scenes.scene import Scene
 
 
@@ -131,11 +132,13 @@ def _changed(scene: Scene, **changes: Any) -> Scene | None:
     regions = changes.get("regions", scene.regions)
     if not loads and not scene.prescribed.moves:
         return None
-    for kind, asked in (("fibres", law.fibres), ("sheets", law.sheets)):
+    for kind, reader in directions_read(law, loads).items():
         changes.setdefault(kind, getattr(scene, kind))
-        changes[kind] = changes[kind] if asked else None
+        changes[kind] = None if reader is None else changes[kind]
+    changes["angles"] = () if changes["fibres"] is None else scene.angles
     parts = (*loads, *changes.get("supports", scene.supports))
     takers = set(law.parameters) | {q.name for part in parts for q in part.quantities}
+    takers |= {q.name for angles in changes["angles"] for q in angles.quantities}
     if regions is not None:
         takers |= {name for name in scene.quantities if name.startswith("stiffness_")}
     try:

@@ -12,15 +12,13 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.fibres import (
-    Angles,
-    Axis,
-    biventricular_directions,
-    rule_based_directions,
-)
+from emulator.geometry.fibres import Axis, Depth, biventricular_depth, depth, turned
 from emulator.geometry.mesh import Mesh
+from emulator.scenes.fibre_angles import FibreAngles, across_wall, without_parameters
 
 Directions = tuple[np.ndarray, np.ndarray | None]
+Angles = tuple[float | str, float | str]
+"""Degrees, or names of parameters."""
 
 
 class FibreRule(Protocol):
@@ -29,7 +27,14 @@ class FibreRule(Protocol):
     rule: ClassVar[str]
 
     def directions(self, mesh: Mesh) -> Directions:
-        """Unit fibres (m, 3), and unit sheets (m, 3) if the rule gives any."""
+        """Unit fibres (m, 3), and unit sheets (m, 3) if the rule gives any.
+
+        Angles that are parameters are zero.
+        """
+        ...
+
+    def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
+        """The rotations of these directions by parameters; none where the rule names none."""
         ...
 
 
@@ -39,7 +44,7 @@ class Helix:
 
     Parameters
     ----------
-    angles : degrees at endocardium and epicardium.
+    angles : degrees at endocardium and epicardium, or names of parameters.
     axis : from apex to base.
     endocardium, epicardium : facet sets.
     """
@@ -53,9 +58,14 @@ class Helix:
 
     def directions(self, mesh: Mesh) -> Directions:
         """Fibres, and the transmural direction as sheets."""
-        return rule_based_directions(
-            mesh, self.endocardium, self.epicardium, self.angles, self.axis
-        )
+        return turned(self._wall(mesh), without_parameters(self.angles), self.axis)
+
+    def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
+        """The helix angles that are parameters."""
+        return across_wall(*self._wall(mesh), self.angles)
+
+    def _wall(self, mesh: Mesh) -> Depth:
+        return depth(mesh, (self.endocardium,), (self.epicardium,))
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,7 @@ class Biventricle:
 
     Parameters
     ----------
-    angles : degrees at endocardium and epicardium.
+    angles : degrees at endocardium and epicardium, or names of parameters.
     axis : from apex to base.
     """
 
@@ -75,7 +85,11 @@ class Biventricle:
 
     def directions(self, mesh: Mesh) -> Directions:
         """Fibres, and the transmural direction as sheets."""
-        return biventricular_directions(mesh, self.angles, self.axis)
+        return turned(biventricular_depth(mesh), without_parameters(self.angles), self.axis)
+
+    def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
+        """The helix angles that are parameters."""
+        return across_wall(*biventricular_depth(mesh), self.angles)
 
 
 @dataclass(frozen=True)
@@ -86,15 +100,21 @@ class Uniform:
     ----------
     direction : of the fibres, of any length above 0.
     sheets : sheet direction, likewise; for a law that takes any.
+    angle : name of a parameter, degrees by which both are turned about ``about``.
+    about : axis of that angle, of any length above 0.
     """
 
     rule: ClassVar[str] = "uniform"
 
     direction: Axis
     sheets: Axis | None = None
+    angle: str | None = None
+    about: Axis | None = None
 
     def __post_init__(self) -> None:
-        for name in ("direction", "sheets"):
+        if (self.angle is None) != (self.about is None):
+            raise InputError("angle and about: give both, the parameter and the axis, or neither")
+        for name in ("direction", "sheets", "about"):
             if (vector := getattr(self, name)) is not None and not np.linalg.norm(vector) > 0.0:
                 raise InputError(f"{name} is zero; expected any length above 0")
 
@@ -102,6 +122,13 @@ class Uniform:
         """The directions, made unit length."""
         sheets = None if self.sheets is None else _everywhere(mesh, self.sheets)
         return _everywhere(mesh, self.direction), sheets
+
+    def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
+        """The angle, if it is a parameter."""
+        if self.angle is None or self.about is None:
+            return ()
+        share = np.ones(len(mesh.elements))
+        return (FibreAngles(_everywhere(mesh, self.about), {self.angle: share}),)
 
 
 def _everywhere(mesh: Mesh, vector: Axis) -> np.ndarray:

@@ -39,7 +39,7 @@ A ventricle, whose mesh file has groups named base, endocardium and epicardium:
 
     [fibres]                                 # without it, they come from the mesh file
     rule = "helix"
-    angles = [60.0, -60.0]                   # degrees, endocardium and epicardium
+    angles = [60.0, -60.0]    # degrees, endocardium and epicardium, or parameters' names
     endocardium = "endocardium"              # facet sets; these are the defaults
     epicardium = "epicardium"
     axis = [0.0, 0.0, 1.0]                   # from apex to base
@@ -119,13 +119,36 @@ takes ``acceleration`` in m/s2. A pressure that is a parameter is called ``press
 key ``parameter`` says. ``published_pressure`` is the pressure work of the released code, on linear
 tetrahedra only.
 
+Muscle contracts by a load of the kind ``active_tension``, along the fibres of the file or of a
+rule, whatever the law: ``tension`` in kPa, or a parameter of that name; ``transverse`` is the share
+of it across the fibre.
+
+Several bodies of one material (:mod:`emulator.geometry.side_by_side`), as two cubes of one liver:
+
+.. code-block:: toml
+
+    [[bodies]]                               # in place of mesh = ...
+    name = "cube1"
+    mesh = "cube1.vtu"                       # its set top is called cube1.top
+
+    [[bodies]]
+    name = "cube2"
+    mesh = "cube2.vtu"
+    shift = [20.0, 0.0, 0.0]                 # mm; no nodes of two bodies may coincide
+
+    [node_sets."cube2.edge"]
+    axis = "x"
+    at = 30.0
+    within = "cube2"                         # the surface of a body
+
 ``loaded_by = {pressure = "imaged"}`` says that the mesh is the body under load, as in an image: the
 parameter or constant ``imaged``, in the unit of the pressure, is what ``pressure`` was then. FEM
 unloads the body before it loads it; displacements are those from the mesh (docs/unloading.md).
 
 ``regions = "segment"`` names cell data of the mesh file, a whole number for each tetrahedron, such
 as gmsh's own ``gmsh:physical``. In region 3 the law's energy is then multiplied by the parameter or
-constant ``stiffness_3``, its resistance to volume change excepted.
+constant ``stiffness_3``, its resistance to volume change excepted. ``regions = "body"`` numbers
+several bodies from 1.
 """
 
 from __future__ import annotations
@@ -140,11 +163,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
 from emulator.line_index import toml_lines
 from emulator.mechanics.laws import Law, find_law
+from emulator.scenes.file_bodies import one_body, several_bodies
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 
@@ -152,7 +174,7 @@ if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with th
     from emulator.scenes.file_models import Plane, SceneFile
     from emulator.schema import Source
 
-Parts = tuple[Mesh, np.ndarray | None, np.ndarray | None]
+Parts = tuple[Mesh, np.ndarray | None, np.ndarray | None, np.ndarray | None]
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 # A node this far from a plane, as a fraction of the body's size, is on it.
@@ -185,10 +207,8 @@ def read_scene(path: str | Path) -> Scene:
 def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
     with source.at("law"):
         law = find_law(file.law)
-    mesh_path = path.parent / file.mesh
-    mesh, fibres, sheets = _body(mesh_path, file, law, source)
-    with source.at("regions"):
-        regions = None if file.regions is None else read_regions(mesh_path, file.regions)
+    mesh, fibres, sheets, regions = _body(path.parent, file, law, source)
+    angles = file.fibres.angles_in(mesh) if file.fibres is not None else ()
     parameters = _parameters(file, source)
     _check_sets(mesh, source)
     try:
@@ -199,6 +219,7 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
             origin={"scene": "file", "path": str(path.resolve())},
             fibres=fibres,
             fibre_rule=file.fibres,
+            angles=angles,
             sheets=sheets,
             regions=regions,
             parameters=parameters,
@@ -239,37 +260,15 @@ def _quantity_in(message: str, file: SceneFile) -> tuple[str, ...]:
     return ()
 
 
-def _body(mesh_path: Path, file: SceneFile, law: Law, source: Source) -> Parts:
-    """The mesh with the sets the file adds, and directions if the law or the file wants any."""
-    with source.at("mesh"):
-        body = _read(mesh_path, file, law)
-    if file.order is not None and file.order < body.mesh.order:
-        problem = f"order = 1; mesh file {mesh_path.name} has quadratic tetrahedra, expected 2"
-        raise source.error(problem, ("order",))
+def _body(folder: Path, file: SceneFile, law: Law, source: Source) -> Parts:
+    """The mesh with the sets the file adds, directions and regions if anything wants them."""
+    body, regions = (several_bodies if file.bodies else one_body)(folder, file, law, source)
     mesh = _with_planes(body.mesh, file, source)
     fibres, sheets = body.fibres, body.sheets
     if file.fibres is not None:
         with source.at("fibres", table=("fibres",)):
             fibres, sheets = file.fibres.directions(mesh)
-    return mesh, fibres, sheets if law.sheets else None
-
-
-def _read(mesh_path: Path, file: SceneFile, law: Law) -> Body:
-    """The mesh file, with the directions the law needs unless a rule gives them."""
-    if not law.fibres or file.fibres is not None:
-        mesh = read_mesh(mesh_path)
-        return Body(to_quadratic(mesh) if file.order == 2 and mesh.order == 1 else mesh)
-    body = read_body(mesh_path, quadratic=file.order == 2)
-    for kind, needed, found in (
-        ("fibres", law.fibres, body.fibres),
-        ("sheets", law.sheets, body.sheets),
-    ):
-        if needed and found is None:
-            raise InputError(
-                f"law '{law.name}' needs {kind}, and mesh file {mesh_path.name} has none; give it "
-                f"cell or point data '{kind}' of 3 components, or this file a table [fibres]"
-            )
-    return body
+    return mesh, fibres, sheets if law.sheets else None, regions
 
 
 def _with_planes(mesh: Mesh, file: SceneFile, source: Source) -> Mesh:

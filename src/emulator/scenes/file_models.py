@@ -37,13 +37,26 @@ class ParameterTable(Table):
     """log to sample equal ratios equally."""
 
 
+class BodyTable(Table):
+    """One of several bodies of one material; its set ``top`` is ``name.top``."""
+
+    name: str
+    """of the body, and of the sets that its surface is; letters, digits, _ and -."""
+    mesh: str
+    """its mesh file, as ``mesh`` of a scene of one body."""
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """by how much it is moved, mm; bodies do not feel each other, but no nodes may coincide."""
+
+
 class SceneFile(Table):
     """A whole scene file."""
 
     law: str
     """a hyperelastic law."""
-    mesh: str
+    mesh: str | None = None
     """mesh file of tetrahedra in mm, any format meshio reads; its path is relative to this file."""
+    bodies: tuple[BodyTable, ...] = ()
+    """several bodies of one material, in place of mesh."""
     parameters: dict[str, ParameterTable]
     """what varies: parameters of the law, of loads and of regions."""
     supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...]
@@ -58,7 +71,8 @@ class SceneFile(Table):
     order: Literal[1, 2] | None = None
     """2 for quadratic tetrahedra, made from linear ones if need be; as the mesh file without it."""
     regions: str | None = None
-    """cell data of the mesh file with a whole number for each tetrahedron, e.g. gmsh:physical."""
+    """cell data of the mesh file with a whole number for each tetrahedron, e.g. gmsh:physical; with
+    several bodies also body: 1, 2, ... in their order."""
     fibres: Annotated[FibreRule, OneOf("rule", FIBRE_RULES)] | None = None
     """a rule for fibres and sheets; without it they come from the mesh file."""
     loaded_by: dict[str, str] = Field(default_factory=dict)

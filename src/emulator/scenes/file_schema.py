@@ -30,7 +30,9 @@ def scene_schema() -> dict[str, Any]:
     keys["constants"]["properties"] = {
         name: {"type": "number", "description": text} for name, text in texts.items()
     }
-    return {"title": "Scene file", **schema, "allOf": [_units(law) for law in LAWS.values()]}
+    one_mesh = {"oneOf": [{"required": ["mesh"]}, {"required": ["bodies"]}]}
+    units = [_units(law) for law in LAWS.values()]
+    return {"title": "Scene file", **schema, "allOf": [one_mesh, *units]}
 
 
 def _takes(law: Law) -> str:

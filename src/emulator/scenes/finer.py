@@ -9,6 +9,7 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.geometry.directions import across
 from emulator.geometry.refinement import Refinement, refined
+from emulator.scenes.fibre_angles import FibreAngles
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.scene import Scene
 
@@ -41,6 +42,7 @@ def finer(scene: Scene) -> Finer:
     refinement = refined(scene.mesh)
     children = refinement.children
     fibres, sheets = _directions(scene, refinement)
+    angles = _angles(scene, refinement) if scene.angles else ()
     moved: dict[str | None, np.ndarray] = {None: refinement.carry(scene.held_displacement)}
     moved |= {n: refinement.carry(per_unit) for n, per_unit in scene.prescribed.per_unit.items()}
     fine = replace(
@@ -48,6 +50,7 @@ def finer(scene: Scene) -> Finer:
         mesh=refinement.mesh,
         fibres=fibres,
         sheets=sheets,
+        angles=angles,
         # A finer mesh is quadratic, and patches are for linear elements.
         dilatation="mean" if scene.dilatation == "patch" else scene.dilatation,
         regions=None if scene.regions is None else np.repeat(scene.regions, children),
@@ -68,6 +71,17 @@ def _directions(scene: Scene, refinement: Refinement) -> tuple[np.ndarray | None
     if fibres is not None and sheets is not None:
         sheets = across(sheets, fibres)
     return fibres, sheets
+
+
+def _angles(scene: Scene, refinement: Refinement) -> tuple[FibreAngles, ...]:
+    """Fibre angles on the finer mesh, by the rule that made them."""
+    rule = scene.fibre_rule
+    angles = rule.angles_in(refinement.mesh) if rule is not None and _made_by(rule, scene) else ()
+    if len(angles) != len(scene.angles):
+        raise InputError(
+            f"scene '{scene.name}': fibre angles without the rule that made them have no finer mesh"
+        )
+    return angles
 
 
 def _made_by(rule: FibreRule, scene: Scene) -> bool:

@@ -41,7 +41,7 @@ def left_ventricle(
     rings: int | None = None,
     around: int | None = None,
     layers: int | None = None,
-    angles: tuple[float, float] = HELIX,
+    angles: tuple[float | str, float | str] = HELIX,
     kappa: float = 25.0,
     wall: tuple[float, float, float, float, float] = astuple(HUMAN),
     thicker: tuple[float, float] = (0.0, 0.0),
@@ -61,7 +61,8 @@ def left_ventricle(
     rings, around, layers, grading : of the mesh, as in
         :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`; by default what the
         elements' order needs.
-    angles : helix angle in degrees on the endocardium and on the epicardium.
+    angles : helix angle on the endocardium and on the epicardium, in degrees, or the name of a
+        parameter, which then varies within 20 degrees of ``HELIX``.
     kappa : resistance to volume change, kPa.
     wall : the dimensions of an :class:`~emulator.geometry.bodies.ellipsoid.EllipsoidalWall`, mm.
     thicker : by which fraction the wall is thicker at the base, and towards which angle in degrees.
@@ -75,12 +76,13 @@ def left_ventricle(
         name="left_ventricle",
         mesh=mesh,
         law=find_law("holzapfel_ogden"),
-        parameters=(*MYOCARDIUM, PRESSURE),
+        parameters=(*MYOCARDIUM, *_varied(angles), PRESSURE),
         loads=(CavityPressure("endocardium"),),
         supports=(Support("base"),),
         constants={"kappa": kappa},
         fibres=rule.directions(mesh)[0],
         fibre_rule=rule,
+        angles=rule.angles_in(mesh),
         origin={
             "scene": "left_ventricle",
             **made,
@@ -91,3 +93,9 @@ def left_ventricle(
             **({} if thicker == (0.0, 0.0) else {"thicker": list(thicker)}),
         },
     )
+
+
+def _varied(angles: tuple[float | str, float | str]) -> tuple[Parameter, ...]:
+    """Parameters of the helix angles that are names, each once."""
+    named = {name: at for name, at in zip(angles, HELIX, strict=True) if isinstance(name, str)}
+    return tuple(Parameter(name, "deg", at - 20.0, at + 20.0) for name, at in named.items())

@@ -24,11 +24,13 @@ class LocalTerm:
     nodes : (k, a) nodes each local energy depends on.
     data : arrays with leading axis k; NumPy's, because JAX arrays made inside jit are tracers.
     energy : ``energy(u, data_row, values) -> ()`` in mN mm for one of them, ``u`` (a, 3).
+    convex : whether each of them is. Its stiffness then helps a body that does not balance it yet.
     """
 
     nodes: np.ndarray
     data: Any
     energy: Callable[[jax.Array, Any, Values], jax.Array]
+    convex: bool = False
 
     def total(self, u: jax.Array, values: Values) -> jax.Array:
         """The sum, shape ()."""

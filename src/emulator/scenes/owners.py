@@ -1,4 +1,4 @@
-"""Who takes which parameter of a scene: its law, a region, a load or a support."""
+"""Who takes which parameter of a scene: its law, a region, an angle, a load or a support."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.mechanics.laws import Law
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.fibre_angles import FibreAngles
 from emulator.scenes.loads.load import Load
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.regions import region_quantities
@@ -22,6 +23,7 @@ Owners = Mapping[str, tuple[Quantity, str]]
 def owners_of(
     law: Law,
     regions: np.ndarray | None,
+    angles: Sequence[FibreAngles],
     loads: Sequence[Load],
     supports: Sequence[BoundaryCondition],
     loaded_by: Mapping[str, str],
@@ -38,7 +40,7 @@ def owners_of(
     owners = {q.name: (q, f"law '{law.name}'") for q in law.quantities}
     if regions is not None:
         owners |= {q.name: (q, "a region") for q in region_quantities(regions)}
-    for what, parts in (("load", loads), ("support", supports)):
+    for what, parts in (("the fibres'", angles), ("load", loads), ("support", supports)):
         others = set(owners)
         for part in parts:
             owner = f"{what} {type(part).__name__}"
@@ -58,6 +60,15 @@ def owners_of(
             )
         owners.setdefault(held_by, (replace(taken[load], name=held_by), f"'{load}' in the image"))
     return owners
+
+
+def directions_read(law: Law, loads: Sequence[Load]) -> dict[str, str | None]:
+    """Who reads ``fibres`` and ``sheets``, in words; None where nobody does."""
+    fibres = f"law '{law.name}'" if law.fibres else None
+    for load in loads:
+        if fibres is None and load.fibres:
+            fibres = f"load '{load.kind}'"
+    return {"fibres": fibres, "sheets": f"law '{law.name}'" if law.sheets else None}
 
 
 def check_given(

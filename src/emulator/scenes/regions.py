@@ -12,7 +12,7 @@ proportional to their ``shape_moduli``, so the factor multiplies these.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,25 @@ class Tissue(NamedTuple):
 
     directions: jax.Array | None = None
     region: jax.Array | None = None
+
+
+def tissue_of(
+    fibres: np.ndarray | None, sheets: np.ndarray | None, regions: np.ndarray | None, points: int
+) -> Tissue:
+    """Material data stacked over elements and their ``points``, leading axes (m, q).
+
+    Parameters
+    ----------
+    fibres, sheets : (m, q, 3), or None. regions : (m,) labels, or None.
+    """
+    directions, region = fibres, None
+    if fibres is not None and sheets is not None:
+        directions = np.stack([fibres, sheets], axis=2)
+    if regions is not None:
+        index = np.unique(regions, return_inverse=True)[1][:, None]
+        region = np.broadcast_to(index, (len(index), points))
+    # NumPy arrays: JAX arrays made inside jit would be tracers, and a scene keeps these.
+    return Tissue(cast(Any, directions), cast(Any, region))
 
 
 def factors(regions: np.ndarray | None, values: Mapping[str, Any]) -> jax.Array | None:

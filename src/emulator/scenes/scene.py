@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError
-from emulator.geometry.directions import checked_directions
+from emulator.geometry.directions import check_across, checked_directions
 from emulator.geometry.discretisation import (
     Blocks,
     Discretisation,
@@ -28,12 +28,13 @@ from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.dilatation import Dilatation, check_dilatation
+from emulator.scenes.fibre_angles import FibreAngles, checked_angles, identity_of_angles, turned
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
-from emulator.scenes.owners import Owners, check_given, check_image, owners_of
+from emulator.scenes.owners import Owners, check_given, check_image, directions_read, owners_of
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
-from emulator.scenes.regions import Tissue, checked_regions
+from emulator.scenes.regions import Tissue, checked_regions, tissue_of
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
 from emulator.scenes.supports.dirichlet import Prescribed, prescribe
 from emulator.scenes.supports.rigid import check_motions
@@ -52,12 +53,12 @@ class Scene(Shown):
     mesh : geometry in mm.
     law : hyperelastic law.
     parameters : entries of theta, in order.
-    loads : external loads; may be empty, when the supports alone deform the body.
+    loads : what deforms the body; may be empty, when the supports alone deform the body.
     supports : prescribed displacements and springs.
     constants : parameters of the law and the loads that do not vary.
-    fibres : unit fibre directions, for laws that read them: at every quadrature point (m, q, 3),
-        or of each element (m, 3). Constant in an element, they cost a quadratic one most of its
-        accuracy.
+    fibres : unit fibre directions, for laws and loads that read them: at every quadrature
+        point (m, q, 3), or of each element (m, 3). Constant in an element, they cost a quadratic
+        one most of its accuracy.
     origin : how a built-in scene was made: its name and arguments, written to scene files.
     dilatation : ``pointwise``, or ``mean`` to use the mean volume change of each element, which
         keeps quadratic elements from locking when the material is nearly incompressible, or
@@ -69,6 +70,9 @@ class Scene(Shown):
         volumetric part; see :mod:`emulator.scenes.regions`.
     fibre_rule : what made the directions of this mesh, for another mesh of the body
         (:mod:`emulator.scenes.finer`).
+    angles : parameters that turn fibres and sheets (:mod:`emulator.scenes.fibre_angles`), one
+        rotation after the other, as the rule's ``angles_in`` gives them; ``fibres`` and ``sheets``
+        are those at angle zero.
     loaded_by : empty where the mesh is at rest. Where it is the loaded shape of an image: for every
         load parameter of theta the name of the parameter or constant that holds its value there,
         ``{"pressure": "imaged"}``. A simulator then unloads and loads
@@ -88,6 +92,7 @@ class Scene(Shown):
     sheets: np.ndarray | None = None
     regions: np.ndarray | None = None
     fibre_rule: FibreRule | None = None
+    angles: tuple[FibreAngles, ...] = ()
     loaded_by: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -95,9 +100,9 @@ class Scene(Shown):
         object.__setattr__(self, "origin", MappingProxyType(dict(self.origin)))
         object.__setattr__(self, "loaded_by", MappingProxyType(dict(self.loaded_by)))
         self._check_regions()
+        self._check_directions()
         with self._named():
             check_given(self._owners, self.law, self.parameters, self.constants)
-        self._check_directions()
         with self._named():
             check_dilatation(self.dilatation, self.mesh.order)
         if not self.parameters:
@@ -120,23 +125,21 @@ class Scene(Shown):
             object.__setattr__(self, "regions", labels)
 
     def _check_directions(self) -> None:
-        for kind, asked in (("fibres", self.law.fibres), ("sheets", self.law.sheets)):
+        for kind, reader in directions_read(self.law, self.loads).items():
             given = getattr(self, kind)
             if given is None:
-                if asked:
-                    raise InputError(f"scene '{self.name}': law '{self.law.name}' needs {kind}")
+                if reader is not None:
+                    raise InputError(f"scene '{self.name}': {reader} needs {kind}")
                 continue
-            if not asked:
+            if reader is None:
                 raise InputError(f"scene '{self.name}': law '{self.law.name}' takes no {kind}")
             with self._named():
                 object.__setattr__(self, kind, checked_directions(given, self.mesh, kind))
-        if self.fibres is not None and self.sheets is not None:
-            fibres, sheets = self.fibres_at_points, self._at_points(self.sheets)
-            along = np.abs(np.einsum("mqi,mqi->mq", fibres, sheets)).max()
-            if not along < 1e-6:
-                raise InputError(
-                    f"scene '{self.name}': sheets are not across the fibres (cosine {along:.2g})"
-                )
+        with self._named():
+            angles = checked_angles(self.angles, self.mesh, self.fibres, self.loads)
+            object.__setattr__(self, "angles", angles)
+            if self.fibres is not None and self.sheets is not None:
+                check_across(self._at_points(self.sheets), self.fibres_at_points)
 
     def _check_supports(self) -> None:
         if not self.supports:
@@ -167,7 +170,9 @@ class Scene(Shown):
 
     @property
     def _owners(self) -> Owners:
-        return owners_of(self.law, self.regions, self.loads, self.supports, self.loaded_by)
+        return owners_of(
+            self.law, self.regions, self.angles, self.loads, self.supports, self.loaded_by
+        )
 
     @cached_property
     def space(self) -> ParameterSpace:
@@ -238,25 +243,30 @@ class Scene(Shown):
             raise InputError(f"scene '{self.name}' has no fibres")
         return self._at_points(self.fibres)
 
-    @cached_property
-    def tissue(self) -> Tissue:
-        """Material data stacked over elements and points, arrays with leading axes (m, q)."""
-        directions = region = None
-        if self.fibres is not None:
-            directions = self.fibres_at_points
-        if self.fibres is not None and self.sheets is not None:
-            directions = np.stack([self.fibres_at_points, self._at_points(self.sheets)], axis=2)
-        if self.regions is not None:
-            points = len(quadrature_points(self.mesh.order))
-            index = np.unique(self.regions, return_inverse=True)[1]
-            region = np.broadcast_to(index[:, None], (len(index), points))
-        # NumPy arrays: JAX arrays made inside jit would be tracers, and this is cached.
-        return Tissue(cast(Any, directions), cast(Any, region))
+    def fibres_at(self, theta: jax.Array) -> jax.Array:
+        """Unit fibre directions (m, q, 3) at ``theta`` (p,); of a scene with fibres."""
+        given = Tissue(jnp.asarray(self.fibres_at_points))
+        return cast(Any, turned(given, self.angles, self.resolve(theta)).directions)
+
+    def tissue_at(self, theta: jax.Array) -> Tissue:
+        """Material data at ``theta`` (p,), stacked over elements and points, (m, q, ...)."""
+        return turned(self._tissue, self.angles, self.resolve(theta))
+
+    def block_tissue_at(self, theta: jax.Array) -> Tissue:
+        """The same stacked over :attr:`blocks` and their points, (b, q, ...)."""
+        if not self.angles:
+            return self._block_tissue
+        return jax.tree.map(self.blocks.gather, self.tissue_at(theta))
 
     @cached_property
-    def block_tissue(self) -> Tissue:
-        """The same stacked over :attr:`blocks` and their points, leading axes (b, q)."""
-        return jax.tree.map(self.blocks.gather, self.tissue)
+    def _tissue(self) -> Tissue:
+        fibres = self.fibres_at_points if self.law.fibres else None
+        sheets = None if self.sheets is None else self._at_points(self.sheets)
+        return tissue_of(fibres, sheets, self.regions, len(quadrature_points(self.mesh.order)))
+
+    @cached_property
+    def _block_tissue(self) -> Tissue:
+        return jax.tree.map(self.blocks.gather, self._tissue)
 
     @cached_property
     def prescribed(self) -> Prescribed:
@@ -302,8 +312,7 @@ class Scene(Shown):
         order = "linear" if mesh.order == 1 else "quadratic"
         if (mesh.order, self.dilatation) != (1, "pointwise"):
             order = f"{order}, {self.dilatation} dilatation"
-        kinds = (", ".join(part.kind for part in parts) for parts in (self.loads, self.supports))
-        loads, supports = kinds
+        loads, supports = (", ".join(p.kind for p in all_) for all_ in (self.loads, self.supports))
         ranges = [f"{p.name} {p.low:.4g} to {p.high:.4g} {p.unit}".strip() for p in self.parameters]
         return f"Scene '{self.name}'", [
             ("mesh", f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra, {order}"),
@@ -325,7 +334,8 @@ class Scene(Shown):
             "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
             "dilatation": self.dilatation,
         }
-        if self.loaded_by:  # fingerprints of scenes at rest are older
+        turning = identity_of_angles(self.angles)
+        if self.loaded_by:  # fingerprints of selfs at rest are older
             description["loaded_by"] = dict(self.loaded_by)
         held, fixed, per_unit = self.prescribed
         moved = {f"displacement per unit of {name}": each for name, each in per_unit.items()}
@@ -333,7 +343,7 @@ class Scene(Shown):
             self.mesh,
             held,
             {"displacement": fixed, **moved},
-            {"fibres": self.fibres, "sheets": self.sheets},
+            {"fibres": self.fibres, "sheets": self.sheets, **turning},
             self.regions,
             sorted({name for part in self.parts for name in part.facet_sets}),
             description,

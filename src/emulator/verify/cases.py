@@ -13,7 +13,7 @@ from emulator.verify.consistency import (
 )
 from emulator.verify.cook import verify_cook
 from emulator.verify.homogeneous import verify_homogeneous
-from emulator.verify.land import verify_beam, verify_ventricle
+from emulator.verify.land import verify_beam, verify_contraction, verify_ventricle
 from emulator.verify.sphere import verify_sphere
 
 CASES: dict[str, Callable[[], list[Benchmark]]] = {
@@ -26,4 +26,5 @@ CASES: dict[str, Callable[[], list[Benchmark]]] = {
     "cook": verify_cook,
     "land_beam": verify_beam,
     "land_ventricle": verify_ventricle,
+    "land_contraction": verify_contraction,
 }

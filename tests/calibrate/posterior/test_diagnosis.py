@@ -53,3 +53,10 @@ def test_divergences_are_placed():
 def test_each_fault_has_its_sentence(change, message):
     (sentence,) = said(**change)
     assert sentence.startswith(message)
+
+
+def test_divergences_of_many_parameters_are_placed_by_three():
+    draws = {f"x{k}": DRAWS["mu"] + 0.1 * k for k in range(6)}
+    summary = dict.fromkeys(draws, GOOD["mu"])
+    (sentence,) = diagnose(draws, {"diverging": DRAWS["mu"] < 67.0}, summary, {})
+    assert sentence.count("low x") == 3

@@ -38,7 +38,7 @@ def log_prior_of(model, **values):
     """Log density of the joint prior in theta, from the sites a model declares."""
     total, draw = 0.0, {}
     for name in model.states.unknowns:
-        prior = model._given_earlier(name, model.prior[name], draw)
+        prior = model.given_earlier(name, model.prior[name], draw)
         draw[name] = jnp.asarray(values[name])
         total += float(prior.log_prob(draw[name]))
     return total

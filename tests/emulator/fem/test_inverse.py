@@ -165,7 +165,9 @@ def test_the_tangent_has_loads_that_depend_on_the_shape_at_rest(load):
 def test_a_system_on_a_traced_mesh_is_that_of_the_mesh(load):
     scene = loaded_block(load, supports=(em.Support("left"), SLIDING))
     w, u = some_way(scene), some_way(scene, seed=1)
-    there = jax.jit(lambda w, u: moved_system(System(scene), w).residual(u, scene.centre))
+    there = jax.jit(
+        lambda w, u: moved_system(System(scene), w, scene.centre).residual(u, scene.centre)
+    )
     expected = System(at_rest(scene, w)).residual(u, scene.centre)
     np.testing.assert_allclose(there(w, u), expected, atol=1e-12)
 

@@ -46,7 +46,12 @@ def ventricle():
 
 @pytest.mark.slow
 def test_an_orthotropic_ventricle_fills(ventricle):
-    assert ventricle.tissue.directions.shape == (len(ventricle.mesh.elements), 1, 2, 3)
+    assert ventricle.tissue_at(ventricle.centre).directions.shape == (
+        len(ventricle.mesh.elements),
+        1,
+        2,
+        3,
+    )
     solution = em.Simulator(ventricle).solve(ventricle.centre)
     assert Status(int(solution.status)) is Status.CONVERGED
 
@@ -75,7 +80,9 @@ def test_a_scene_without_sheets_does_not_pay_for_them(ventricle):
     constants = {**plain, "kappa": 25.0}
     law = find_law("holzapfel_ogden")
     without = replace(ventricle, law=law, constants=constants, sheets=None)
-    np.testing.assert_array_equal(without.tissue.directions, without.fibres[:, None])
+    np.testing.assert_array_equal(
+        without.tissue_at(without.centre).directions, without.fibres[:, None]
+    )
     assert operations(without) < operations(ventricle)
 
 

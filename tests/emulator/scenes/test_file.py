@@ -17,7 +17,14 @@ from emulator.geometry.fibres import (
 )
 from emulator.geometry.io import write_mesh
 from emulator.scenes import Parameter, file
-from emulator.scenes.loads import FollowerPressure, Force, Gravity, PublishedPressure, Traction
+from emulator.scenes.loads import (
+    ActiveTension,
+    FollowerPressure,
+    Force,
+    Gravity,
+    PublishedPressure,
+    Traction,
+)
 from emulator.scenes.supports import ElasticSupport
 from scene_file_support import HEART, SCENE
 
@@ -105,6 +112,16 @@ def test_a_scene_from_a_file(folder):
             "[constants]",
             "[fibres]\nrule = 'uniform'\ndirection = [1, 0, 0]\n[constants]",
             "law 'neo_hookean' takes no fibres",
+        ),
+        (
+            "[constants]",
+            "[[loads]]\nkind = 'active_tension'\ntension = 5.0\n[constants]",
+            "load 'active_tension' needs fibres, and mesh file block.vtu has none; give it cell",
+        ),
+        (
+            "[constants]",
+            "[[loads]]\nkind = 'active_tension'\ntension = -5.0\n[constants]",
+            "tension is -5.0 kPa; it must be 0 or more",
         ),
         (
             "[constants]",
@@ -203,7 +220,7 @@ def test_importing_the_package_does_not_import_pydantic():
 
 def test_the_examples_of_the_documentation(folder):
     blocks = re.split(r"\.\. code-block:: toml\n", file.__doc__)[1:]
-    for name, text in zip(("block", "ventricle", "cube"), blocks, strict=True):
+    for name, text in zip(("block", "ventricle", "cube", "bodies"), blocks, strict=True):
         kept = [line for line in text.splitlines() if not line or line.startswith("    ")]
         (folder / f"{name}.toml").write_text(textwrap.dedent("\n".join(kept)))
     write_mesh(folder / "ventricle.vtu", human_ventricle(5, 12, 1))
@@ -232,6 +249,22 @@ def test_the_examples_of_the_documentation(folder):
     np.testing.assert_array_equal(cube.mesh.node_set("edge"), edge)
     assert cube.loads == (Force("edge", (0.0, 0.0, -0.5)),)
     assert scene_from_origin(cube.origin).fingerprint == cube.fingerprint
+    _two_cubes(folder)
+
+
+def _two_cubes(folder):
+    """The last example is a part of a file: the bodies in place of a mesh."""
+    for name in ("cube1", "cube2"):
+        write_mesh(folder / f"{name}.vtu", box((10.0, 10.0, 10.0), (1, 1, 1)))
+    rest = (folder / "cube.toml").read_text().split("[node_sets.edge]")[0]
+    rest = rest.replace('mesh = "cube.vtu"', "").replace('"bottom"', '"cube1.bottom"')
+    held = '[[supports]]\nnode_set = "cube2.bottom"\n'
+    rest = rest.replace('"top"', '"cube1.top"') + held + (folder / "bodies.toml").read_text()
+    table = "[parameters.mu]\nunit = 'kPa'\nrange = [1, 10]\n[parameters.shear]\nrange = [0, 1]\n"
+    (folder / "both.toml").write_text(rest + table + "[constants]\nlam = 80.0\n")
+    both = find_scene(str(folder / "both.toml"))
+    assert len(both.mesh.node_set("cube2.edge")) == 4
+    assert both.mesh.nodes[:, 0].max() == 30.0
 
 
 def test_pressures_as_parameters_and_other_rules_for_fibres(folder):
@@ -248,6 +281,20 @@ def test_pressures_as_parameters_and_other_rules_for_fibres(folder):
         else:
             expected = biventricular_directions(scene.mesh, (60.0, -60.0)).fibres
             np.testing.assert_allclose(scene.fibres, expected)
+
+
+def test_muscle_of_a_law_without_fibres(folder):
+    text = (folder / "scene.toml").read_text()
+    active = "[[loads]]\nkind = 'active_tension'\nparameter = 'contractility'\ntransverse = 0.1\n"
+    varied = "[parameters.contractility]\nunit = 'kPa'\nrange = [0.0, 60.0]\n"
+    rule = "[fibres]\nrule = 'uniform'\ndirection = [0, 0, 2]\n"
+    file = folder / "muscle.toml"
+    file.write_text(text.replace("[constants]", active + varied + rule + "[constants]"))
+    scene = find_scene(str(file))
+    assert scene.loads[-1] == ActiveTension(parameter="contractility", transverse=0.1)
+    assert scene.load_parameters == ("contractility",)
+    np.testing.assert_array_equal(scene.fibres_at_points[..., 2], 1.0)
+    assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
 
 
 def test_unknown_names(tmp_path):

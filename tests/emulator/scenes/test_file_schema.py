@@ -40,7 +40,8 @@ def written():
         text = page.read_text(encoding="utf-8")
         found += re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
         found += re.findall(r'= """\n(law = .*?)"""', text, re.DOTALL)
-    complete = [text for text in found if "[parameters" in text and "{" not in text]
+    whole = re.compile(r"^law = .*^\[parameters", re.DOTALL | re.MULTILINE)
+    complete = [text for text in found if whole.search(text) and "{" not in text]
     assert len(complete) > 3
     return dict.fromkeys(complete)
 

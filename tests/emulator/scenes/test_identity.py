@@ -10,7 +10,7 @@ from emulator.mechanics.laws import LAWS
 from emulator.mechanics.laws.identity import law_identity, probed
 from emulator.scenes import Parameter, Support
 from emulator.scenes.identity import _as_set
-from emulator.scenes.loads import LOADS, Force, Gravity, GravityVector, Traction
+from emulator.scenes.loads import LOADS, ActiveTension, Force, Gravity, GravityVector, Traction
 from emulator.scenes.supports import SUPPORTS, ElasticSupport
 from scene_support import block
 
@@ -169,6 +169,10 @@ PARTS = {
         kind: (LOADS[kind]("top"), {"facet_set": "left", "pressure": 0.3, "parameter": "p"})
         for kind in ("cavity_pressure", "follower_pressure", "dead_pressure", "published_pressure")
     },
+    "active_tension": (
+        ActiveTension(),
+        {"tension": 3.0, "parameter": "contractility", "transverse": 0.2},
+    ),
     "held": (
         Support("bottom", np.array([0.1, 0.0, 0.0]), amount="shear"),
         {
@@ -199,6 +203,8 @@ def test_every_field_of_every_load_and_support_counts(kind):
         given = {"loads": (part,)} if kind in LOADS else {"supports": (*beside, part)}
         held = (*base.supports, *(Support(s) for s in ("top", "left") if "cavity" in kind))
         given = given if kind in SUPPORTS else {**given, "supports": held}
+        if getattr(part, "fibres", False):
+            given["fibres"] = np.tile([1.0, 0.0, 0.0], (len(base.mesh.elements), 1))
         return replace(base, parameters=(*parameters, *own), **given).fingerprint
 
     assert set(others) == {each.name for each in fields(part)}

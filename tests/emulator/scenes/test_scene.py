@@ -113,7 +113,7 @@ def test_directions_of_another_shape(kind, order, shapes):
     assert (scene.fingerprint == of_elements.fingerprint) == (order == 1)
     for each in (scene, of_elements):
         np.testing.assert_array_equal(each.fibres_at_points, right["fibres"])
-        assert each.tissue.directions.shape == (6, points, 2, 3)
+        assert each.tissue_at(each.centre).directions.shape == (6, points, 2, 3)
     for shape in ((5, 3), (6, 2), (6, 3, 3), (6, points, 3, 1), (24, 3)):
         with pytest.raises(InputError) as caught:
             replace(scene, **{kind: np.ones(shape)})

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+import axisymmetric_support
 import emulator as em
 from calibrate.cli.commands.verify import CASE_NAMES
 from emulator.verify import CASES, Benchmark
 from emulator.verify.consistency import verify_barriers, verify_invariance, verify_patch
 from emulator.verify.cook import deflection, membrane
-from emulator.verify.land import beam
+from emulator.verify.land import apexes, beam, contraction, fibres
 from emulator.verify.sphere import INNER, OUTER, inner_stretch, order_of, pressure_at, sphere_scene
 from emulator.verify.sphere import MU as SHEAR
 
@@ -79,3 +80,34 @@ def test_lands_beam_on_a_coarse_mesh():
 @pytest.mark.parametrize("name", CASE_NAMES)
 def test_every_case_in_full(name):
     assert [row for row in CASES[name]() if not row.passed] == []
+
+
+def test_fibres_of_the_benchmark():
+    """Unit vectors in the ellipsoids, along the meridian on both surfaces, a circle between."""
+    scene = contraction(3, 8, 1)
+    mesh = scene.mesh
+    along = fibres(mesh)
+    np.testing.assert_allclose(np.linalg.norm(along, axis=-1), 1.0, rtol=1e-12)
+    X = np.einsum("qa,mai->mqi", scene.discretisation.values, mesh.nodes[mesh.elements])
+    radius, z = np.hypot(X[..., 0], X[..., 1]), X[..., 2]
+    # (r / (7 + 3t))^2 + (z / (17 + 3t))^2 = 1 and the slope of an ellipsoid, written again.
+    circle = np.stack([-X[..., 1], X[..., 0], 0.0 * z], axis=-1) / radius[..., None]
+    alpha = np.arccos(np.clip(np.einsum("mqi,mqi->mq", along, circle), -1.0, 1.0))
+    meridian = along - np.cos(alpha)[..., None] * circle
+    sign = np.sign(-meridian[..., 2])  # the meridian is taken towards the apex
+    t = 0.5 - sign * alpha / np.pi
+    short, long = 7.0 + 3.0 * t, 17.0 + 3.0 * t
+    np.testing.assert_allclose((radius / short) ** 2 + (z / long) ** 2, 1.0, atol=1e-9)
+    normal = np.stack([X[..., 0] / short**2, X[..., 1] / short**2, z / long**2], axis=-1)
+    np.testing.assert_allclose(np.einsum("mqi,mqi->mq", along, normal), 0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_contracting_ventricle_by_other_elements():
+    """Numbers of the table by axisymmetric elements; a coarse mesh of tetrahedra is near them."""
+    inside, outside = axisymmetric_support.apexes(3, 24)
+    assert inside == pytest.approx(-12.33, abs=0.08)
+    assert outside == pytest.approx(-15.47, abs=0.02)
+    inside, outside = apexes(contraction(5, 10, 2), C=2.0)
+    assert inside == pytest.approx(-12.33, abs=0.5)
+    assert outside == pytest.approx(-15.47, abs=0.08)

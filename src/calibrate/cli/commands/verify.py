@@ -24,6 +24,7 @@ CASE_NAMES = (
     "cook",
     "land_beam",
     "land_ventricle",
+    "land_contraction",
 )
 
 

@@ -96,7 +96,7 @@ class StressIterates:
 
     def begin(self, u: jax.Array) -> StressState:
         """The state at ``u`` (n, 3) mm that Newton's method would start from."""
-        unknown, measures = jnp.full((), jnp.inf, float), _measures_of(self.system, u)
+        unknown, measures = jnp.full((), jnp.inf, float), _measures_of(self.system, u, self.theta)
         return StressState(u, measures, unknown, jnp.ones(()), jnp.array(True), jnp.array(0))
 
     def step(
@@ -168,16 +168,13 @@ def _seen(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 @compiled
-def _measures_of(system: System, u: jax.Array) -> jax.Array:
+def _measures_of(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Strain measures (b, q, k) of the displacement ``u`` (n, 3) mm."""
     scene, names = system.scene, measures_read(system.scene.law)
     assert names is not None, "see applies"
     measures = Measures(names)
     return at_points(
-        scene,
-        lambda H, at: measures.of(H, at.directions),
-        _seen(scene, u),
-        tissue=scene.block_tissue,
+        lambda H, at: measures.of(H, at.directions), scene.block_tissue_at(theta), _seen(scene, u)
     )
 
 
@@ -198,9 +195,8 @@ def _promised(
     def linearise(H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, ...]:
         return point.linearise(H, own, at, geometric)
 
-    stress, moduli, known = at_points(
-        scene, linearise, _seen(scene, u), measures, tissue=scene.block_tissue
-    )
+    tissue = scene.block_tissue_at(theta)
+    stress, moduli, known = at_points(linearise, tissue, _seen(scene, u), measures)
     forces, bulk = block_derivatives(scene, u, stress, moduli, known)
     residual = system.restrict(system.scatter(forces) + system.others(u, theta, level))
     tangent, solvable, pull = system.equations(bulk, u, theta, stiffening, level)
@@ -241,7 +237,7 @@ def _taken(
     """Displacement (n, 3) mm and measures (m, q, k) after ``fraction`` of the step."""
     scene, point = system.scene, MaterialPoint(system.scene, theta)
     H, change = jax.jvp(lambda v: _seen(scene, v), (u,), (move,))
-    after = at_points(scene, point.at_stress, H, change, measures, tissue=scene.block_tissue)
+    after = at_points(point.at_stress, scene.block_tissue_at(theta), H, change, measures)
     taken = fraction > 0.0
     return jnp.where(taken, u + fraction * move, u), jnp.where(taken, after, measures)
 

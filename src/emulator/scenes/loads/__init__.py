@@ -1,8 +1,9 @@
-"""External loads, one kind a file; ``LOADS`` is their registry.
+"""Loads, one kind a file; ``LOADS`` is their registry.
 
 A new kind is a frozen dataclass derived from :class:`Load` in a file of its own, named here.
 """
 
+from emulator.scenes.loads.active_tension import ActiveTension
 from emulator.scenes.loads.dead_pressure import DeadPressure
 from emulator.scenes.loads.follower import FollowerPressure
 from emulator.scenes.loads.force import Force
@@ -24,12 +25,14 @@ LOADS: dict[str, type[Load]] = {
         FollowerPressure,
         DeadPressure,
         PublishedPressure,
+        ActiveTension,
     )
 }
 
 __all__ = [
     "KPA_PER_MMHG",
     "LOADS",
+    "ActiveTension",
     "CavityPressure",
     "DeadPressure",
     "FollowerPressure",

@@ -13,11 +13,11 @@ from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.identity import plain_fields
-from emulator.scenes.local_terms import LocalForce, LocalTerm
+from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
 
 
 class Load(ABC):
-    """An external load; a concrete one is a frozen dataclass whose fields a scene file can give.
+    """What deforms a body; a concrete one is a frozen dataclass whose fields a scene file can give.
 
     A load contributes in one of four ways, and overrides the method for it: a dead nodal force, one
     in proportion to parameters, a potential, or a force that has no potential.
@@ -31,6 +31,11 @@ class Load(ABC):
     def facet_sets(self) -> tuple[str, ...]:
         """Facet sets the load acts on; they must be in the mesh."""
         return ()
+
+    @property
+    def fibres(self) -> bool:
+        """Whether the load reads fibre directions, which the scene must then have."""
+        return False
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -76,12 +81,19 @@ class Load(ABC):
         """Dead nodal force (n, 3) in mN per unit of each parameter that scales one."""
         return {}
 
-    def term(self, grid: Discretisation) -> LocalTerm | None:
-        """Potential of a load that follows the deformation, or None."""
+    def term(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalTerm | None:
+        """Potential of a load that follows the deformation, or None.
+
+        fibres : (m, q, 3) at the quadrature points, None in a scene without.
+        """
         return None
 
     def force(self, grid: Discretisation) -> LocalForce | None:
         """Force of a load that follows the deformation and has no potential, or None."""
+        return None
+
+    def first_piola(self, F: jax.Array, fibres: jax.Array, values: Values) -> jax.Array | None:
+        """Stress (m, q, 3, 3) in kPa that it adds to the law's, where F (m, q, 3, 3); or None."""
         return None
 
     def on_loaded(self, grid: Discretisation) -> LocalForce:

@@ -38,8 +38,9 @@ class PublishedPressure(SurfacePressure):
                 "tetrahedra; use CavityPressure on quadratic ones"
             )
 
-    def term(self, grid: Discretisation) -> LocalTerm:
+    def term(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalTerm:
         """The released work, facet by facet."""
+        del fibres
         mesh = grid.mesh
         facets = mesh.facet_set(self.facet_set)
         behind = mesh.elements_behind(facets)

@@ -52,6 +52,11 @@ def describe(scene: Scene) -> Described:
     """
     if scene.fibres is None:
         raise InputError(f"scene '{scene.name}' has no fibres; this network was trained with them")
+    if scene.angles:
+        raise InputError(
+            f"scene '{scene.name}': theta turns its fibres, and this network was trained with "
+            "fibres that are known; train one for the scene"
+        )
     cavity = find_cavity(scene).facet_set
     try:
         body = ventricle(scene.mesh, cavity, scene.held.all(axis=1))

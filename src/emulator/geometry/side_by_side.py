@@ -1,0 +1,151 @@
+"""Several bodies as one mesh of disjoint parts.
+
+A scene of such a mesh has one law and one theta: bodies of one material, each with its own loads,
+supports and observations. They share no node and do not feel each other, wherever they are.
+
+Sets are called ``body.set``, and the whole surface of a body is the facet set and the node set
+``body``. The dot has no meaning in words that say what is observed, where ``:`` ends a name
+(``reaction:SUPPORT:AXIS``), nor in the names of files' variables, where ``/`` has one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from emulator.errors import InputError, look_up
+from emulator.geometry.mesh import Mesh, frozen_array
+from emulator.geometry.tetrahedra import coincident
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Bodies in one mesh. :func:`side_by_side` makes it.
+
+    Parameters
+    ----------
+    mesh : all bodies; elements and nodes in the bodies' order.
+    names : of the bodies.
+    body : (m,) index of each element's body.
+    """
+
+    mesh: Mesh
+    names: tuple[str, ...]
+    body: np.ndarray
+
+    def elements(self, name: str) -> np.ndarray:
+        """Indices (k,) of the elements of body ``name``; :class:`InputError` lists the bodies."""
+        index = look_up({n: k for k, n in enumerate(self.names)}, name, "body")
+        return np.flatnonzero(self.body == index)
+
+    def nodes(self, name: str) -> np.ndarray:
+        """Indices (k,) of all nodes of body ``name``, in its own order."""
+        return np.unique(self.mesh.elements[self.elements(name)])
+
+    def stacked(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Values at the elements of each body, (k, ...) by its name, as those of the mesh (m, ...).
+
+        Fibres and sheets (k, 3) or (k, q, 3), or regions (k,).
+
+        Raises
+        ------
+        InputError
+            A body without values, or with those of another number of elements or another shape.
+        """
+        parts: list[np.ndarray] = []
+        for k, name in enumerate(self.names):
+            if name not in values:
+                raise InputError(f"bodies: no values for '{name}'; give one array for each")
+            part, count = np.asarray(values[name]), int(np.sum(self.body == k))
+            if len(part) != count or (parts and part.shape[1:] != parts[0].shape[1:]):
+                others = f" and {parts[0].shape[1:]} for '{self.names[0]}'" if parts else ""
+                raise InputError(
+                    f"bodies: values of '{name}' have shape {part.shape}; it has {count} elements"
+                    + others
+                )
+            parts.append(part)
+        return np.concatenate(parts)
+
+
+def side_by_side(meshes: Mapping[str, Mesh], *, gap: float | None = None) -> Bodies:
+    """``meshes`` as one, by the bodies' names; a body's set ``top`` becomes ``body.top``.
+
+    Parameters
+    ----------
+    gap : mm between one body and the next along x; ``None`` leaves them where they are. A body that
+        is moved is moved along x only: a plane of symmetry x = 0 is no longer there.
+
+    Raises
+    ------
+    InputError
+        No bodies, a name that is none, bodies of different orders, a gap that is not above 0, or
+        bodies with nodes at the same place.
+    """
+    if not meshes:
+        raise InputError("bodies: give one mesh or more, by name")
+    if gap is not None and not 0.0 < gap < np.inf:
+        raise InputError(f"bodies: gap is {gap} mm; it must be above 0, or None to move none")
+    (first, order), *others = ((name, mesh.order) for name, mesh in meshes.items())
+    for name, other in others:
+        if other != order:
+            raise InputError(
+                f"bodies: '{first}' has tetrahedra of order {order} and '{name}' of order {other}; "
+                "make all linear, or all quadratic"
+            )
+    for name in meshes:
+        check_name(name)
+    moved = list(meshes.values()) if gap is None else _apart(list(meshes.values()), gap)
+    names = tuple(meshes)
+    sizes = [len(mesh.nodes) for mesh in moved]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    nodes = np.concatenate([mesh.nodes for mesh in moved])
+    _check_apart(names, nodes, np.repeat(np.arange(len(names)), sizes))
+    node_sets: dict[str, np.ndarray] = {}
+    facet_sets: dict[str, np.ndarray] = {}
+    for name, mesh, start in zip(names, moved, starts[:-1], strict=True):
+        facet_sets[name] = mesh.surface + start
+        node_sets[name] = np.unique(facet_sets[name])
+        node_sets |= {f"{name}.{of}": rows + start for of, rows in mesh.node_sets.items()}
+        facet_sets |= {f"{name}.{of}": rows + start for of, rows in mesh.facet_sets.items()}
+    elements = [mesh.elements + start for mesh, start in zip(moved, starts[:-1], strict=True)]
+    body = np.repeat(np.arange(len(names)), [len(part) for part in elements])
+    mesh = Mesh(nodes, np.concatenate(elements), node_sets, facet_sets)
+    return Bodies(mesh, names, frozen_array(body, np.int64))
+
+
+def shifted(mesh: Mesh, shift: tuple[float, float, float]) -> Mesh:
+    """``mesh`` moved by ``shift`` mm."""
+    return Mesh(mesh.nodes + np.asarray(shift), mesh.elements, mesh.node_sets, mesh.facet_sets)
+
+
+def check_name(name: str) -> None:
+    """:class:`InputError` unless ``name`` can be a body's: letters, digits, _ and -."""
+    if not _NAME.fullmatch(name):
+        raise InputError(
+            f"body '{name}': a name has letters, digits, _ and -, and begins with a letter"
+        )
+
+
+def _apart(meshes: list[Mesh], gap: float) -> list[Mesh]:
+    """The first where it is, each next one ``gap`` beyond the one before along x."""
+    found = meshes[:1]
+    for mesh in meshes[1:]:
+        beyond = found[-1].nodes[:, 0].max() + gap - mesh.nodes[:, 0].min()
+        found.append(shifted(mesh, (beyond, 0.0, 0.0)))
+    return found
+
+
+def _check_apart(names: tuple[str, ...], nodes: np.ndarray, owner: np.ndarray) -> None:
+    pairs = coincident(nodes)
+    pairs = pairs[owner[pairs[:, 0]] != owner[pairs[:, 1]]] if len(pairs) else pairs
+    if len(pairs):
+        one, other = sorted(int(owner[node]) for node in pairs[0])
+        raise InputError(
+            f"bodies: '{names[one]}' and '{names[other]}' have {len(pairs)} nodes at the same "
+            "places, where it is not clear whose a support is; move one of them"
+        )

@@ -1,0 +1,136 @@
+r"""Tension that muscle fibres develop, added to the passive stress.
+
+With the tension :math:`T_a` along the fibre :math:`f_0`, and a share :math:`\eta` of it across,
+
+.. math::
+    \Psi = \int_\Omega \frac{T_a}{2}
+        \left[(I_{4f} - 1) + \eta\,(I_{4s} + I_{4n} - 2)\right] dX, \qquad
+    I_{4f} = |F f_0|^2, \quad I_{4s} + I_{4n} = I_1 - I_{4f},
+
+so that :math:`S = T_a\,[f_0 \otimes f_0 + \eta\,(I - f_0 \otimes f_0)]` is what the second Piola
+stress gains, as in Land et al. (2015), problem 3, where :math:`\eta = 0`.
+
+The measures are those of F itself, also where the law reads isochoric ones or mean dilatation
+replaces J: the published stress is that of F. Isochoric measures would take the pressure
+:math:`\tfrac13 \operatorname{tr}(F S F^T) / J` off, which tissue that keeps its volume cannot feel.
+
+:math:`\Psi` is quadratic in the places :math:`x = X + u` of the nodes,
+
+.. math::
+    \Psi = \frac{T_a}{2} \sum_{ab} k_{ab}\,(x_a \cdot x_b - X_a \cdot X_b), \qquad
+    k_{ab} = \int (1 - \eta)\,(f_0 \cdot \nabla N_a)(f_0 \cdot \nabla N_b)
+             + \eta\, \nabla N_a \cdot \nabla N_b \; dX .
+
+Shape functions add up to 1, so rows of k add up to 0, and :math:`\Psi` is the energy of linear
+springs of stiffness :math:`-T_a k_{ab}` between the nodes a < b of an element, pulling from rest:
+
+.. math:: \Psi = -T_a \sum_{a<b} k_{ab}\,\left(D \cdot \Delta + \tfrac12 \Delta \cdot \Delta\right),
+          \qquad D = X_b - X_a, \quad \Delta = u_b - u_a .
+
+k is positive semidefinite: the tangent is constant, and tension stiffens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.errors import InputError
+from emulator.geometry.discretisation import Discretisation
+from emulator.mechanics.quantity import Quantity
+from emulator.scenes.identity import plain_fields
+from emulator.scenes.loads.load import Load
+from emulator.scenes.local_terms import LocalTerm, Values
+
+
+@dataclass(frozen=True)
+class ActiveTension(Load):
+    """Tension along the fibres, by which muscle contracts; the scene must have fibres.
+
+    Parameters
+    ----------
+    tension : T_a in kPa, 0 or more, or ``None`` to make it a parameter of the scene.
+    parameter : name of that parameter. It belongs to a load state, so that end-diastole and
+        end-systole are two states of one body that share its passive material.
+    transverse : share eta of the tension that acts in every direction across the fibre, 0 to 1.
+    """
+
+    kind: ClassVar[str] = "active_tension"
+
+    tension: float | None = None
+    parameter: str = "tension"
+    transverse: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.tension is not None and not 0.0 <= self.tension < np.inf:
+            raise InputError(f"active_tension: tension is {self.tension} kPa; it must be 0 or more")
+        if not 0.0 <= self.transverse <= 1.0:
+            raise InputError(
+                f"active_tension: transverse is {self.transverse}; it is a share between 0 and 1"
+            )
+
+    @property
+    def fibres(self) -> bool:
+        """Yes."""
+        return True
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """The tension, if it is a parameter; 0 is tissue at rest."""
+        if self.tension is not None:
+            return ()
+        return (Quantity(self.parameter, "kPa", low_admitted=True),)
+
+    @property
+    def simpler(self) -> tuple[str, None]:
+        """Passive tissue."""
+        return "active tension", None
+
+    def to_json(self) -> list[Any]:
+        """Every field; a parameter's name says nothing where the tension is known."""
+        return plain_fields(self, () if self.tension is None else ("parameter",))
+
+    def value(self, values: Values) -> jax.Array | float:
+        """The tension in kPa, taken from the scene's resolved parameters if it is one."""
+        return values[self.parameter] if self.tension is None else self.tension
+
+    def first_piola(self, F: jax.Array, fibres: jax.Array, values: Values) -> jax.Array:
+        """``F S`` (m, q, 3, 3) in kPa."""
+        along = jnp.einsum("mqij,mqj,mqk->mqik", F, fibres, fibres)
+        return self.value(values) * (along + self.transverse * (F - along))
+
+    def term(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalTerm:
+        """The springs between nodes."""
+        assert fibres is not None, "a scene with this load has fibres"
+        pairs, stiffness = _springs(grid, fibres, self.transverse)
+        X = grid.mesh.nodes
+
+        def energy(u: jax.Array, spring: Any, values: Values) -> jax.Array:
+            stiffness, at_rest = spring
+            longer = u[1] - u[0]
+            work = jnp.vdot(at_rest, longer) + 0.5 * jnp.vdot(longer, longer)
+            return self.value(values) * stiffness * work
+
+        return LocalTerm(pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), energy, convex=True)
+
+
+def _springs(
+    grid: Discretisation, fibres: np.ndarray, transverse: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (k, 2) and stiffness ``-k_ab`` (k,) in mm of each spring, for a tension of 1."""
+    along = np.einsum("mqai,mqi->mqa", grid.gradients, fibres)
+    stiffness = (1.0 - transverse) * np.einsum("mq,mqa,mqb->mab", grid.weights, along, along)
+    if transverse:
+        gradients = grid.gradients
+        stiffness += transverse * np.einsum(
+            "mq,mqai,mqbi->mab", grid.weights, gradients, gradients, optimize=True
+        )
+    one, other = np.triu_indices(grid.connectivity.shape[1], 1)
+    ends = np.sort(grid.connectivity[:, np.stack([one, other], axis=1)], axis=2).reshape(-1, 2)
+    pairs, which = np.unique(ends, axis=0, return_inverse=True)
+    amounts = stiffness[:, one, other].ravel()
+    return pairs, -np.bincount(which.ravel(), amounts, minlength=len(pairs))

@@ -1,0 +1,146 @@
+r"""A cube between plates as a scene, and what a formula makes of it.
+
+One plate is held; the other, a height :math:`H` above it, moves by :math:`H` times the amounts of
+shear along y and z and of stretch along x, the plates' normal. The formula is that of a homogeneous
+deformation, isochoric, with no lateral traction when stretched:
+
+.. math:: F_y = A\, P_{yx}(I + \gamma\, e_y \otimes e_x), \qquad
+          F_x = \frac{A}{\lambda} \left[\sigma_{xx} - \tfrac12 (\sigma_{yy} + \sigma_{zz})\right],
+          \quad \sigma = P F^T, \quad F = \mathrm{diag}(\lambda, \lambda^{-1/2}, \lambda^{-1/2})
+
+with the area :math:`A` of a plate. Glued plates make FEM's forces differ from it by tens of
+percent.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.fem.energy import point_energy
+from emulator.geometry.bodies.box import box
+from emulator.mechanics.laws import find_law
+from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.fibre_angles import FibreAngles, turned
+from emulator.scenes.regions import Tissue
+
+CELLS = 3
+"""Along an edge, of six quadratic tetrahedra each: 343 nodes."""
+KAPPA = 100.0  # kPa: shear moduli are about 1
+AMOUNTS = ("shear_y", "shear_z", "stretch")
+"""Of the modes of a cube, in their order."""
+MATERIAL = (
+    Parameter("a", "kPa", 0.05, 5.0, "log"),
+    Parameter("b", "", 0.5, 40.0, "log"),
+    Parameter("a_f", "kPa", 0.001, 12.0),
+    Parameter("b_f", "", 0.5, 40.0, "log"),
+    Parameter("a_s", "kPa", 0.001, 6.0),
+    Parameter("b_s", "", 0.5, 40.0, "log"),
+    Parameter("a_fs", "kPa", 0.001, 3.0),
+    Parameter("b_fs", "", 0.5, 40.0, "log"),
+)
+ANGLES = (Parameter("in_plane", "deg", -45.0, 45.0), Parameter("out_of_plane", "deg", -45.0, 45.0))
+"""By which the fibres of a cube miss the direction it was cut along: towards s, then towards n."""
+_MOVED = tuple(Parameter(name, "", -0.7, 0.7) for name in AMOUNTS)
+# Fibre, sheet and normal are axes 0, 1, 2; of each cube those along x (the plates' normal), y, z.
+_CUT = ((0, 1, 2), (1, 0, 2), (2, 0, 1))
+
+
+def _frame(cube: int) -> tuple[np.ndarray, ...]:
+    """Fibre and sheet in the cube numbered ``cube``, and the axes of the angles, (3,) each.
+
+    About the first axis fibres turn towards the sheet, about the second towards the normal.
+    """
+    f, s, n = np.eye(3)[np.argsort(_CUT[cube])]
+    return f, s, np.cross(f, s), np.cross(f, n)
+
+
+def scene(cube: int, sizes: np.ndarray, cells: int = CELLS) -> Scene:
+    """The cube numbered ``cube`` from 0, of ``sizes`` (3,) mm as in the files."""
+    width, depth, height = sizes
+    mesh = box((height, width, depth), (cells,) * 3, 2)
+    f, s, across, along = (np.tile(v, (len(mesh.elements), 1)) for v in _frame(cube))
+    one = np.ones(len(mesh.elements))
+    plates = tuple(
+        Support("right", height * np.eye(3)["xyz".index(axis)], axis, amount=amount)
+        for axis, amount in zip("yzx", AMOUNTS, strict=True)
+    )
+    return Scene(
+        f"cube {cube + 1}",
+        mesh,
+        find_law("holzapfel_ogden_orthotropic"),
+        (*MATERIAL, *ANGLES, *_MOVED),
+        supports=(Support("left"), *plates),
+        constants={"kappa": KAPPA},
+        fibres=f,
+        sheets=s,
+        angles=(FibreAngles(across, {"in_plane": one}), FibreAngles(along, {"out_of_plane": one})),
+    )
+
+
+@lru_cache
+def _law_of() -> Scene:
+    """A scene of a cube, for its law and its box."""
+    return scene(0, np.ones(3), cells=1)
+
+
+def _turned(number: int, x: jax.Array) -> jax.Array:
+    """Fibre and sheet (2, 3) of a cube at a position (p,) in the box."""
+    f, s, across, along = (v[None, None] for v in _frame(number))
+    one = np.ones((1, 1))
+    angles = (
+        FibreAngles(across, {"in_plane": one}),
+        FibreAngles(along, {"out_of_plane": one}),
+    )
+    given = Tissue(jnp.stack([jnp.asarray(f), jnp.asarray(s)], axis=2))
+    found = turned(given, angles, _law_of().resolve(theta_of(x))).directions
+    assert found is not None
+    return found[0, 0]
+
+
+def theta_of(x: jax.Array) -> jax.Array:
+    """Theta of an unmoved cube at a position (p,) in the box."""
+    return _law_of().from_unit(jnp.concatenate([0.5 * (x + 1.0), 0.5 * jnp.ones(len(AMOUNTS))]))
+
+
+def homogeneous(amounts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement gradients (3, j, 3, 3) of a cube's modes, and what its force is of P.
+
+    Parameters
+    ----------
+    amounts : (3, j) of each mode.
+
+    Returns
+    -------
+    H, and C (3, j, 3, 3) with which the force over the area is C : P.
+    """
+    H, C = np.zeros((2, *amounts.shape, 3, 3))
+    for mode in (0, 1):
+        H[mode, :, 1 + mode, 0] = amounts[mode]
+        C[mode, :, 1 + mode, 0] = 1.0
+    stretch = 1.0 + amounts[2]
+    F = np.stack([stretch, stretch**-0.5, stretch**-0.5], axis=1)
+    rows = np.arange(3)
+    H[2][:, rows, rows] = F - 1.0
+    C[2][:, rows, rows] = F / stretch[:, None] * [1.0, -0.5, -0.5]
+    return H, C
+
+
+def formula(x: jax.Array, H: jax.Array, C: jax.Array, area: jax.Array) -> jax.Array:
+    """Homogeneous forces (c, 3 j) in N of cubes, their modes one after the other.
+
+    Parameters
+    ----------
+    x : (c, p) positions in the box, of which the material is the first's. H, C : (c, 3, j, 3, 3),
+        see :func:`homogeneous`. area : (c,) mm2 of a plate.
+    """
+    stress = jax.grad(point_energy(_law_of(), theta_of(x[0])))
+    count = H.shape[1] * H.shape[2]
+    directions = jnp.stack([_turned(k, x[k]) for k in range(len(x))])
+    each = jnp.repeat(directions, count, axis=0)
+    P = jax.vmap(lambda h, d: stress(h, Tissue(d)))(H.reshape(-1, 3, 3), each)
+    forces = jnp.einsum("kij,kij->k", C.reshape(-1, 3, 3), P).reshape(len(x), count)
+    return 1e-3 * area[:, None] * forces  # kPa mm2 is mN

@@ -1,0 +1,166 @@
+"""Fibres that parameters turn: the angle's meaning, exact derivatives, finer meshes, files."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.catalogue import find_scene
+from emulator.error.mesh_error import mesh_error
+from emulator.errors import InputError
+from emulator.fem.energy import potential_energy
+from emulator.geometry.bodies.box import box
+from emulator.mechanics.laws import find_law
+from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.effects import effects_of
+from emulator.scenes.fibre_angles import FibreAngles
+from emulator.scenes.fibre_rules import Helix, Uniform
+from emulator.scenes.finer import finer
+from emulator.scenes.loads import ActiveTension
+from scene_file_support import HEART
+
+KNOWN = {"a": 0.3, "b": 2.0, "a_f": 5.0, "b_f": 2.0, "pressure": 0.9}
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """A ventricle whose helix angles are parameters."""
+    return em.scenes.left_ventricle(4, 8, 1, order=1, angles=("inner", "outer"))
+
+
+@pytest.fixture(scope="module")
+def fixed():
+    """The same ventricle with known angles."""
+    return em.scenes.left_ventricle(4, 8, 1, order=1, angles=(63.0, -51.0))
+
+
+def test_angles_turn_fibres_to_where_the_rule_lays_them(turning, fixed):
+    theta = turning.theta(**KNOWN, inner=63.0, outer=-51.0)
+    found = np.asarray(turning.tissue_at(theta).directions)
+    np.testing.assert_allclose(found, fixed.fibres_at_points, atol=1e-12)
+    u = 0.01 * jax.random.normal(jax.random.key(0), turning.held.shape) * ~turning.held
+    one = potential_energy(turning)(u, theta)
+    other = potential_energy(fixed)(u, fixed.theta(**KNOWN))
+    assert one == pytest.approx(float(other), rel=1e-12)
+
+
+def test_equilibria_and_their_derivatives(turning, fixed):
+    simulator = em.fem.Simulator(turning)
+    theta = turning.theta(**KNOWN, inner=63.0, outer=-51.0)
+    u = simulator(theta)
+    np.testing.assert_allclose(u, em.fem.Simulator(fixed)(fixed.theta(**KNOWN)), atol=1e-10)
+    slopes = simulator.sensitivities(u, theta)
+    for name in ("inner", "outer"):
+        k = turning.parameter_names.index(name)
+        step = jnp.zeros(len(theta)).at[k].set(0.05)
+        by_difference = (simulator(theta + step) - simulator(theta - step)) / 0.1
+        np.testing.assert_allclose(slopes[k], by_difference, atol=1e-7)
+
+
+def test_sheets_turn_with_the_fibres_and_stay_across():
+    scene = em.scenes.left_ventricle(3, 6, 1, angles=("inner", -60.0))
+    n = scene.angles[0].axis
+    sheets = np.cross(n, scene.fibres)
+    law = find_law("holzapfel_ogden_orthotropic")
+    more = {"a_s": 1.0, "b_s": 1.0, "a_fs": 0.2, "b_fs": 1.0}
+    both = replace(scene, law=law, sheets=sheets, constants={**scene.constants, **more}, origin={})
+    found = np.asarray(both.tissue_at(both.theta(**KNOWN, inner=50.0)).directions)
+    assert np.abs(np.einsum("mqi,mqi->mq", found[:, :, 0], found[:, :, 1])).max() < 1e-12
+    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.cross(n, found[:, :, 0]), found[:, :, 1], atol=1e-12)
+
+
+def test_a_block_about_an_axis():
+    rule = Uniform((1.0, 0.0, 0.0), angle="alpha", about=(0.0, 0.0, 2.0))
+    mesh = box((1.0, 1.0, 1.0), (1, 1, 1))
+    angles, fibres = rule.angles_in(mesh), rule.directions(mesh)[0]
+    law, block = find_law("holzapfel_ogden"), Support("left")
+    scene = Scene(
+        "cube", mesh, law, (Parameter("alpha", "deg", 0.0, 90.0),), (), (block,),
+        {"a": 1.0, "b": 1.0, "a_f": 1.0, "b_f": 1.0, "kappa": 10.0},
+        fibres=fibres, fibre_rule=rule, angles=angles,
+    )  # fmt: skip
+    found = np.asarray(scene.tissue_at(scene.theta(alpha=30.0)).directions)
+    np.testing.assert_allclose(found, np.broadcast_to([np.sqrt(0.75), 0.5, 0.0], found.shape))
+    assert scene.load_parameters == ()
+
+
+def test_angles_are_part_of_what_a_scene_is(turning):
+    shares = dict(turning.angles[0].shares)
+    other = replace(
+        turning, angles=(FibreAngles(turning.angles[0].axis, {**shares, "inner": shares["outer"]}),)
+    )
+    assert other.fingerprint != turning.fingerprint
+    back = replace(turning, angles=(FibreAngles(-turning.angles[0].axis, shares),))
+    assert back.fingerprint != turning.fingerprint
+    assert (
+        replace(turning, angles=(FibreAngles(turning.angles[0].axis, shares),)).fingerprint
+        == turning.fingerprint
+    )
+
+
+def test_a_finer_mesh_lays_them_anew(turning):
+    fine = finer(turning).scene
+    expected = Helix(("inner", "outer")).angles_in(fine.mesh)[0]
+    np.testing.assert_allclose(fine.angles[0].axis, expected.axis)
+    np.testing.assert_allclose(fine.angles[0].shares["inner"], expected.shares["inner"])
+    with pytest.raises(InputError, match="without the rule that made them have no finer mesh"):
+        mesh_error(replace(turning, fibre_rule=None))
+
+
+@pytest.mark.parametrize(
+    ("axis", "shares", "message"),
+    [
+        (2.0, {}, "axes of fibre angles are not unit vectors"),
+        (1.0, {"inner": np.ones(3)}, r"share of fibre angle 'inner' has shape \(3,\)"),
+        (1.0, {"b": None}, "'b'"),
+        (1.0, {"inner": np.nan}, "share of fibre angle 'inner' .* is not finite"),
+    ],
+)
+def test_angles_that_do_not_fit(turning, axis, shares, message):
+    given = dict(turning.angles[0].shares)
+    for name, share in shares.items():
+        fits = given["inner"] if share is None else share * np.ones_like(given["inner"])
+        given[name] = share if np.ndim(share) else fits
+    with pytest.raises(InputError, match=message):
+        replace(turning, angles=(FibreAngles(axis * turning.angles[0].axis, given),))
+
+
+def test_a_law_without_fibres_has_nothing_to_turn(turning, beam):
+    with pytest.raises(InputError, match="fibre angles turn fibres, and it has none"):
+        replace(beam, angles=turning.angles)
+
+
+def test_from_a_file(tmp_path):
+    from emulator.geometry.bodies.ellipsoid import human_ventricle
+    from emulator.geometry.io import write_mesh
+
+    mesh = human_ventricle(4, 8, 1)
+    write_mesh(tmp_path / "heart.vtu", mesh)
+    text = HEART.format(rule="helix", options='angles = ["inner", -60]')
+    text = text.replace("lv_endocardium", "endocardium").replace("rv_endocardium", "epicardium")
+    inner = '[parameters.inner]\nunit = "deg"\nrange = [40, 80]\n[parameters.pressure]'
+    (tmp_path / "heart.toml").write_text(text.replace("[parameters.pressure]", inner))
+    scene = find_scene(str(tmp_path / "heart.toml"))
+    assert scene.parameter_names == ("inner", "pressure")
+    found = np.asarray(scene.tissue_at(scene.theta(inner=60.0, pressure=1.0)).directions)
+    laid = Helix((60.0, -60.0)).directions(scene.mesh)[0]
+    np.testing.assert_allclose(found[:, 0], laid, atol=1e-12)
+    (tmp_path / "heart.toml").write_text(text)
+    with pytest.raises(InputError, match="needs 'inner'"):
+        find_scene(str(tmp_path / "heart.toml"))
+
+
+def test_without_fibres_angles_are_left_out(turning):
+    for name, effect in effects_of(turning).items():
+        without = effect.without
+        assert bool(without.angles) == (without.fibres is not None), name
+        assert ("inner" in without.parameter_names) == bool(without.angles), name
+
+
+def test_a_load_along_fibres_that_turn_is_refused(turning):
+    with pytest.raises(InputError, match="'active_tension' acts along fibres that theta turns"):
+        replace(turning, loads=(*turning.loads, ActiveTension(10.0)))
