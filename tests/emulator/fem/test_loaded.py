@@ -40,7 +40,9 @@ def theta_of(pressure, image):
 
 def test_the_image_has_loads_of_its_own(imaged, ventricle):
     np.testing.assert_array_equal(image_theta(imaged, theta_of(1.2, 0.8)), theta_of(0.8, 0.8))
-    np.testing.assert_array_equal(image_theta(ventricle, theta_of(1.2, 0)[:5]), theta_of(1.2, 0)[:5])
+    np.testing.assert_array_equal(
+        image_theta(ventricle, theta_of(1.2, 0)[:5]), theta_of(1.2, 0)[:5]
+    )
     assert imaged.load_parameters == ("pressure",)
     at_rest = replace(ventricle, origin={})
     fixed = seen(
@@ -79,7 +81,7 @@ def test_at_the_pressure_of_the_image_nothing_moves(simulator, imaged):
 @pytest.mark.parametrize("dilatation", ["pointwise", "mean"])
 def test_derivatives_follow_by_the_chain_rule(dilatation):
     order = 1 if dilatation == "pointwise" else 2
-    scene = em.scenes.left_ventricle(4, 8, 1, order=order)
+    scene = em.scenes.left_ventricle(3, 6, 1, order=order)
     simulator = em.Simulator(seen(replace(scene, dilatation=dilatation)))
     theta, step = theta_of(1.2, 0.8), 1e-4
 
@@ -91,6 +93,8 @@ def test_derivatives_follow_by_the_chain_rule(dilatation):
     size = float(jnp.abs(difference).max())
     rows = simulator.sensitivities(u(theta), theta)
     np.testing.assert_allclose(jnp.tensordot(direction, rows, 1), difference, atol=1e-6 * size)
+    if dilatation == "mean":  # ways through other programs differ in nothing more
+        return
     along = jax.jvp(u, (theta,), (direction,))[1]
     np.testing.assert_allclose(along, difference, atol=1e-6 * size)
     weights = jnp.asarray(np.random.default_rng(0).normal(size=along.shape))
@@ -99,12 +103,15 @@ def test_derivatives_follow_by_the_chain_rule(dilatation):
 
 
 @pytest.mark.slow
-def test_a_campaign_and_a_reduced_model(simulator, imaged):
+def test_a_campaign_and_emulators(simulator, imaged, tmp_path):
     runs = em.run_campaign(simulator, design(imaged, 20, 0), sensitivities=True)
     assert np.isnan(runs.energy).all()
     reduced = em.fit_reduced(imaged, runs)
     at_a_run = reduced(runs.theta[3])
     np.testing.assert_allclose(at_a_run, runs.displacement[3], atol=0.05)
+    plan = replace(em.recipe("mechanics"), simulations=10, order=1)
+    forward = em.train(imaged, plan, tmp_path).cache()
+    np.testing.assert_allclose(forward(runs.theta[3]), runs.displacement[3], atol=0.1)
 
 
 @pytest.mark.slow
@@ -121,8 +128,9 @@ NEEDING_REST = [
     lambda scene: em.element_fields(scene, np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
     lambda scene: em.Simulator(scene).reactions(np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
     lambda scene: em.Simulator(scene).is_stable(np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
-    lambda scene: em.train(scene, em.recipe("mechanics"), "nowhere"),
-    lambda scene: em.train(scene, em.recipe("physics"), "nowhere"),
+    lambda scene: em.train(scene, em.recipe("hybrid"), "nowhere"),
+    lambda scene: em.train(scene, em.recipe("modal"), "nowhere"),
+    lambda scene: em.train(scene, em.recipe("sweeps"), "nowhere"),
 ]
 
 
@@ -135,7 +143,9 @@ def test_what_needs_a_scene_at_rest_says_so(needs, imaged, tmp_path, monkeypatch
 
 
 def test_what_was_said_wrong_of_the_image(ventricle):
-    with pytest.raises(InputError, match="loaded_by: 'push' is no parameter of a load; there are p"):
+    with pytest.raises(
+        InputError, match="loaded_by: 'push' is no parameter of a load; there are p"
+    ):
         seen(ventricle, loaded_by={"push": "imaged"})
     with pytest.raises(InputError, match="'pressure' in the image needs 'imaged'"):
         seen(ventricle, parameters=ventricle.parameters)
