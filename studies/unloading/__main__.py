@@ -25,7 +25,8 @@ from emulator.scenes import Scene
 
 HERE = Path(__file__).parent
 SEED = 17
-COUNT, BLOCK = 100, 10  # theta of a body, and those of a case
+COARSE, MIDDLE = (4, 8, 1), (10, 20, 2)  # rings, around, layers
+COUNT, BLOCK, FEW = 100, 10, 2  # theta of a body, of a case, and of what else must hold
 TRIP = "unload and load"
 ORDERS = {1: "linear", 2: "quadratic"}
 
@@ -34,7 +35,7 @@ def bodies(quick: bool, published: Path | None) -> dict[str, Any]:
     """Scenes by name, each made when it is asked for."""
     found: dict[str, Any] = {}
     for order, name in ORDERS.items():
-        found[f"built-in, {name}"] = lambda order=order: built_in(order, coarse=quick)
+        found[f"built-in, {name}"] = lambda order=order: built_in(order, COARSE if quick else ())
         if published is not None:
             found[f"released, {name}"] = lambda order=order: released(order, published)
     return found
@@ -74,9 +75,9 @@ def checks(results: Results, body: str, scene: Scene, few: int) -> None:
 
 def maps(results: Results, quick: bool) -> None:
     """Emulators of the built-in ventricle taken from an image, and the series of its rest."""
-    scene = built_in(1, coarse=quick)
+    scene = built_in(1, COARSE if quick else MIDDLE)
     runs, tests = (12, 3) if quick else (30, 20)
-    for order in (0, 1) if quick else (0, 3):
+    for order in (1,) if quick else (1, 3):
         results.case(
             f"{runs} runs, series of order {order}",
             lambda order=order: composed(scene, order, runs, tests, SEED),
@@ -127,6 +128,10 @@ def check(cases: list[Case]) -> None:
     """The README's claims."""
     for case in cases:
         kind = case.get("kind")
+        if kind == TRIP:
+            # Loading may lead elsewhere only where tissue so soft would not stay in the mesh.
+            told = (r["outcome"] == "met" or r.get("stable") is False for r in case["rows"])
+            assert all(told), case["name"]
         if kind in ("load and unload", "a scene of its own"):
             assert max(case["missed_mm"]) <= MET, case["name"]
         if kind == "two methods":
@@ -142,19 +147,16 @@ def main() -> None:
     arguments.add_argument("--published", type=Path, help="folder of the paper's released data")
     words = arguments.parse_args()
     results = Results(words.out, SEED, again=words.again, settings={"quick": words.quick})
-    count, few = (6, 2) if words.quick else (COUNT, 3)
-    cells = ((3, 2),) if words.quick else ((4, 3), (8, 6))
-    for each in cells:
-        for nu in (0.4999,):
-            label = f"sphere, {each[0]} x {each[1]} cells, nu {nu}"
-            results.case(label, lambda e=each, nu=nu: round_trip.sphere(e, 1.2, nu))
+    count = 6 if words.quick else COUNT
+    for cells in ((3, 2),) if words.quick else ((4, 3), (8, 6)):
+        label = "sphere, {} x {} cells".format(*cells)
+        results.case(label, lambda cells=cells: round_trip.sphere(cells, 1.2))
     found = bodies(words.quick, words.published)
     for body, make in found.items():  # a few of each body before the rest of any
         trips(results, body, make(), min(BLOCK, count))
+    for order, name in ORDERS.items():
+        checks(results, f"coarse, {name}", built_in(order, COARSE), FEW)
     maps(results, words.quick)
-    for body, make in found.items():
-        if body.startswith("built-in"):
-            checks(results, body, make(), few)
     for body, make in found.items():
         trips(results, body, make(), count)
     results.write(summary=summary(results.cases))

@@ -17,9 +17,12 @@ from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
 PRESSURE = Parameter("pressure", "kPa", 4.0 * KPA_PER_MMHG, 15.0 * KPA_PER_MMHG)
 
 
-def built_in(order: int, *, coarse: bool = False) -> Scene:
-    """The built-in left ventricle with elements of ``order``, 4 to 15 mmHg."""
-    return _wide(em.scenes.left_ventricle(*((4, 8, 1) if coarse else ()), order=order))
+def built_in(order: int, cells: tuple[int, ...] = ()) -> Scene:
+    """The built-in left ventricle with elements of ``order``, 4 to 15 mmHg.
+
+    cells : rings, around, layers; by default its own.
+    """
+    return _wide(em.scenes.left_ventricle(*cells, order=order))
 
 
 def released(order: int, root: Path) -> Scene:

@@ -20,7 +20,7 @@ from emulator.fem.moved import at_rest
 from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Scene
-from emulator.verify.sphere import INNER, MU, OUTER, pressure_at, sphere_scene
+from emulator.verify.sphere import INNER, MU, NU, OUTER, pressure_at, sphere_scene
 
 MET = 1e-8  # mm
 
@@ -165,13 +165,16 @@ def unloaded_radii(inner: float, outer: float, pressure: float) -> tuple[float, 
     return A, (outer**3 - inner**3 + A**3) ** (1.0 / 3.0)
 
 
-def sphere(cells: tuple[int, int], stretch: float, nu: float) -> Case:
-    """A loaded sphere unloaded, and its radii by the integral."""
+def sphere(cells: tuple[int, int], stretch: float) -> Case:
+    """A loaded sphere unloaded, and its radii by the integral.
+
+    stretch : of its inner surface; the tissue is all but incompressible.
+    """
     inner = stretch * INNER
     outer = (OUTER**3 + inner**3 - INNER**3) ** (1.0 / 3.0)
     pressure = pressure_at(stretch)
     scene = replace(sphere_scene(cells), mesh=sphere_octant(inner, outer, cells, 1.5, order=2))
-    unloaded = em.unload(scene, jnp.array([MU, bulk_modulus(MU, nu), pressure]))
+    unloaded = em.unload(scene, jnp.array([MU, bulk_modulus(MU, NU), pressure]))
     mesh = unloaded.scene.mesh
     exact = dict(zip(("inner", "outer"), unloaded_radii(inner, outer, pressure), strict=True))
     found = {n: float(np.linalg.norm(mesh.nodes[mesh.node_set(n)], axis=1).mean()) for n in exact}

@@ -99,8 +99,8 @@ class Unloader:
     Parameters
     ----------
     scene : its mesh, and the directions of its tissue, are those under load.
-    method : ``inverse`` or ``fixed_point``; by default the former, which needs a tenth of the
-        factorisations and finds every shape that the other does (docs/experiments.md, "Unloading").
+    method : ``inverse`` or ``fixed_point``; by default the former, which needs about a tenth of the
+        factorisations (docs/experiments.md, "Unloading").
     options : controls of Newton's method.
     factorisation : as for a :class:`~emulator.fem.simulator.Simulator`.
 
