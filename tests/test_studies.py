@@ -49,6 +49,7 @@ QUICK = {
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half elements_10000_to_1 springs_1e12 twist_360_from_rest laplace_two_modes float32_once_clamped_beam "
     "outside_by_half_once_clamped_beam",
+    "unloading": "--quick",
     "ventricle_family": "--quick",
     "verification": "--quick",
     "transfer": "--quick --one --family 2 --pretrain 6 --steps 3 --longest 4 --runs 3 --tests 2",

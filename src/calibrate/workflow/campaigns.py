@@ -96,7 +96,7 @@ def question(
             f"campaign: thetas have shape {chosen.shape}; expected (count, "
             f"{len(scene.parameters)}) for {', '.join(scene.parameter_names)}"
         )
-    has_energy = all(load.has_potential for load in scene.loads)
+    has_energy = all(load.has_potential for load in scene.loads) and not scene.loaded_by
     simulator = Simulator(scene, NewtonOptions() if options is None else options)
     solver = Solver(simulator, sensitivities=slopes, energy=has_energy)
     about = {**about, "samples": len(chosen)}

@@ -7,12 +7,15 @@ Where :math:`r(u(\theta), \theta) = 0`,
 
 (where free; the derivative of r has what the supports pull, where theta moves them)
 gives forward derivatives by one more solve with the tangent, and reverse ones by its transpose.
+A displacement may be a sum of several, each the root of equations that depend on those before
+(:class:`Equations`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +28,20 @@ from emulator.fem.system import System
 
 Find = Callable[[System, NewtonOptions, jax.Array, jax.Array], Solution]
 Found = Callable[[jax.Array, jax.Array], Solution]
+
+
+class Equations(NamedTuple):
+    """Equations of one displacement at one theta, and its root.
+
+    system : its free degrees of freedom, and what solves with the tangent.
+    u : (n, 3) mm, the root. tangent : (nnz,) there.
+    residual : (f,) mN, of theta (p,), of the displacements before, and of this one.
+    """
+
+    system: System
+    u: jax.Array
+    tangent: jax.Array
+    residual: Callable[..., jax.Array]
 
 
 def differentiable(

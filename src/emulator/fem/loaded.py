@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem.continuation import find_equilibrium
-from emulator.fem.implicit import inert
+from emulator.fem.implicit import Equations, inert
 from emulator.fem.loop import jit, one_by_one
 from emulator.fem.moved import moved_system
 from emulator.fem.options import NewtonOptions
@@ -69,7 +69,7 @@ class LoadedEquilibrium:
         From ``start`` (n, 3) mm, likewise, or from the unloaded shape. Where that is not found, the
         status is why, and the displacement zero.
         """
-        unloaded = self._unloaded(theta)
+        unloaded = self.unloaded(theta)
         w = unloaded.displacement
         begin = jnp.zeros_like(w) if start is None else start - w
         loaded = self._load(theta, w, jax.lax.stop_gradient(begin))
@@ -89,13 +89,25 @@ class LoadedEquilibrium:
 
     def sensitivities(self, v: jax.Array, theta: jax.Array) -> jax.Array:
         """Derivatives (p, n, 3) of the displacement ``v`` (n, 3) mm from the mesh, for numbers."""
-        unloaded, image = self._unloaded(theta), image_theta(self.scene, theta)
+        unloaded, image = self.unloaded(theta), image_theta(self.scene, theta)
         turned = jax.jacfwd(partial(image_theta, self.scene))(theta)
         ways = jnp.tensordot(turned.T, self.unloader.sensitivities(unloaded, image), 1)
         w = unloaded.displacement
         return self._columns(theta, w, v - w, ways)
 
-    def _unloaded(self, theta: jax.Array) -> Unloaded:
+    def equations(self, v: jax.Array, theta: jax.Array) -> tuple[Equations, ...]:
+        """Those of w, and those of u, at ``v`` (n, 3) mm from the mesh, for numbers."""
+        image = partial(image_theta, self.scene)
+        w = self.unloaded(theta).displacement
+        (unloading,) = self.unloader.equations(w, image(theta))
+        at_rest = unloading.residual
+        tangent = self._tangent(theta, w, v - w)
+        return (
+            unloading._replace(residual=lambda theta, w: at_rest(image(theta), w)),
+            Equations(self.system, v - w, tangent, lambda t, w, u: self._residual(u, t, w)),
+        )
+
+    def unloaded(self, theta: jax.Array) -> Unloaded:
         """The shape at rest; a solve and the derivatives after it share one."""
         image = image_theta(self.scene, theta)
         if isinstance(image, jax.core.Tracer):
@@ -113,6 +125,16 @@ class LoadedEquilibrium:
 
     def _residual(self, u: jax.Array, theta: jax.Array, w: jax.Array) -> jax.Array:
         return moved_system(self.system, w, theta).residual(u, theta)
+
+    @cached_property
+    def _tangent(self) -> Callable[[jax.Array, jax.Array, jax.Array], jax.Array]:
+        """Nonzeros (nnz,) of the tangent at theta, w and u."""
+
+        @jit
+        def tangent(theta: jax.Array, w: jax.Array, u: jax.Array) -> jax.Array:
+            return moved_system(self.system, w, theta).safe_tangent(u, theta)[0]
+
+        return tangent
 
     @cached_property
     def _load(self) -> Callable[[jax.Array, jax.Array, jax.Array], Solution]:

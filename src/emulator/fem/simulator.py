@@ -14,7 +14,7 @@ import numpy as np
 
 from emulator._precision import require_float64
 from emulator.errors import InputError, SolverError
-from emulator.fem.implicit import Found, derivatives, differentiable
+from emulator.fem.implicit import Equations, Found, derivatives, differentiable
 from emulator.fem.linear import Outcome, find_solver
 from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.options import NewtonOptions
@@ -208,6 +208,17 @@ class Simulator(Shown):
             No such set.
         """
         return _resultant(self.reactions(u, theta), nodes_of(self.scene.mesh, name))
+
+    def equations(self, u: jax.Array, theta: jax.Array) -> tuple[Equations, ...]:
+        """What the equilibrium ``u`` (n, 3) mm at ``theta`` (p,) solves.
+
+        One set of equations; of a scene whose mesh is loaded two, of displacements whose sum is
+        ``u``.
+        """
+        if self.scene.loaded_by:
+            return self._loaded.equations(u, theta)
+        residual = lambda theta, u: self.system.residual(u, theta)  # noqa: E731
+        return (Equations(self.system, u, self.tangent(u, theta), residual),)
 
     def tangent(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Nonzeros (nnz,) of the tangent at ``u`` (n, 3) mm and ``theta`` (p,), for the system."""

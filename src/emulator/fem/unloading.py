@@ -23,7 +23,7 @@ from emulator.fem.balance import relative_residual
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.energy import require_rest
 from emulator.fem.fixed_point import find_by_loading
-from emulator.fem.implicit import Find, Found, derivatives, differentiable
+from emulator.fem.implicit import Equations, Find, Found, derivatives, differentiable
 from emulator.fem.inverse import InverseSystem
 from emulator.fem.linear import find_solver
 from emulator.fem.loop import compiled
@@ -99,8 +99,8 @@ class Unloader:
     Parameters
     ----------
     scene : its mesh, and the directions of its tissue, are those under load.
-    method : ``inverse`` or ``fixed_point``; by default the former, which needs a tenth of the
-        factorisations and finds every shape that the other does (docs/experiments.md, "Unloading").
+    method : ``inverse`` or ``fixed_point``; by default the former, which needs about a tenth of the
+        factorisations (docs/experiments.md, "Unloading").
     options : controls of Newton's method.
     factorisation : as for a :class:`~emulator.fem.simulator.Simulator`.
 
@@ -172,6 +172,13 @@ class Unloader:
                 "tangent"
             )
         return found
+
+    def equations(self, w: jax.Array, theta: jax.Array) -> tuple[Equations]:
+        """What the displacement ``w`` (n, 3) mm to the stress-free shape solves."""
+        tangent = self.system.safe_tangent(w, theta)[0]
+        return (
+            Equations(self.system, w, tangent, lambda theta, w: self.system.residual(w, theta)),
+        )
 
     @cached_property
     def _found(self) -> Found:

@@ -14,6 +14,9 @@ beyond one solve a series costs residuals differentiated along paths, and back-s
 ventricle with five parameters, over the whole box, orders 1, 2, 3 and 4 leave a median error of
 0.20, 0.047, 0.010 and 0.003 mm; at the corners, near the series' radius of convergence, the error
 is much larger.
+
+Where the displacement is a sum, as that of a body whose mesh is loaded
+(:mod:`emulator.fem.loaded`), each one's terms of an order follow from those of the ones before.
 """
 
 from __future__ import annotations
@@ -29,10 +32,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.errors import InputError, SolverError
+from emulator.fem.implicit import Equations
 from emulator.fem.simulator import Simulator
-from emulator.fem.system import System
+from emulator.fem.unloading import Unloader
 from emulator.scenes.scene import Scene
 from emulator.surrogates.part import CachedPart, OfArrays, widened
+
+Terms = dict[tuple[int, ...], jax.Array]
+"""Derivatives (n, 3) mm by the parameters they are in, in order."""
 
 _MOST_TERMS = 200  # in one order; 18 parameters have 171 of the second and 1140 of the third
 
@@ -140,11 +147,14 @@ def monomials(indices: np.ndarray, step: jax.Array) -> jax.Array:
     return jnp.prod(powers, axis=-1) / factorials
 
 
-def expand(simulator: Simulator, theta: jax.Array | None = None, order: int = 3) -> Expansion:
+def expand(
+    simulator: Simulator | Unloader, theta: jax.Array | None = None, order: int = 3
+) -> Expansion:
     """The Taylor series of the equilibrium about ``theta`` (p,), the centre of the box by default.
 
     Parameters
     ----------
+    simulator : or an ``Unloader``, for the series of the stress-free shape.
     order : 1 to 4; the series stops before an order with more than 200 terms.
 
     Raises
@@ -160,30 +170,35 @@ def expand(simulator: Simulator, theta: jax.Array | None = None, order: int = 3)
     return expand_at(simulator, u, theta, order)
 
 
-def expand_at(simulator: Simulator, u: jax.Array, theta: jax.Array, order: int) -> Expansion:
+def expand_at(
+    simulator: Simulator | Unloader, u: jax.Array, theta: jax.Array, order: int
+) -> Expansion:
     """:func:`expand` about a known equilibrium ``u`` (n, 3) mm at ``theta`` (p,)."""
     _check_order(order)
     scene, theta, u = simulator.scene, jnp.asarray(theta, dtype=float), jnp.asarray(u, dtype=float)
     position = scene.to_unit(theta)
-    system, tangent = simulator.system, simulator.tangent(u, theta)
+    chain = simulator.equations(u, theta)
     count = len(position)
-    found: dict[tuple[int, ...], jax.Array] = {}
+    found: list[Terms] = [{} for _ in chain]
     for degree in range(1, order + 1):
         if comb(count + degree - 1, degree) > _MOST_TERMS:
             break
         terms = list(combinations_with_replacement(range(count), degree))
-        forces, held = _forces(system, u, position, terms, found)
-        moved = jax.vmap(system.extend, in_axes=1)(-jax.jit(system.solve)(tangent, forces.T))
-        moved += held
-        if not jnp.isfinite(moved).all():
-            raise SolverError(
-                f"scene '{scene.name}': derivatives of order {degree} in theta are not finite"
-            )
-        found.update(zip(terms, moved, strict=True))
-    if not found:
+        for k, each in enumerate(chain):
+            system = each.system
+            forces, held = _forces(chain[: k + 1], position, terms, found)
+            solved = -jax.jit(system.solve)(each.tangent, forces.T)
+            moved = jax.vmap(system.extend, in_axes=1)(solved) + held
+            if not jnp.isfinite(moved).all():
+                raise SolverError(
+                    f"scene '{scene.name}': derivatives of order {degree} in theta are not finite"
+                )
+            found[k].update(zip(terms, moved, strict=True))
+    if not found[0]:
         return constant(np.asarray(position), u)
-    indices = np.array([[*term, *(-1,) * (order - len(term))] for term in found])
-    return Expansion(np.asarray(position), u, indices, jnp.stack(list(found.values())))
+    indices = np.array([[*term, *(-1,) * (order - len(term))] for term in found[0]])
+    derivatives = sum(jnp.stack(list(each.values())) for each in found)
+    return Expansion(np.asarray(position), u, indices, jnp.asarray(derivatives))
 
 
 def _check_order(order: int) -> None:
@@ -192,47 +207,59 @@ def _check_order(order: int) -> None:
 
 
 def _forces(
-    system: System,
-    u: jax.Array,
+    chain: tuple[Equations, ...],
     position: jax.Array,
     terms: list[tuple[int, ...]],
-    found: dict[tuple[int, ...], jax.Array],
+    found: list[Terms],
 ) -> tuple[jax.Array, jax.Array]:
-    """Mixed derivative (t, f) of the residual along each term's path, its own term left out.
+    """Mixed derivative (t, f) of the last residual of ``chain`` along each term's path.
 
+    Its own term is left out there; those of the displacements before are in ``found``.
     And (t, n, 3) of the displacement where theta moves supports, (t, 1, 1) of zeros where it moves
     none. Term by term (``lax.map``): the paths of all terms at once would not fit into memory.
     """
-    degree = len(terms[0])
-    # The path holds one term for every proper subset of the multi-index.
-    parts = [s for size in range(1, degree) for s in combinations(range(degree), size)]
-    places = {term: k for k, term in enumerate(found)}
-    paths = [[places[tuple(term[k] for k in part)] for part in parts] for term in terms]
-    known = jnp.stack(list(found.values())) if found else jnp.zeros((0, *u.shape))
+    degree, last = len(terms[0]), chain[-1]
+    scene = last.system.scene
+    # The path holds one term for every proper subset of the multi-index, and those of the
+    # displacements before one for the whole, too.
+    proper = [s for size in range(1, degree) for s in combinations(range(degree), size)]
+    whole = [*proper, tuple(range(degree))]
+    subsets = [whole if each is not last else proper for each in chain]
+    paths = [_places(terms, parts, here) for parts, here in zip(subsets, found, strict=False)]
+    nothing = jnp.zeros((0, *last.u.shape))
+    known = [jnp.stack(list(h.values())) if h else nothing for h in found[: len(chain)]]
+    moving = bool(scene.prescribed.per_unit)
 
-    moving = bool(system.scene.prescribed.per_unit)
-
-    def one(argument: tuple[jax.Array, jax.Array], known: jax.Array) -> tuple[jax.Array, jax.Array]:
-        directions, path = argument
+    def one(argument: tuple[jax.Array, list[jax.Array]], known: Any) -> tuple[jax.Array, jax.Array]:
+        directions, paths = argument
 
         def along(*steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-            v = u
-            for part, place in zip(parts, path, strict=True):
-                v = v + prod((steps[k] for k in part), start=jnp.ones(())) * known[place]
+            fields = []
+            for each, parts, path, values in zip(chain, subsets, paths, known, strict=True):
+                v = each.u
+                for part, place in zip(parts, path, strict=True):
+                    v = v + prod((steps[k] for k in part), start=jnp.ones(())) * values[place]
+                fields.append(v)
             x = position + sum(s * d for s, d in zip(steps, directions, strict=True))
-            theta = system.scene.from_unit(x)
+            theta = scene.from_unit(x)
             if not moving:
-                return system.residual(v, theta), jnp.zeros((1, 1))
-            v = system.scene.on_supports(v, theta)
-            return system.residual(v, theta), jnp.where(system.scene.held, v, 0.0)
+                return last.residual(theta, *fields), jnp.zeros((1, 1))
+            v = scene.on_supports(fields[-1], theta)
+            return last.residual(theta, *fields[:-1], v), jnp.where(scene.held, v, 0.0)
 
         return _mixed(along, degree)()
 
     directions = jnp.stack([jnp.eye(len(position))[jnp.array(term)] for term in terms])
-    indices = jnp.array(paths, dtype=int).reshape(len(terms), len(parts))
-    return jax.jit(lambda d, i, k: jax.lax.map(lambda each: one(each, k), (d, i)))(
-        directions, indices, known
+    return jax.jit(lambda d, p, k: jax.lax.map(lambda each: one(each, k), (d, p)))(
+        directions, paths, known
     )
+
+
+def _places(terms: list[tuple[int, ...]], parts: list[tuple[int, ...]], found: Terms) -> jax.Array:
+    """Places (t, parts) in ``found`` of the derivatives in each of the ``parts`` of each term."""
+    places = {term: k for k, term in enumerate(found)}
+    rows = [[places[tuple(term[k] for k in part)] for part in parts] for term in terms]
+    return jnp.array(rows, dtype=int).reshape(len(terms), len(parts))
 
 
 def _mixed(function: Callable[..., Any], degree: int) -> Callable[[], Any]:

@@ -11,6 +11,7 @@ from typing import Any
 from emulator.catalogue import finer_of
 from emulator.errors import InputError
 from emulator.fem.campaign import StoredRuns
+from emulator.fem.energy import require_rest
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.files import load, save_emulator
@@ -66,6 +67,8 @@ def train(
     """
     if campaign is not None and not (plan.runs or resume):
         raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
+    if plan.steps:
+        require_rest(scene)  # networks learn from the energy there, or have its modes
     if plan.as_learned:
         return _as_learned(scene, plan, start)
     session = open_session(folder, scene.fingerprint, scene.name, plan, architecture, resume=resume)

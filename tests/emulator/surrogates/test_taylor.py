@@ -24,6 +24,13 @@ def pressed():
     return replace(scene, loads=loads, parameters=parameters, constants={"lam": 4.0})
 
 
+def imaged():
+    """The same body, its mesh that of an image: unloaded, and loaded again."""
+    scene = pressed()
+    constants = {**scene.constants, "imaged": 0.3}
+    return replace(scene, loaded_by={"pressure": "imaged"}, constants=constants)
+
+
 def halves():
     """Two regions, each with a factor of its own."""
     scene = block(loads=(Gravity(density=500.0),), cells=(2, 1, 1))
@@ -43,6 +50,7 @@ SCENES = {
     "quadratic": lambda: heavy_block("P2"),
     "mean dilatation": lambda: heavy_block("P2, mean dilatation"),
     "follower pressure": pressed,
+    "a loaded mesh": imaged,
 }
 
 
@@ -69,9 +77,7 @@ def orders(simulator, series, directions, steps):
     [
         pytest.param(
             k,
-            marks=pytest.mark.slow
-            if k in ("a face moved", "follower pressure", "mean dilatation", "quadratic", "regions")
-            else [],
+            marks=pytest.mark.slow if k != "gravity" else [],
         )
         for k in SCENES
     ],

@@ -56,8 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
     solution = simulator.solve(theta)
     status = Status(int(solution.status))
     J = np.asarray(jax.jit(partial(volume_ratio, scene))(solution.displacement))
-    # A follower pressure on an open patch has no potential energy.
-    open_patch = not all(load.has_potential for load in scene.loads)
+    # A follower pressure on an open patch has no potential energy; that of a body whose mesh is
+    # loaded, its stresses and reactions belong to the scene at rest (calibrate unload).
+    at_rest = not scene.loaded_by
+    open_patch = not (at_rest and all(load.has_potential for load in scene.loads))
     energy = None
     if not open_patch:
         energy = float(jax.jit(potential_energy(scene))(solution.displacement, theta))
@@ -79,12 +81,12 @@ def run(arguments: argparse.Namespace) -> int:
     }
     reactions: dict[str, list[float]] = {}
     if status is Status.CONVERGED:
-        for name in supported_sets(scene):
+        for name in supported_sets(scene) if at_rest else ():
             reactions[name] = simulator.reaction(name, solution.displacement, theta).tolist()
         result["reactions"] = reactions
     if arguments.out and status is Status.CONVERGED:
         u = np.asarray(solution.displacement)
-        fields = element_fields(scene, solution.displacement, theta)
+        fields = element_fields(scene, solution.displacement, theta) if at_rest else {}
         write_solution(arguments.out, scene.mesh, u, fields)
         result["out"] = arguments.out
     lines = [f"{scene.name}: {status.text}, {result['iterations']} Newton iterations"]

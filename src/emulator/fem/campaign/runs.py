@@ -20,7 +20,8 @@ from emulator.progress import counting
 class Runs(NamedTuple):
     """Converged FEM solutions.
 
-    theta : (c, p). displacement : (c, n, 3) mm. energy : (c,) mN mm.
+    theta : (c, p). displacement : (c, n, 3) mm. energy : (c,) mN mm; NaN of a scene whose mesh is
+    loaded.
     sensitivities : (c, p, n, 3), du/dtheta in mm per unit of each parameter; None unless requested.
     """
 
@@ -83,7 +84,9 @@ def run_campaign(
         A solve failed; the message names the run and the reason.
     """
     rows = MemoryRows(thetas)
-    solver = Solver(simulator, sensitivities=sensitivities, energy=True)
+    # The potential of a body whose mesh is loaded is that of the shape at rest, another each time.
+    at_rest = not simulator.scene.loaded_by
+    solver = Solver(simulator, sensitivities=sensitivities, energy=at_rest)
     solved = solve_rows(
         solver,
         thetas,
