@@ -23,7 +23,6 @@
 # %%
 from dataclasses import replace
 
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
