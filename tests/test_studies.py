@@ -45,6 +45,7 @@ QUICK = {
     "released_networks": "--quick --published PUBLISHED",
     "sbc": "--replicates 20 --only map",
     "sensitivity": "--quick",
+    "sheep_myocardium": "--data MEASURED/ovine_myocardium --quick",
     "silicone_beam": "--data MEASURED/silicone_beam --quick",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half elements_10000_to_1 springs_1e12 twist_360_from_rest laplace_two_modes float32_once_clamped_beam "
