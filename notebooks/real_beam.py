@@ -136,4 +136,4 @@ assert verdicts["noise alone"].verdict == "not certified"  # the data does not f
 assert np.std(draws["hand and rig unknown"]) > 2.0 * np.std(draws["noise alone"])
 
 # %% [markdown]
-# Whoever believes noise alone is sure and off, and the certificate says that the data does not fit. With three lines more the interval is wide, and right. What makes it narrower is not a better camera but a rig that stays where it is.
+# Whoever believes noise alone is sure and off, and the certificate says that the data does not fit. With three lines more the interval is wide. The truth is just outside of its 90 %, as it is in one experiment of ten; of forty such experiments in `studies/silicone_beam` it covers 35. What makes it narrower is not a better camera but a rig that stays where it is.
