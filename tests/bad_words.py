@@ -4,6 +4,12 @@ Words as in a shell.
 """
 
 COMMANDS = [
+    ("mesh --endocardium none.stl --epicardium no.stl --out lv.vtu", "none.stl does not exist"),
+    ("mesh --endocardium none.stl", "arguments are required: --epicardium, --out"),
+    (
+        "mesh --endocardium none.stl --epicardium no.stl --out lv.xyz",
+        "--out lv.xyz: the file name must end in .vtu",
+    ),
     ("simulate beam", "scene 'beam' is unknown"),
     ("simulate missing.toml", "missing.toml does not exist"),
     ("simulate once_clamped_beam --theta mu=500 lam=60", "parameter 'mu' is 500 kPa"),

@@ -70,6 +70,7 @@ def calibrated(beam, members, replicates, options, **more):
     return calibration_of(map(one, range(replicates)))
 
 
+@pytest.mark.slow
 def test_a_population_of_one_parameter_is_calibrated(beam):
     options = NUTSOptions(warmup=150, draws=150, chains=2, rounds=1)
     found = calibrated(beam, 2, 20, options, known={"lam": 75.0})

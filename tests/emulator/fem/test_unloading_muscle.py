@@ -25,7 +25,8 @@ def at(scene, **values):
     return scene.theta(**{**centre, **values})
 
 
-@pytest.mark.parametrize("transverse", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("transverse", [0.0, 0.3])
 def test_the_unloaded_shape_loaded_from_rest_is_the_mesh(transverse):
     """The force on the loaded shape and the potential from rest are two ways to one stress."""
     scene = contracting(transverse)
