@@ -138,7 +138,7 @@ class FEMLikelihood:
 
     def _stable(self, solved: list[jax.Array], thetas: jax.Array) -> bool | None:
         """Whether every load state's equilibrium is a minimum of the energy, where there is one."""
-        if self.simulator.system.forces:
+        if not all(load.has_potential for load in self.simulator.scene.loads):
             return None
         return all(
             self.simulator.is_stable(u, theta) for u, theta in zip(solved, thetas, strict=True)

@@ -113,7 +113,8 @@ class MeshError:
         begin = self._carried(coarse)
         if near is not None:
             begin = begin + near.fine - self._carried(near.coarse)
-        stepped = self._stepped(theta, begin)
+        # Steps are those of one set of equations; a mesh that is loaded has two.
+        stepped = None if self.fine.scene.loaded_by else self._stepped(theta, begin)
         if stepped is not None:
             return MeshErrorEstimate(theta, coarse, stepped, solved=False)
         with self._alone:

@@ -29,6 +29,7 @@ import numpy as np
 
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.implicit import Equations, inert
+from emulator.fem.linear import Outcome
 from emulator.fem.loop import jit, one_by_one
 from emulator.fem.moved import moved_system
 from emulator.fem.options import NewtonOptions
@@ -106,6 +107,12 @@ class LoadedEquilibrium:
             unloading._replace(residual=lambda theta, w: at_rest(image(theta), w)),
             Equations(self.system, v - w, tangent, lambda t, w, u: self._residual(u, t, w)),
         )
+
+    def is_stable(self, v: jax.Array, theta: jax.Array) -> bool:
+        """Whether the body at ``v`` (n, 3) mm from the mesh is at a minimum of its energy."""
+        w = self.unloaded(theta).displacement
+        K, nothing = self._tangent(theta, w, v - w), jnp.zeros(len(self.system.free))
+        return int(self.system.attempt(K, nothing)[1]) == Outcome.OK
 
     def unloaded(self, theta: jax.Array) -> Unloaded:
         """The shape at rest; a solve and the derivatives after it share one."""

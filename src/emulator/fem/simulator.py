@@ -170,8 +170,9 @@ class Simulator(Shown):
         """Whether the equilibrium ``u`` (n, 3) mm at ``theta`` (p,) is a minimum of the energy.
 
         Its tangent is then positive definite. At a saddle, such as a column that stays straight
-        under twice its critical load, forces balance but any disturbance leads away. For numbers,
-        not under ``jit``.
+        under twice its critical load, forces balance but any disturbance leads away. Of a scene
+        whose mesh is loaded, it is the body loaded from its stress-free shape that is asked. For
+        numbers, not under ``jit``.
 
         Raises
         ------
@@ -179,11 +180,13 @@ class Simulator(Shown):
             A load without a potential: there is no energy to be least.
         """
         theta, u = self._checked(theta, u, "displacement")
-        if self.system.forces:
+        if not all(load.has_potential for load in self.scene.loads):
             raise InputError(
                 f"scene '{self.scene.name}': a follower pressure has no potential, so stability is "
                 "not a question of its tangent's sign"
             )
+        if self.scene.loaded_by:
+            return bool(np.isfinite(u).all()) and self._loaded.is_stable(u, theta)
         sound = bool(np.isfinite(u).all() and self.system.least_volume_ratio(u) > 0.0)
         nothing = jnp.zeros(len(self.system.free))
         return sound and int(self.system.attempt(self.tangent(u, theta), nothing)[1]) == Outcome.OK

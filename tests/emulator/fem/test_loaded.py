@@ -127,7 +127,6 @@ NEEDING_REST = [
     lambda scene: em.unload(scene, theta_of(1.0, 0.8)),
     lambda scene: em.element_fields(scene, np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
     lambda scene: em.Simulator(scene).reactions(np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
-    lambda scene: em.Simulator(scene).is_stable(np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
     lambda scene: em.train(scene, em.recipe("hybrid"), "nowhere"),
     lambda scene: em.train(scene, em.recipe("modal"), "nowhere"),
     lambda scene: em.train(scene, em.recipe("sweeps"), "nowhere"),
@@ -157,3 +156,16 @@ def test_what_was_said_wrong_of_the_image(ventricle):
     constant = {**ventricle.constants, "pressure": 1.0}
     with pytest.raises(InputError, match="loaded_by: 'pressure' is a constant, so the mesh is"):
         seen(ventricle, parameters=(*ventricle.parameters[:4], IMAGED), constants=constant)
+
+
+@pytest.mark.slow
+def test_stability_and_the_error_of_the_mesh(simulator):
+    theta = theta_of(1.2, 0.8)
+    u = simulator(theta)
+    assert simulator.is_stable(u, theta)
+    assert not simulator.is_stable(u * jnp.nan, theta)
+    maker = em.mesh_error(simulator)
+    error = maker(theta)
+    np.testing.assert_allclose(error.coarse, u, atol=1e-9)
+    np.testing.assert_allclose(error.fine, maker.fine(theta), atol=1e-6)
+    assert float(error.err_u.max()) > 1e-3
