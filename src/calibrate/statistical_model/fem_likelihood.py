@@ -138,7 +138,12 @@ class FEMLikelihood:
 
     def _stable(self, solved: list[jax.Array], thetas: jax.Array) -> bool | None:
         """Whether every load state's equilibrium is a minimum of the energy, where there is one."""
-        if not all(load.has_potential for load in self.simulator.scene.loads):
+        scene = self.simulator.scene
+        if scene.loaded_by:  # without a system of its own: one at rest for each theta
+            has_energy = all(load.has_potential for load in scene.loads)
+        else:
+            has_energy = not self.simulator.system.forces
+        if not has_energy:
             return None
         return all(
             self.simulator.is_stable(u, theta) for u, theta in zip(solved, thetas, strict=True)
