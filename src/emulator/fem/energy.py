@@ -200,7 +200,7 @@ def spring_terms(scene: Scene) -> list[LocalTerm]:
 
 def local_terms(scene: Scene) -> list[LocalTerm]:
     """Potentials of the loads that follow the deformation."""
-    fibres = None if scene.fibres is None else scene.fibres_at_points
+    fibres = scene.fibres_of_loads
     terms = (load.term(scene.discretisation, fibres) for load in scene.loads)
     return [term for term in terms if term is not None]
 

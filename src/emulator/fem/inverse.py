@@ -62,8 +62,7 @@ class InverseSystem(System):
     @cached_property
     def forces(self) -> list[LocalForce]:
         """Loads on the loaded shape."""
-        grid = self.scene.discretisation
-        fibres = None if self.scene.fibres is None else self.scene.fibres_at_points
+        grid, fibres = self.scene.discretisation, self.scene.fibres_of_loads
         return [load.on_loaded(grid, fibres) for load in self.scene.loads]
 
     @cached_property

@@ -17,7 +17,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,7 +28,6 @@ from emulator.geometry.directions import checked_directions
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.quantity import Quantity
-from emulator.scenes.loads.load import Load
 from emulator.scenes.local_terms import Values
 from emulator.scenes.regions import Tissue
 
@@ -91,22 +92,17 @@ class FibreAngles:
 
 
 def checked_angles(
-    angles: Sequence[FibreAngles], mesh: Mesh, fibres: np.ndarray | None, loads: Sequence[Load]
+    angles: Sequence[FibreAngles], mesh: Mesh, fibres: np.ndarray | None
 ) -> tuple[FibreAngles, ...]:
     """The ``angles`` of a scene, their arrays checked and frozen.
 
     Raises
     ------
     InputError
-        A scene without fibres, arrays that do not fit its mesh, or a load along its fibres.
+        A scene without fibres, or arrays that do not fit its mesh.
     """
     if angles and fibres is None:
         raise InputError("fibre angles turn fibres, and it has none")
-    for load in loads:
-        if angles and load.fibres:
-            raise InputError(
-                f"load '{load.kind}' acts along fibres that theta turns; give angles as numbers"
-            )
     return tuple(each.checked(mesh) for each in angles)
 
 
@@ -115,6 +111,33 @@ def turned(tissue: Tissue, angles: tuple[FibreAngles, ...], values: Values) -> T
     for each in angles:
         tissue = each.turned(tissue, values)
     return tissue
+
+
+@dataclass(frozen=True, eq=False)
+class Fibres:
+    """The fibres of a scene, as loads along them see them, an element after the other.
+
+    given : unit directions (m, q, 3) at the quadrature points, at angles zero; traced where the
+        body is at rest on a shape that is sought.
+    angles : by which parameters turn them.
+    """
+
+    given: Any
+    angles: tuple[FibreAngles, ...] = ()
+
+    @property
+    def rows(self) -> Any:
+        """Arrays with the leading axis m, of which :meth:`of_element` takes a row."""
+        return self.given, [(each.axis, dict(each.shares)) for each in self.angles]
+
+    @staticmethod
+    def of_element(row: Any, values: Values) -> jax.Array:
+        """Unit fibres (q, 3) of one element at the parameters ``values``."""
+        given, turns = jax.tree.map(lambda array: array[None], row)
+        angles = tuple(FibreAngles(axis, shares) for axis, shares in turns)
+        found = turned(Tissue(given), angles, values).directions
+        assert found is not None
+        return found[0]
 
 
 def identity_of_angles(angles: Sequence[FibreAngles]) -> dict[str, np.ndarray]:

@@ -28,7 +28,13 @@ from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.identity import law_identity
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.dilatation import Dilatation, check_dilatation
-from emulator.scenes.fibre_angles import FibreAngles, checked_angles, identity_of_angles, turned
+from emulator.scenes.fibre_angles import (
+    FibreAngles,
+    Fibres,
+    checked_angles,
+    identity_of_angles,
+    turned,
+)
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.loads.load import Load
@@ -136,7 +142,7 @@ class Scene(Shown):
             with self._named():
                 object.__setattr__(self, kind, checked_directions(given, self.mesh, kind))
         with self._named():
-            angles = checked_angles(self.angles, self.mesh, self.fibres, self.loads)
+            angles = checked_angles(self.angles, self.mesh, self.fibres)
             object.__setattr__(self, "angles", angles)
             if self.fibres is not None and self.sheets is not None:
                 check_across(self._at_points(self.sheets), self.fibres_at_points)
@@ -243,6 +249,11 @@ class Scene(Shown):
         if self.fibres is None:
             raise InputError(f"scene '{self.name}' has no fibres")
         return self._at_points(self.fibres)
+
+    @property
+    def fibres_of_loads(self) -> Fibres | None:
+        """What loads along the fibres act along; None in a scene without."""
+        return None if self.fibres is None else Fibres(self.fibres_at_points, self.angles)
 
     def fibres_at(self, theta: jax.Array) -> jax.Array:
         """Unit fibre directions (m, q, 3) at ``theta`` (p,); of a scene with fibres."""

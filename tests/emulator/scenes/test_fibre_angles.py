@@ -12,6 +12,7 @@ from emulator.catalogue import find_scene
 from emulator.error.mesh_error import mesh_error
 from emulator.errors import InputError
 from emulator.fem.energy import potential_energy
+from emulator.fem.inverse import InverseSystem
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
@@ -161,6 +162,48 @@ def test_without_fibres_angles_are_left_out(turning):
         assert ("inner" in without.parameter_names) == bool(without.angles), name
 
 
-def test_a_load_along_fibres_that_turn_is_refused(turning):
-    with pytest.raises(InputError, match="'active_tension' acts along fibres that theta turns"):
-        replace(turning, loads=(*turning.loads, ActiveTension(10.0)))
+@pytest.mark.parametrize("transverse", [0.0, 0.3])
+def test_muscle_pulls_along_fibres_that_turn(turning, fixed, transverse):
+    """Energy of elements against springs, its slope by an angle, and the force on a loaded mesh."""
+    loads = (*fixed.loads, ActiveTension(20.0, transverse=transverse))
+    pulled, known = (replace(each, loads=loads, origin={}) for each in (turning, fixed))
+    theta, numbers = pulled.theta(**KNOWN, inner=63.0, outer=-51.0), known.theta(**KNOWN)
+    u = 0.5 * jax.random.normal(jax.random.key(0), turning.held.shape) * ~turning.held
+    energy, by_springs = potential_energy(pulled), potential_energy(known)
+    assert energy(u, theta) == pytest.approx(float(by_springs(u, numbers)), rel=1e-12)
+    force = jax.grad(by_springs)(u, numbers)
+    np.testing.assert_allclose(jax.grad(energy)(u, theta), force, atol=1e-10 * jnp.abs(force).max())
+    step = jnp.zeros(len(theta)).at[turning.parameter_names.index("inner")].set(0.01)
+    slope = (energy(u, theta + step) - energy(u, theta - step)) / 0.02
+    assert jax.grad(energy, 1)(u, theta) @ step / 0.01 == pytest.approx(float(slope), rel=1e-6)
+    loaded, by_rows = (InverseSystem(each, "cholesky") for each in (known, pulled))
+    w = 0.2 * u
+    found = by_rows.external_force(w, theta)
+    right = loaded.external_force(w, numbers)
+    np.testing.assert_allclose(found, right, atol=1e-12 * jnp.abs(right).max())
+
+
+@pytest.mark.slow
+def test_an_imaged_heart_contracts_along_fibres_that_turn(turning, fixed):
+    """Equilibria are those of the same angles as numbers, slopes those of differences."""
+    image = {"loaded_by": {"pressure": "imaged", "tension": "slack"}, "origin": {}}
+    tension, hearts = Parameter("tension", "kPa", 0.0, 40.0), []
+    for each in (turning, fixed):
+        parameters = (*each.parameters, tension)
+        constants = {**each.constants, "imaged": 0.8, "slack": 0.0}
+        loads = (*each.loads, ActiveTension())
+        hearts.append(
+            replace(each, parameters=parameters, constants=constants, loads=loads, **image)
+        )
+    scene, known = hearts
+    values = {**KNOWN, "pressure": 1.2, "tension": 12.0}
+    theta = scene.theta(**values, inner=63.0, outer=-51.0)
+    simulator = em.fem.Simulator(scene)
+    v = simulator.solve(theta).require_converged().displacement
+    np.testing.assert_allclose(v, em.fem.Simulator(known)(known.theta(**values)), atol=1e-8)
+    slopes = simulator.sensitivities(v, theta)
+    for name, width in (("inner", 0.05), ("tension", 0.01)):
+        k = scene.parameter_names.index(name)
+        step = jnp.zeros(len(theta)).at[k].set(width)
+        by_difference = (simulator(theta + step) - simulator(theta - step)) / (2.0 * width)
+        np.testing.assert_allclose(slopes[k], by_difference, atol=1e-6)

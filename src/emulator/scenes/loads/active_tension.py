@@ -27,7 +27,11 @@ springs of stiffness :math:`-T_a k_{ab}` between the nodes a < b of an element, 
 .. math:: \Psi = -T_a \sum_{a<b} k_{ab}\,\left(D \cdot \Delta + \tfrac12 \Delta \cdot \Delta\right),
           \qquad D = X_b - X_a, \quad \Delta = u_b - u_a .
 
-k is positive semidefinite: the tangent is constant, and tension stiffens.
+k is positive semidefinite: the tangent is constant, and tension stiffens. Where parameters turn the
+fibres, k differs with theta, and the energy is summed over elements in place of springs,
+
+.. math:: \Psi_e = \frac{T_a}{2} \int (1 - \eta)\,(|f + h f|^2 - 1)
+          + \eta\,(|I + h|^2 - 3) \; dX, \qquad h = \partial u/\partial X .
 
 On a body whose loaded shape x is known, with w from there to rest and :math:`f = I + \partial
 w/\partial x = F^{-1}`, fibres m of the loaded tissue are :math:`f_0 = f m / |f m|` at rest, and the
@@ -50,6 +54,7 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
 from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
@@ -111,10 +116,12 @@ class ActiveTension(Load):
         along = jnp.einsum("mqij,mqj,mqk->mqik", F, fibres, fibres)
         return self.value(values) * (along + self.transverse * (F - along))
 
-    def term(self, grid: Discretisation, fibres: Any = None) -> LocalTerm:
-        """The springs between nodes."""
+    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
+        """The springs between nodes; where theta turns the fibres, the energy of each element."""
         assert fibres is not None, "a scene with this load has fibres"
-        pairs, stiffness = _springs(grid, fibres, self.transverse)
+        if fibres.angles:
+            return self._of_elements(grid, fibres)
+        pairs, stiffness = _springs(grid, fibres.given, self.transverse)
         X = grid.mesh.nodes
 
         def energy(u: jax.Array, spring: Any, values: Values) -> jax.Array:
@@ -125,7 +132,24 @@ class ActiveTension(Load):
 
         return LocalTerm(pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), energy, convex=True)
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def _of_elements(self, grid: Discretisation, fibres: Fibres) -> LocalTerm:
+        def longer(h: jax.Array, weight: jax.Array, f: jax.Array) -> jax.Array:
+            """What the measures gain on 1, on their mean: exact where h is small."""
+            pull = h @ f
+            along = 2.0 * jnp.vdot(f, pull) + jnp.vdot(pull, pull)
+            everywhere = 2.0 * jnp.trace(h) + jnp.vdot(h, h)
+            return weight * ((1.0 - self.transverse) * along + self.transverse * everywhere)
+
+        def energy(u: jax.Array, element: Any, values: Values) -> jax.Array:
+            gradients, weights, row = element
+            h = jnp.einsum("ai,qaj->qij", u, gradients)
+            work = jax.vmap(longer)(h, weights, Fibres.of_element(row, values))
+            return 0.5 * self.value(values) * work.sum()
+
+        data = grid.gradients, grid.weights, fibres.rows
+        return LocalTerm(grid.connectivity, data, energy, convex=True)
+
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The force of the stress on each element's nodes."""
         assert fibres is not None, "a scene with this load has fibres"
 
@@ -141,9 +165,12 @@ class ActiveTension(Load):
             return -weight * det * gradients @ stress
 
         def force(w: jax.Array, element: Any, values: Values) -> jax.Array:
-            return self.value(values) * jax.vmap(at_point, (None, 0, 0, 0))(w, *element).sum(0)
+            gradients, weights, row = element
+            m = Fibres.of_element(row, values)
+            found = jax.vmap(at_point, (None, 0, 0, 0))(w, gradients, weights, m)
+            return self.value(values) * found.sum(0)
 
-        return LocalForce(grid.connectivity, (grid.gradients, grid.weights, fibres), force)
+        return LocalForce(grid.connectivity, (grid.gradients, grid.weights, fibres.rows), force)
 
 
 def _springs(grid: Discretisation, fibres: Any, transverse: float) -> tuple[np.ndarray, Any]:

@@ -9,13 +9,14 @@ to first order in the displacement, and needs no facet while solving.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import numpy as np
 
 from emulator.geometry.discretisation import Discretisation, FacetRule, facet_rule
 from emulator.geometry.facets import nodal_area_vectors
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.load import nodal_sums
 from emulator.scenes.loads.surface_pressure import SurfacePressure
 from emulator.scenes.local_terms import LocalForce, Values
@@ -35,7 +36,7 @@ class DeadPressure(SurfacePressure):
         """Consistent nodal forces (n, 3) in mN for 1 kPa of a pressure that is a parameter."""
         return {} if self.pressure is not None else {self.parameter: self._per_kpa(grid)}
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The force by the surface at rest, ``x + w``."""
         del fibres
         mesh = grid.mesh

@@ -12,13 +12,14 @@ is not symmetric, and a scene with one can be simulated but has no energy to tra
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import area_vectors
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.dead_pressure import DeadPressure, at_rest
 from emulator.scenes.loads.surface_pressure import SurfacePressure
 from emulator.scenes.local_terms import LocalForce, Values
@@ -55,7 +56,7 @@ class FollowerPressure(SurfacePressure):
 
         return LocalForce(facets, mesh.nodes[facets], force)
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The force on the known surface, whatever the shape at rest."""
         del fibres
         following = self.force(grid)

@@ -19,6 +19,7 @@ from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import EDGES
 from emulator.mechanics.quantity import Quantity, number
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
 from emulator.scenes.local_terms import LocalForce, Values
@@ -73,7 +74,7 @@ class Force(Load):
         """Nodal forces (n, 3) in mN per unit of the amount."""
         return {} if self.amount is None else {self.amount: self._spread(grid.mesh)}
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The force, wherever its nodes are."""
         del fibres
         mesh, amount = grid.mesh, self.amount

@@ -18,6 +18,7 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.mechanics.kinematics import determinant
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.load import Load, nodal_sums
 from emulator.scenes.local_terms import LocalForce, Values
 
@@ -69,7 +70,7 @@ class Gravity(Load):
         """Consistent nodal forces, (n, 3) in mN."""
         return _nodal_volumes(grid)[:, None] * self.body_force
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The weight of the volume at rest."""
         del fibres
         return _weight_at_rest(grid, lambda _: self.body_force)
@@ -111,7 +112,7 @@ class GravityVector(Load):
             for quantity, axis in zip(self.quantities, np.eye(3), strict=True)
         }
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The weight of the volume at rest."""
         del fibres
         weight = self.density * _KPA_PER_MM

@@ -12,6 +12,7 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.quantity import Quantity
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
 
@@ -81,11 +82,11 @@ class Load(ABC):
         """Dead nodal force (n, 3) in mN per unit of each parameter that scales one."""
         return {}
 
-    def term(self, grid: Discretisation, fibres: Any = None) -> LocalTerm | None:
+    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm | None:
         """Potential of a load that follows the deformation, or None.
 
-        fibres : (m, q, 3) at the quadrature points, None in a scene without. They and the grid's
-        arrays are traced where the body is at rest on a shape that is sought.
+        fibres : of the tissue, None in a scene without. They and the grid's arrays are traced
+        where the body is at rest on a shape that is sought.
         """
         return None
 
@@ -97,12 +98,12 @@ class Load(ABC):
         """Stress (m, q, 3, 3) in kPa that it adds to the law's, where F (m, q, 3, 3); or None."""
         return None
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """Its force on the body whose *loaded* shape is the mesh, of w from there to rest.
 
         What is given per volume or area at rest depends on w; what follows the surface does not.
-        Its local displacements are those of w (:mod:`emulator.fem.inverse`). fibres : (m, q, 3) of
-        the loaded tissue at the quadrature points, None in a scene without.
+        Its local displacements are those of w (:mod:`emulator.fem.inverse`). fibres : of the
+        loaded tissue, None in a scene without.
 
         Raises
         ------

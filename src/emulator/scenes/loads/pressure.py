@@ -14,7 +14,7 @@ potential: see :mod:`emulator.scenes.loads.follower`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -23,6 +23,7 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.facets import cone_volume, rim
 from emulator.geometry.mesh import Mesh
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.dead_pressure import DeadPressure, at_rest
 from emulator.scenes.loads.follower import FollowerPressure
 from emulator.scenes.loads.surface_pressure import SurfacePressure
@@ -68,7 +69,7 @@ class CavityPressure(SurfacePressure):
 
         return LocalTerm(facets, grid.mesh.nodes[facets], energy)
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The force on the known wall, whatever the shape at rest."""
         del fibres
         return self.at_held_nodes.on_loaded(grid)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import nodal_areas
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.load import Load, nodal_sums
 from emulator.scenes.local_terms import LocalForce, Values
 
@@ -49,7 +50,7 @@ class Traction(Load):
         area = nodal_areas(mesh.nodes[facets], rule)
         return nodal_sums(mesh, facets, area)[:, None] * np.asarray(self.traction, dtype=float)
 
-    def on_loaded(self, grid: Discretisation, fibres: Any = None) -> LocalForce:
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The force by the surface at rest, ``x + w``."""
         del fibres
         mesh = grid.mesh
