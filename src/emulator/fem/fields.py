@@ -48,7 +48,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     P = _first_piola(scene, H, theta)
     if scene.fibres is not None:
         values, directions = scene.resolve(theta), scene.fibres_at(theta)
-        active = (load.first_piola(F, directions, values) for load in scene.loads)
+        active = (load.first_piola(F, scene.mesh, directions, values) for load in scene.loads)
         P = sum((stress for stress in active if stress is not None), P)
     # Round-off leaves sigma slightly asymmetric; eigenvalue routines need it symmetric.
     sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]

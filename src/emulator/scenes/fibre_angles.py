@@ -125,6 +125,14 @@ class Fibres:
     given: Any
     angles: tuple[FibreAngles, ...] = ()
 
+    def some(self, elements: np.ndarray) -> Fibres:
+        """Those of ``elements`` (k,)."""
+        chosen = [
+            FibreAngles(each.axis[elements], {n: s[elements] for n, s in each.shares.items()})
+            for each in self.angles
+        ]
+        return Fibres(self.given[elements], tuple(chosen))
+
     @property
     def rows(self) -> Any:
         """Arrays with the leading axis m, of which :meth:`of_element` takes a row."""

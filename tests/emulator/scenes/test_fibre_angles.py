@@ -12,6 +12,7 @@ from emulator.catalogue import find_scene
 from emulator.error.mesh_error import mesh_error
 from emulator.errors import InputError
 from emulator.fem.energy import potential_energy
+from emulator.fem.fields import element_fields
 from emulator.fem.inverse import InverseSystem
 from emulator.geometry.bodies.box import box
 from emulator.mechanics.laws import find_law
@@ -20,7 +21,7 @@ from emulator.scenes.effects import effects_of
 from emulator.scenes.fibre_angles import FibreAngles
 from emulator.scenes.fibre_rules import Helix, Uniform
 from emulator.scenes.finer import finer
-from emulator.scenes.loads import ActiveTension
+from emulator.scenes.loads import ActiveTension, CavityPressure
 from scene_file_support import HEART
 
 KNOWN = {"a": 0.3, "b": 2.0, "a_f": 5.0, "b_f": 2.0, "pressure": 0.9}
@@ -181,6 +182,38 @@ def test_muscle_pulls_along_fibres_that_turn(turning, fixed, transverse):
     found = by_rows.external_force(w, theta)
     right = loaded.external_force(w, numbers)
     np.testing.assert_allclose(found, right, atol=1e-12 * jnp.abs(right).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("angles", [("inner", "outer"), (63.0, -51.0)])
+def test_one_of_two_bodies_contracts(angles):
+    """The filling heart and the contracting one are where each is alone."""
+    alone = em.scenes.left_ventricle(3, 6, 1, order=1, angles=angles)
+    alone = replace(alone, loads=(*alone.loads, ActiveTension(10.0)), origin={})
+    at_rest = replace(alone, loads=alone.loads[:1])
+    bodies = em.side_by_side({"filling": alone.mesh, "systole": alone.mesh}, gap=20.0)
+    walls = [tuple(f"{n}.{wall}" for n in bodies.names) for wall in ("endocardium", "epicardium")]
+    rule = Helix(angles, endocardium=walls[0], epicardium=walls[1])
+    both = replace(
+        alone,
+        mesh=bodies.mesh,
+        fibres=rule.directions(bodies.mesh)[0],
+        angles=rule.angles_in(bodies.mesh),
+        loads=(
+            *(CavityPressure(cavity) for cavity in walls[0]),
+            ActiveTension(10.0, within="systole"),
+        ),
+        supports=tuple(Support(f"{name}.base") for name in bodies.names),
+        fibre_rule=rule,
+    )
+    values = {**KNOWN, **({"inner": 63.0, "outer": -51.0} if both.angles else {})}
+    u = em.Simulator(both)(both.theta(**values))
+    for name, scene in (("filling", at_rest), ("systole", alone)):
+        right = em.Simulator(scene)(scene.theta(**values))
+        np.testing.assert_allclose(u[bodies.nodes(name)], right, atol=1e-8)
+    stress = element_fields(both, u, both.theta(**values))["cauchy_stress"]
+    right = element_fields(alone, right, alone.theta(**values))["cauchy_stress"]
+    np.testing.assert_allclose(stress[bodies.elements("systole")], right, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ force on node a is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import jax
@@ -52,6 +52,8 @@ import numpy as np
 
 from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.tetrahedra import parts
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.fibre_angles import Fibres
@@ -70,6 +72,8 @@ class ActiveTension(Load):
     parameter : name of that parameter. It belongs to a load state, so that end-diastole and
         end-systole are two states of one body that share its passive material.
     transverse : share eta of the tension that acts in every direction across the fibre, 0 to 1.
+    within : facet set of the body that contracts, where a mesh has several
+        (:mod:`emulator.geometry.side_by_side`); by default all do.
     """
 
     kind: ClassVar[str] = "active_tension"
@@ -77,6 +81,7 @@ class ActiveTension(Load):
     tension: float | None = None
     parameter: str = "tension"
     transverse: float = 0.0
+    within: str | None = None
 
     def __post_init__(self) -> None:
         if self.tension is not None and not 0.0 <= self.tension < np.inf:
@@ -85,6 +90,11 @@ class ActiveTension(Load):
             raise InputError(
                 f"active_tension: transverse is {self.transverse}; it is a share between 0 and 1"
             )
+
+    @property
+    def facet_sets(self) -> tuple[str, ...]:
+        """What bounds the body that contracts."""
+        return () if self.within is None else (self.within,)
 
     @property
     def fibres(self) -> bool:
@@ -111,14 +121,15 @@ class ActiveTension(Load):
         """The tension in kPa, taken from the scene's resolved parameters if it is one."""
         return values[self.parameter] if self.tension is None else self.tension
 
-    def first_piola(self, F: jax.Array, fibres: jax.Array, values: Values) -> jax.Array:
+    def first_piola(self, F: jax.Array, mesh: Mesh, fibres: jax.Array, values: Values) -> jax.Array:
         """``F S`` (m, q, 3, 3) in kPa."""
         along = jnp.einsum("mqij,mqj,mqk->mqik", F, fibres, fibres)
-        return self.value(values) * (along + self.transverse * (F - along))
+        stress = self.value(values) * (along + self.transverse * (F - along))
+        return stress * self._contracts(mesh)[:, None, None, None]
 
     def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
         """The springs between nodes; where theta turns the fibres, the energy of each element."""
-        assert fibres is not None, "a scene with this load has fibres"
+        grid, fibres = self._muscle(grid, fibres)
         if fibres.angles:
             return self._of_elements(grid, fibres)
         pairs, stiffness = _springs(grid, fibres.given, self.transverse)
@@ -131,6 +142,24 @@ class ActiveTension(Load):
             return self.value(values) * stiffness * work
 
         return LocalTerm(pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), energy, convex=True)
+
+    def _contracts(self, mesh: Mesh) -> np.ndarray:
+        """Whether each element does, (m,)."""
+        if self.within is None:
+            return np.ones(len(mesh.elements), bool)
+        part = parts(mesh.elements, len(mesh.nodes))
+        return np.isin(part[mesh.elements[:, 0]], part[mesh.facet_set(self.within)])
+
+    def _muscle(self, grid: Discretisation, fibres: Fibres | None) -> tuple[Discretisation, Fibres]:
+        """Elements that contract, and their fibres."""
+        assert fibres is not None, "a scene with this load has fibres"
+        if self.within is None:
+            return grid, fibres
+        chosen = np.flatnonzero(self._contracts(grid.mesh))
+        muscle = {
+            name: getattr(grid, name)[chosen] for name in ("connectivity", "gradients", "weights")
+        }
+        return replace(grid, **muscle), fibres.some(chosen)
 
     def _of_elements(self, grid: Discretisation, fibres: Fibres) -> LocalTerm:
         def longer(h: jax.Array, weight: jax.Array, f: jax.Array) -> jax.Array:
@@ -151,7 +180,7 @@ class ActiveTension(Load):
 
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """The force of the stress on each element's nodes."""
-        assert fibres is not None, "a scene with this load has fibres"
+        grid, fibres = self._muscle(grid, fibres)
 
         def at_point(
             w: jax.Array, gradients: jax.Array, weight: jax.Array, m: jax.Array

@@ -94,7 +94,9 @@ class Load(ABC):
         """Force of a load that follows the deformation and has no potential, or None."""
         return None
 
-    def first_piola(self, F: jax.Array, fibres: jax.Array, values: Values) -> jax.Array | None:
+    def first_piola(
+        self, F: jax.Array, mesh: Mesh, fibres: jax.Array, values: Values
+    ) -> jax.Array | None:
         """Stress (m, q, 3, 3) in kPa that it adds to the law's, where F (m, q, 3, 3); or None."""
         return None
 
