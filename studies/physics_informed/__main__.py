@@ -45,9 +45,9 @@ TEST_SEED, SEED = 90_210, 0
 
 
 def with_published_pressure() -> Scene:
-    """The ventricle under the load that the paper's networks were trained with."""
+    """The linear ventricle under the load that the paper's networks were trained with."""
     load = PublishedPressure("endocardium")
-    return replace(em.scenes.left_ventricle(), loads=(load,), origin={})
+    return replace(em.scenes.left_ventricle(order=1), loads=(load,), origin={})
 
 
 BODIES: dict[str, Callable[[], Scene]] = {

@@ -46,15 +46,15 @@ class Helix:
     ----------
     angles : degrees at endocardium and epicardium, or names of parameters.
     axis : from apex to base.
-    endocardium, epicardium : facet sets; several where a mesh has several walls.
+    endocardium, epicardium : facet sets.
     """
 
     rule: ClassVar[str] = "helix"
 
     angles: Angles
     axis: Axis = (0.0, 0.0, 1.0)
-    endocardium: str | tuple[str, ...] = "endocardium"
-    epicardium: str | tuple[str, ...] = "epicardium"
+    endocardium: str = "endocardium"
+    epicardium: str = "epicardium"
 
     def directions(self, mesh: Mesh) -> Directions:
         """Fibres, and the transmural direction as sheets."""
@@ -65,11 +65,7 @@ class Helix:
         return across_wall(*self._wall(mesh), self.angles)
 
     def _wall(self, mesh: Mesh) -> Depth:
-        inner, outer = (
-            (name,) if isinstance(name, str) else tuple(name)
-            for name in (self.endocardium, self.epicardium)
-        )
-        return depth(mesh, inner, outer)
+        return depth(mesh, (self.endocardium,), (self.epicardium,))
 
 
 @dataclass(frozen=True)

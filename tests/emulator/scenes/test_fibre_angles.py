@@ -192,17 +192,17 @@ def test_one_of_two_bodies_contracts(angles):
     alone = replace(alone, loads=(*alone.loads, ActiveTension(10.0)), origin={})
     at_rest = replace(alone, loads=alone.loads[:1])
     bodies = em.side_by_side({"filling": alone.mesh, "systole": alone.mesh}, gap=20.0)
-    walls = [tuple(f"{n}.{wall}" for n in bodies.names) for wall in ("endocardium", "epicardium")]
-    rule = Helix(angles, endocardium=walls[0], epicardium=walls[1])
+    sets = dict(bodies.mesh.facet_sets)
+    for wall in ("endocardium", "epicardium"):
+        sets[wall] = np.concatenate([sets[f"{name}.{wall}"] for name in bodies.names])
+    mesh, rule = replace(bodies.mesh, facet_sets=sets), Helix(angles)
+    cavities = (CavityPressure(f"{name}.endocardium") for name in bodies.names)
     both = replace(
         alone,
-        mesh=bodies.mesh,
-        fibres=rule.directions(bodies.mesh)[0],
-        angles=rule.angles_in(bodies.mesh),
-        loads=(
-            *(CavityPressure(cavity) for cavity in walls[0]),
-            ActiveTension(10.0, within="systole"),
-        ),
+        mesh=mesh,
+        fibres=rule.directions(mesh)[0],
+        angles=rule.angles_in(mesh),
+        loads=(*cavities, ActiveTension(10.0, within="systole")),
         supports=tuple(Support(f"{name}.base") for name in bodies.names),
         fibre_rule=rule,
     )

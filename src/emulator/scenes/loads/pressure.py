@@ -59,7 +59,7 @@ class CavityPressure(SurfacePressure):
                 "so -p V is not the potential of its pressure; hold the rim or use FollowerPressure"
             )
 
-    def term(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalTerm:
+    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
         """The potential ``-p [V(u) - V(0)]``."""
         del fibres
         facets = grid.mesh.facet_set(self.facet_set)

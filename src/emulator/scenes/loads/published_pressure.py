@@ -19,6 +19,7 @@ from emulator.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.kinematics import cofactor
+from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.surface_pressure import SurfacePressure
 from emulator.scenes.local_terms import LocalTerm, Values
 
@@ -38,7 +39,7 @@ class PublishedPressure(SurfacePressure):
                 "tetrahedra; use CavityPressure on quadratic ones"
             )
 
-    def term(self, grid: Discretisation, fibres: np.ndarray | None = None) -> LocalTerm:
+    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
         """The released work, facet by facet."""
         del fibres
         mesh = grid.mesh
