@@ -112,6 +112,10 @@ def test_a_campaign_and_emulators(simulator, imaged, tmp_path):
     plan = replace(em.recipe("mechanics"), simulations=10, order=1)
     forward = em.train(imaged, plan, tmp_path).cache()
     np.testing.assert_allclose(forward(runs.theta[3]), runs.displacement[3], atol=0.1)
+    errors = em.evaluate(forward, runs.theta, runs.displacement)
+    off = np.linalg.norm(jax.vmap(forward)(runs.theta) - runs.displacement, axis=-1)
+    assert errors["err_u"]["mean"] == pytest.approx(off.mean())
+    assert "err_V" in errors and "err_Pi" not in errors
 
 
 @pytest.mark.slow

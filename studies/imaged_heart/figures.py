@@ -1,0 +1,49 @@
+"""What each way infers of each heart, beside the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from studies.common.output import Case, save
+
+from calibrate.figures.drawing import pyplot
+from calibrate.figures.palette import BLUE, ORANGE, VERMILION
+
+COLOURS = {"unloaded": BLUE, "fibres known": ORANGE, "image at rest": VERMILION}
+LABELS = {
+    "stiffness": "fibre stress at 10 % stretch, kPa",
+    "tension": "tension of systole, kPa",
+    "pressure in the image": "pressure in the image, mmHg",
+    "unloaded volume": "unloaded volume, mL",
+    "endo": "endocardial angle, degrees",
+    "epi": "epicardial angle, degrees",
+}
+
+
+def draw(cases: list[Case], told: Case, truth: dict[str, list[float]], path: Path) -> None:
+    """A panel a quantity: 90 % intervals against the truth, a colour a way.
+
+    told : of the study's summary. truth : (hearts,) by quantity.
+    """
+    figure, panels = pyplot().subplots(2, 3, figsize=(11.5, 7.2), layout="constrained")
+    for axes, (name, label) in zip(panels.flat, LABELS.items(), strict=True):
+        order = np.argsort(np.argsort(truth[name]))
+        for k, (way, colour) in enumerate(COLOURS.items()):
+            rows = [case["ways"][way]["intervals"].get(name) for case in cases]
+            if None in rows:
+                continue
+            place = order + 0.24 * (k - 1)
+            low, high = np.array([row["90"] for row in rows]).T
+            inside = told[way][name]["inside"]
+            text = f"{way}: {inside} of {len(cases)}"
+            axes.vlines(place, low, high, color=colour, lw=2.2, label=text)
+            axes.plot(place, [row["mean"] for row in rows], "o", color=colour, ms=3)
+        low, high = order - 0.45, order + 0.45
+        axes.hlines(truth[name], low, high, color="black", lw=1.0)
+        axes.set(title=label, xticks=[], xlabel="hearts, by what is true (black)")
+        axes.title.set_size(10)
+        axes.legend(frameon=False, fontsize=8, loc="best")
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.suptitle("From an image to a posterior: 90 % intervals")
+    save(figure, path)
