@@ -30,13 +30,14 @@ def draw(cases: list[Case], told: Case, truth: dict[str, list[float]], path: Pat
     for axes, (name, label) in zip(panels.flat, LABELS.items(), strict=True):
         order = np.argsort(np.argsort(truth[name]))
         for k, (way, colour) in enumerate(COLOURS.items()):
-            rows = [case["ways"][way]["intervals"].get(name) for case in cases]
-            if None in rows:
+            tried = [n for n, case in enumerate(cases) if way in case["ways"]]
+            rows = [cases[n]["ways"][way]["intervals"].get(name) for n in tried]
+            if not rows or None in rows or rows[0]["sd"] == 0.0:  # not asked, or known
                 continue
-            place = order + 0.24 * (k - 1)
+            place = order[tried] + 0.24 * (k - 1)
             low, high = np.array([row["90"] for row in rows]).T
             inside = told[way][name]["inside"]
-            text = f"{way}: {inside} of {len(cases)}"
+            text = f"{way}: {inside} of {len(rows)}"
             axes.vlines(place, low, high, color=colour, lw=2.2, label=text)
             axes.plot(place, [row["mean"] for row in rows], "o", color=colour, ms=3)
         low, high = order - 0.45, order + 0.45

@@ -49,7 +49,11 @@ def at_rest() -> Scene:
     return replace(
         scene,
         loads=(cavity, ActiveTension(transverse=TRANSVERSE)),
-        parameters=(*MUSCLE, replace(SYSTOLIC, name="pressure"), TENSION),
+        parameters=(
+            *MUSCLE,
+            replace(SYSTOLIC, name="pressure", low=0.0),
+            replace(TENSION, low=0.0),
+        ),
         dilatation="mean",
         origin={},
     )
