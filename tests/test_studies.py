@@ -31,6 +31,7 @@ QUICK = {
     "fem_posterior": "--quick",
     "fem_speed": "--quick",
     "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
+    "imaged_heart": "--quick",
     "inverse_benchmark": "--quick",
     "large_meshes": "--quick",
     "many_solves": "--solves 3",
