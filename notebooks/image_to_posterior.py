@@ -245,7 +245,7 @@ for axes, (name, true) in zip(panels, truth.items(), strict=True):
     axes.set(xlabel=name, yticks=[])
     axes.set_ylim(0.0, 1.3 * np.histogram(ours[name], bins, density=True)[0].max())
     axes.spines[["top", "right", "left"]].set_visible(False)
-panels[0].legend(frameon=False)
+_ = panels[0].legend(frameon=False)
 
 # %%
 for name, true in truth.items():
@@ -260,6 +260,6 @@ print(f"With the image at rest the half-filled volume is missed by {off:.0f} sd.
 assert off > 5.0
 
 # %% [markdown]
-# The unloaded shape is the right one, within its interval, though nobody measured it. Without unloading the muscle seems as stiff as its range allows,
-# and the misfit says that the model is wrong. `studies/imaged_heart` repeats this over twenty hearts, with noise in the image, fibre angles that are not
-# known, Klotz's relation and certificates.
+# The unloaded volume is right, within its interval, though nobody measured it. Without unloading every interval is narrow and beside the truth: the
+# cavity at rest is almost twice as large as it was, the tension at the end of its range, and the misfit says that the model is wrong. `studies/imaged_heart`
+# repeats this over several hearts, with noise in the image, fibre angles that are not known, Klotz's relation and certificates.
