@@ -36,7 +36,7 @@ HERE = Path(__file__).parent
 SEED, HEARTS, CERTIFIED = 61, 20, 2
 AT_REST, KNOWN = 2, 8  # hearts that are also inferred by the other ways, which add their time
 _DRAWS, _QUICK_DRAWS = 300, 25
-_FEM = 40  # solves of a certificate; none on a finer mesh, on which each takes a minute
+_FEM = 120  # solves of a certificate; none on a finer mesh, on which each takes a minute
 WAYS = {"unloaded": (True, True), "fibres known": (True, False), "image at rest": (False, True)}
 """Way -> whether the image is unloaded, and whether fibre angles are unknown."""
 
