@@ -171,7 +171,7 @@ PARTS = {
     },
     "active_tension": (
         ActiveTension(),
-        {"tension": 3.0, "parameter": "contractility", "transverse": 0.2},
+        {"tension": 3.0, "parameter": "contractility", "transverse": 0.2, "within": "left"},
     ),
     "held": (
         Support("bottom", np.array([0.1, 0.0, 0.0]), amount="shear"),
