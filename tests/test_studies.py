@@ -3,6 +3,7 @@
 A new study is its folder and a line in ``QUICK``; ``CHECKS`` may say more of its results.
 """
 
+import importlib
 import importlib.util
 import json
 import subprocess
@@ -211,3 +212,17 @@ def test_beam_coverage_in_full(tmp_path, published):
     results = run("beam_coverage", published, "--out", tmp_path)
     assert results["summary"]["accepted"] >= 48
     assert all(40 <= hits <= 50 for hits in results["summary"]["covered"].values())
+
+
+def test_the_stress_of_a_strip_of_muscle_is_the_slope_of_its_energy():
+    measured = importlib.import_module("studies.imaged_heart.measured")
+    a, b, a_f, b_f = 0.35, 2.2, 4.5, 2.5
+
+    def energy(stretch):
+        """Of a strip that keeps its volume."""
+        F = jnp.diag(jnp.array([stretch, stretch**-0.5, stretch**-0.5]))
+        C = F.T @ F
+        matrix = 0.5 * a / b * jnp.expm1(b * (jnp.trace(C) - 3.0))
+        return matrix + 0.5 * a_f / b_f * jnp.expm1(b_f * (C[0, 0] - 1.0) ** 2)
+
+    assert measured.fibre_stress(a, b, a_f, b_f) == pytest.approx(float(jax.grad(energy)(1.1)))

@@ -15,6 +15,7 @@ import emulator as em
 from emulator.geometry.mesh import Mesh
 from emulator.scenes import Scene
 from emulator.scenes.fibre_rules import Helix
+from emulator.scenes.left_ventricle import MYOCARDIUM
 from emulator.scenes.loads import KPA_PER_MMHG, ActiveTension, CavityPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.supports import Support
@@ -27,14 +28,8 @@ _STATES = ("filling", "systole")
 _IMAGED_UNDER = {"pressure": "imaged", "systolic": "imaged", "tension": "slack"}
 _MMHG = KPA_PER_MMHG
 
-
-def _muscle() -> tuple[Parameter, ...]:
-    """Stiffness and angles, as the built-in ventricle has them."""
-    scene = em.scenes.left_ventricle(*COARSE, angles=ANGLES)
-    return tuple(p for p in scene.parameters if p.name != "pressure")
-
-
-MUSCLE = _muscle()
+MUSCLE = (*MYOCARDIUM, Parameter("endo", "deg", 40.0, 80.0), Parameter("epi", "deg", -80.0, -40.0))
+"""Stiffness, and angles as the built-in ventricle has them."""
 PRESSURE = Parameter("pressure", "kPa", 0.0, FILLED * _MMHG)
 SYSTOLIC = Parameter("systolic", "kPa", 85.0 * _MMHG, 115.0 * _MMHG)
 TENSION = Parameter("tension", "kPa", 60.0, 110.0)
@@ -95,7 +90,5 @@ def imaged(mesh: Mesh, *, loaded: bool = True) -> Scene:
         fibre_rule=rule,
         angles=rule.angles_in(both),
         dilatation="mean",
-        loaded_by={"pressure": "imaged", "systolic": "imaged", "tension": "slack"}
-        if loaded
-        else {},
+        loaded_by=_IMAGED_UNDER if loaded else {},
     )

@@ -20,7 +20,6 @@ from studies.imaged_heart.heart import (
     SYSTOLIC,
     TENSION,
     at_rest,
-    imaged,
     template,
 )
 from studies.imaged_heart.image import fitted
@@ -29,6 +28,7 @@ import calibrate as cal
 import emulator as em
 from emulator.errors import InputError, SolverError
 from emulator.fem.energy import displacement_gradient
+from emulator.geometry.cavity import Cavity
 from emulator.geometry.mesh import Mesh
 from emulator.scenes import Scene
 from emulator.scenes.fibre_rules import Helix
@@ -198,13 +198,11 @@ def _measured(truth: dict[str, float], found: _Followed, rng: np.random.Generato
     }
     read = float(np.clip(data["parameter:imaged"], IMAGED.low, IMAGED.high))
     at = float(np.clip(data["parameter:pressure"], 0.25 * read, read))
-    filling = cal.CavityVolume(imaged(mesh), "filling.endocardium")
-    name, ed = f"klotz:{read:.6g}", float(filling(np.zeros((len(filling.nodes), 3)), None))
+    name, ed = f"klotz:{read:.6g}", Cavity(mesh, "endocardium").rest
     data[name], sd[name] = ed, float(cal.Klotz(ed, read).sd(at))
-    volume = cal.CavityVolume(scene)
     truth = truth | {
         "stiffness": float(fibre_stress(*(truth[n] for n in ("a", "b", "a_f", "b_f")))),
-        "unloaded": float(volume(np.zeros((len(volume.nodes), 3)), None)),
+        "unloaded": Cavity(scene.mesh, "endocardium").rest,
     }
     return Case(truth, mesh, data, sd, chords, read)
 
