@@ -6,7 +6,8 @@ with :math:`P` the prolongation (:mod:`emulator.geometry.refinement`), so that t
 function of place on both meshes, and of theta. What the coarse mesh gets wrong varies little with
 theta, compared with the displacement: a discrepancy model of a few runs on the finer mesh, with
 their sensitivities, adds it (recipe ``two_meshes``; two levels of the model of Kennedy and O'Hagan
-2000, of fields and their slopes).
+2000, of fields and their slopes), and so does a polynomial of a few sweeps over the box (recipe
+``sweeps``, without any FEM run).
 """
 
 from __future__ import annotations
@@ -26,9 +27,14 @@ from emulator.scenes.scene import Scene
 from emulator.store import inside
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.part import CachedPart, Part, widened
+from emulator.surrogates.polynomial import Polynomial
 from emulator.surrogates.taylor import Expansion
 
-_PARTS: dict[str, type[Part]] = {"taylor": Expansion, "discrepancy": Discrepancy}
+_PARTS: dict[str, type[Part]] = {
+    "taylor": Expansion,
+    "polynomial": Polynomial,
+    "discrepancy": Discrepancy,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +101,12 @@ def carried(parts: Mapping[str, Part], body: Finer) -> Coarse:
     Raises
     ------
     InputError
-        No parts, or one that is not a sum of a series and discrepancies.
+        No parts, or one that is not a series, a polynomial or a discrepancy.
     """
     if not parts or not set(parts) <= set(_PARTS):
         raise InputError(
-            f"two_meshes: the emulator on the coarser mesh is {' + '.join(parts) or 'empty'}; give "
-            "one of a series and a discrepancy, as recipe mechanics makes"
+            f"two meshes: the emulator on the coarser mesh is {' + '.join(parts) or 'empty'}; give "
+            "one of a series and a discrepancy, or a polynomial, as recipes mechanics and sweeps "
+            "make"
         )
     return Coarse(dict(parts), csr_matrix(body.refinement.prolongation))

@@ -51,6 +51,7 @@ from emulator.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network.part import Network
 from emulator.surrogates.network.pignn import Architecture
+from emulator.training.blocked import Blocked
 from emulator.training.objectives import Scales
 from emulator.training.step import in_branch
 
@@ -104,31 +105,18 @@ class Modal:
 
     def __post_init__(self) -> None:
         # Now, because what is first wanted inside jit would be traced there.
-        self._product, self._groups, self.targets  # noqa: B018
+        self._product, self._groups, self._pulled  # noqa: B018
 
     @cached_property
-    def _product(self) -> tuple[jax.Array, jax.Array]:
-        """K by rows, its largest number of entries for each: columns (n, e) and values (n, e)."""
+    def _product(self) -> Blocked:
+        """K (n, n)."""
         n, rule = len(self.scene.mesh.nodes), self.scene.discretisation
         weight = (self.scales.displacement / self.scales.gradient) ** 2 / rule.weights.sum()
-        matrix = sp.csr_matrix(weight * rule.laplacian() + sp.identity(n) / n)
-        entries = np.diff(matrix.indptr)
-        place = np.arange(entries.max())[None] < entries[:, None]
-        columns, values = np.zeros(place.shape, dtype=np.int32), np.zeros(place.shape)
-        columns[place], values[place] = matrix.indices, matrix.data
-        return jnp.asarray(columns), jnp.asarray(values)
+        return Blocked.of(sp.csr_matrix(weight * rule.laplacian() + sp.identity(n) / n))
 
     def weighted(self, fields: jax.Array) -> jax.Array:
         """K times ``fields`` (n, ...), in units of the scale."""
-        columns, values = self._product
-        flat = fields.reshape(len(fields), -1)
-
-        def add(total: jax.Array, entry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-            column, value = entry
-            return total + value[:, None] * flat[column], None
-
-        total, _ = jax.lax.scan(add, jnp.zeros_like(flat), (columns.T, values.T))
-        return total.reshape(fields.shape)
+        return (self._product @ fields.reshape(len(fields), -1)).reshape(fields.shape)
 
     @cached_property
     def _snapshots(self) -> tuple[np.ndarray, np.ndarray]:
@@ -157,6 +145,11 @@ class Modal:
         return jnp.asarray(np.pad(found, ((0, 0), (0, 0), (0, most - len(order)))))
 
     @cached_property
+    def _pulled(self) -> jax.Array:
+        """K times the targets, (n, 3, r)."""
+        return jax.jit(self.weighted)(self.targets)
+
+    @cached_property
     def _groups(self) -> list[tuple[list[int], jax.Array]]:
         """Components held at the same nodes, with 1 at their free ones (n, 1)."""
         free = (~self.scene.held).astype(float)
@@ -175,18 +168,17 @@ class Modal:
         W = jnp.zeros((H.shape[1], 3, self.targets.shape[-1]))
         misfit, pull, size = jnp.zeros(()), jnp.zeros_like(H), jnp.zeros(())
         for components, free in self._groups:
-            mine, wanted = free * H, self.targets[:, components]
+            mine, wanted = free * H, self.targets[:, components].reshape(len(H), -1)
             weighted = free * self.weighted(mine)
+            pulled = free * self._pulled[:, components].reshape(len(H), -1)
             gram = mine.T @ weighted
             gram += _RIDGE * jnp.trace(gram) / len(gram) * jnp.eye(len(gram))
             factor = jax.scipy.linalg.cho_factor(gram)
-            flat = wanted.reshape(len(H), -1)
-            w = jax.scipy.linalg.cho_solve(factor, weighted.T @ flat)
-            left = flat - mine @ w
-            force = self.weighted(left)
-            misfit += jnp.vdot(left, force)
-            size += jnp.vdot(flat, self.weighted(flat))
-            pull -= 2.0 * free * (force @ w.T)
+            w = jax.scipy.linalg.cho_solve(factor, weighted.T @ wanted)
+            force = pulled - weighted @ w  # of what is left
+            misfit += jnp.vdot(wanted - mine @ w, force)
+            size += jnp.vdot(wanted, pulled)
+            pull -= 2.0 * (force @ w.T)
             W = W.at[:, jnp.array(components)].set(w.reshape(len(gram), len(components), -1))
         return W, misfit / size, pull / size
 

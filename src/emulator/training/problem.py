@@ -73,7 +73,7 @@ def prepare(
     Parameters
     ----------
     start : the emulator whose network to begin from, on any mesh; its architecture then is the
-        default. Of a plan on a coarser mesh, the emulator there.
+        default. Of a plan on a coarser mesh, and of sweeps, the emulator there.
     campaign : FEM runs that are there already; the centre's alone is then solved.
     folder : where sweeps are kept, and taken up again.
     budget : ends FEM runs in time, except the fewest that a discrepancy model can be judged by.
@@ -85,16 +85,17 @@ def prepare(
     """
     deadline = np.inf if budget is None else budget.fem_deadline(plan)
     if plan.on_coarse:
-        carried = on_finer(start, scene)
+        carried = on_finer(start, scene, plan)
         assert start is not None, "checked by on_finer"
-        cached = carried.cache()
-        before = lambda position: cached(scene.from_unit(position))  # noqa: E731
+        before = _by_position(carried)
         runs = _runs(Simulator(scene), plan, before, campaign, deadline, progress)
         plan = replace(plan, simulations=len(runs.theta) - 1)
         return Problem(plan, carried, runs, series=start.taylor)
-    family = None
+    family = below = None
     if start is not None and start.family is not None:
         family = family_on(start, scene, plan)
+    elif start is not None and plan.sweeps and not plan.steps:
+        below = on_finer(start, scene, plan)
     elif start is not None:
         architecture = architecture_from(start, scene, plan, architecture)
     simulator, record = Simulator(scene), dict[str, Any]()
@@ -104,6 +105,7 @@ def prepare(
             plan.sweeps,
             plan.seed,
             start=_beginning(simulator, plan, family),
+            beneath=None if below is None else _by_position(below),
             folder=folder,
             deadline=deadline,
             progress=progress,
@@ -111,8 +113,9 @@ def prepare(
         plan, series = replace(plan, sweeps=swept.number), None
         record["sweeps"] = swept.record
         if not plan.steps:
-            alone = Emulator(scene, polynomial=part_of(simulator, swept))
-            return Problem(plan, alone, None, record=record)
+            found = below or Emulator(scene)
+            found = replace(found, polynomial=part_of(simulator, swept))
+            return Problem(plan, found, None, record=record)
         taught = design(scene, plan.simulations, plan.seed)
         runs = runs_of(simulator, swept, jnp.concatenate([scene.centre[None], taught]))
     else:
@@ -149,11 +152,15 @@ def _beginning(
     simulator: Simulator, plan: Plan, family: FamilyNetwork | None
 ) -> Callable[[jax.Array], jax.Array] | None:
     """Where sweeps begin under the whole load, by position in the box; None at rest."""
-    scene = simulator.scene
     if family is not None:
-        cached = Emulator(scene, family=family).cache()
-        return lambda position: cached(scene.from_unit(position))
+        return _by_position(Emulator(simulator.scene, family=family))
     return expand(simulator, order=plan.order) if plan.order else None
+
+
+def _by_position(emulator: Emulator) -> Callable[[jax.Array], jax.Array]:
+    """``emulator`` of the position in the unit box."""
+    cached = emulator.cache()
+    return lambda position: cached(emulator.scene.from_unit(position))
 
 
 def _runs(

@@ -56,18 +56,25 @@ def family_on(start: Emulator, scene: Scene, plan: Plan) -> FamilyNetwork:
     return on_body(start.family.learned, scene)
 
 
-def on_finer(start: Emulator | None, scene: Scene) -> Emulator:
+def on_finer(start: Emulator | None, scene: Scene, plan: Plan) -> Emulator:
     """``start``, an emulator on the mesh that the scene's is finer than, on ``scene``.
 
     Raises
     ------
     InputError
-        No such emulator, a scene that is not on a finer mesh, or one of another body.
+        No such emulator, a scene that is not on a finer mesh, one of another body, or a plan that
+        begins at a series as well.
     """
     body = finer_of(scene)
     if start is None:
         raise InputError(
-            "recipe 'two_meshes' stands on an emulator on the coarser mesh; give it as the start"
+            f"recipe '{plan.recipe}' stands on an emulator on the coarser mesh; give it as the "
+            "start"
+        )
+    if plan.order:
+        raise InputError(
+            f"recipe '{plan.recipe}': an emulator on the coarser mesh to stand on, and a series of "
+            f"order {plan.order} to begin at; give one of them"
         )
     if start.scene.fingerprint != body.coarse.fingerprint:
         raise InputError(

@@ -13,6 +13,9 @@ the degree of the polynomial grow, as long as the newest targets, which no fit h
 it should. At a theta not seen before the step is the polynomial's own error to first order, so
 that every sweep tells an honest error bar, and the sweeps end where that is round-off.
 
+On a finer mesh the sweeps can stand on a map of the coarser one, carried over: the polynomial is
+then what that leaves, which is small and smooth, so that a low degree and a few sweeps do.
+
 A sweep of c theta costs c/8 factorisations and, for each theta, some six substitutions and
 products. Smooth equilibria are followed to round-off in a few parameters; in five, terms run out.
 """
@@ -116,6 +119,7 @@ def sweep_box(
     seed: int,
     *,
     start: Map | None = None,
+    beneath: Map | None = None,
     folder: Path | None = None,
     deadline: float = np.inf,
     progress: bool = False,
@@ -128,6 +132,8 @@ def sweep_box(
     start : position (p,) to displacement (n, 3) mm under the whole load, as another map has it; by
         default they begin at the body at rest, and they do, too, where no step can be taken from
         there: where no tangent is positive definite.
+    beneath : position (p,) to displacement (n, 3) mm under the whole load, to which the polynomial
+        is added, at first zero.
     folder : where the state is kept, and taken up again.
     deadline : value of ``time.perf_counter`` after which none begins, once the loads are there.
 
@@ -138,14 +144,14 @@ def sweep_box(
     SolverError
         Equilibria were not followed up to the loads, or not over the whole box.
     """
-    check_sweeps(simulator.scene, sweeps, at_rest=start is None)
-    state = _restored(folder) or (_at_rest(simulator) if start is None else _at(simulator, start))
+    check_sweeps(simulator.scene, sweeps, at_rest=start is None and beneath is None)
+    state = _restored(folder) or _first(simulator, start, beneath)
     written = time.perf_counter()
     with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
         while state.number < sweeps and not state.done:
             if time.perf_counter() > deadline and state.level == 1.0:
                 break
-            state, told = _sweep(simulator, state, seed)
+            state, told = _sweep(simulator, state, seed, beneath)
             if start is not None and state.level == 1.0 and not np.isfinite(state.left):
                 state = replace(_at_rest(simulator), number=state.number, lost=True)
             bar.set_postfix(told)
@@ -180,6 +186,13 @@ def check_sweeps(scene: Scene, sweeps: int, *, at_rest: bool) -> None:
         )
 
 
+def _first(simulator: Simulator, start: Map | None, beneath: Map | None) -> Swept:
+    """The state before the first sweep."""
+    if beneath is not None:
+        return replace(_at_rest(simulator), level=1.0)
+    return _at_rest(simulator) if start is None else _at(simulator, start)
+
+
 def _at_rest(simulator: Simulator) -> Swept:
     parameters, free = len(simulator.scene.parameters), len(simulator.system.free)
     degrees = degrees_up_to(parameters, _first_degree(parameters))
@@ -195,18 +208,26 @@ def _at(simulator: Simulator, start: Map) -> Swept:
     if terms(parameters, degree + 1) <= MOST_TERMS:
         degree += 1
     position = np.random.default_rng(0).random((2 * terms(parameters, degree), parameters))
-    there = jax.lax.map(lambda x: simulator.system.restrict(start(x)), jnp.asarray(position))
+    there = _fields(simulator, start, position)
     if not np.isfinite(there).all():
         return replace(rest, lost=True)
-    fitted = fit(Values(position, np.asarray(there), np.zeros(len(position))), degree, 1.0)
+    fitted = fit(Values(position, there, np.zeros(len(position))), degree, 1.0)
     return replace(rest, polynomial=fitted, before=0.0 * fitted.coefficients, level=1.0)
+
+
+def _fields(simulator: Simulator, of: Map, position: np.ndarray) -> np.ndarray:
+    """What a map says at ``position`` (c, p), where free: (c, f) mm."""
+    free = lambda x: simulator.system.restrict(of(x))  # noqa: E731
+    return np.asarray(jax.lax.map(free, jnp.asarray(position)))
 
 
 def _first_degree(parameters: int) -> int:
     return _FIRST_DEGREE if terms(parameters, _FIRST_DEGREE) <= MOST_TERMS else 1
 
 
-def _sweep(simulator: Simulator, state: Swept, seed: int) -> tuple[Swept, dict[str, Any]]:
+def _sweep(
+    simulator: Simulator, state: Swept, seed: int, beneath: Map | None
+) -> tuple[Swept, dict[str, Any]]:
     """The state after one sweep, and what is told of it."""
     from scipy.stats import qmc  # half a second, which only this needs
 
@@ -216,11 +237,12 @@ def _sweep(simulator: Simulator, state: Swept, seed: int) -> tuple[Swept, dict[s
     rng = np.random.default_rng([seed, state.number])
     position = qmc.Sobol(parameters, rng=rng).random(count)
     level, ahead = _next_level(state) if state.rises else (state.level, state.polynomial)
-    found = targets(simulator, ahead.at(position), position, level)
+    below = 0.0 if beneath is None else _fields(simulator, beneath, position)
+    found = targets(simulator, below + ahead.at(position), position, level)
     usable = np.isfinite(found.error)
     taken = float(np.mean(usable & (found.fraction >= _TAKEN)))
     told = {"load": f"{level:.2f}", "taken": f"{taken:.2f}"}
-    new = Values(position, found.fields, found.error).take(usable)
+    new = Values(position, found.fields - below, found.error).take(usable)
     steps = found.step[usable]
     if not usable.any() or (state.rises and taken < _ENOUGH):
         after = _closer(state)

@@ -10,6 +10,7 @@ import pytest
 import emulator as em
 from emulator.catalogue import find_scene, finer_of
 from emulator.errors import InputError
+from emulator.fem import simulator as fem_simulator
 from emulator.fem import sobol
 from emulator.scenes.finer import finer
 from emulator.surrogates import load, save_emulator
@@ -76,10 +77,15 @@ def test_a_finer_scene_has_a_name():
 def test_what_it_cannot_stand_on_is_refused(body, coarse, tmp_path):
     with pytest.raises(InputError, match="not on a mesh made finer; name it finer:"):
         train(body.coarse, PLAN, tmp_path, start=coarse)
+    sweeps = replace(recipe("sweeps"), sweeps=5)
+    with pytest.raises(InputError, match="not on a mesh made finer; name it finer:"):
+        train(body.coarse, sweeps, tmp_path, start=coarse)
+    with pytest.raises(InputError, match="and a series of order 3 to begin at; give one"):
+        train(body.scene, replace(sweeps, order=3), tmp_path, start=coarse)
     other = finer(em.scenes.once_clamped_beam(cells=(3, 1, 1), order=1)).scene
     with pytest.raises(InputError, match="expected one of the mesh that finer:"):
         train(other, PLAN, tmp_path, start=coarse)
-    with pytest.raises(InputError, match="as recipe mechanics makes"):
+    with pytest.raises(InputError, match="as recipes mechanics and sweeps make"):
         train(body.scene, PLAN, tmp_path, start=replace(coarse, taylor=None, discrepancy=None))
 
 
@@ -91,3 +97,31 @@ def test_it_resumes_on_the_emulator_it_stands_on(body, coarse, fine, tmp_path):
     other = replace(coarse, discrepancy=None)
     with pytest.raises(InputError, match="stands on another emulator than is given"):
         train(body.scene, Plan(), tmp_path, resume=True, start=other)
+
+
+@pytest.mark.slow
+def test_sweeps_take_it_to_the_finer_mesh_without_a_run(tmp_path, monkeypatch):
+    """Both meshes by the energy alone, kept and found again; what is left is told."""
+    body = finer(em.scenes.twisting_cube(cells=2))
+    tests, simulator = sobol(body.scene, 4, seed=7), em.Simulator(body.scene)
+    exact = [simulator(theta) for theta in tests]
+
+    def refuse(*_):
+        raise AssertionError("a FEM solution was asked for")
+
+    monkeypatch.setattr(fem_simulator, "differentiable", lambda *_: refuse)
+    below = train(body.coarse, replace(recipe("sweeps"), sweeps=30), tmp_path / "coarse")
+    plan = replace(recipe("sweeps"), sweeps=5)
+    save_emulator(train(body.scene, plan, tmp_path / "fine", start=below), tmp_path / "kept")
+    found = load(tmp_path / "kept")
+    assert list(found.parts) == ["coarse", "polynomial"]
+    carried = replace(found, polynomial=None)
+    off = [[rms(one.cache()(t) - u) for t, u in zip(tests, exact, strict=True)]
+           for one in (carried, found)]  # fmt: skip
+    assert np.median(off[1]) < 0.02 * np.median(off[0])
+    assert np.median(off[1]) < 5.0 * found.record["sweeps"]["error_mm"]
+
+
+def rms(field):
+    """Root mean square over the nodes, mm."""
+    return float(jnp.sqrt(jnp.mean(jnp.sum(field**2, axis=-1))))
