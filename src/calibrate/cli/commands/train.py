@@ -36,9 +36,9 @@ def register(commands: Any) -> None:
         "--start",
         metavar="EMULATOR",
         help="begin from the network of this emulator (folder or ventricle_family), whatever its "
-        "mesh; the recipe then is network, or family, unless another is given; for finer:SCENE with "
-        "recipe two_meshes or sweeps, stand on this emulator of SCENE; give it again with --resume "
-        "where no network is trained",
+        "mesh; the recipe then is network, or family, unless another is given; for finer:SCENE by "
+        "two_meshes or sweeps: stand on this emulator of SCENE; give it again with --resume where "
+        "no network is trained",
     )
     parser.add_argument(
         "--objective",

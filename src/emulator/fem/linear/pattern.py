@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import csr_matrix
 
 # Relative increase of the diagonal, four units of round-off: an exactly zero pivot becomes tiny.
 _RAISE = 2.0**-50
@@ -54,6 +55,11 @@ class Pattern:
             return self.rows, self.columns, values
         rows, columns, source = self._whole
         return rows, columns, values[source]
+
+    def matrix(self, values: jax.Array) -> csr_matrix:
+        """The matrix (size, size) for SciPy."""
+        rows, columns, both = self.both(values)
+        return csr_matrix((np.asarray(both), (rows, columns)), shape=(self.size, self.size))
 
     def product(self, values: jax.Array, x: jax.Array) -> jax.Array:
         """``A x``, shape of ``x``: (size,) or (size, k)."""
