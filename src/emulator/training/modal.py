@@ -21,18 +21,12 @@ processor and the trunk below descend: since w minimises, the derivative of
 
 with w held, K the matrix of the inner product. No theta enters: a step costs one processor pass.
 
-**Coefficients.** The modes are kept, and the coefficients of a run are those of least energy in
-their span, to second order about its equilibrium: with M (f, r) the modes where free and K_i the
-tangent there,
+**Coefficients.** The modes are kept, the snapshots projected on them, and the branch is fitted to
+values and slopes of all runs at once,
 
-.. math:: a_i = G_i^{-1} M^T K_i\, d_i, \qquad a_{ij} = G_i^{-1} M^T K_i\, d_{ij}, \qquad
-    G_i = M^T K_i M / 2 |\Pi_i| ,
-
-in which norm the branch is fitted to values and slopes of all runs at once: what it is off by in
-the potential energy, relative to it,
-
-.. math:: \frac1c \sum_i \Big[ |c(x_i) - a_i|_{G_i}^2
-    + \gamma \sum_j |\partial_j c(x_i) - a_{ij}|_{G_i}^2 \Big],
+.. math:: \frac1c \sum_i \Big[ |c(x_i) - a_i|_G^2
+    + \gamma \sum_j |\partial_j c(x_i) - a_{ij}|_G^2 \Big], \qquad
+    G_{kl} = \langle \varphi_k, \varphi_l \rangle,
 
 by Adam and then by L-BFGS.
 """
@@ -53,8 +47,6 @@ import scipy.sparse as sp
 from flax import nnx
 
 from emulator.fem.campaign import Runs
-from emulator.fem.loop import jit
-from emulator.fem.system import System
 from emulator.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network.part import Network
@@ -78,7 +70,6 @@ solve, and a deep branch (docs/experiments.md, "A network alone")."""
 _SLOPES = 0.1  # gamma: positions have a variance of 1/12 in the unit box
 _RIDGE = 1e-9  # of the mean square of the hidden layer; weights beyond are noise in float32
 _ZERO = 1e-12  # of the sum of the modes' squares
-_LEAST_ENERGY = 1e-3  # of the runs' mean, that a run counts by: without loads it has none
 _MEMORY = 20  # steps that L-BFGS remembers
 _AT_ONCE = 50  # of its iterations, between two looks at the progress
 
@@ -89,7 +80,7 @@ class Taught(NamedTuple):
     """What the branch is fitted to.
 
     modes : (r, n, 3) in units of the network's scale. values : (c, r). slopes : (c, p, r).
-    products : (c, r, r), of the modes in the tangent of each run, over twice its energy.
+    products : (r, r), of the modes.
     """
 
     modes: jax.Array
@@ -221,21 +212,21 @@ class Modal:
         """The modes of ``weights`` and the snapshots' coefficients in them."""
         deviations, slopes = self._snapshots
         kept = jax.jit(lambda w: self.network.prepare(self._settled(w))[1])(weights)
-        system, energies = System(self.scene), np.abs(self.runs.energy)
-        tangent = jit(system.tangent)
-        mm = self.scales.displacement
-        M = mm * np.asarray(jax.vmap(system.restrict)(kept.astype(float))).T
-        least = _LEAST_ENERGY * energies.mean()
-        rows = []
-        for k, energy in enumerate(energies):
-            values = tangent(self.runs.displacement[k], self.runs.theta[k])
-            both = mm * np.concatenate([deviations[k : k + 1], slopes[k]])
-            a, G = _of_least_energy(
-                M, system.pattern.matrix(values), both.reshape(len(both), -1)[:, system.free]
-            )
-            rows.append((a[0], a[1:], G / (2.0 * max(energy, least))))
-        columns = (np.stack(column) for column in zip(*rows, strict=True))
-        return Taught(kept, *(jnp.asarray(x, dtype=jnp.float32) for x in columns))
+        free = ~self.scene.held
+        modes = np.moveaxis(np.asarray(kept, dtype=float) * free, 0, -1)  # (n, 3, r)
+        weighted = np.asarray(jax.jit(self.weighted)(jnp.asarray(modes)))
+        flat, weighted = (fields.reshape(-1, modes.shape[-1]) for fields in (modes, weighted))
+        products = flat.T @ weighted
+        # Modes beyond the rank of the snapshots are zero.
+        safe = products + _ZERO * np.trace(products) * np.eye(len(products))
+
+        def coefficients(fields: np.ndarray) -> jax.Array:
+            pulled = fields.reshape(-1, len(flat)) @ weighted
+            found = scipy.linalg.solve(safe, pulled.T, assume_a="pos").T
+            return jnp.asarray(found.reshape(*fields.shape[:-2], -1), dtype=jnp.float32)
+
+        values, along = coefficients(deviations), coefficients(slopes)
+        return Taught(kept, values, along, jnp.asarray(products, dtype=jnp.float32))
 
     def _branch_misfit(self, weights: Weights, taught: Taught) -> jax.Array:
         """The misfit of the coefficients as a part of the snapshots', ()."""
@@ -246,14 +237,10 @@ class Modal:
 
         x = self.scene.to_unit(self.runs.theta)
         value, slope = jax.vmap(lambda x: (branch(x), jax.jacfwd(branch)(x)))(x)
-        slope = jnp.swapaxes(slope, 1, 2).astype(jnp.float32)
-
-        def squares(values: jax.Array, slopes: jax.Array) -> jax.Array:
-            both = jnp.concatenate([values[:, None], np.sqrt(self.slopes) * slopes], axis=1)
-            return jnp.sum((both @ taught.products) * both)
-
-        left = squares(value - taught.values, slope - taught.slopes)
-        return left / squares(taught.values, taught.slopes)
+        squares = lambda e: jnp.sum((e @ taught.products) * e)  # noqa: E731
+        left = squares(value - taught.values)
+        left += self.slopes * squares(jnp.swapaxes(slope, 1, 2).astype(jnp.float32) - taught.slopes)
+        return left / (squares(taught.values) + self.slopes * squares(taught.slopes))
 
     def finish(self, weights: Weights, iterations: int, *, progress: bool = False) -> Weights:
         """``weights`` with the last layer solved for and the branch led on by L-BFGS."""
@@ -288,17 +275,6 @@ class Modal:
                 bar.update(_AT_ONCE)
                 bar.set_postfix(loss=f"{least:.3e}")
         return joined(best)
-
-
-def _of_least_energy(
-    M: np.ndarray, K: sp.csr_matrix, fields: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (k, r) of ``fields`` (k, f) in the modes (f, r), and M^T K M (r, r)."""
-    pulled = K @ M
-    G = M.T @ pulled
-    # Modes beyond the rank of the snapshots are zero.
-    safe = G + _ZERO * np.trace(G) * np.eye(len(G))
-    return scipy.linalg.solve(safe, pulled.T @ fields.T, assume_a="pos").T, G
 
 
 def _split(weights: Weights) -> tuple[list[jax.Array], Callable[[list[jax.Array]], Weights]]:

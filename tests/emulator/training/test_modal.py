@@ -117,28 +117,6 @@ def test_coefficients_are_of_values_and_slopes(modal, problem):
         assert np.sqrt(np.mean((found - slope)[free] ** 2)) < 0.1 * np.sqrt(np.mean(slope**2))
 
 
-def test_coefficients_are_of_least_energy(modal, problem):
-    """The potential rises along the modes as the products say, and not along what is left."""
-    scene, runs, system = modal.scene, problem.runs, em.Simulator(modal.scene).system
-    taught = modal.keep(jax.jit(modal._settled)(problem.training.initial()[0]))
-    modes = np.where(scene.held, 0.0, taught.modes) * modal.scales.displacement
-    for run in (2, 7):
-        u, theta, G = runs.displacement[run], runs.theta[run], np.asarray(taught.products[run])
-        step = np.random.default_rng(run).normal(size=len(G))
-        step *= np.sqrt(1e-6 / (step @ G @ step))
-        ends = [u + sign * np.tensordot(step, modes, axes=1) for sign in (1.0, -1.0, 0.0)]
-        high, low, there = (float(system.potential(v, theta)[0]) for v in ends)
-        rise = 0.5 * (high + low) - there
-        assert rise == pytest.approx(1e-6 * abs(float(runs.energy[run])), rel=1e-3)
-        # Forces of what the modes leave of a run and of its slopes do no work on the modes.
-        field = u - runs.displacement[0] - np.tensordot(taught.values[run], modes, axes=1)
-        forces = jax.grad(lambda v, theta=theta: system.potential(v, theta)[0])
-        force = jax.jvp(forces, (u,), (field,))[1]
-        work = modes.reshape(len(modes), -1) @ np.asarray(force).ravel()
-        size = np.linalg.norm(modes.reshape(len(modes), -1), axis=1) * np.linalg.norm(force)
-        assert (np.abs(work) < 1e-3 * size).all()
-
-
 @pytest.mark.slow
 def test_a_network_alone_learns_a_beam(beam, tmp_path):
     plan = replace(PLAN, simulations=30, steps=450, freeze=150, polish=200)

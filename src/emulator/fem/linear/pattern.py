@@ -58,8 +58,9 @@ class Pattern:
 
     def matrix(self, values: jax.Array) -> csr_matrix:
         """The matrix (size, size) for SciPy."""
-        rows, columns, both = self.both(values)
-        return csr_matrix((np.asarray(both), (rows, columns)), shape=(self.size, self.size))
+        rows, columns, both = self.both(values)  # row by row
+        starts = np.searchsorted(rows, np.arange(self.size + 1))
+        return csr_matrix((np.asarray(both), columns, starts), shape=(self.size, self.size))
 
     def product(self, values: jax.Array, x: jax.Array) -> jax.Array:
         """``A x``, shape of ``x``: (size,) or (size, k)."""
