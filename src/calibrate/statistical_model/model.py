@@ -26,7 +26,7 @@ from numpyro import handlers
 from calibrate.data.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.noise import Noise
 from calibrate.observations import Observations
-from calibrate.observations.present import leave_out_missing, missing_values
+from calibrate.observations.present import leave_out_missing
 from calibrate.priors import Prior
 from calibrate.priors.joint_prior import Conditional, Dependence
 from calibrate.state_names import split
@@ -258,7 +258,7 @@ class Model:
             As :meth:`check_data`, or every value of an observation is missing.
         """
         observe, present = leave_out_missing(self.observe, self._fitting(data))
-        if not missing_values(observe):
+        if all(part is self.observe.parts[name] for name, part in observe.parts.items()):
             return self, self.check_data(present)
         if self.error is not None:
             raise InputError(
