@@ -18,7 +18,7 @@ import numpy as np
 from calibrate.observations.points import DisplacementPoints
 from calibrate.observations.present import Present
 from calibrate.state_names import split
-from calibrate.statistical_model.curve import curve_covariance, curve_modes
+from calibrate.statistical_model.curve import check_curve, curve_modes
 from calibrate.statistical_model.model import Model
 from calibrate.statistical_model.systematic import (
     Systematic,
@@ -29,6 +29,7 @@ from calibrate.statistical_model.systematic import (
 from emulator import schema
 from emulator.errors import InputError, look_up
 
+CURVE_SHARE = "curve_share"
 Vector = tuple[float, float, float]
 
 
@@ -203,7 +204,9 @@ class Curve:
     of : a single number in several load states, as ``reaction:top:x``.
     along : parameter that is known in each state and says where on the curve it is.
     length : over which the error changes, in the unit of ``along``.
-    share : sd of the error as a share of what was measured.
+    share : sd of the error as a share of what was measured, known.
+    share_scale : instead, the scale of the share's half-normal prior: it is inferred, as
+        ``curve_share``, one for all curves.
     sd : sd of the rest of it, in the unit of the data.
     constant : part of the variance that is the same along the whole curve.
     """
@@ -212,12 +215,18 @@ class Curve:
     along: str
     length: float
     share: float = 0.0
+    share_scale: float | None = None
     sd: float = 0.0
     constant: float = 0.0
 
     def __post_init__(self) -> None:
         _check({"share": self.share, "sd": self.sd})
-        curve_covariance(np.zeros(1), np.zeros(1), self.length, constant=self.constant)
+        if self.share_scale is not None:
+            if not self.share_scale > 0.0:
+                raise InputError(f"share_scale is {self.share_scale}; it must be above 0")
+            if self.share or self.sd:
+                raise InputError("share_scale is beside share or sd; give one of them")
+        check_curve(self.length, self.constant)
 
     def systematic(self, name: str, seen: Seen) -> Systematic:
         """As many unknowns as the curve can tell apart."""
@@ -227,11 +236,13 @@ class Curve:
                 raise InputError(f"of: '{each}' is not a single number, as a force is")
         at = np.array([seen.known(self.along, each) for each in observed])
         values = np.array([float(seen.whole(each)[1]) for each in observed])
+        size = None if self.share_scale is None else (CURVE_SHARE, self.share_scale)
+        share = self.share if size is None else 1.0
         modes = curve_modes(
-            at, values, self.length, share=self.share, sd=self.sd, constant=self.constant
+            at, values, self.length, share=share, sd=self.sd, constant=self.constant
         )
         names = tuple(f"{name} {k + 1}" for k in range(len(modes)))
-        return Systematic(names, {each: modes[:, k] for k, each in enumerate(observed)})
+        return Systematic(names, {each: modes[:, k] for k, each in enumerate(observed)}, size)
 
 
 SHARED_ERRORS: dict[str, type[Any]] = {

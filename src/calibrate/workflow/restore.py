@@ -25,6 +25,7 @@ from emulator.store import read_arrays, save_arrays
 from emulator.surrogates.protocol import ForwardMap
 
 # Paths of scene and emulator may change when a folder moves; their fingerprints may not.
+_WORDS = "systematic"  # metadata of a measurement's errors
 _PLACES = ("scene", "root", "emulator")
 
 
@@ -66,8 +67,8 @@ def check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
 
 def keep_error(file: Path, error: ErrorModes) -> None:
     """Write what a likelihood allows for besides noise, for :func:`restore_error`."""
-    names = {"names": json.dumps(error.names)} if isinstance(error, SystematicError) else {}
-    save_arrays(file, error.arrays(), names)
+    words = {_WORDS: json.dumps(error.words)} if isinstance(error, SystematicError) else {}
+    save_arrays(file, error.arrays(), words)
 
 
 def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ErrorModes:
@@ -83,8 +84,8 @@ def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ErrorModes:
     arrays, metadata = read_arrays(file)
     error: ErrorModes
     try:
-        if "names" in metadata:
-            error = SystematicError(**arrays, names=tuple(json.loads(metadata["names"])))
+        if _WORDS in metadata:
+            error = SystematicError.restore(arrays, json.loads(metadata[_WORDS]))
         else:
             error = ApproximationError.restore(arrays)
     except KeyError as missing:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibrate.statistical_model.curve import curve_covariance, curve_modes
+from calibrate.statistical_model.curve import check_curve, curve_covariance, curve_modes
 from emulator.errors import InputError
 
 AT = np.array([0.0, 0.1, 0.3, -0.2])
@@ -31,6 +31,15 @@ def test_a_curve_that_is_off_as_one_has_one_mode():
 
 def test_what_cannot_be():
     with pytest.raises(InputError, match="length is 0; it must be above 0"):
-        curve_covariance(AT, VALUES, 0)
+        check_curve(0, 0.5)
     with pytest.raises(InputError, match=r"constant is 1.5; it is a part, 0 to 1"):
-        curve_covariance(AT, VALUES, 0.1, constant=1.5)
+        check_curve(0.1, 1.5)
+
+
+def test_several_curves_at_once():
+    at, values = np.stack([AT, 2.0 * AT]), np.stack([VALUES, -VALUES])
+    lengths = np.array([0.2, 0.4])[:, None, None]
+    found = curve_covariance(at, values, lengths, share=0.1, constant=0.5)
+    for C, a, y, length in zip(found, at, values, (0.2, 0.4), strict=True):
+        one = curve_covariance(a, y, length, share=0.1, constant=0.5)
+        np.testing.assert_allclose(C, one, rtol=1e-14)

@@ -2,19 +2,22 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 
 import calibrate as cal
+from calibrate.statistical_model.curve import curve_covariance
 from calibrate.statistical_model.shared_errors import (
     Seen,
     shared_error,
     turned,
     with_shared_errors,
 )
-from calibrate.statistical_model.systematic import Systematic
+from calibrate.statistical_model.systematic import Systematic, SystematicError
 from emulator.errors import InputError
 from emulator.scenes import Scene
 from linear_support import linear_forward
@@ -185,3 +188,73 @@ def test_where_a_curve_is_must_be_known():
         with_shared_errors(model, data, {"e": words})
     with pytest.raises(InputError, match="along: 'shear' is no parameter; there are mu, lam"):
         with_shared_errors(model, data, {"e": {**words, "along": "shear"}})
+
+
+def test_a_share_that_is_inferred_after_errors_of_known_sds_is_the_dense_covariance():
+    """log N(y; g, W^-1 + V V^T + a^2 U U^T) at two sizes a, by map and by FEM; replicates have it."""
+    model = forces(block(), 4, mu=True)
+    values = np.array([4.0, 5.0, 5.5, 7.0])
+    data = {name: np.array(v) for name, v in zip(model.observe.parts, values, strict=True)}
+    curve = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 0.4}
+    words = {
+        "gain": {"kind": "gain", "of": "parameter:lam", "share": 0.01},
+        "law": {**curve, "share_scale": 0.3, "constant": 0.5},
+    }
+    found, present = with_shared_errors(model, data, words)
+    assert found.names == ("lam", "curve_share")
+    at = 2.0 + np.arange(4) / 4
+    gain = 0.01 * values
+    for share in (0.02, 0.2):
+        law = curve_covariance(at, values, 0.4, share=share, constant=0.5)
+        C = 1e-6 * np.eye(4) + np.outer(gain, gain) + np.asarray(law)
+        draw = {"lam": jnp.asarray(5.2), "curve_share": jnp.asarray(share)}
+        expected = multivariate_normal(np.full(4, 5.2), C).logpdf(values)
+        assert float(found.map_log_likelihood(draw, present)) == pytest.approx(expected, rel=1e-6)
+        means = {name: jnp.asarray(5.2) for name in data}
+        by_fem = found.fem_log_likelihood(draw, means, present)
+        assert float(by_fem) == pytest.approx(expected, rel=1e-6)
+        left = found.error.information_left(jnp.eye(4) / 1e-6, jnp.array([5.2, share]))
+        np.testing.assert_allclose(left, np.linalg.inv(C), rtol=1e-4, atol=1e-3)
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    drawn = jax.vmap(lambda key: jnp.stack(list(found.fem_means(key, draw, means).values())))(keys)
+    np.testing.assert_allclose(np.cov(np.asarray(drawn).T), C - 1e-6 * np.eye(4), atol=0.1)
+    # Kept and read again it is the same error.
+    back = SystematicError.restore(found.error.arrays(), found.error.words)
+    assert back.fingerprint == found.error.fingerprint
+    assert back.priors.keys() == {"curve_share"}
+    with pytest.raises(InputError, match="the size 'curve_share' is inferred"):
+        found.error.unknowns(present)
+
+
+def test_curves_tell_the_share_that_a_law_is_off_by():
+    """Eight numbers far apart along a curve: the share is the scatter of them, its sd 1 / sqrt(2 n)."""
+    scene = block()
+    names = [f"parameter:lam@{k}" for k in range(8)]
+    model = cal.model(
+        linear_forward(scene),
+        dict.fromkeys(names, cal.MeasuredParameter(scene, "lam")),
+        cal.GaussianNoise(sd=1e-3),
+        known={f"mu@{k}": 2.0 + 100.0 * k for k in range(8)},
+        check_scale=False,
+    )
+    values = 5.0 * (1.0 + 0.1 * np.random.default_rng(1).normal(size=8))
+    data = {name: np.array(v) for name, v in zip(names, values, strict=True)}
+    curve = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 1.0}
+    found, present = with_shared_errors(model, data, {"e": {**curve, "share_scale": 0.3}})
+    posterior = cal.sample(found, present, sampler="laplace", seed=1, predictions=False)
+    row, scatter = posterior.summary()["curve_share"], float(np.std(values / values.mean()))
+    assert abs(row["mean"] - scatter) < 1.5 * row["sd"]
+    assert row["sd"] == pytest.approx(scatter / 4.0, rel=0.6)
+
+
+def test_one_share_is_inferred_and_not_beside_a_known_one():
+    model = forces(block(), 3, mu=True)
+    data = {name: np.array(5.0) for name in model.observe.parts}
+    curve = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 0.4}
+    with pytest.raises(InputError, match="share_scale is beside share or sd; give one of them"):
+        with_shared_errors(model, data, {"e": {**curve, "share_scale": 0.3, "share": 0.1}})
+    with pytest.raises(InputError, match=r"share_scale is -0.3; it must be above 0"):
+        with_shared_errors(model, data, {"e": {**curve, "share_scale": -0.3}})
+    two = {"a": {**curve, "share_scale": 0.3}, "b": {**curve, "share_scale": 0.2}}
+    with pytest.raises(InputError, match="only one can be, by one name and scale"):
+        with_shared_errors(model, data, two)
