@@ -156,7 +156,7 @@ def _models(alone: Mapping[str, Posterior]) -> dict[str, Model]:
 
 
 def _medians(given: Shared) -> dict[str, dist.Distribution]:
-    return {name: log_normal(*numbers) for name, numbers in given.median.items()}
+    return {name: log_normal(median, sd) for name, (median, sd) in given.median.items()}
 
 
 def cohort_report(found: Hierarchy, verdicts: Mapping[str, str]) -> dict[str, Any]:

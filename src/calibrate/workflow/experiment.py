@@ -75,9 +75,14 @@ class Shared:
     """
 
     shared: tuple[str, ...] | None = None
-    median: dict[str, tuple[float, float]] = field(default_factory=dict)
+    median: dict[str, list[float]] = field(default_factory=dict)
     spread: dict[str, float] = field(default_factory=dict)
     eta: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name, numbers in self.median.items():
+            if len(numbers) != 2:
+                raise InputError(f"median of '{name}' is {numbers}; give median and relative sd")
 
 
 @dataclass(frozen=True)

@@ -151,6 +151,10 @@ def test_members_have_what_is_common_and_what_is_their_own(file):
     ("change", "message"),
     [
         (("seed = 3", "seeds = 3"), "member 'second', line 20: unknown key 'seeds'"),
+        (
+            ("[members.second.noise]\ndisplacement", "[population]\nmedian.mu = [70.0]\nspread.mu"),
+            "line 22: median of 'mu' is [70.0]; give median and relative sd",
+        ),
         (("= 0.4", "= -0.4"), "member 'second': displacement (mm): noise: standard deviation is"),
         (("[members.first]", "[members.'a/b']"), "members: 'a/b' is no name"),
         (("[members.first]\n", "[other]\n"), "unknown key 'other'"),
