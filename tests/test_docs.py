@@ -4,12 +4,17 @@ import inspect
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 import calibrate
 import emulator
+from calibrate.statistical_model.shared_errors import SHARED_ERRORS
+from calibrate.workflow import Run
+from calibrate.workflow.experiment import Shared
+from emulator.schema import read_as
 
 ROOT = Path(__file__).parents[1]
 
@@ -25,6 +30,22 @@ def test_pages_are_reached():
     listed = set(re.findall(r"^[a-z_/]+$", text, flags=re.MULTILINE))
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"}
     assert pages <= listed
+
+
+def test_experiment_files_of_the_docs_are_right():
+    """Their keys, and those of errors that numbers share; the files that they name are nobody's."""
+    text = (ROOT / "docs" / "experiment_files.md").read_text(encoding="utf-8")
+    blocks = [
+        tomllib.loads(each) for each in re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    ]
+    assert len(blocks) == 3
+    for entries in blocks:
+        read_as(Shared, entries.pop("population", {}), "docs")
+        for own in entries.pop("members", {"": {}}).values():
+            run = read_as(Run, {**entries, **own}, "docs")
+            assert run.systematic or own
+    kinds = set(re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE))
+    assert kinds == set(SHARED_ERRORS)
 
 
 @pytest.mark.slow

@@ -220,12 +220,24 @@ def read_json_as[Kind](kind: type[Kind], path: str | FilePath) -> Kind:
     """The dataclass ``kind`` from a JSON file; mistakes as in :func:`parse`."""
     data = read_json(path)
     lines = json_lines(FilePath(path).read_text(encoding="utf-8"))
-    table = parse(table_of(kind), data, str(path), lines, toml=False)
+    return read_as(kind, data, str(path), lines)
+
+
+def read_as[Kind](
+    kind: type[Kind],
+    mapping: Any,
+    where: str,
+    lines: Mapping[Path, int] | None = None,
+    *,
+    toml: bool = False,
+) -> Kind:
+    """The dataclass ``kind`` from plain data of ``where``; mistakes as in :func:`parse`."""
+    table = parse(table_of(kind), mapping, where, lines, toml=toml)
     try:
         return _builder(kind)(table)
     except InputError as error:
         first_word = str(error).split(" ", 1)[0]  # often the field
-        raise Source(str(path), data, lines).error(str(error), (first_word,)) from error
+        raise Source(where, mapping, lines or {}, toml).error(str(error), (first_word,)) from error
 
 
 def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:

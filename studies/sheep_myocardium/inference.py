@@ -6,8 +6,9 @@ r"""The posterior of a heart: one material, three cubes, nine modes.
               1_{\gamma = \gamma'}\big)
 
 Each mode m is off by a fraction of its own, half of it the same along the curve and half changing
-with the amount :math:`\gamma` (Matern 3/2, length half of the largest amount), so that a hundred
-points of a curve are not a hundred facts; 3 % of each point are its own, for what the emulator is
+with the amount :math:`\gamma` (Matern 3/2, length half of the largest amount; what
+:mod:`calibrate.statistical_model.curve` is for), so that a hundred points of a curve are not a
+hundred facts; 3 % of each point are its own, for what the emulator is
 off. :math:`\omega` is inferred, the load cell's noise is 3 mN. Each cube has fibre angles of its
 own, 15 degrees about the direction it was cut along.
 
@@ -30,6 +31,8 @@ from numpyro.infer import MCMC, NUTS, init_to_value
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
+
+from calibrate.statistical_model.curve import curve_covariance
 
 CELL = 3e-3  # N, noise of the load cell
 POINT = 0.03  # of a force, at each point for itself
@@ -91,11 +94,9 @@ def means(of: Seen, material: jax.Array, turned: jax.Array) -> jax.Array:
 def covariances(amounts: jax.Array, mean: jax.Array, omega: jax.Array) -> jax.Array:
     """Covariances (..., j, j) in N2 of modes' data with ``mean`` (..., j)."""
     length = 0.5 * jnp.abs(amounts).max(axis=-1)[..., None, None]
-    apart = jnp.sqrt(3.0) * jnp.abs(amounts[..., :, None] - amounts[..., None, :]) / length
-    shape = 0.5 + 0.5 * (1.0 + apart) * jnp.exp(-apart)
-    products = mean[..., :, None] * mean[..., None, :]
-    own = jnp.eye(mean.shape[-1])
-    return (omega**2 * shape + POINT**2 * own) * products + CELL**2 * own
+    alike = curve_covariance(amounts, mean, length, share=omega, constant=0.5)
+    own = jnp.eye(mean.shape[-1]) * mean[..., None, :] ** 2
+    return alike + POINT**2 * own + CELL**2 * jnp.eye(mean.shape[-1])
 
 
 def log_likelihoods(of: Seen, mean: jax.Array, omega: jax.Array) -> jax.Array:

@@ -30,12 +30,12 @@ def answer(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], 
     parser.set_defaults(run=run)
 
 
-def add_scene(parser: argparse.ArgumentParser) -> None:
-    """Add the scene and, for published ones, the folder of the data."""
+def add_scene(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """Add the scene and, for published ones, the folder of the data; ``more`` it may be."""
     parser.add_argument(
         "scene",
         metavar="SCENE",
-        help="built-in name, .toml file, or published:<Model>; finer:SCENE refines its mesh",
+        help="built-in name, .toml file, or published:<Model>; finer:SCENE refines its mesh" + more,
     )
     parser.add_argument("--root", metavar="DIR", help="folder of the published data")
 

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import add_scene, assignments, scene_words
-from calibrate.cli.forward import add_forward, forward_options
+from calibrate.cli.forward import add_forward, given_options
 from calibrate.cli.noise_words import discrepancy_words, noise_scale_words, noise_words
+from calibrate.places import absolute, emulator_place, prior_place, scene_place
 from emulator.errors import InputError
 
 if TYPE_CHECKING:
+    from calibrate.workflow import Run
+    from calibrate.workflow.experiment import Cohort
     from emulator.surrogates.additive import Emulator
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
-    """Add everything that says which posterior is meant, but its sampler."""
-    add_scene(parser)
+    """Add everything that says which posterior is meant, but its sampler.
+
+    Options have no defaults here: those of a run, or an experiment file's entries, are theirs.
+    """
+    add_scene(parser, "; or an experiment file, whose entries the options replace")
     parser.add_argument(
-        "--data", default="synthetic", metavar="FILE|synthetic", help=".csv or netCDF, mm and mL"
+        "--data", metavar="FILE|synthetic", help=".csv or netCDF, mm and mL (default synthetic)"
     )
     parser.add_argument(
         "--truth",
@@ -38,11 +44,10 @@ def add_model(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--prior",
-        default="box",
         metavar="NAME|FILE",
-        help="box (uniform over the scene's range), ventricles (correlated Holzapfel-Ogden "
-        "parameters of human ventricles), or a population's medians, log sds and correlations "
-        "in a .json file",
+        help="box (uniform over the scene's range; the default), ventricles (correlated "
+        "Holzapfel-Ogden parameters of human ventricles), or a population's medians, log sds and "
+        "correlations in a .json file",
     )
     parser.add_argument(
         "--observe",
@@ -53,18 +58,15 @@ def add_model(parser: argparse.ArgumentParser) -> None:
         "landmarks:24+volume",
     )
     _add_noise(parser)
-    add_forward(parser)
+    add_forward(parser, default=None)
     parser.add_argument(
         "--emulator", metavar="NAME|DIR", help="default: the one shipped for the scene"
     )
-    parser.add_argument(
-        "--load-steps", type=int, default=1, metavar="N", help="as for simulate (default 1)"
-    )
+    parser.add_argument("--load-steps", type=int, metavar="N", help="as for simulate (default 1)")
     allowed = parser.add_mutually_exclusive_group()
     allowed.add_argument(
         "--error-runs",
         type=int,
-        default=0,
         metavar="N",
         help="FEM runs (8 or more) from which the forward map's own error is learned, so that a "
         "poor map widens the posterior instead of moving it",
@@ -72,7 +74,6 @@ def add_model(parser: argparse.ArgumentParser) -> None:
     allowed.add_argument(
         "--mesh-error",
         type=int,
-        default=0,
         metavar="N",
         help="the same with solves on the next finer mesh, so that the error of the mesh widens "
         "the posterior, too",
@@ -80,33 +81,74 @@ def add_model(parser: argparse.ArgumentParser) -> None:
 
 
 def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What :func:`add_model` read, as fields of :class:`~calibrate.workflow.Run`."""
-    scene, root = scene_words(arguments)
-    measured = arguments.data != "synthetic"
+    """What :func:`add_model` read and was given, as fields of :class:`~calibrate.workflow.Run`.
+
+    Of an experiment file, what takes the place of its entries.
+    """
+    experiment = experiment_file(arguments.scene)
+    scene, root = (None, arguments.root) if experiment else scene_words(arguments)
+    measured = arguments.data not in (None, "synthetic")
     for option in ("truth", "observe") if measured else ():
         if getattr(arguments, option):
             raise InputError(
                 f"--{option} has no effect beside --data {arguments.data}: it is for synthetic data"
             )
-    return {
-        "scene": _scene(scene),
-        "root": root and _absolute(root),
-        "data": _absolute(arguments.data, is_path=measured),
+    found = {
+        "scene": scene and scene_place(scene),
+        "root": root and absolute(root),
+        "data": arguments.data and absolute(arguments.data, is_path=measured),
         "truth": assignments(arguments.truth),
         "known": assignments(arguments.known),
-        "observe": arguments.observe or "nodes:20",
-        "prior": prior_word(arguments.prior),
+        "observe": arguments.observe,
+        "prior": arguments.prior and prior_place(arguments.prior),
         "noise": noise_words(arguments.noise),
         "noise_scale": noise_scale_words(arguments.noise_scale),
         "discrepancy": discrepancy_words(arguments.discrepancy),
-        "check_scale": not arguments.no_unit_check,
+        "check_scale": False if arguments.no_unit_check else None,
         "forward": arguments.forward,
-        "emulator": emulator_word(arguments.emulator),
-        "forward_options": forward_options(arguments),
+        "emulator": emulator_place(arguments.emulator),
+        "forward_options": given_options(arguments),
         "error_runs": arguments.error_runs,
         "mesh_error_runs": arguments.mesh_error,
         "load_steps": arguments.load_steps,
     }
+    return {name: value for name, value in found.items() if value is not None and value != {}}
+
+
+def plan_of(arguments: argparse.Namespace, **sampling: Any) -> Run | Cohort:
+    """The run that :func:`add_model` read, or the experiment of its file.
+
+    ``sampling`` are further fields of a run, ``None`` where nothing was given.
+    """
+    from calibrate.workflow import Run
+    from calibrate.workflow.experiment import read_experiment
+
+    given = model_of(arguments) | {n: v for n, v in sampling.items() if v is not None}
+    if experiment_file(arguments.scene):
+        return read_experiment(arguments.scene, given)
+    return Run(**given)
+
+
+def run_of(arguments: argparse.Namespace, **sampling: Any) -> Run:
+    """:func:`plan_of` where it is of one body; :class:`InputError` where it is of several."""
+    from calibrate.workflow import Run
+
+    plan = plan_of(arguments, **sampling)
+    if not isinstance(plan, Run):
+        raise InputError(
+            f"{arguments.scene} has members of a population; give an experiment file of one of them"
+        )
+    return plan
+
+
+def experiment_file(word: str) -> bool:
+    """Whether a word is a TOML file that names a scene or members instead of being a scene."""
+    if not word.endswith(".toml") or not Path(word).is_file():
+        return False
+    try:
+        return bool({"scene", "members"} & tomllib.loads(Path(word).read_text("utf-8")).keys())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return False  # told when it is read as a scene
 
 
 def _add_noise(parser: argparse.ArgumentParser) -> None:
@@ -141,32 +183,6 @@ def _add_noise(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="take data however far from every prediction (m for mm, mm3 for mL, zero)",
     )
-
-
-def prior_word(word: str) -> str | dict[str, Any]:
-    """A name as it is; a file's content, because a kept run must not change with the file."""
-    from calibrate.priors.population import read_population
-
-    return asdict(read_population(word)) if word.endswith(".json") else word
-
-
-def _scene(word: str) -> str:
-    """A scene's name as it is, its file as an absolute path; ``finer:`` stays before either."""
-    refined = "finer:" * word.startswith("finer:")
-    name = word.removeprefix(refined)
-    return refined + (_scene(name) if refined else _absolute(name, is_path=name.endswith(".toml")))
-
-
-def _absolute(word: str, *, is_path: bool = True) -> str:
-    """An absolute path, because a kept run may be read from any folder."""
-    return str(Path(word).resolve()) if is_path else word
-
-
-def emulator_word(word: str | None) -> str | None:
-    """A shipped name as it is, a folder as an absolute path."""
-    from emulator.surrogates import shipped
-
-    return word if word is None or word in shipped() else _absolute(word)
 
 
 def emulator_of(body: str, emulator: str | None = None) -> Emulator:

@@ -1,4 +1,4 @@
-"""A posterior's parameter table and verdict as text."""
+"""Tables of a posterior, or of a population, and verdicts as text."""
 
 from __future__ import annotations
 
@@ -52,3 +52,29 @@ def summary(report: dict[str, Any]) -> str:
         )
         lines += [f"- {finding}" for finding in c["findings"] if finding != c["reason"]]
     return "\n".join(lines)
+
+
+def cohort_summary(report: dict[str, Any]) -> str:
+    """The population, its members alone and among the others, and one not seen."""
+    columns = ("mean", "sd", "low", "high", "r_hat", "ess_bulk")
+    titles = ("population", "mean", "sd", "5 %", "95 %", "R-hat", "ESS")
+    rows = [
+        (name, *(row[column] for column in columns))
+        for name, row in report["population"].items()
+        if name.startswith(("median[", "sd[", "correlation["))
+    ]
+    names = list(report["new_member"])
+    head = ["member"]
+    for name in names:
+        head += [f"{name} alone", "sd", "with the others", "sd"]
+    members = []
+    for member, by in report["members"].items():
+        cells = [by[n][k] for n in names for k in ("alone_mean", "alone_sd", "mean", "sd")]
+        members.append((member, *cells, by["verdict"]))
+    lines = [table(titles, rows), "", table((*head, "FEM says"), members), ""]
+    for name, row in report["new_member"].items():
+        lines.append(
+            f"a member not seen: {name} {row['median']:.4g}, 90 % {row['low']:.4g} to "
+            f"{row['high']:.4g}"
+        )
+    return "\n".join(lines + report["warnings"])

@@ -12,13 +12,19 @@ A netCDF file has a variable ``displacement`` with one row a point, and beside i
 Of a body in several load states, a CSV file has a column ``state`` with the state's name in every
 row, and a netCDF file variables such as ``volume@diastole``.
 
+A parameter that is known exactly in a load state, such as the amount of a motion, is a column
+``known:NAME``, the same number in every row of the state or given once. A CSV file
+with such columns and neither ``state`` nor places is a loading curve: each row is a load state,
+named by its number.
+
 Each kind of observation (``calibrate.observations.OBSERVATIONS``) names its own columns and
 variables.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +43,15 @@ from calibrate.state_names import in_state, split
 from emulator.errors import InputError
 from emulator.scenes.scene import Scene
 
+Files = str | Path | Mapping[str, str]
+"""A data file, or the file of each load state by the state's name."""
 
-def read_data(scene: Scene, path: str | Path) -> tuple[Observations, dict[str, np.ndarray]]:
+
+def read_data(scene: Scene, files: Files) -> tuple[Observations, dict[str, np.ndarray]]:
     """Observations of a file and their data, by the same names.
+
+    Of several files, by load state, each has the data of its state; one with states of its own,
+    such as a loading curve ``pull``, those of ``pull.1``, ``pull.2`` and so on.
 
     Raises
     ------
@@ -47,23 +59,52 @@ def read_data(scene: Scene, path: str | Path) -> tuple[Observations, dict[str, n
         Missing or malformed file, a place that is not finite, an infinite value, an unknown node, a
         point outside, an unknown cavity.
     """
-    path = Path(path)
-    file = open_data(path)
     parts: dict[str, Observation] = {}
     data: dict[str, np.ndarray] = {}
-    for state, rows in file.states().items():
+    known: dict[str, Observation] = {}
+    for path, state, rows in _states(files):
         layouts = _found(path, rows)
         for base, (kind, fields) in layouts.items():
             others = _others_there(fields, [f for _, f in layouts.values()])
             name, arrays = in_state(base, state), rows.arrays(fields, others)
             try:
-                parts[name], data[name] = kind.from_arrays(scene, base, arrays)
+                part, data[name] = kind.from_arrays(scene, base, arrays)
+                # One object for all states in which the same was observed: one program for them.
+                parts[name] = known.setdefault(json.dumps(part.to_json()), part)
                 parts[name].check(name, data[name])
                 check_some(base, data[name])
             except InputError as error:
                 where = f", state '{state}'" if state else ""
                 raise InputError(f"data file {path}{where}: {error}") from error
     return Observations(parts), data
+
+
+def read_known(files: Files) -> dict[str, float]:
+    """Known parameters of a data file by ``parameter@state``, from its columns ``known:NAME``.
+
+    Raises
+    ------
+    InputError
+        A value that is no number, or differs within one load state.
+    """
+    return {
+        in_state(parameter, state): value
+        for _, state, rows in _states(files)
+        for parameter, value in rows.known().items()
+    }
+
+
+def _states(files: Files) -> Iterator[tuple[Path, str, DataFile]]:
+    """Path, load state and content of each file and state."""
+    if not isinstance(files, Mapping):
+        for state, rows in open_data(Path(files)).states().items():
+            yield Path(files), state, rows
+        return
+    for name, file in files.items():
+        if not name or set("@/+") & set(name):
+            raise InputError(f"data: load state '{name}'; give it a name without @, / and +")
+        for state, rows in open_data(Path(file)).states().items():
+            yield Path(file), f"{name}.{state}" if state else name, rows
 
 
 def _others_there(fields: Sequence[Field], every: Iterable[Sequence[Field]]) -> set[str]:

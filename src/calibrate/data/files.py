@@ -4,7 +4,9 @@ A CSV file has one header line, and columns separated by commas, semicolons or t
 header has; with the latter two, numbers may have decimal commas. Blanks around words, empty lines
 and lines that begin with ``#`` are ignored. A measured value that is missing is an empty cell,
 ``NA`` or ``nan``, and NaN in netCDF; nodes and positions may not be missing. A column ``state``
-names the load state of each row; in netCDF, variables are called ``name@state``.
+names the load state of each row; in netCDF, variables are called ``name@state``. A column or
+variable ``known:NAME`` is a parameter's value in a state; rows of a CSV file with such columns
+and neither ``state`` nor places are a load state each.
 """
 
 from __future__ import annotations
@@ -28,6 +30,10 @@ from emulator.errors import InputError
 STATE = "state"
 """Column of a CSV file that names the load state of a row."""
 
+KNOWN = "known:"
+"""Before a parameter's name: a column of its value, where that is known."""
+
+_PLACES = {"node", "x", "segment"}  # columns of tables whose rows are places, not load states
 _TEXT = (".csv", ".tsv", ".txt")
 _SPREADSHEETS = (".xlsx", ".xls", ".ods")
 _MISSING = ("", "na", "n/a", "nan")
@@ -51,6 +57,16 @@ class DataFile(ABC):
         ------
         InputError
             Some of it belongs to a state and some to none.
+        """
+
+    @abstractmethod
+    def known(self) -> dict[str, float]:
+        """Values of the parameters that are known, of one load state.
+
+        Raises
+        ------
+        InputError
+            A value that is no number, or several that differ.
         """
 
     @abstractmethod
@@ -109,12 +125,14 @@ class CSVFile(DataFile):
             raise InputError(f"data file {path}: names of columns, and no row below them")
 
     def states(self) -> dict[str, CSVFile]:
-        """Rows of each state, by the word in the column ``state``."""
-        if STATE not in self.words:
+        """Rows of each state, by the word in the column ``state``; each row of a loading curve."""
+        known = any(word.startswith(KNOWN) for word in self.words)
+        curve = STATE not in self.words and known and not _PLACES & set(self.words)
+        if STATE not in self.words and not curve:
             return {"": self}
         found: dict[str, CSVFile] = {}
         for number, row in self.rows.items():
-            state = row[STATE]
+            state = str(number) if curve else row[STATE]
             if not state or "@" in state or "/" in state:
                 raise InputError(
                     f"data file {self.path}: row {number}, column '{STATE}' is '{state}'; "
@@ -127,6 +145,20 @@ class CSVFile(DataFile):
         # A column that is empty in a state was not measured there.
         for part in found.values():
             part.words = [w for w in part.words if any(row[w] for row in part.rows.values())]
+        return found
+
+    def known(self) -> dict[str, float]:
+        """Numbers of columns ``known:NAME``; empty cells say nothing."""
+        found: dict[str, float] = {}
+        for word in (w for w in self.words if w.startswith(KNOWN)):
+            name, field = word.removeprefix(KNOWN), Field(word, (word,), where=True)
+            for number, row in self.rows.items():
+                value = self._number(number, row, word, field) if row[word] else None
+                if value is not None and found.setdefault(name, value) != value:
+                    raise InputError(
+                        f"data file {self.path}: row {number}, column '{word}' is {value}, and "
+                        f"{found[name]} before it in the same load state"
+                    )
         return found
 
     def _row(self, number: int, cells: list[str]) -> dict[str, str]:
@@ -229,6 +261,15 @@ class NetCDFFile(DataFile):
             part.state = state
             part.words = [base for base, its in map(split, own) if its == state]
         return found
+
+    def known(self) -> dict[str, float]:
+        """Numbers of variables ``known:NAME``."""
+        words = [word for word in self.words if word.startswith(KNOWN)]
+        arrays = self.arrays([Field(word, (word,), where=True) for word in words])
+        for word, array in arrays.items():
+            if np.shape(array) != ():
+                raise InputError(f"data file {self.path}: variable '{word}' is not a number")
+        return {word.removeprefix(KNOWN): float(array) for word, array in arrays.items()}
 
     def needs(self, field: Field) -> tuple[str, ...]:
         """The field's variable."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -22,6 +24,7 @@ from calibrate.posterior import sample
 from calibrate.posterior.posterior import describe_distribution
 from calibrate.provenance import versions
 from calibrate.samplers import NUTSOptions, check_options
+from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
@@ -29,8 +32,11 @@ from calibrate.statistical_model import Data, Model
 _PRIOR_DRAWS = 2000
 # The spread of few members reaches towards 0, where steps have to be short (docs/experiments.md,
 # "Members of one population").
-_TARGET_ACCEPT = 0.98
+TARGET_ACCEPT = 0.98
 _NEW, _OF_PRIOR = 0x9E3779B9, 0x85EBCA6B  # keep these keys apart from the sampler's
+
+Alone = Mapping[str, Mapping[str, np.ndarray]]
+"""Draws (s,) of the shared unknowns, by member and name."""
 
 Members = Mapping[str, tuple[Model, Any]]
 """Model and data of each member; data as :func:`calibrate.sample` takes it, ``None`` of none."""
@@ -88,25 +94,49 @@ def sample_hierarchy(
     data: Mapping[str, Data],
     *,
     options: NUTSOptions | None = None,
-    alone: str = "nuts",
+    alone: str | Alone = "nuts",
     seed: int = 0,
     progress: bool = False,
+    checkpoint: str | Path | None = None,
 ) -> Hierarchy:
-    """The posterior of ``model`` given ``data`` by member, checked before."""
-    options = check_options(NUTS, options or NUTSOptions(target_accept=_TARGET_ACCEPT))
-    by_member = _alone(model, data, alone, seed, progress=progress)
+    """The posterior of ``model`` given ``data`` by member, checked before.
+
+    Parameters
+    ----------
+    alone : sampler of each member alone, or draws of it by member.
+    checkpoint : as of :func:`calibrate.sample`, for all members together.
+    """
+    options = check_options(NUTS, options or NUTSOptions(target_accept=TARGET_ACCEPT))
+    if isinstance(alone, str):
+        by_member, sampler = _alone(model, data, alone, seed, progress=progress), alone
+    else:
+        by_member, sampler = {m: dict(alone[m]) for m in model.members}, "given"
     information = _information(model, by_member, data)
     density = density_of_hierarchy(model)
     observed = Observed(dict(data), information)
-    found = NUTS.sample(density, observed, options, seed, Context(progress))
+    made = _provenance(model, options, sampler, seed)
+    state = Checkpoint(checkpoint, _identity(made, data, by_member))
+    found = NUTS.sample(density, observed, options, seed, Context(progress, state))
     key = jax.random.fold_in(jax.random.key(seed), _NEW)
     flat = jnp.asarray(found.z).reshape(-1, density.dimension)
     drawn = density.constrain(flat, information)
     tree = make_tree(model, drawn, found.z.shape[:2], found.statistics, key)
     tree[ALONE] = tree_of_alone(by_member)
-    for name, value in _provenance(model, options, alone, seed).items():
+    for name, value in made.items():
         tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
+    state.remove()
     return Hierarchy(tree)
+
+
+def _identity(made: Mapping[str, Any], data: Mapping[str, Data], alone: Alone) -> dict[str, str]:
+    """What a run is of: its provenance, and a hash of data and of the members' draws."""
+    digest = hashlib.sha256()
+    for member in sorted(alone):
+        for values in (data.get(member, {}), alone[member]):
+            for name in sorted(values):
+                digest.update(f"{member} {name}".encode() + np.asarray(values[name]).tobytes())
+    described = {name: json.dumps(value) for name, value in made.items()}
+    return {**described, "data": digest.hexdigest()[:16]}
 
 
 def _alone(

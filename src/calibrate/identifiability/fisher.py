@@ -43,9 +43,15 @@ def informations(model: Model, values: np.ndarray, *, log: bool) -> np.ndarray:
 
 
 def _information(model: Model, means: dict[str, jax.Array], unknowns: jax.Array) -> jax.Array:
-    """Information (d, d) of the data about its means, less what errors besides noise take of it."""
+    """Information (d, d) of the data about its means, less what errors besides noise take of it.
+
+    An error of unknown size has its prior's mean.
+    """
     found = information_about_means(model.noise, means)
-    return found if model.error is None else model.error.information_left(found, unknowns)
+    if model.error is None:
+        return found
+    sizes = [jnp.asarray(prior.mean) for prior in model.error.priors.values()]
+    return model.error.information_left(found, jnp.concatenate([unknowns, jnp.array(sizes)]))
 
 
 def sensitivities(

@@ -97,7 +97,7 @@ class Present:
                 f"data has shape {values.shape}; the observation expects {self.shape}, "
                 f"as {self.missing} values are missing ({name}, {self.unit})"
             )
-        self.whole.check(name, self._filled(values))
+        self.whole.check(name, self.filled(values))
 
     def labels(self, name: str) -> Labels:
         """Entries, numbered as in the raveled data; constants of the whole observation."""
@@ -111,9 +111,10 @@ class Present:
 
     def to_arrays(self, name: str, values: np.ndarray) -> dict[str, np.ndarray]:
         """The whole observation's arrays, NaN where missing."""
-        return self.whole.to_arrays(name, self._filled(np.asarray(values)))
+        return self.whole.to_arrays(name, self.filled(np.asarray(values)))
 
-    def _filled(self, values: np.ndarray) -> np.ndarray:
+    def filled(self, values: np.ndarray) -> np.ndarray:
+        """``values`` (n,) of the entries as data of the whole observation, NaN where missing."""
         filled = np.full(int(np.prod(self.whole.shape, dtype=int)), np.nan)
         filled[self.entries] = values
         return filled.reshape(self.whole.shape)

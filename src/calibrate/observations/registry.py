@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -91,6 +92,6 @@ def observations_from_json(
     scene: Scene, description: Mapping[str, Mapping[str, Any]]
 ) -> Observations:
     """What :meth:`Observations.to_json` described."""
-    return Observations(
-        {name: observation_from_json(scene, part) for name, part in description.items()}
-    )
+    made = {json.dumps(part): part for part in description.values()}
+    parts = {key: observation_from_json(scene, part) for key, part in made.items()}
+    return Observations({name: parts[json.dumps(part)] for name, part in description.items()})

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from calibrate.observations.protocol import Observation
@@ -82,11 +83,28 @@ class Observations:
         displacement : (..., S, k, 3) mm, of ``nodes`` in every load state.
         thetas : (..., S, p), theta in every load state.
         """
-        found = {}
+        found: dict[str, jax.Array] = {}
+        for names in self._alike:
+            part, rows = self.parts[names[0]], self._rows[names[0]]
+            where = [self.states.index(split(name)[1]) for name in names]
+            if len(where) == 1:  # without a gather
+                found[names[0]] = part(
+                    displacement[..., where[0], rows, :], thetas[..., where[0], :]
+                )
+                continue
+            at = np.array(where)
+            values = part(displacement[..., at, :, :][..., rows, :], thetas[..., at, :])
+            each = jnp.moveaxis(values, values.ndim - 1 - len(part.shape), 0)
+            found |= dict(zip(names, each, strict=True))
+        return {name: found[name] for name in self.parts}
+
+    @cached_property
+    def _alike(self) -> list[list[str]]:
+        """Names of one and the same observation together: points of a curve are one program."""
+        found: dict[int, list[str]] = {}
         for name, part in self.parts.items():
-            s = self.states.index(split(name)[1])
-            found[name] = part(displacement[..., s, self._rows[name], :], thetas[..., s, :])
-        return found
+            found.setdefault(id(part), []).append(name)
+        return list(found.values())
 
     def expand[T](self, values: Mapping[str, T], what: str) -> dict[str, tuple[str, T]]:
         """Values of the parts' names, from values by name or by name without its state.

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 
 from emulator.surrogates.protocol import fingerprint_of
@@ -51,9 +52,19 @@ class ErrorModes(ABC):
     modes: np.ndarray
 
     def size(self, unknowns: jax.Array) -> jax.Array:
-        r"""The size :math:`\alpha`, (), at ``unknowns`` (q,)."""
+        r"""The size :math:`\alpha`, (), at ``unknowns``: theta's (q,), then those of ``priors``."""
         del unknowns
         return jnp.ones(())
+
+    @property
+    def priors(self) -> dict[str, dist.Distribution]:
+        """Of its own unknown numbers, by their names in the posterior."""
+        return {}
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Modes (r, d) at their largest plausible size."""
+        return self.modes
 
     def log_ratio(self, unknowns: jax.Array, residual: Means) -> jax.Array:
         """What the error adds to the log likelihood of ``residual``, data less prediction."""

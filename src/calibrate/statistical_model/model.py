@@ -26,7 +26,7 @@ from numpyro import handlers
 from calibrate.data.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.noise import Noise
 from calibrate.observations import Observations
-from calibrate.observations.present import leave_out_missing, missing_values
+from calibrate.observations.present import leave_out_missing
 from calibrate.priors import Prior
 from calibrate.priors.joint_prior import Conditional, Dependence
 from calibrate.state_names import split
@@ -98,16 +98,17 @@ class Model:
 
     @cached_property
     def noise_priors(self) -> dict[str, dist.Distribution]:
-        """Prior of every unknown number of the noises, by its name in the posterior."""
-        return {
+        """Prior of every unknown number of noises and error, by its name in the posterior."""
+        noises = {
             site: self.noise[name].priors[number]
             for name, sites in self.noise_sites.items()
             for number, site in sites.items()
         }
+        return noises if self.error is None else {**noises, **self.error.priors}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is inferred: the unknowns of theta, then those of the noises."""
+        """What is inferred: the unknowns of theta, then those of noises and error."""
         return (*self.states.unknowns, *self.noise_priors)
 
     @property
@@ -226,7 +227,9 @@ class Model:
         return self.error.log_ratio(self._stacked(draw), residual)
 
     def _stacked(self, draw: Mapping[str, Any]) -> jax.Array:
-        return jnp.stack([jnp.asarray(draw[name], float) for name in self.states.unknowns])
+        own = () if self.error is None else self.error.priors
+        names = (*self.states.unknowns, *own)
+        return jnp.stack([jnp.asarray(draw[name], float) for name in names])
 
     def prior_draws(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
         """Draws (count,) from the prior of each unknown of theta."""
@@ -258,7 +261,7 @@ class Model:
             As :meth:`check_data`, or every value of an observation is missing.
         """
         observe, present = leave_out_missing(self.observe, self._fitting(data))
-        if not missing_values(observe):
+        if all(part is self.observe.parts[name] for name, part in observe.parts.items()):
             return self, self.check_data(present)
         if self.error is not None:
             raise InputError(
@@ -286,9 +289,9 @@ class Model:
     def _sds(self) -> dict[str, float]:
         """Largest plausible sd of each observation's noise and what else data has, in its unit."""
         found = {name: noise.upper_sd for name, noise in self.noise.items()}
-        if self.error is not None and self.error.of_fem:
+        if self.error is not None and self.error.of_fem and self.error.largest.size:
             shapes = {name: jnp.zeros(shape) for name, shape in self.observe.shapes.items()}
-            each = jax.vmap(ravel_pytree(shapes)[1])(jnp.asarray(self.error.modes))
+            each = jax.vmap(ravel_pytree(shapes)[1])(jnp.asarray(self.error.largest))
             for name, modes in each.items():
                 most = np.linalg.norm(np.reshape(modes, (len(modes), -1)), 2)
                 found[name] = float(np.hypot(found[name], most))

@@ -13,19 +13,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 
 from calibrate.noise.information import information_about_means
 from calibrate.statistical_model.error_modes import ErrorModes, Means, diagonal
 from calibrate.statistical_model.model import Model
+from calibrate.statistical_model.sized_error import SizedError
 from emulator.errors import InputError
 
 _AXES = "xyz"
+_SIZED = "sized_"  # before names of arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +37,13 @@ class Systematic:
 
     names : of its s unknowns, each a standard normal.
     modes : by the observation's name, what one sd of each changes of its data, (s, *shape).
+    size : where the size of the error is inferred, its name in the posterior and the scale of its
+        half-normal prior; modes are then those of size 1. Errors with one name have one size.
     """
 
     names: tuple[str, ...]
     modes: Mapping[str, np.ndarray]
+    size: tuple[str, float] | None = None
 
 
 def rigid_motion(
@@ -104,19 +110,52 @@ class SystematicError(ErrorModes):
 
     names : of their s unknowns.
     mixing : (r, s), what the diagonal modes are made of.
+    sized : those whose size is inferred, if there are any. Its weights are those of the information
+        that the others leave, so that one after the other is exact.
     """
 
     names: tuple[str, ...]
     mixing: np.ndarray
+    sized: SizedError | None = None
 
     of_fem: ClassVar[bool] = True
     with_mesh: ClassVar[bool] = False
 
+    @property
+    def priors(self) -> dict[str, dist.Distribution]:
+        """Of the size that is inferred."""
+        return {} if self.sized is None else self.sized.priors
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Modes of both kinds at their largest plausible size."""
+        return self.modes if self.sized is None else np.vstack([self.modes, self.sized.largest])
+
+    def log_ratio(self, unknowns: jax.Array, residual: Means) -> jax.Array:
+        """What both kinds add to the log likelihood of ``residual``."""
+        found = super().log_ratio(unknowns, residual)
+        return found if self.sized is None else found + self.sized.log_ratio(unknowns, residual)
+
+    def information_left(self, information: jax.Array, unknowns: jax.Array) -> jax.Array:
+        """What both kinds leave of the noise's ``information`` (d, d)."""
+        left = super().information_left(information, unknowns)
+        return left if self.sized is None else self.sized.information_left(left, unknowns)
+
+    def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
+        """``means`` plus a draw of both kinds."""
+        if self.sized is None:
+            return super().draw(rng_key, unknowns, means)
+        key, own = jax.random.split(rng_key)
+        return self.sized.draw(own, unknowns, super().draw(key, unknowns, means))
+
     def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
         """Mean (s,) and covariance (s, s) of the unknowns, in their sds, given ``residual``.
 
-        ``residual`` is data less prediction at one draw of the parameters.
+        ``residual`` is data less prediction at one draw of the parameters. Of errors of known sds
+        alone: :class:`InputError` where the size of one is inferred.
         """
+        if self.sized is not None:
+            raise InputError(f"what is known of errors: the size '{self.sized.name}' is inferred")
         flat = np.asarray(ravel_pytree(dict(residual))[0])
         inflated = 1.0 + self.strength
         mean = self.mixing.T @ ((self.weights @ flat) / inflated)
@@ -126,7 +165,25 @@ class SystematicError(ErrorModes):
     def arrays(self) -> dict[str, np.ndarray]:
         """All that changes a likelihood, by name."""
         names = ("weights", "strength", "modes", "mixing")
-        return {name: getattr(self, name) for name in names}
+        found = {name: getattr(self, name) for name in names}
+        own = {} if self.sized is None else self.sized.arrays()
+        return found | {f"{_SIZED}{name}": array for name, array in own.items()}
+
+    @property
+    def words(self) -> dict[str, Any]:
+        """What :meth:`restore` needs besides the arrays; plain JSON."""
+        return {"names": self.names, "size": self.sized and self.sized.name}
+
+    @classmethod
+    def restore(cls, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> SystematicError:
+        """The error of these :meth:`arrays` and :attr:`words`."""
+        own = {n.removeprefix(_SIZED): a for n, a in arrays.items() if n.startswith(_SIZED)}
+        known: dict[str, Any] = {n: a for n, a in arrays.items() if not n.startswith(_SIZED)}
+        sized = None
+        if own:
+            numbers: dict[str, Any] = {**own, "scale": float(own["scale"])}
+            sized = SizedError(**numbers, name=words["size"])
+        return cls(**known, names=tuple(words["names"]), sized=sized)
 
 
 def with_systematic(model: Model, *errors: Systematic) -> Model:
@@ -142,32 +199,69 @@ def with_systematic(model: Model, *errors: Systematic) -> Model:
         raise InputError("systematic errors: give one or more")
     if model.error is not None:
         raise InputError("systematic errors: the model's likelihood has an error already")
-    parts = model.observe.parts
     for name, noise in model.noise.items():
         if noise.priors or not noise.gaussian:
             raise InputError(
                 f"systematic errors: the noise of {name} must be Gaussian and of known sd"
             )
-    names = tuple(name for error in errors for name in error.names)
-    rows = []
     for error in errors:
-        for name, modes in error.modes.items():
-            if name not in parts:
-                raise InputError(
-                    f"{error.names[0]}: '{name}' is not observed; observed: {', '.join(parts)}"
-                )
-            if np.shape(modes) != (len(error.names), *parts[name].shape):
-                raise InputError(
-                    f"{error.names[0]}: modes of '{name}' have shape {np.shape(modes)}; expected "
-                    f"{(len(error.names), *parts[name].shape)}"
-                )
+        _check_modes(model, error)
+    known = [error for error in errors if error.size is None]
+    means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
+    information = np.asarray(jax.jit(lambda m: information_about_means(model.noise, m))(means))
+    weights, strength, modes, mixing = diagonal(_rows(model, known), information)
+    names = tuple(name for error in known for name in error.names)
+    found = SystematicError(weights, strength, modes, names, mixing)
+    left = np.asarray(found.information_left(jnp.asarray(information), jnp.zeros(0)))
+    return replace(model, error=replace(found, sized=_sized(model, errors, left)))
+
+
+def _sized(
+    model: Model, errors: Sequence[Systematic], information: np.ndarray
+) -> SizedError | None:
+    """Those of ``errors`` whose size is inferred."""
+    those = [error for error in errors if error.size is not None]
+    sizes = list(dict.fromkeys(error.size for error in those if error.size is not None))
+    if not sizes:
+        return None
+    if len(sizes) > 1:
+        raise InputError(
+            f"systematic errors: sizes {sizes[0]} and {sizes[1]} are to be inferred; only one can "
+            "be, by one name and scale"
+        )
+    (name, scale) = sizes[0]
+    if name in model.names:
+        raise InputError(
+            f"systematic errors: a size is called '{name}', as an unknown of the model"
+        )
+    weights, strength, modes, _ = diagonal(_rows(model, those), information)
+    return SizedError(weights, strength, modes, name, scale)
+
+
+def _check_modes(model: Model, error: Systematic) -> None:
+    """:class:`InputError` where an error does not fit the model's observations."""
+    parts = model.observe.parts
+    for name, modes in error.modes.items():
+        if name not in parts:
+            raise InputError(
+                f"{error.names[0]}: '{name}' is not observed; observed: {', '.join(parts)}"
+            )
+        if np.shape(modes) != (len(error.names), *parts[name].shape):
+            raise InputError(
+                f"{error.names[0]}: modes of '{name}' have shape {np.shape(modes)}; expected "
+                f"{(len(error.names), *parts[name].shape)}"
+            )
+
+
+def _rows(model: Model, errors: Sequence[Systematic]) -> np.ndarray:
+    """Modes (s, d) of all data, raveled."""
+    shapes = model.observe.shapes
+    rows = [np.zeros((0, sum(int(np.prod(shape)) for shape in shapes.values())))]
+    for error in errors:
         for k in range(len(error.names)):
             each = {
                 name: jnp.asarray(error.modes[name][k]) if name in error.modes else jnp.zeros(shape)
-                for name, shape in model.observe.shapes.items()
+                for name, shape in shapes.items()
             }
-            rows.append(np.asarray(ravel_pytree(each)[0]))
-    means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
-    information = np.asarray(jax.jit(lambda m: information_about_means(model.noise, m))(means))
-    weights, strength, modes, mixing = diagonal(np.stack(rows), information)
-    return replace(model, error=SystematicError(weights, strength, modes, names, mixing))
+            rows.append(np.asarray(ravel_pytree(each)[0])[None])
+    return np.vstack(rows)

@@ -11,14 +11,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
+from calibrate.observations import Observations
+from calibrate.observations.present import leave_out_missing
+from calibrate.posterior import Posterior
 from calibrate.statistical_model.approximation_error import ApproximationError
+from calibrate.statistical_model.error_modes import ErrorModes
+from calibrate.statistical_model.systematic import SystematicError
 from emulator.errors import InputError
-from emulator.store import read_arrays
+from emulator.store import read_arrays, save_arrays
 from emulator.surrogates.protocol import ForwardMap
 
 # Paths of scene and emulator may change when a folder moves; their fingerprints may not.
+_WORDS = "systematic"  # metadata of a measurement's errors
 _PLACES = ("scene", "root", "emulator")
 
 
@@ -58,8 +65,14 @@ def check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
         )
 
 
-def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ApproximationError:
-    """The forward map's error kept in ``file``, with which the posterior was sampled.
+def keep_error(file: Path, error: ErrorModes) -> None:
+    """Write what a likelihood allows for besides noise, for :func:`restore_error`."""
+    words = {_WORDS: json.dumps(error.words)} if isinstance(error, SystematicError) else {}
+    save_arrays(file, error.arrays(), words)
+
+
+def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ErrorModes:
+    """What the likelihood allows for, kept in ``file``, with which the posterior was sampled.
 
     Raises
     ------
@@ -67,12 +80,28 @@ def restore_error(path: Path, tree: xr.DataTree, file: Path) -> ApproximationErr
         The file is missing, damaged or of another posterior.
     """
     if not file.is_file():
-        raise InputError(f"{file}, the forward map's error of the posterior beside it, is missing")
-    arrays, _ = read_arrays(file)
+        raise InputError(f"{file}, the error in the likelihood of the posterior, is missing")
+    arrays, metadata = read_arrays(file)
+    error: ErrorModes
     try:
-        error = ApproximationError.restore(arrays)
+        if _WORDS in metadata:
+            error = SystematicError.restore(arrays, json.loads(metadata[_WORDS]))
+        else:
+            error = ApproximationError.restore(arrays)
     except KeyError as missing:
         raise InputError(f"{file}: array {missing} is missing; infer again") from missing
+    except TypeError as wrong:
+        raise InputError(f"{file} holds other arrays than an error has; infer again") from wrong
     if tree.attrs.get("forward_error") != error.fingerprint:
         raise InputError(f"{path} was sampled with another error than {file} holds; infer again")
     return error
+
+
+def is_of(posterior: Posterior, observe: Observations, data: Mapping[str, np.ndarray]) -> bool:
+    """Whether a posterior is of ``data`` of these observations, NaN where missing."""
+    reduced, there = leave_out_missing(observe, data)
+    described = json.loads(json.dumps(reduced.to_json()))
+    return described == json.loads(posterior.tree.attrs["observe"]) and all(
+        np.array_equal(np.ravel(there[name]), np.ravel(values))
+        for name, values in posterior.data.items()
+    )

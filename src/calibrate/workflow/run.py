@@ -10,6 +10,7 @@ from calibrate.noise import Noise, noise_of, with_discrepancy
 from calibrate.observations import DISPLACEMENT, Observations
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
+from calibrate.statistical_model.shared_errors import shared_error
 from emulator.errors import InputError
 from emulator.surrogates import registry
 
@@ -19,11 +20,12 @@ class Run:
     """What to calibrate and how.
 
     scene, root : a scene's name or file; the folder of the published data.
-    data : a file, or ``synthetic``: FEM at ``truth`` plus noise.
+    data : a file, files by load state (:func:`calibrate.data.read_data`), or ``synthetic``: FEM at
+        ``truth`` plus noise.
     truth : parameters of synthetic data by name, ``parameter@state`` in one of several load states
         (:mod:`calibrate.state_names`).
-    known : parameters that are not inferred, by the same names. They are those of synthetic data
-        too, unless ``truth`` says otherwise.
+    known : parameters that are not inferred, by the same names; what the data's files know comes to
+        them. They are those of synthetic data too, unless ``truth`` says otherwise.
     observe : observations of synthetic data, joined by ``+``, e.g. ``landmarks:24+volume``; each
         kind of ``calibrate.observations.OBSERVATIONS`` says which words ask for it. They are made
         in every load state that ``truth`` and ``known`` name; ``volume@diastole`` in one.
@@ -37,6 +39,10 @@ class Run:
         inferred; synthetic data then still has the one of ``noise``.
     discrepancy : discrepancy of the model (:mod:`calibrate.noise.discrepancy`) by the
         observation's name, e.g. ``{"scale": 0.5, "length": 20.0}``; synthetic data has none.
+    systematic : errors that several numbers share, by a name of their own, each a kind of
+        :data:`calibrate.statistical_model.shared_errors.SHARED_ERRORS` with its options, e.g.
+        ``{"camera": {"kind": "rigid_motion", "of": "displacement", "shift": 2.0, "turn": 1.0}}``;
+        synthetic data has none.
     check_scale : refuse data that is far from every prediction (:mod:`calibrate.data.magnitude`).
     forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
         options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
@@ -50,7 +56,7 @@ class Run:
 
     scene: str
     root: str | None = None
-    data: str = "synthetic"
+    data: str | dict[str, str] = "synthetic"
     truth: dict[str, float] = field(default_factory=dict)
     known: dict[str, float] = field(default_factory=dict)
     observe: str = "nodes:20"
@@ -58,6 +64,7 @@ class Run:
     noise: Mapping[str, float | dict[str, Any]] | float = field(default_factory=dict)
     noise_scale: Mapping[str, float] | float = field(default_factory=dict)
     discrepancy: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    systematic: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     check_scale: bool = True
     forward: str = "emulator"
     emulator: str | None = None
@@ -86,6 +93,12 @@ class Run:
         if self.error_runs and self.mesh_error_runs:
             raise InputError(
                 "error_runs and mesh_error_runs are both given; the latter see the map's error, too"
+            )
+        for name, description in self.systematic.items():
+            shared_error(name, description)
+        if self.systematic and (self.error_runs or self.mesh_error_runs):
+            raise InputError(
+                "systematic and error_runs are both given; a likelihood allows for one of them"
             )
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be 0 or more")

@@ -21,7 +21,7 @@ import numpy as np
 
 from calibrate.certificate import Certificate, examine
 from calibrate.certificate.reweight import keeps, reweighted
-from calibrate.data import read_data, write_data
+from calibrate.data import read_data, read_known, write_data
 from calibrate.observations import Observations, observations_from_json, parse_observation
 from calibrate.observations.present import missing_values
 from calibrate.posterior import Posterior, read_tree, sample
@@ -30,15 +30,16 @@ from calibrate.samplers import find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, with_error
 from calibrate.statistical_model.build import model
-from calibrate.statistical_model.load_states import known_thetas
-from calibrate.workflow.restore import check_forward, check_run, restore_error
+from calibrate.statistical_model.load_states import known_thetas, load_states
+from calibrate.statistical_model.shared_errors import with_shared_errors
+from calibrate.workflow.restore import check_forward, check_run, keep_error, restore_error
 from calibrate.workflow.run import Run
 from emulator import schema
 from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.fem import NewtonOptions, Simulator
 from emulator.scenes.scene import Scene
-from emulator.store import exclusive, read_json, save_arrays, write_json
+from emulator.store import exclusive, read_json, write_json
 from emulator.surrogates import registry
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.kind import Ingredients
@@ -111,14 +112,57 @@ def build_model(run: Run, scene: Scene, observe: Observations, *, progress: bool
 def model_before_data(run: Run, *, progress: bool = False) -> Model:
     """The statistical model of a run that has no data yet."""
     scene = find_scene(run.scene, run.root)
+    run = with_known(run)
     observe = observed(run, scene)
-    return build_model(run.named(observe), scene, observe, progress=progress)
+    built = build_model(run.named(observe), scene, observe, progress=progress)
+    if not run.systematic:
+        return built
+    # Some of these errors depend on where a body is seen: at a draw of the prior.
+    draw = {name: each[0] for name, each in built.prior_draws(jax.random.key(run.seed), 1).items()}
+    means = {name: np.asarray(mean) for name, mean in built.predict(draw)[0].items()}
+    return with_shared_errors(built, means, run.systematic)[0]
+
+
+def check_names(run: Run) -> None:
+    """Refuse names that do not fit a run's scene and data, before a forward map is built.
+
+    Raises
+    ------
+    InputError
+        An observation, a parameter or a load state that is not there, by its name.
+    """
+    scene, run = find_scene(run.scene, run.root), with_known(run)
+    observe = observed(run, scene)
+    run.noises(observe)
+    load_states(scene, observe.states, prior_of(run.prior, scene), run.known)
+    for name, description in run.systematic.items():
+        words = dict.fromkeys(str(description["of"]).split("+"))
+        observe.expand(words, f"systematic '{name}': of")
+
+
+def with_known(run: Run) -> Run:
+    """The run with all that is known of its load states, what its files say included.
+
+    Raises
+    ------
+    InputError
+        A file and the run say different things.
+    """
+    told = {} if run.data == "synthetic" else read_known(run.data)
+    for name, value in told.items():
+        if run.known.get(name, value) != value:
+            raise InputError(
+                f"known: '{name}' is {value} in the data file and {run.known[name]} beside it; "
+                "say it once"
+            )
+    return replace(run, known={**told, **run.known})
 
 
 def by_fem(model: Model) -> Model:
     """``model`` with FEM as its forward map, to make the data it is checked with."""
     whole = fem_forward(simulator_of(model.forward.scene), model.full)
-    return replace(model, full=whole, forward=whole.at(model.observe.nodes), error=None)
+    error = model.error if model.error is not None and model.error.of_fem else None
+    return replace(model, full=whole, forward=whole.at(model.observe.nodes), error=error)
 
 
 def infer(
@@ -168,7 +212,7 @@ def _keep(
     write_json(folder / RUN, asdict(run))
     registry.keep_forward(posterior.model.full, folder / FORWARD)
     if posterior.model.error is not None:
-        save_arrays(folder / ERROR, posterior.model.error.arrays(), {})
+        keep_error(folder / ERROR, posterior.model.error)
     posterior.tree.attrs["run"] = json.dumps(asdict(run))
     posterior.save(folder / POSTERIOR)
 
@@ -181,10 +225,13 @@ def _sampled(
     length = {"warmup": run.warmup, "draws": run.draws, "chains": run.chains}
     options = options_from(sampler, run.sampler_options, **length)
     scene = find_scene(run.scene, run.root)
+    run = with_known(run)
     observe, data = make_data(run, scene)
     run = run.named(observe)
     built = build_model(run, scene, observe, progress=progress)
     present: Mapping[str, Any] = data
+    if run.systematic:
+        built, present = with_shared_errors(built, data, run.systematic)
     if runs := run.error_runs or run.mesh_error_runs:
         built, present = built.given(data)
         # Now that the data is checked, sampling need not check it again.
@@ -220,6 +267,10 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     """
     folder = Path(folder)
     path = folder / POSTERIOR
+    if "members" in read_json(folder / RUN):
+        raise InputError(
+            f"{folder} holds a population; name one of its members, {folder / 'members'}/NAME"
+        )
     run = schema.read_json_as(Run, folder / RUN)
     scene = find_scene(run.scene, run.root)
     tree = read_tree(path)
@@ -233,7 +284,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     # Its data was checked when it was sampled, or the check was overruled.
     prior = prior_of(run.prior, scene)
     built: Model = model(forward, observe, noises, prior, known=run.known, check_scale=False)
-    if run.error_runs or run.mesh_error_runs:
+    if run.error_runs or run.mesh_error_runs or run.systematic:
         error = restore_error(path, tree, folder / ERROR)
         built = replace(built, error=error)
     observed = tree["observed_data"]

@@ -21,7 +21,7 @@ from calibrate.cli.common import (
     show_progress,
     table,
 )
-from calibrate.cli.model_words import add_model, model_of
+from calibrate.cli.model_words import add_model, run_of
 from calibrate.cli.noise_words import noise_words
 from emulator.errors import InputError
 
@@ -40,7 +40,7 @@ def register(commands: Any) -> None:
     prior = kinds.add_parser("prior", help="what the prior predicts: 500 data sets and a picture")
     for kind, run in ((sbc, run_sbc), (prior, run_prior)):
         add_model(kind)
-        kind.add_argument("--seed", type=int, default=0)
+        kind.add_argument("--seed", type=int)
         kind.add_argument("--out", required=True, metavar="DIR")
         answer(kind, run)
     sbc.add_argument("--replicates", type=int, default=200, metavar="N", help="data sets")
@@ -139,14 +139,14 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     from calibrate.figures.calibration import draw
     from calibrate.posterior.simulation_based import sbc
     from calibrate.samplers import NUTSOptions
-    from calibrate.workflow import Run, by_fem, model_before_data
+    from calibrate.workflow import by_fem, model_before_data
     from emulator.store import check_folder, write_json
 
     folder, progress = check_folder(arguments.out), show_progress(arguments)
     if arguments.scheduler is not None and not arguments.fem_data:
         raise InputError("--scheduler has no effect without --fem-data")
     scheduler = scheduler_word(arguments)
-    run = Run(**model_of(arguments), seed=arguments.seed)
+    run = run_of(arguments, seed=arguments.seed)
     model = model_before_data(run, progress=progress)
     truth = model
     if arguments.true_noise:
@@ -159,7 +159,7 @@ def run_sbc(arguments: argparse.Namespace) -> int:
         arguments.replicates,
         truth=truth,
         options=options,
-        seed=arguments.seed,
+        seed=run.seed,
         progress=progress,
         scheduler=scheduler,
     )
@@ -185,13 +185,13 @@ def run_prior(arguments: argparse.Namespace) -> int:
     from calibrate.figures.calibration import draw_prior_predictive
     from calibrate.observations.pressure_volume import in_mmhg
     from calibrate.posterior.predictions import prior_replicates
-    from calibrate.workflow import Run, model_before_data
+    from calibrate.workflow import model_before_data
     from emulator.store import check_folder, save_arrays
 
     folder: Path = check_folder(arguments.out)
-    run = Run(**model_of(arguments), seed=arguments.seed)
+    run = run_of(arguments, seed=arguments.seed)
     model = model_before_data(run, progress=show_progress(arguments))
-    found = prior_replicates(model, jax.random.key(arguments.seed))
+    found = prior_replicates(model, jax.random.key(run.seed))
     units = {name: part.unit for name, part in model.observe.parts.items()}
     save_arrays(folder / "prior_predictive.safetensors", {**found.draws, **found.data})
     title = f"{run.scene}: what the prior predicts"
@@ -202,7 +202,7 @@ def run_prior(arguments: argparse.Namespace) -> int:
     }
     rows = [(f"{name} ({units[name]})", *by.values()) for name, by in result.items()]
     text = table(("observation", "5 %", "50 %", "95 %"), rows)
-    if (band := _klotz(model, arguments.seed)) is not None:
+    if (band := _klotz(model, run.seed)) is not None:
         result["klotz"] = {"fraction": band.fraction, "band_kpa": band.band}
         text += (
             f"\n{100.0 * band.fraction:.0f} % of {band.apart.size} pressure-volume curves lie "

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from calibrate.cli.common import DONE, answer, emit, table
-from calibrate.cli.model_words import add_model, model_of
+from calibrate.cli.model_words import add_model, run_of
 
 
 def register(commands: Any) -> None:
@@ -15,7 +15,7 @@ def register(commands: Any) -> None:
     kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
     before = kinds.add_parser("before", help="of data not yet measured, from a scene")
     add_model(before)
-    before.add_argument("--seed", type=int, default=0)
+    before.add_argument("--seed", type=int)
     after = kinds.add_parser("after", help="of a posterior that calibrate infer wrote")
     after.add_argument("folder", metavar="DIR")
     after.add_argument(
@@ -36,9 +36,9 @@ def run_before(arguments: argparse.Namespace) -> int:
     """What the observations would determine."""
     from calibrate.identifiability import expected_precision
     from calibrate.identifiability.combinations import products_in_words
-    from calibrate.workflow import Run, model_before_data
+    from calibrate.workflow import model_before_data
 
-    model = model_before_data(Run(**model_of(arguments), seed=arguments.seed))
+    model = model_before_data(run_of(arguments, seed=arguments.seed))
     found = expected_precision(model)
     rows = [(name, f"{100 * ratio:.3g} %") for name, ratio in found["sd"].items()]
     lines = [table(("parameter", "expected sd / prior sd"), rows)]

@@ -5,20 +5,30 @@ from __future__ import annotations
 import argparse
 from contextlib import suppress
 from dataclasses import fields
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import DONE, FAILED, emit, show_progress
-from calibrate.cli.model_words import add_model, model_of
-from calibrate.cli.posterior_table import summary
+from calibrate.cli.model_words import add_model, plan_of
+from calibrate.cli.posterior_table import cohort_summary, summary
 from calibrate.samplers import SAMPLERS, find_sampler
 from emulator.errors import InputError
+
+if TYPE_CHECKING:
+    from calibrate.workflow import Run
+    from calibrate.workflow.experiment import Cohort
 
 
 def register(commands: Any) -> None:
     """Add the command."""
-    parser = commands.add_parser("infer", help="sample a posterior")
+    parser = commands.add_parser(
+        "infer",
+        help="sample a posterior",
+        epilog="examples: calibrate infer SCENE --data measured.csv --noise 0.2 --out DIR; "
+        "calibrate infer experiment.toml --out DIR",
+    )
     add_model(parser)
-    parser.add_argument("--sampler", choices=tuple(SAMPLERS), default="nuts")
+    parser.add_argument("--sampler", choices=tuple(SAMPLERS), help="default nuts")
     parser.add_argument(
         "--sampler-options",
         nargs="+",
@@ -26,10 +36,10 @@ def register(commands: Any) -> None:
         metavar="NAME=VALUE",
         help="e.g. target_accept=0.95, start=pathfinder; an unknown name lists those there are",
     )
-    parser.add_argument("--draws", type=int, default=1000)
+    parser.add_argument("--draws", type=int, help="of each chain (default 1000)")
     parser.add_argument("--warmup", type=int, help="iterations that adapt (default 500)")
-    parser.add_argument("--chains", type=int, default=4)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--chains", type=int, help="default 4")
+    parser.add_argument("--seed", type=int, help="default 0")
     parser.add_argument(
         "--no-certify", action="store_true", help="leave the check against FEM for later"
     )
@@ -55,31 +65,40 @@ def sampler_options(words: list[str]) -> dict[str, Any]:
     return found
 
 
-def warmup(sampler: str, given: int | None) -> int:
-    """Iterations that adapt; :class:`InputError` where they are given to a sampler without any."""
+def check_warmup(sampler: str, given: int | None) -> None:
+    """:class:`InputError` where iterations that adapt are given to a sampler without any."""
     if given is not None and "warmup" not in {
         f.name for f in fields(find_sampler(sampler).options)
     }:
         raise InputError(f"--warmup has no effect with sampler '{sampler}', which does not adapt")
-    return 500 if given is None else given
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Sample and keep a posterior."""
-    from calibrate.workflow import Run, certify_and_keep, report
-    from calibrate.workflow import infer as run_inference
+    """Sample and keep a posterior, or those of members of a population."""
+    from calibrate.workflow import Run
     from emulator.store import check_folder
 
-    folder, progress = check_folder(arguments.out), show_progress(arguments)
-    plan = Run(
-        **model_of(arguments),
+    folder = check_folder(arguments.out)
+    plan = plan_of(
+        arguments,
         sampler=arguments.sampler,
-        sampler_options=sampler_options(arguments.sampler_options),
-        warmup=warmup(arguments.sampler, arguments.warmup),
+        sampler_options=sampler_options(arguments.sampler_options) or None,
+        warmup=arguments.warmup,
         draws=arguments.draws,
         chains=arguments.chains,
         seed=arguments.seed,
     )
+    if not isinstance(plan, Run):
+        return _run_cohort(arguments, plan, folder)
+    check_warmup(plan.sampler, arguments.warmup)
+    return _run_one(arguments, plan, folder)
+
+
+def _run_one(arguments: argparse.Namespace, plan: Run, folder: Path) -> int:
+    from calibrate.workflow import certify_and_keep, report
+    from calibrate.workflow import infer as run_inference
+
+    progress = show_progress(arguments)
     posterior = run_inference(plan, folder, force=arguments.force, progress=progress)
     certificate = None
     if not (arguments.no_certify or find_sampler(plan.sampler).solves_fem):
@@ -92,3 +111,21 @@ def run(arguments: argparse.Namespace) -> int:
     )
     emit(result, as_json=arguments.json, text=text)
     return DONE if certificate is None or certificate.verdict == "accepted" else FAILED
+
+
+def _run_cohort(arguments: argparse.Namespace, plan: Cohort, folder: Path) -> int:
+    from calibrate.workflow.cohort import cohort_report, infer_cohort
+
+    found, verdicts = infer_cohort(
+        plan,
+        folder,
+        certify=not arguments.no_certify,
+        force=arguments.force,
+        progress=show_progress(arguments),
+    )
+    result = cohort_report(found, verdicts)
+    text = f"{cohort_summary(result)}\nwritten to {folder}; a member's page: calibrate report "
+    text += f"{folder}/members/NAME"
+    emit(result, as_json=arguments.json, text=text)
+    good = all(verdict in ("accepted", "decided by FEM") for verdict in verdicts.values())
+    return DONE if good else FAILED

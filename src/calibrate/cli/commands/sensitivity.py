@@ -93,8 +93,8 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Analyse a scene's forward map."""
-    from calibrate.cli.model_words import emulator_word, prior_word
     from calibrate.observations import parse_observation
+    from calibrate.places import emulator_place, prior_place
     from calibrate.priors import prior_of
     from calibrate.sensitivity_analysis import sensitivity
     from emulator import Simulator
@@ -113,13 +113,13 @@ def run(arguments: argparse.Namespace) -> int:
     options = forward_options(arguments)
     groups = _groups(arguments.group)
     made_of = Ingredients(
-        scene, Simulator(scene), emulator_word(arguments.emulator), arguments.seed, progress=False
+        scene, Simulator(scene), emulator_place(arguments.emulator), arguments.seed, progress=False
     )
     forward = build_forward(arguments.forward, made_of, options)
     found = sensitivity(
         forward,
         observe or None,
-        prior=prior_of(prior_word(arguments.prior), scene),
+        prior=prior_of(prior_place(arguments.prior), scene),
         method=arguments.method,
         samples=_SAMPLES[arguments.method] if arguments.samples is None else arguments.samples,
         groups=groups,

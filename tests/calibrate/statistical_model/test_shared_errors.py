@@ -1,0 +1,260 @@
+"""Systematic errors in words, against the arrays they stand for."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
+
+import calibrate as cal
+from calibrate.statistical_model.curve import curve_covariance
+from calibrate.statistical_model.shared_errors import (
+    Seen,
+    shared_error,
+    turned,
+    with_shared_errors,
+)
+from calibrate.statistical_model.systematic import Systematic, SystematicError
+from emulator.errors import InputError
+from emulator.scenes import Scene
+from linear_support import linear_forward
+from scene_support import block
+
+NODES = [3, 11, 20]
+A, B = "displacement@a", "displacement@b"
+
+
+@pytest.fixture(scope="module")
+def model():
+    scene = block()
+    seen = cal.nodal_displacements(scene, NODES)
+    return cal.model(
+        linear_forward(scene), {A: seen, B: seen}, cal.GaussianNoise(sd=0.1), check_scale=False
+    )
+
+
+@pytest.fixture(scope="module")
+def data(model):
+    rng = np.random.default_rng(0)
+    return {name: 0.3 * rng.normal(size=(3, 3)) for name in (A, B)}
+
+
+def of(model, data, **description):
+    """The one error that a description makes."""
+    return shared_error("e", description).systematic("e", Seen(model, data))
+
+
+def test_a_rigid_motion_turns_points_where_they_were_seen_or_at_rest(model, data):
+    rest = model.observe.parts[A].points
+    made = of(model, data, kind="rigid_motion", of=B, shift=0.5, turn=[1.0, 2.0, 0.0])
+    expected = cal.rigid_motion("e", {B: rest + data[B]}, 0.5, (1.0, 2.0, 0.0))
+    assert made.names == expected.names
+    assert made.modes.keys() == {B}
+    np.testing.assert_array_equal(made.modes[B], expected.modes[B])
+    made = of(model, data, kind="rigid_motion", of="displacement", turn=1.0, at="rest")
+    expected = cal.rigid_motion("e", {A: rest, B: rest}, 0.0, 1.0)
+    for name in (A, B):
+        np.testing.assert_array_equal(made.modes[name], expected.modes[name])
+    made = of(model, data, kind="rigid_motion", of=A, turn=1.0, at="rest", about=rest[1].tolist())
+    np.testing.assert_array_equal(made.modes[A][:, 1], 0.0)
+
+
+def test_a_placement_has_an_offset_for_the_rows_it_names(model, data):
+    made = of(model, data, kind="placement", of=f"{A}+{B}", sd=0.7, rows=[1])
+    assert made.names == ("e 1,0", "e 1,1", "e 1,2")
+    for name in (A, B):
+        np.testing.assert_array_equal(made.modes[name][:, 1], 0.7 * np.eye(3))
+        np.testing.assert_array_equal(made.modes[name][:, [0, 2]], 0.0)
+
+
+def test_pins_move_as_the_turn_of_their_surface_says(model):
+    rest = model.observe.parts[A].points
+    R = Rotation.from_rotvec([0.1, -0.3, 0.2]).as_matrix()
+    moved = {A: rest @ R.T - rest + [1.0, 2.0, 3.0], B: np.zeros((3, 3))}
+    np.testing.assert_allclose(turned(rest, moved[A]), R, atol=1e-12)
+    made = of(model, moved, kind="pins", of="displacement", sd=2.0)
+    for k, axis in enumerate(np.eye(3)):
+        expected = np.tile(2.0 * (R - np.eye(3)) @ axis, (3, 1))
+        np.testing.assert_allclose(made.modes[A][k], expected, atol=1e-12)
+    np.testing.assert_allclose(made.modes[B], 0.0, atol=1e-12)
+
+
+def test_a_gain_is_one_factor_of_all_data(model, data):
+    made = of(model, data, kind="gain", of="displacement", share=0.02)
+    assert made.names == ("e",)
+    for name in (A, B):
+        np.testing.assert_array_equal(made.modes[name], [0.02 * data[name]])
+
+
+def test_missing_values_are_left_out_of_the_modes(model, data):
+    gappy = {A: data[A].copy(), B: data[B]}
+    gappy[A][1, 2] = np.nan
+    words = {"gain": {"kind": "gain", "of": "displacement", "share": 0.1}}
+    found, present = with_shared_errors(model, gappy, words)
+    assert present[A].shape == (8,)
+    kept = np.delete(0.1 * data[A].ravel(), 5)
+    by_hand = cal.with_systematic(
+        model.given(gappy)[0], Systematic(("gain",), {A: kept[None], B: 0.1 * data[B][None]})
+    )
+    draw = {"mu": jnp.asarray(3.0), "lam": jnp.asarray(4.0)}
+    expected = by_hand.map_log_likelihood(draw, present)
+    assert float(found.map_log_likelihood(draw, present)) == pytest.approx(float(expected))
+    # What is left is taken as it is.
+    assert found.given(present)[0] is found
+
+
+def test_data_may_be_as_far_off_as_the_errors_are(model):
+    far = {name: np.full((3, 3), 10.0) for name in (A, B)}
+    checking = replace(model, check_scale=True)
+    camera = {"kind": "rigid_motion", "of": "displacement", "shift": 10.0}
+    found, present = with_shared_errors(checking, far, {"camera": camera})
+    found.check_data(present)
+    little = {"camera": {**camera, "shift": 0.01}}
+    found, present = with_shared_errors(checking, far, little)
+    with pytest.raises(InputError, match="larger than predicted"):
+        found.check_data(present)
+
+
+@pytest.mark.parametrize(
+    ("description", "message"),
+    [
+        ({"kind": "wind", "of": A}, "systematic 'e': kind 'wind' is unknown; known: rigid_motion"),
+        ({"of": A}, "systematic 'e': key 'kind' is missing; give rigid_motion, placement"),
+        ({"kind": "gain", "of": A}, "systematic 'e': key 'share' is missing"),
+        ({"kind": "gain", "of": A, "share": "2 %"}, 'share = "2 %"; expected a number'),
+        ({"kind": "gain", "of": A, "share": -0.1}, "share is -0.1; it must be 0 or more"),
+        ({"kind": "gain", "of": A, "share": 0.1, "sd": 1.0}, "unknown key 'sd'; known: of, share"),
+        ({"kind": "gain", "of": "volume", "share": 0.1}, "of: 'volume' is not observed; observed"),
+        ({"kind": "placement", "of": A, "sd": 1.0, "rows": [3]}, "rows: there is no point 3"),
+        ({"kind": "rigid_motion", "of": A, "turn": [1.0]}, "turn"),
+        ({"kind": "rigid_motion", "of": A, "at": "sea"}, 'at = "sea"; expected "loaded" or "rest"'),
+        (
+            {"kind": "curve", "of": A, "along": "mu", "length": 0.1},
+            "of: 'displacement@a' is not a single number",
+        ),
+        (
+            {"kind": "curve", "of": A, "along": "mu", "length": 0.0},
+            "length is 0.0; it must be abov",
+        ),
+        (
+            {"kind": "curve", "of": A, "along": "mu", "length": 1.0, "constant": 2.0},
+            "constant is 2.0; it is a part, 0 to 1",
+        ),
+    ],
+)
+def test_what_cannot_be_is_one_line(model, data, description, message):
+    with pytest.raises(InputError) as told:
+        with_shared_errors(model, data, {"e": description})
+    assert message in str(told.value)
+    assert str(told.value).startswith("systematic 'e'")
+    assert "\n" not in str(told.value)
+
+
+def forces(scene: Scene, count: int, **known):
+    """A model of one number in each of ``count`` states, mu known there if at all."""
+    number = cal.MeasuredParameter(scene, "lam")
+    names = [f"parameter:lam@{k}" for k in range(count)]
+    given = {f"mu@{k}": 2.0 + k / count for k in range(count)} if known.get("mu") else None
+    return cal.model(
+        linear_forward(scene), dict.fromkeys(names, number), cal.GaussianNoise(sd=1e-3), known=given
+    )
+
+
+def test_a_hundred_points_of_a_curve_are_not_a_hundred_facts():
+    """The mean of what is measured stays as uncertain as the curve is, however many points."""
+    sds = {}
+    for count in (10, 100):
+        model = forces(block(), count, mu=True)
+        data = {name: np.array(5.0) for name in model.observe.parts}
+        words = {
+            "kind": "curve", "of": "parameter:lam", "along": "mu", "length": 1e3, "share": 0.04
+        }  # fmt: skip
+        found, _ = with_shared_errors(model, data, {"e": words})
+        information = np.eye(count) / 1e-6
+        left = found.error.information_left(information, jnp.ones(1))
+        sds[count] = float(np.sum(left)) ** -0.5
+    assert sds[10] == pytest.approx(0.2, rel=1e-3)
+    assert sds[100] == pytest.approx(0.2, rel=1e-3)  # 1e-4 were they a hundred facts
+
+
+def test_where_a_curve_is_must_be_known():
+    model = forces(block(), 3)
+    data = {name: np.array(5.0) for name in model.observe.parts}
+    words = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 0.1, "share": 0.1}
+    with pytest.raises(InputError, match="along: 'mu' is not known; give its value as known"):
+        with_shared_errors(model, data, {"e": words})
+    with pytest.raises(InputError, match="along: 'shear' is no parameter; there are mu, lam"):
+        with_shared_errors(model, data, {"e": {**words, "along": "shear"}})
+
+
+def test_a_share_that_is_inferred_after_errors_of_known_sds_is_the_dense_covariance():
+    """log N(y; g, W^-1 + V V^T + a^2 U U^T) at two sizes a, by map and by FEM; replicates have it."""
+    model = forces(block(), 4, mu=True)
+    values = np.array([4.0, 5.0, 5.5, 7.0])
+    data = {name: np.array(v) for name, v in zip(model.observe.parts, values, strict=True)}
+    curve = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 0.4}
+    words = {
+        "gain": {"kind": "gain", "of": "parameter:lam", "share": 0.01},
+        "law": {**curve, "share_scale": 0.3, "constant": 0.5},
+    }
+    found, present = with_shared_errors(model, data, words)
+    assert found.names == ("lam", "curve_share")
+    at = 2.0 + np.arange(4) / 4
+    gain = 0.01 * values
+    for share in (0.02, 0.2):
+        law = curve_covariance(at, values, 0.4, share=share, constant=0.5)
+        C = 1e-6 * np.eye(4) + np.outer(gain, gain) + np.asarray(law)
+        draw = {"lam": jnp.asarray(5.2), "curve_share": jnp.asarray(share)}
+        expected = multivariate_normal(np.full(4, 5.2), C).logpdf(values)
+        assert float(found.map_log_likelihood(draw, present)) == pytest.approx(expected, rel=1e-6)
+        means = {name: jnp.asarray(5.2) for name in data}
+        by_fem = found.fem_log_likelihood(draw, means, present)
+        assert float(by_fem) == pytest.approx(expected, rel=1e-6)
+        left = found.error.information_left(jnp.eye(4) / 1e-6, jnp.array([5.2, share]))
+        np.testing.assert_allclose(left, np.linalg.inv(C), rtol=1e-4, atol=1e-3)
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    drawn = jax.vmap(lambda key: jnp.stack(list(found.fem_means(key, draw, means).values())))(keys)
+    np.testing.assert_allclose(np.cov(np.asarray(drawn).T), C - 1e-6 * np.eye(4), atol=0.1)
+    # Kept and read again it is the same error.
+    back = SystematicError.restore(found.error.arrays(), found.error.words)
+    assert back.fingerprint == found.error.fingerprint
+    assert back.priors.keys() == {"curve_share"}
+    with pytest.raises(InputError, match="the size 'curve_share' is inferred"):
+        found.error.unknowns(present)
+
+
+def test_curves_tell_the_share_that_a_law_is_off_by():
+    """Eight numbers far apart along a curve: the share is the scatter of them, its sd 1 / sqrt(2 n)."""
+    scene = block()
+    names = [f"parameter:lam@{k}" for k in range(8)]
+    model = cal.model(
+        linear_forward(scene),
+        dict.fromkeys(names, cal.MeasuredParameter(scene, "lam")),
+        cal.GaussianNoise(sd=1e-3),
+        known={f"mu@{k}": 2.0 + 100.0 * k for k in range(8)},
+        check_scale=False,
+    )
+    values = 5.0 * (1.0 + 0.1 * np.random.default_rng(1).normal(size=8))
+    data = {name: np.array(v) for name, v in zip(names, values, strict=True)}
+    curve = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 1.0}
+    found, present = with_shared_errors(model, data, {"e": {**curve, "share_scale": 0.3}})
+    posterior = cal.sample(found, present, sampler="laplace", seed=1, predictions=False)
+    row, scatter = posterior.summary()["curve_share"], float(np.std(values / values.mean()))
+    assert abs(row["mean"] - scatter) < 1.5 * row["sd"]
+    assert row["sd"] == pytest.approx(scatter / 4.0, rel=0.6)
+
+
+def test_one_share_is_inferred_and_not_beside_a_known_one():
+    model = forces(block(), 3, mu=True)
+    data = {name: np.array(5.0) for name in model.observe.parts}
+    curve = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 0.4}
+    with pytest.raises(InputError, match="share_scale is beside share or sd; give one of them"):
+        with_shared_errors(model, data, {"e": {**curve, "share_scale": 0.3, "share": 0.1}})
+    with pytest.raises(InputError, match=r"share_scale is -0.3; it must be above 0"):
+        with_shared_errors(model, data, {"e": {**curve, "share_scale": -0.3}})
+    two = {"a": {**curve, "share_scale": 0.3}, "b": {**curve, "share_scale": 0.2}}
+    with pytest.raises(InputError, match="only one can be, by one name and scale"):
+        with_shared_errors(model, data, two)
