@@ -34,10 +34,6 @@ from emulator.fem.system import System
 from emulator.mechanics.kinematics import determinant
 from emulator.scenes.scene import Scene
 
-# A factor of a tangent that is not symmetric is worth more steps than one that is
-# (docs/experiments.md, "Unloading").
-_KEEP_TANGENT = 0.3
-
 
 @dataclass(frozen=True, eq=False)
 class Unloaded:
@@ -218,8 +214,7 @@ def _by_inverse_motion(
     system: System, options: NewtonOptions, theta: jax.Array, start: jax.Array
 ) -> Solution:
     """From ``start``, which is the loaded mesh, at the whole load, then load level by level."""
-    keep = max(options.keep_tangent, _KEEP_TANGENT) if options.keep_tangent else 0.0
-    plain = replace(options, stress_iterates=False, keep_tangent=keep)
+    plain = replace(options, stress_iterates=False)
     return _upright(system, find_equilibrium(system, plain, theta, start))
 
 
