@@ -11,15 +11,13 @@ Directions m of the loaded tissue are carried back as material lines, :math:`f_0
 Sheets are carried back likewise and then turned to be orthogonal to the fibres, in the plane of
 both: laws are written for orthogonal ones.
 
-A law is a function of strain measures, :math:`W = \varphi(\xi)`
-(:mod:`emulator.mechanics.measures`), so with :math:`B_k = (\partial\xi_k/\partial F)\, F^T`
+With the law's own stress and moduli at F, and the slopes of its stress in the directions,
 
 .. math::
-    \tau = \sum_k s_k B_k, \quad s = \varphi'(\xi), \qquad
-    d\tau = \sum_{kl} B_k\, \varphi''_{kl}\, d\xi_l + \sum_k s_k\, dB_k .
+    d\tau = \left(\frac{\partial P}{\partial F} : dF
+        + \frac{\partial P}{\partial f_0} \cdot df_0\right) F^T + P\, dF^T .
 
-Only measures are differentiated along all nine components of h, directions included, never the
-exponentials of the law.
+Only F and :math:`f_0` are differentiated along all nine components of h, never the law.
 """
 
 from __future__ import annotations
@@ -31,9 +29,8 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.energy import point_energy, with_volume_change
-from emulator.fem.material_point import MaterialPoint
+from emulator.fem.material_point import stress_and_moduli
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.mechanics.measures import measures_read
 from emulator.scenes.scene import Scene
 
 Seen = Callable[..., tuple[jax.Array, jax.Array | None]]
@@ -87,38 +84,29 @@ def kirchhoff_and_slopes(
 ) -> Callable[..., tuple[jax.Array, tuple[jax.Array, ...]]]:
     """:func:`kirchhoff` with its derivatives in each of the ``count`` parts of ``x``."""
     every = tuple(range(count))
-    if measures_read(scene.law) is None:
-        stress = kirchhoff(scene, theta, seen)
-        return lambda *x: (stress(*x), jax.jacfwd(stress, every)(*x))
-    point = MaterialPoint(scene, theta)
-    measures = point.measures
+    law = stress_and_moduli(scene, theta)
+    energy = point_energy(scene, theta)
 
     def linearised(*x: Any) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        *point_x, at = x
-        phi = point.energy(at)
+        *point, at = x
 
-        def measured(*x: jax.Array) -> jax.Array:
-            return measures.of(*seen(*x, at.directions))
+        def place(*x: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            return seen(*x, at.directions)
 
-        def basis(*x: jax.Array) -> jax.Array:
-            H, directions = seen(*x, at.directions)
-            slopes = measures.derivatives(H, directions, jnp.zeros(measures.size))[0]
-            return slopes @ (H + jnp.eye(3, dtype=H.dtype)).T
+        def pulled(directions: jax.Array) -> jax.Array:
+            return jax.grad(energy)(H, at._replace(directions=directions)) @ F.T
 
-        def stresses(own: jax.Array) -> tuple[jax.Array, jax.Array]:
-            s = jax.grad(phi)(own)
-            return s, s
-
-        C, s = jax.jacfwd(stresses, has_aux=True)(measured(*point_x))
-        B = basis(*point_x)
-        along = jax.jacfwd(measured, every)(*point_x)
-        bent = jax.jacfwd(lambda *x: jnp.tensordot(s, basis(*x), 1), every)(*point_x)
-        stiff = jnp.tensordot(C, B, 1)  # C is symmetric
-        slopes = (
-            jnp.tensordot(stiff, xi, ((0,), (0,))) + turned
-            for xi, turned in zip(along, bent, strict=True)
-        )
-        return jnp.tensordot(s, B, 1), tuple(slopes)
+        H, directions = place(*point)
+        ways, turns = jax.jacfwd(place, every)(*point)
+        F = H + jnp.eye(3, dtype=H.dtype)
+        P, A = law(H, at._replace(directions=directions))
+        in_H = jnp.einsum("ijkl,mj->imkl", A, F) + jnp.einsum("il,mk->imkl", P, jnp.eye(3))
+        slopes = [jnp.tensordot(in_H, way, 2) for way in ways]
+        if directions is not None:
+            turned = jax.jacfwd(pulled)(directions)
+            turning = [jnp.tensordot(turned, turn, directions.ndim) for turn in turns]
+            slopes = [one + other for one, other in zip(slopes, turning, strict=True)]
+        return P @ F.T, tuple(slopes)
 
     return linearised
 

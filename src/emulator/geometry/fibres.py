@@ -7,6 +7,9 @@ the circumferential :math:`c = k \times n / |k \times n|`, and
 .. math:: f = \cos\alpha\, c + \sin\alpha\, (n \times c), \qquad
           \alpha = \alpha_{endo} + \tau\, (\alpha_{epi} - \alpha_{endo}).
 
+Sheets are transmural, or turned about the fibre by an angle that varies likewise,
+:math:`s = \cos\beta\, n + \sin\beta\, (f \times n)`.
+
 A positive angle climbs from the circumference towards the base when ``axis`` points there, going
 round anticlockwise as seen from the base: the right-handed helix of a heart's endocardium.
 
@@ -148,7 +151,9 @@ def _harmonic(grid: Discretisation, low: np.ndarray, high: np.ndarray) -> np.nda
     return value
 
 
-def turned(wall: Depth, angles: Angles, axis: Axis) -> Directions:
+def turned(
+    wall: Depth, angles: Angles, axis: Axis, sheet_angles: Angles = (0.0, 0.0)
+) -> Directions:
     """Directions in a wall of known depth, by the rule in the module docstring.
 
     The axis may have any length.
@@ -156,12 +161,19 @@ def turned(wall: Depth, angles: Angles, axis: Axis) -> Directions:
     k = np.asarray(axis, dtype=float)
     if k.shape != (3,) or not np.isfinite(k).all() or not k.any():
         raise InputError(f"fibres: axis {axis}; expected three numbers, not all zero")
-    if len(angles) != 2 or not np.isfinite(angles).all():
-        raise InputError(f"fibres: angles {angles}; expected two numbers in degrees")
+    for pair in (angles, sheet_angles):
+        if len(pair) != 2 or not np.isfinite(pair).all():
+            raise InputError(f"fibres: angles {pair}; expected two numbers in degrees")
     n, c = wall.normal, circumferential(wall.normal, k / np.linalg.norm(k))
+    alpha, beta = (_across(wall, pair) for pair in (angles, sheet_angles))
+    f = np.cos(alpha) * c + np.sin(alpha) * np.cross(n, c)
+    return Directions(f, np.cos(beta) * n + np.sin(beta) * np.cross(f, n))
+
+
+def _across(wall: Depth, angles: Angles) -> np.ndarray:
+    """Angle in radians that goes from one side of the wall to the other, with a last axis of 1."""
     first, last = np.radians(angles)
-    alpha = (first + wall.value * (last - first))[..., None]
-    return Directions(np.cos(alpha) * c + np.sin(alpha) * np.cross(n, c), n)
+    return (first + wall.value * (last - first))[..., None]
 
 
 def circumferential(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from emulator.errors import InputError
 from emulator.geometry.directions import of_elements
 from emulator.geometry.quadratic import corner_parents, to_linear
+from emulator.scenes.fibre_angles import that_turn
 from emulator.scenes.owners import directions_read
 from emulator.scenes.scene import Scene
 
@@ -135,7 +136,7 @@ def _changed(scene: Scene, **changes: Any) -> Scene | None:
     for kind, reader in directions_read(law, loads).items():
         changes.setdefault(kind, getattr(scene, kind))
         changes[kind] = None if reader is None else changes[kind]
-    changes["angles"] = () if changes["fibres"] is None else scene.angles
+    changes["angles"] = that_turn(scene.angles, changes["fibres"], changes["sheets"])
     parts = (*loads, *changes.get("supports", scene.supports))
     takers = set(law.parameters) | {q.name for part in parts for q in part.quantities}
     takers |= {q.name for angles in changes["angles"] for q in angles.quantities}

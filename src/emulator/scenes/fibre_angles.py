@@ -8,8 +8,9 @@ At a point with the unit axis :math:`n`, a direction d given at angle zero becom
 
 (Rodrigues), with the shares :math:`s_k` of the parameters :math:`\theta_k` in degrees. In a
 ventricle's wall of depth :math:`\tau` the axis is transmural and the helix angles on endocardium
-and epicardium have the shares :math:`1 - \tau` and :math:`\tau`; in a block there is one axis and
-one share of 1. The derivative is exact, as that of any other parameter.
+and epicardium have the shares :math:`1 - \tau` and :math:`\tau`; sheet angles, with equal shares,
+turn sheets about the fibre before both turn. In a block there is one axis and one share of 1. The
+derivative is exact, as that of any other parameter.
 """
 
 from __future__ import annotations
@@ -78,6 +79,11 @@ class FibreAngles:
         axis = axis if axis.ndim == 3 else axis[:, None]
         return FibreAngles(frozen_array(np.broadcast_to(axis, (*wide, 3))), shares)
 
+    def turns(self, fibres: np.ndarray) -> bool:
+        """Whether ``fibres`` (m, 3) or (m, q, 3) turn, and not only the sheets about them."""
+        along = np.sum(self.axis * (fibres if fibres.ndim == 3 else fibres[:, None]), axis=-1)
+        return not np.allclose(np.abs(along), 1.0)
+
     def turned(self, tissue: Tissue, values: Values) -> Tissue:
         """``tissue`` (m, q, ...) with its directions turned by the angles among ``values``."""
         assert tissue.directions is not None, "a scene's angles are checked against its directions"
@@ -92,18 +98,32 @@ class FibreAngles:
 
 
 def checked_angles(
-    angles: Sequence[FibreAngles], mesh: Mesh, fibres: np.ndarray | None
+    angles: Sequence[FibreAngles], mesh: Mesh, fibres: np.ndarray | None, sheets: np.ndarray | None
 ) -> tuple[FibreAngles, ...]:
     """The ``angles`` of a scene, their arrays checked and frozen.
 
     Raises
     ------
     InputError
-        A scene without fibres, or arrays that do not fit its mesh.
+        A scene without fibres, sheet angles without sheets, or arrays that do not fit its mesh.
     """
-    if angles and fibres is None:
+    if not angles:
+        return ()
+    if fibres is None:
         raise InputError("fibre angles turn fibres, and it has none")
-    return tuple(each.checked(mesh) for each in angles)
+    checked = tuple(each.checked(mesh) for each in angles)
+    if len(that_turn(checked, fibres, sheets)) < len(checked):
+        raise InputError("sheet angles turn sheets, and its law takes none")
+    return checked
+
+
+def that_turn(
+    angles: Sequence[FibreAngles], fibres: np.ndarray | None, sheets: np.ndarray | None
+) -> tuple[FibreAngles, ...]:
+    """Those of ``angles`` that turn any of these directions, (m, 3) or (m, q, 3)."""
+    if fibres is None:
+        return ()
+    return tuple(each for each in angles if sheets is not None or each.turns(fibres))
 
 
 def turned(tissue: Tissue, angles: tuple[FibreAngles, ...], values: Values) -> Tissue:
@@ -160,12 +180,12 @@ def identity_of_angles(angles: Sequence[FibreAngles]) -> dict[str, np.ndarray]:
 def across_wall(
     depth: np.ndarray, normal: np.ndarray, angles: tuple[float | str, float | str]
 ) -> tuple[FibreAngles, ...]:
-    """The rotation of a wall's fibres by angles that are parameters; none if both are numbers.
+    """The rotation of a wall's fibres or sheets by parameters; none if both angles are numbers.
 
     Parameters
     ----------
     depth : (m,) or (m, q), 0 on the endocardium and 1 on the epicardium.
-    normal : unit transmural directions, with one more axis of 3.
+    normal : unit axes with a last axis of 3: transmural directions, or fibres for sheets.
     angles : on endocardium and epicardium, each in degrees or the name of a parameter.
     """
     shares: dict[str, np.ndarray] = {}

@@ -46,6 +46,7 @@ class Helix:
     ----------
     angles : degrees at endocardium and epicardium, or names of parameters.
     axis : from apex to base.
+    sheet_angles : by which sheets are turned from the wall's normal about the fibres, likewise.
     endocardium, epicardium : facet sets.
     """
 
@@ -55,14 +56,15 @@ class Helix:
     axis: Axis = (0.0, 0.0, 1.0)
     endocardium: str = "endocardium"
     epicardium: str = "epicardium"
+    sheet_angles: Angles = (0.0, 0.0)
 
     def directions(self, mesh: Mesh) -> Directions:
-        """Fibres, and the transmural direction as sheets."""
-        return turned(self._wall(mesh), without_parameters(self.angles), self.axis)
+        """Fibres and sheets."""
+        return _laid(self, self._wall(mesh))
 
     def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
-        """The helix angles that are parameters."""
-        return across_wall(*self._wall(mesh), self.angles)
+        """The sheet angles and the helix angles that are parameters."""
+        return _turning(self, self._wall(mesh))
 
     def _wall(self, mesh: Mesh) -> Depth:
         return depth(mesh, (self.endocardium,), (self.epicardium,))
@@ -76,20 +78,22 @@ class Biventricle:
     ----------
     angles : degrees at endocardium and epicardium, or names of parameters.
     axis : from apex to base.
+    sheet_angles : by which sheets are turned from the wall's normal about the fibres, likewise.
     """
 
     rule: ClassVar[str] = "biventricle"
 
     angles: Angles
     axis: Axis = (0.0, 0.0, 1.0)
+    sheet_angles: Angles = (0.0, 0.0)
 
     def directions(self, mesh: Mesh) -> Directions:
-        """Fibres, and the transmural direction as sheets."""
-        return turned(biventricular_depth(mesh), without_parameters(self.angles), self.axis)
+        """Fibres and sheets."""
+        return _laid(self, biventricular_depth(mesh))
 
     def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
-        """The helix angles that are parameters."""
-        return across_wall(*biventricular_depth(mesh), self.angles)
+        """The sheet angles and the helix angles that are parameters."""
+        return _turning(self, biventricular_depth(mesh))
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,18 @@ class Uniform:
             return ()
         share = np.ones(len(mesh.elements))
         return (FibreAngles(_everywhere(mesh, self.about), {self.angle: share}),)
+
+
+def _laid(rule: Helix | Biventricle, wall: Depth) -> Directions:
+    """Directions in a wall; angles that are parameters are zero."""
+    angles, sheet_angles = map(without_parameters, (rule.angles, rule.sheet_angles))
+    return turned(wall, angles, rule.axis, sheet_angles)
+
+
+def _turning(rule: Helix | Biventricle, wall: Depth) -> tuple[FibreAngles, ...]:
+    """Rotations of these directions: of sheets about the fibres, then of both."""
+    fibres = _laid(rule, wall)[0]
+    return across_wall(wall.value, fibres, rule.sheet_angles) + across_wall(*wall, rule.angles)
 
 
 def _everywhere(mesh: Mesh, vector: Axis) -> np.ndarray:

@@ -114,9 +114,10 @@ one that moves, with a weight on one edge:
 
 Other rules for fibres are ``biventricle`` (``angles``, ``axis``; facet sets lv_endocardium,
 rv_endocardium, epicardium) and ``uniform`` (``direction``). They also give the sheets, for a law
-that takes any, as the transmural direction; ``uniform`` has a key ``sheets`` for them. Gravity also
-takes ``acceleration`` in m/s2. A pressure that is a parameter is called ``pressure``, or what its
-key ``parameter`` says. ``published_pressure`` is the pressure work of the released code, on linear
+that takes any, as the transmural direction, turned about the fibres by ``sheet_angles`` where these
+are given, as ``angles`` are; ``uniform`` has a key ``sheets`` for them. Gravity also takes
+``acceleration`` in m/s2. A pressure that is a parameter is called ``pressure``, or what its key
+``parameter`` says. ``published_pressure`` is the pressure work of the released code, on linear
 tetrahedra only.
 
 Muscle contracts by a load of the kind ``active_tension``, along the fibres of the file or of a

@@ -142,7 +142,7 @@ class Scene(Shown):
             with self._named():
                 object.__setattr__(self, kind, checked_directions(given, self.mesh, kind))
         with self._named():
-            angles = checked_angles(self.angles, self.mesh, self.fibres)
+            angles = checked_angles(self.angles, self.mesh, self.fibres, self.sheets)
             object.__setattr__(self, "angles", angles)
             if self.fibres is not None and self.sheets is not None:
                 check_across(self._at_points(self.sheets), self.fibres_at_points)

@@ -75,6 +75,70 @@ def test_sheets_turn_with_the_fibres_and_stay_across():
     np.testing.assert_allclose(np.cross(n, found[:, :, 0]), found[:, :, 1], atol=1e-12)
 
 
+def orthotropic(rule, *names):
+    """A coarse ventricle of an orthotropic law with directions by ``rule``."""
+    scene = em.scenes.left_ventricle(3, 6, 1, order=1, angles=(60.0, -60.0))
+    fibres, sheets = rule.directions(scene.mesh)
+    more = {"a_s": 2.0, "b_s": 2.0, "a_fs": 0.5, "b_fs": 1.0}
+    return replace(
+        scene,
+        law=find_law("holzapfel_ogden_orthotropic"),
+        parameters=(*scene.parameters, *(Parameter(name, "deg", -90.0, 90.0) for name in names)),
+        constants={**scene.constants, **more},
+        fibres=fibres,
+        sheets=sheets,
+        fibre_rule=rule,
+        angles=rule.angles_in(scene.mesh),
+        origin={},
+    )
+
+
+def test_sheet_angles_turn_sheets_about_the_fibres():
+    names = ("in", "out", "s_in", "s_out")
+    scene = orthotropic(Helix(names[:2], sheet_angles=names[2:]), *names)
+    values = dict(zip(names, (63.0, -51.0, 30.0, -20.0), strict=True))
+    found = np.asarray(scene.tissue_at(scene.theta(**KNOWN, **values)).directions)
+    laid = Helix((63.0, -51.0), sheet_angles=(30.0, -20.0)).directions(scene.mesh)
+    np.testing.assert_allclose(found[:, 0, 0], laid[0], atol=1e-12)
+    np.testing.assert_allclose(found[:, 0, 1], laid[1], atol=1e-12)
+    depth, normal = scene.angles[1].shares["out"][:, 0], scene.angles[1].axis[:, 0]
+    angle = np.deg2rad(30.0 - 50.0 * depth)
+    np.testing.assert_allclose(np.sum(laid[1] * normal, axis=1), np.cos(angle), atol=1e-12)
+    right_handed = np.sum(np.cross(laid[0], normal) * laid[1], axis=1)
+    np.testing.assert_allclose(right_handed, np.sin(angle), atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [em.Simulator, em.Unloader])
+def test_slopes_in_sheet_angles_are_those_of_differences(solver):
+    rule = Helix((60.0, -60.0), sheet_angles=("s_in", "s_out"))
+    scene = orthotropic(rule, "s_in", "s_out")
+    solves = solver(scene)
+    theta = scene.theta(**KNOWN, s_in=30.0, s_out=-20.0)
+    u = solves.solve(theta).require_converged()
+    point = u if solver is em.Unloader else u.displacement
+    slopes = solves.sensitivities(point, theta)
+    for name in ("s_in", "s_out"):
+        k = scene.parameter_names.index(name)
+        step = jnp.zeros(len(theta)).at[k].set(0.05)
+        ends = [solves.solve(theta + s * step).require_converged().displacement for s in (1, -1)]
+        by_difference = (ends[0] - ends[1]) / 0.1
+        largest = jnp.abs(by_difference).max()
+        assert largest > 1e-5  # mm a degree: they matter
+        np.testing.assert_allclose(slopes[k], by_difference, atol=1e-6 * float(largest))
+
+
+def test_sheet_angles_without_sheets(fixed):
+    rule = Helix((63.0, -51.0), sheet_angles=("s_in", 0.0))
+    parameters = (*fixed.parameters, Parameter("s_in", "deg", -90.0, 90.0))
+    with pytest.raises(InputError, match="sheet angles turn sheets, and its law takes none"):
+        replace(fixed, parameters=parameters, angles=rule.angles_in(fixed.mesh))
+    scene = orthotropic(rule, "s_in")
+    without = [e.without for e in effects_of(scene).values() if e.without.sheets is None]
+    assert without
+    assert all("s_in" not in each.parameter_names for each in without)
+
+
 def test_a_block_about_an_axis():
     rule = Uniform((1.0, 0.0, 0.0), angle="alpha", about=(0.0, 0.0, 2.0))
     mesh = box((1.0, 1.0, 1.0), (1, 1, 1))

@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix
 # Relative increase of the diagonal, four units of round-off: an exactly zero pivot becomes tiny.
 _RAISE = 2.0**-50
 _LEAST_ROW = 1e-290  # a row whose absolute sum is below this is empty
+_ALIKE = 1e-13  # of the largest entry: mirror images whose sums are rounded differently
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,23 @@ class Pattern:
         rows, columns, both = self.both(values)  # row by row
         starts = np.searchsorted(rows, np.arange(self.size + 1))
         return csr_matrix((np.asarray(both), columns, starts), shape=(self.size, self.size))
+
+    @cached_property
+    def half(self) -> Pattern:
+        """The upper triangle of a pattern with both; its ``sum`` of these values has its own."""
+        kept = np.flatnonzero(self.rows <= self.columns).astype(np.int32)
+        target = np.arange(len(kept), dtype=np.int32)
+        return Pattern(self.rows[kept], self.columns[kept], kept, target, self.size, upper=True)
+
+    @cached_property
+    def _mirror(self) -> np.ndarray:
+        """Index of the mirror image of every nonzero; they are sorted by row, then column."""
+        return np.lexsort((self.rows, self.columns))
+
+    def is_symmetric(self, values: jax.Array) -> jax.Array:
+        """Whether ``values`` of both triangles are mirror images, shape ()."""
+        apart = jnp.max(jnp.abs(values - values[self._mirror]))
+        return apart <= _ALIKE * jnp.max(jnp.abs(values))
 
     def product(self, values: jax.Array, x: jax.Array) -> jax.Array:
         """``A x``, shape of ``x``: (size,) or (size, k)."""

@@ -65,6 +65,34 @@ def test_solutions_and_derivatives_are_those_of_the_dense_matrix(name, shift, sy
     np.testing.assert_allclose(curvature, inverse.T @ inverse, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.parametrize("shift", [20.0, -20.0, 0.0])
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["python", "jit"])
+def test_a_symmetric_matrix_with_both_triangles(wrap, shift):
+    """Definite of either sign it is CHOLMOD's; UMFPACK's where it is neither, or not symmetric."""
+    A, pattern, _, b = matrix(symmetric=False)
+    A = 0.5 * (A + A.T) + (shift - 4.0) * np.eye(len(b))
+    values = jnp.asarray(A[pattern.rows, pattern.columns])
+    used = []
+
+    class Told(type(SUITESPARSE)):
+        def solve(self, *arguments, definite, **more):
+            x, outcome = super().solve(*arguments, definite=definite, **more)
+            jax.debug.callback(lambda: used.append(definite), ordered=True)
+            return x, outcome
+
+    trial = wrap(partial(attempt, Told(), pattern))
+    for entries, matrix_ in ((values, A), (values.at[1].add(1e-6), None)):
+        used.clear()
+        x, outcome = jax.block_until_ready(trial(entries, b))
+        jax.effects_barrier()
+        assert outcome == Outcome.OK
+        if matrix_ is None:
+            assert used == [False]
+        else:
+            np.testing.assert_allclose(x, np.linalg.solve(A, b), rtol=1e-9, atol=1e-9)
+            assert used == ([True, False] if shift == 0.0 else [True])
+
+
 @pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["python", "jit"])
 def test_an_outcome_is_data(wrap):
     A, pattern, values, b = matrix(shift=20.0)
