@@ -16,6 +16,7 @@ from studies.silicone_beam.experiment import (
 
 import calibrate as cal
 from calibrate.statistical_model import Model
+from calibrate.statistical_model.shared_errors import turned
 from calibrate.statistical_model.systematic import Systematic, SystematicError
 from emulator.geometry.bodies.box import box, toward_ends
 from emulator.mechanics.laws import find_law
@@ -55,13 +56,6 @@ def scene(cells: tuple[int, int, int] = (12, 3, 3)) -> Scene:
         supports=(Support("left"),),
         dilatation="mean",
     )
-
-
-def turned(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) that carries ``points`` (d, 3) nearest to where they went."""
-    there = points + displacement
-    U, _, V = np.linalg.svd((there - there.mean(axis=0)).T @ (points - points.mean(axis=0)))
-    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
 
 
 def hand(observed: Iterable[str], seen: Measured) -> Systematic:
