@@ -5,12 +5,10 @@
     python -m studies.physics_informed --minutes 60   # for each network
     python -m studies.physics_informed --ways physics --keep DIR    # networks into DIR
     python -m studies.physics_informed --only --family 20    # ventricles no network has seen
-    python -m studies.physics_informed --only --cures 100    # other cures on the beam, seconds each
-    python -m studies.physics_informed --only --finer        # the ventricle's next finer mesh
     python -m studies.physics_informed --quick --out DIR  # a coarse beam
 
 No FEM solution is used but where a case says so; FEM judges at 50 theta that nothing has seen.
-Writes results.json, after each case, physics.png and cures.png, and asserts what the README says.
+Writes results.json, after each case, and physics.png, and asserts what the README says.
 """
 
 import tempfile
@@ -25,10 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results, parser, save
-from studies.physics_informed.cures import WAYS as CURES
-from studies.physics_informed.cures import cure, draw_cures
-from studies.physics_informed.finer_mesh import WAYS as FINER
-from studies.physics_informed.finer_mesh import on_finer
 
 import calibrate as cal
 import emulator as em
@@ -265,8 +259,6 @@ def main() -> None:
     arguments.add_argument("--keep", type=Path, help="folder that the networks are written to")
     arguments.add_argument("--tests", type=int, default=50)
     arguments.add_argument("--family", type=int, default=0, help="unseen ventricles, up to 20")
-    arguments.add_argument("--cures", type=float, help="seconds of processor for each cure")
-    arguments.add_argument("--finer", action="store_true", help="to a finer mesh of the ventricle")
     given = arguments.parse_args()
     bodies = BODIES
     if given.quick:
@@ -282,16 +274,7 @@ def main() -> None:
             results.case(f"{name}, {way}", partial(body.case, way, given))
     for k, shape in enumerate(ventricles(20, FAMILY_SEED)[: given.family]):
         results.case(f"unseen ventricle {k}", partial(from_family, shape))
-    if given.cures:
-        body = Body("beam", BODIES["beam"](), given.tests)
-        for way in CURES:
-            told = partial(cure, way, body.scene, body.known, given.cures, SEED)
-            results.case(f"cure: {way}", told)
-            jax.clear_caches()
-    for way in FINER if given.finer else ():
-        results.case(f"finer mesh: {way}", partial(on_finer, way))
     draw([case for case in results.cases if "body" in case], given.out / "physics.png")
-    draw_cures([case for case in results.cases if "cure" in case], given.out / "cures.png")
     if given.quick:
         return
     for case in (case for case in results.cases if "body" in case):

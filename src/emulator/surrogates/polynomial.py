@@ -68,6 +68,10 @@ def compressed(degrees: np.ndarray, fields: np.ndarray, error: float) -> Polynom
     beyond = np.sqrt(np.cumsum(sizes[::-1] ** 2)[::-1] / fields.shape[1])
     kept = max(int(np.sum(beyond > error)), 1)
     modes = sizes[:kept, None] * right[:kept]
+    rounded = modes.astype(np.float32).astype(float)
+    off = np.sum((rounded - modes) ** 2) + np.sum(sizes[kept:] ** 2)
+    if off <= error**2 * fields.shape[1]:
+        modes = rounded  # files then take half of the room
     return Polynomial(degrees, left[:, :kept], modes.reshape(kept, *fields.shape[1:]))
 
 

@@ -37,6 +37,8 @@ def test_fewer_modes_are_off_by_no_more_than_was_allowed():
         found = compressed(degrees, fields, error)
         off = np.mean(np.sum(np.asarray(found(x) - whole(x)) ** 2, axis=-1), axis=-1)
         assert np.sqrt(mass @ off) <= error + 1e-14
+        single = np.array_equal(found.modes, found.modes.astype(np.float32))
+        assert single == (error > 1e-7)
     assert len(compressed(degrees, fields, 1e-2).modes) < 5
     assert len(compressed(degrees, 0.0 * fields, 1.0).modes) == 1
 
