@@ -10,7 +10,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_matrix
 
 # Relative increase of the diagonal, four units of round-off: an exactly zero pivot becomes tiny.
 _RAISE = 2.0**-50
@@ -56,12 +55,6 @@ class Pattern:
             return self.rows, self.columns, values
         rows, columns, source = self._whole
         return rows, columns, values[source]
-
-    def matrix(self, values: jax.Array) -> csr_matrix:
-        """The matrix (size, size) for SciPy."""
-        rows, columns, both = self.both(values)  # row by row
-        starts = np.searchsorted(rows, np.arange(self.size + 1))
-        return csr_matrix((np.asarray(both), columns, starts), shape=(self.size, self.size))
 
     @cached_property
     def half(self) -> Pattern:
