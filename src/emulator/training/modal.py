@@ -20,6 +20,8 @@ processor and the trunk below descend: since w minimises, the derivative of
     -2 \sum_k K (t_k - H w_k)\, w_k^T
 
 with w held, K the matrix of the inner product. No theta enters: a step costs one processor pass.
+Steps are as long in every direction of a layer's weights
+(:func:`~emulator.training.step.orthogonal_steps`).
 
 **Coefficients.** The modes are kept, the snapshots projected on them, and the branch is fitted to
 values and slopes of all runs at once,

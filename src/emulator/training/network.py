@@ -22,7 +22,7 @@ from emulator.training.basis import mechanical_modes
 from emulator.training.modal import ARCHITECTURE, Modal
 from emulator.training.objectives import Scales, make_loss, mean_square_gradient
 from emulator.training.plan import Plan
-from emulator.training.step import Step, batch_descent, clipped_adam, make_step
+from emulator.training.step import Step, batch_descent, clipped_adam, make_step, orthogonal_steps
 
 # Standard deviation of the displacements as a fraction of the centre's, where no FEM run tells it.
 _GUESSED_SD = 0.2
@@ -63,14 +63,14 @@ class NetworkTraining:
 
 def network_training(emulator: Emulator, plan: Plan, runs: Runs, scales: Scales) -> NetworkTraining:
     """The training of the network in ``emulator``; ``scales`` are those of the loss."""
-    scene, network, optimiser = emulator.scene, emulator.network, clipped_adam()
+    scene, network = emulator.scene, emulator.network
     assert network is not None, "asked only of an emulator with a network"
     if plan.objective == "modes":
-        modal = Modal(scene, network, runs, scales)
+        modal, optimiser = Modal(scene, network, runs, scales), orthogonal_steps()
         return NetworkTraining(
             plan, network, optimiser, make_step(plan, modal.descend, optimiser), modal
         )
-    loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
+    optimiser, loss = clipped_adam(), make_loss(scene, plan.objective, scales, plan.energy_weight)
     step = make_step(plan, batch_descent(emulator, plan, runs, loss), optimiser)
     return NetworkTraining(plan, network, optimiser, step)
 

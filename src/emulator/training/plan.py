@@ -36,7 +36,7 @@ class Plan:
         energy), or ``modes`` (simulations, their deformation gradients and slopes in theta, all at
         every step: :mod:`~emulator.training.modal`).
     batch : theta a step.
-    learning_rate : of Adam at its peak.
+    learning_rate : of the optimiser, Adam or (for ``modes``) Muon, at its peak.
     schedule : ``cosine`` to zero after a warm-up, or ``halves``: the peak, then a tenth of it.
     energy_weight : weight of the energy gap in ``both``.
     decoder : ``pointwise`` or ``separable``.
