@@ -5,6 +5,7 @@
     python -m studies.physics_informed --minutes 60   # for each network
     python -m studies.physics_informed --ways physics --keep DIR    # networks into DIR
     python -m studies.physics_informed --only --family 20    # ventricles no network has seen
+    python -m studies.physics_informed --only --finer        # the ventricle's next finer mesh
     python -m studies.physics_informed --quick --out DIR  # a coarse beam
 
 No FEM solution is used but where a case says so; FEM judges at 50 theta that nothing has seen.
@@ -23,6 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results, parser, save
+from studies.physics_informed.finer_mesh import WAYS as FINER
+from studies.physics_informed.finer_mesh import on_finer
 
 import calibrate as cal
 import emulator as em
@@ -42,12 +45,21 @@ from emulator.training.sweeps import part_of, sweep_box
 
 HERE = Path(__file__).parent
 TEST_SEED, SEED = 90_210, 0
+PART = 0.25
 
 
 def with_published_pressure() -> Scene:
-    """The linear ventricle under the load that the paper's networks were trained with."""
+    """The linear ventricle under the load that the paper's networks were trained with.
+
+    That work does not follow the surface: above 0.4 kPa the softest tissue of the scene's range has
+    no equilibrium near rest, so that the range of pressures is a quarter of the scene's.
+    """
+    scene = em.scenes.left_ventricle(order=1)
+    *tissue, pressure = scene.parameters
+    range_ = {"low": PART * pressure.low, "high": PART * pressure.high}
+    parameters = (*tissue, replace(pressure, **range_))
     load = PublishedPressure("endocardium")
-    return replace(em.scenes.left_ventricle(order=1), loads=(load,), origin={})
+    return replace(scene, loads=(load,), parameters=parameters, origin={})
 
 
 BODIES: dict[str, Callable[[], Scene]] = {
@@ -259,6 +271,7 @@ def main() -> None:
     arguments.add_argument("--keep", type=Path, help="folder that the networks are written to")
     arguments.add_argument("--tests", type=int, default=50)
     arguments.add_argument("--family", type=int, default=0, help="unseen ventricles, up to 20")
+    arguments.add_argument("--finer", action="store_true", help="to a finer mesh of the ventricle")
     given = arguments.parse_args()
     bodies = BODIES
     if given.quick:
@@ -274,6 +287,8 @@ def main() -> None:
             results.case(f"{name}, {way}", partial(body.case, way, given))
     for k, shape in enumerate(ventricles(20, FAMILY_SEED)[: given.family]):
         results.case(f"unseen ventricle {k}", partial(from_family, shape))
+    for way in FINER if given.finer else ():
+        results.case(f"finer mesh: {way}", partial(on_finer, way))
     draw([case for case in results.cases if "body" in case], given.out / "physics.png")
     if given.quick:
         return
