@@ -117,9 +117,7 @@ def posterior(
     }
     if certified:
         began = perf_counter()
-        told = cal.certify(
-            found, em.Simulator(scene), draws=_FEM, at_most=_MOST, mesh=0, seed=SEED
-        )
+        told = cal.certify(found, em.Simulator(scene), draws=_FEM, at_most=_MOST, mesh=0, seed=SEED)
         case["certificate"] = {
             "verdict": told.verdict,
             "reason": told.reason,

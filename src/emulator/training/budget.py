@@ -12,8 +12,8 @@ from emulator.training.plan import Plan
 
 LEAST_S = 5.0
 """Seconds below which a budget is refused at once."""
-# Fractions of a budget: until when FEM runs may start, and until when the network trains, with a
-# discrepancy model to fit afterwards and without.
+# Fractions of a budget: until when FEM runs may start, and until when the network trains, with
+# something to fit afterwards (a discrepancy model, the branch by L-BFGS) and without.
 _FEM_SHARE = 0.3
 _NETWORK_SHARE = 0.85
 _NETWORK_ALONE = 0.99
@@ -57,5 +57,5 @@ class Budget:
 
     def network_deadline(self, plan: Plan) -> float:
         """When the last optimiser step should end."""
-        share = _NETWORK_SHARE if plan.discrepancy else _NETWORK_ALONE
+        share = _NETWORK_SHARE if plan.discrepancy or plan.polish else _NETWORK_ALONE
         return self.started + share * self.seconds
