@@ -71,7 +71,8 @@ BODIES: dict[str, Callable[[], Scene]] = {
     "ventricle, the paper's pressure": with_published_pressure,
 }
 # err_u in mm of the paper's networks on its own versions of these scenes, trained on a GPU.
-PAPER = {"beam": 2.0e-2, "cube": 8.5e-4, "liver": 8.8e-3, "ventricle": 2.8e-2}
+PAPER = {"beam": 2.0e-2, "cube": 8.5e-4, "liver": 8.8e-3, "ventricle": 2.8e-2,
+         "ventricle, the paper's pressure": 2.8e-2}  # fmt: skip
 ERRORS = ("err_u", "err_F", "err_Pi", "err_V")
 SWEEPS, EVERY = 60, 3
 FAMILY_SEED, FAMILY_TESTS = 1, 5
