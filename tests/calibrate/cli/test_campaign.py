@@ -59,8 +59,8 @@ def test_stores_that_are_none(capsys, block, store, tmp_path):
     assert "cannot write to" in complaint(capsys, *words, "/dev/null/runs.zarr")
     other = tmp_path / "scene.toml"
     # The range first: a path may have a 30, too.
-    softer = SCENE.replace("30", "40")
-    other.write_text(softer.replace("block.vtu", str(block.parent / "block.vtu")))
+    changed = SCENE.replace("30", "40")
+    other.write_text(changed.replace("block.vtu", str(block.parent / "block.vtu")))
     said = complaint(capsys, "campaign", other, "--samples", 3, "--out", store)
     assert "is of scene 'scene' with another mesh, law, load or range" in said
 
