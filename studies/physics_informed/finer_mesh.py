@@ -16,18 +16,17 @@ from dataclasses import replace
 from typing import Any
 
 import jax
-import numpy as np
 from studies.common.output import Case
+from studies.physics_informed.judged import TEST_SEED, errors_of
 
 import emulator as em
-from emulator.error.comparison import case_errors, quantiles
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes.finer import finer
 from emulator.surrogates import Emulator, load
 from emulator.surrogates.coarse import carried
 from emulator.training import Plan, recipe, train
 
-SEED, TESTS = 90_210, 6
+TESTS = 6
 WAYS: dict[str, tuple[str, Plan]] = {
     "3 sweeps": ("left_ventricle_physics", replace(recipe("sweeps"), sweeps=3)),
     "10 FEM runs": ("left_ventricle", recipe("two_meshes")),
@@ -50,17 +49,11 @@ def on_finer(way: str) -> Case:
     alone = Emulator(body.scene, coarse=carried(start.parts, body))
     return {"finer": way, "nodes": len(body.scene.mesh.nodes), "processor_seconds": seconds,
             "peak_memory_gb": memory, "error_bar_mm": told.get("error_mm"),
-            "errors": errors(found, known), "coarse_alone": errors(alone, known)}  # fmt: skip
+            "errors": errors_of(found, known), "coarse_alone": errors_of(alone, known)}  # fmt: skip
 
 
 def nearby(simulator: em.Simulator, found: Emulator) -> Runs:
     """FEM at theta that nothing has seen, each solve from where ``found`` says."""
     cached, scene = found.cache(), simulator.scene
     predictor: Callable[[Any], Any] = lambda position: cached(scene.from_unit(position))  # noqa: E731
-    return run_campaign(simulator, sobol(scene, TESTS, SEED), predictor=predictor)
-
-
-def errors(emulator: Emulator, known: Runs) -> Case:
-    """Quantiles over the tests."""
-    found = case_errors(emulator.cache(), known.theta, known.displacement)
-    return {k: quantiles(np.asarray(found.fields[k])) for k in ("err_u", "err_Pi", "err_V")}
+    return run_campaign(simulator, sobol(scene, TESTS, TEST_SEED), predictor=predictor)

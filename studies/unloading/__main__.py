@@ -27,6 +27,7 @@ HERE = Path(__file__).parent
 SEED = 17
 COARSE, MIDDLE = (4, 8, 1), (10, 20, 2)  # rings, around, layers
 COUNT, BLOCK, FEW = 100, 10, 2  # theta of a body, of a case, and of what else must hold
+SOFT = 0.2  # kPa; a below it is tissue that quadratic elements do not hold up in the mesh's shape
 TRIP = "unload and load"
 ORDERS = {1: "linear", 2: "quadratic"}
 
@@ -129,12 +130,12 @@ def check(cases: list[Case]) -> None:
     for case in cases:
         kind = case.get("kind")
         if kind == TRIP:
-            # Loading may lead elsewhere only where tissue so soft would not stay in the mesh; what
-            # finds no shape at all names its failure.
+            # Loading may lead elsewhere only where tissue so soft would not stay in the mesh; an
+            # unloading may fail, by name, only on such tissue.
             told = (
                 r["outcome"] == "met"
                 or r.get("stable") is False
-                or r["outcome"].startswith("unloading: ")
+                or (r["outcome"].startswith("unloading: ") and r["theta"][0] < SOFT)
                 for r in case["rows"]
             )
             assert all(told), case["name"]

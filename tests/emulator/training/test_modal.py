@@ -13,6 +13,7 @@ from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import design, sobol
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training import Plan, pretrain, recipe, train
+from emulator.training.budget import Budget
 from emulator.training.modal import Modal
 from emulator.training.objectives import mean_square_gradient
 from emulator.training.problem import prepare
@@ -97,10 +98,11 @@ def test_the_derivative_in_the_hidden_layer_needs_none_of_the_solution(modal, pr
 
 
 def test_orthogonal_steps_are_as_long_in_every_direction():
-    """Of a kernel, whatever its gradient's singular values are; of a bias each number's is."""
+    """Of a kernel, whatever its gradient's singular values; of a bias each number, as by Adam."""
     rng = np.random.default_rng(0)
     gradient = {"kernel": jnp.asarray(rng.normal(size=(6, 3)) @ np.diag([1.0, 0.1, 0.01])),
-                "bias": jnp.asarray([2.0, -0.5, 1e-3])}  # fmt: skip
+                "bias": jnp.asarray([2.0, -0.5, 1e-3]),
+                "branch": {"kernel": jnp.asarray([[2.0, -0.5], [1e-3, 4.0]])}}  # fmt: skip
     optimiser = orthogonal_steps()
     weights = jax.tree.map(jnp.zeros_like, gradient)
     updates, _ = optimiser.update(gradient, optimiser.init(weights), weights)
@@ -113,6 +115,13 @@ def test_orthogonal_steps_are_as_long_in_every_direction():
     bias = updates["bias"] * jnp.sign(gradient["bias"])
     assert jnp.all(bias > 0.0)
     np.testing.assert_allclose(bias, bias[0], rtol=1e-3)
+    step, g = (part["branch"]["kernel"] for part in (updates, gradient))
+    np.testing.assert_allclose(step, jnp.sign(g), rtol=1e-3)  # the first of Adam's
+
+
+def test_a_budget_leaves_time_for_the_branch():
+    budget = Budget(100.0, 0.0)
+    assert budget.network_deadline(PLAN) < budget.network_deadline(replace(PLAN, polish=0)) <= 100.0
 
 
 def test_coefficients_are_of_values_and_slopes(modal, problem):
