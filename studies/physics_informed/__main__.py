@@ -4,6 +4,7 @@
     python -m studies.physics_informed --only beam liver
     python -m studies.physics_informed --minutes 60   # for each network
     python -m studies.physics_informed --ways physics --keep DIR    # networks into DIR
+    python -m studies.physics_informed --only beam --ways physics --seed 1    # another beginning
     python -m studies.physics_informed --only --family 20    # ventricles no network has seen
     python -m studies.physics_informed --only --finer        # the ventricle's next finer mesh
     python -m studies.physics_informed --quick --out DIR  # a coarse beam
@@ -150,23 +151,22 @@ def posterior(emulator: Emulator, known: Runs) -> Case:
             "verdict": certificate.verdict, "reason": certificate.reason}  # fmt: skip
 
 
-def network(
-    scene: Scene, known: Runs, name: str, minutes: float, small: bool, keep: Path | None
-) -> Case:
+def network(scene: Scene, known: Runs, name: str, keep: Path | None, given: Any) -> Case:
     """The network that a recipe trains in so many minutes, and a posterior with it."""
-    plan = replace(recipe(name), seed=SEED)
+    small = given.quick
+    plan = replace(recipe(name), seed=given.seed)
     sizes = SMALL if small and plan.decoder == "separable" else None
     if small:
         plan = replace(plan, steps=60, simulations=20, freeze=30, polish=50)
     with tempfile.TemporaryDirectory() as folder:
-        budget = None if small else 60.0 * minutes
+        budget = None if small else 60.0 * given.minutes
         emulator = train(scene, plan, folder, architecture=sizes, budget=budget)
     record = emulator.record
     if keep:
         save_emulator(emulator, keep)
     runs = 0 if plan.sweeps else plan.runs + int(plan.centred)
-    found = {"fem_solutions": runs, "seconds": record["seconds"], "steps": record["plan"]["steps"],
-             "errors": errors_of(emulator, known)}  # fmt: skip
+    found = {"fem_solutions": runs, "seed": given.seed, "seconds": record["seconds"],
+             "steps": record["plan"]["steps"], "errors": errors_of(emulator, known)}  # fmt: skip
     return found | ({} if small else {"posterior": posterior(emulator, known)})
 
 
@@ -207,7 +207,7 @@ class Body:
         """One way of learning it."""
         if way in NETWORKS:
             keep = given.keep and given.keep / f"{self.name}, {way}"
-            found = network(self.scene, self.known, NETWORKS[way], given.minutes, given.quick, keep)
+            found = network(self.scene, self.known, NETWORKS[way], keep, given)
         else:
             centre = way == "sweeps about the centre"
             sweeps = 30 if given.quick else SWEEPS
@@ -262,6 +262,7 @@ def main() -> None:
     arguments.add_argument("--only", nargs="*", help="bodies")
     arguments.add_argument("--ways", nargs="*", choices=tuple(COLOURS), help="ways of learning")
     arguments.add_argument("--minutes", type=float, default=60.0, help="for each network")
+    arguments.add_argument("--seed", type=int, default=SEED, help="of the networks")
     arguments.add_argument("--keep", type=Path, help="folder that the networks are written to")
     arguments.add_argument("--tests", type=int, default=50)
     arguments.add_argument("--family", type=int, default=0, help="unseen ventricles, up to 20")
@@ -278,7 +279,8 @@ def main() -> None:
             continue
         body = Body(name, make(), given.tests)
         for way in given.ways or COLOURS:
-            results.case(f"{name}, {way}", partial(body.case, way, given))
+            seed = f", seed {given.seed}" if way in NETWORKS and given.seed != SEED else ""
+            results.case(f"{name}, {way}{seed}", partial(body.case, way, given))
     for k, shape in enumerate(ventricles(20, FAMILY_SEED)[: given.family]):
         results.case(f"unseen ventricle {k}", partial(from_family, shape))
     for way in FINER if given.finer else ():
