@@ -1,10 +1,24 @@
 """The study of sheep myocardium: its files, its formula and its emulator, without its long runs."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
-from studies.sheep_myocardium import campaign, cube, curves, experiment, inference
+from numpyro.infer import MCMC, NUTS
+from studies.sheep_myocardium import (
+    campaign,
+    checked,
+    cube,
+    curves,
+    experiment,
+    inference,
+    moves,
+    process,
+)
 
 from emulator.errors import InputError
 
@@ -110,15 +124,132 @@ def test_angles_turn_fibres_towards_sheet_and_normal():
             np.testing.assert_allclose(turned, np.sqrt(0.75) * f + 0.5 * towards, atol=1e-12)
 
 
-def test_the_process_covariances_are_the_kernels_derivatives():
-    x, y = jax.random.normal(jax.random.key(0), (2, 4))
-    k = curves._kernel
-    np.testing.assert_allclose(curves._to_run(x, y)[1:], jax.grad(k, argnums=1)(x, y), atol=1e-14)
-    between = curves._between_runs(x, y)
-    np.testing.assert_allclose(between[0, 1:], jax.grad(k, argnums=1)(x, y), atol=1e-14)
-    np.testing.assert_allclose(between[1:, 0], jax.grad(k, argnums=0)(x, y), atol=1e-14)
-    cross = jax.jacfwd(jax.grad(k, argnums=0), argnums=1)(x, y)
-    np.testing.assert_allclose(between[1:, 1:], cross, atol=1e-14)
+ENDS = process.ends(np.array([[-0.3, 0.35], [-0.4, 0.3], [-0.1, 0.12]]))
+
+
+def test_features_are_ratios_of_moduli():
+    x = position(a=0.8, b=7.0, a_f=1.6, b_f=10.0, in_plane=9.0)
+    found = process.features(x, jnp.asarray(ENDS))
+    np.testing.assert_allclose(ENDS, [0.16, 0.24**2])
+    np.testing.assert_allclose(found[2:5], np.log1p([1.6 / 0.8, 0.001 / 0.8, 0.001 / 0.8]))
+    grown = 1.6 * np.exp(10.0 * 0.24**2) / (0.8 * np.exp(7.0 * 0.16))
+    assert float(found[5]) == pytest.approx(np.log1p(grown))
+    np.testing.assert_allclose(found[8:], [0.2, 0.0], atol=1e-12)
+
+
+def test_a_term_that_is_off_has_no_exponent():
+    x = jnp.stack([position(a=1.0, b=5.0, b_f=b_f) for b_f in (0.5, 20.0)])
+    phi = jax.vmap(process.features, (0, None))(x, jnp.asarray(ENDS))
+    assert float(jnp.abs(phi[1] - phi[0]).max()) < 2e-3
+
+
+def test_the_processs_correlations_are_the_kernels_derivatives():
+    x, y = 0.5 * jax.random.normal(jax.random.key(0), (2, 10))
+    lengths = jnp.linspace(0.5, 2.0, process.FEATURES)
+
+    def kernel(x, y):
+        step = (
+            process.features(x, jnp.asarray(ENDS)) - process.features(y, jnp.asarray(ENDS))
+        ) / lengths
+        return jnp.exp(-0.5 * step @ step)
+
+    phi, J = process.with_slopes(jnp.stack([x, y]), jnp.asarray(ENDS))
+    found = process.correlations(phi[:1], J[:1], phi[1:], J[1:], lengths)[0, :, 0]
+    np.testing.assert_allclose(found[0, 0], kernel(x, y), rtol=1e-12)
+    np.testing.assert_allclose(found[0, 1:], jax.grad(kernel, 1)(x, y), atol=1e-12)
+    np.testing.assert_allclose(found[1:, 0], jax.grad(kernel, 0)(x, y), atol=1e-12)
+    cross = jax.jacfwd(jax.grad(kernel, 0), 1)(x, y)
+    np.testing.assert_allclose(found[1:, 1:], cross, atol=1e-12)
+
+
+def made_up(x):
+    """A q of one point, smooth in features: (n, 1) and its slopes (n, 1, p)."""
+
+    def q(x):
+        phi = process.features(x, jnp.asarray(ENDS))
+        return jnp.array([0.3 * jnp.sin(phi[2]) + 0.1 * phi[8] ** 2])
+
+    x = jnp.asarray(x)
+    return np.asarray(jax.vmap(q)(x)), np.asarray(jax.vmap(jax.jacfwd(q))(x))
+
+
+@pytest.fixture(scope="module")
+def told():
+    x = np.random.default_rng(0).uniform(-0.6, 0.6, (12, 10))
+    return process.known(x, *made_up(x), ENDS)
+
+
+def test_a_process_goes_through_its_runs_and_says_what_it_leaves(told):
+    lengths = process.likeliest(told)
+    made = process.conditioned(told, jnp.asarray(lengths))
+    there = jax.vmap(process.correction, (None, 0))(made, told.phi[:12])
+    np.testing.assert_allclose(there, told.y[:12, 0] + told.mean, atol=1e-3)
+    # Features that q does not read have longer lengths than those it does.
+    assert lengths[2] < lengths[[3, 4, 9]].min()
+    x = np.random.default_rng(1).uniform(-0.6, 0.6, (60, 10))
+    phi, J = process.with_slopes(jnp.asarray(x), jnp.asarray(ENDS))
+    covariance, sd = process.left(told, jnp.asarray(lengths), phi, J)
+    rows = np.arange(60) * 11
+    said = float(sd) * np.sqrt(np.maximum(np.asarray(covariance)[rows, rows], 0.0))
+    wrong = (
+        np.asarray(jax.vmap(process.correction, (None, 0))(made, phi))[:, 0] - made_up(x)[0][:, 0]
+    )
+    assert np.abs(wrong).max() < 0.03
+    assert 0.3 < np.sqrt(np.mean((wrong / (said + 1e-5)) ** 2)) < 3.0
+
+
+def test_next_runs_take_the_most_variance_away():
+    """Against conditioning on each run by hand."""
+    half = np.random.default_rng(2).normal(size=(12, 12))
+    C = half @ half.T
+    values = np.arange(0, 12, 3)
+    left = []
+    for i in range(4):
+        rows = np.arange(3 * i, 3 * i + 3)
+        after = C - C[:, rows] @ np.linalg.inv(C[np.ix_(rows, rows)]) @ C[rows]
+        left.append(np.trace(after[np.ix_(values, values)]))
+    first, second = process.next_runs(C, 4, 2)
+    assert first == int(np.argmin(left))
+    assert second != first
+
+
+def test_a_transport_between_modes_is_undone_and_keeps_its_balance():
+    rng = np.random.default_rng(3)
+    z = rng.normal(size=(4, 200, 3)) * np.array([1.0, 0.3, 2.0]) + 4.0 * np.arange(4)[:, None, None]
+    found = moves.modes(z, rng.normal(size=(4, 200)))
+    at, i, j = jnp.asarray(z[1, 0]), jnp.asarray(1), jnp.asarray(3)
+    there, more = moves.transported(found, at, i, j)
+    back, less = moves.transported(found, there, j, i)
+    np.testing.assert_allclose(back, at, atol=1e-10)
+    assert float(more) == pytest.approx(-float(less))
+    jacobian = jax.jacfwd(lambda z: moves.transported(found, z, i, j)[0])(at)
+    shares = [moves._log_shares(found, z) for z in (at, there)]
+    given = shares[1][3] + found.log_weight[1] - shares[0][1] - found.log_weight[3]
+    expected = float(given) + np.log(np.linalg.det(np.asarray(jacobian)))
+    assert float(more) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_moves_join_modes_that_nuts_does_not(known):
+    """Two Gaussians of one and three quarters of the mass, 20 sd apart."""
+
+    def program(_):
+        apart = dist.MixtureSameFamily(
+            dist.Categorical(jnp.array([0.25, 0.75])),
+            dist.Normal(jnp.array([-10.0, 10.0]), jnp.array([1.0, 0.5])),
+        )
+        numpyro.sample("x", apart)
+
+    z = np.stack([np.linspace(-11.5, -8.5, 100), np.linspace(9.3, 10.7, 100)])[:, :, None]
+    z = np.concatenate([z, z])
+    given = moves.modes(z, np.zeros((4, 100))) if known else moves.unknown(1)
+    run = MCMC(
+        moves.Moving(NUTS(program), "angles"), num_warmup=100, num_samples=600,
+        progress_bar=False, jit_model_args=True,
+    )  # fmt: skip
+    run.run(jax.random.key(0), given)
+    right = float((np.asarray(run.get_samples()["x"]) > 0.0).mean())
+    assert (0.65 < right < 0.85) if known else right in (0.0, 1.0)
 
 
 def test_the_emulator_goes_through_its_runs(tmp_path):
@@ -136,7 +267,7 @@ def test_the_emulator_goes_through_its_runs(tmp_path):
     # At angles zero the cut is the frame, so that only the first cube is like this formula.
     force, slopes = jax.jit(jax.vmap(made))(x), jax.jit(jax.vmap(jax.jacfwd(made)))(x)
     runs = curves.Runs(*(np.asarray(a) for a in (x, force, slopes, force)))
-    emulated = curves.fit(bodies[:1], [runs])
+    emulated = curves.fit(bodies[:1], [runs]).emulated
     again = jax.jit(jax.vmap(lambda x: curves.forces(emulated, x[None])[0]))(x)
     np.testing.assert_allclose(again, force, rtol=1e-4)
 
@@ -162,3 +293,40 @@ def test_half_of_what_a_mode_is_off_is_the_same_along_its_curve():
     covariance = np.asarray(inference.covariances(amounts, jnp.ones(10), jnp.asarray(0.2)))
     assert covariance[0, 0] == pytest.approx(0.04 + inference.POINT**2 + inference.CELL**2)
     assert 0.02 < covariance[0, -1] < 0.025
+
+
+def checked_heart(differences, spread=1.0):
+    """A heart whose draws are Gaussian in logarithms, tested at 30 of them."""
+    rng = np.random.default_rng(4)
+    names = inference.parameters(inference.ORTHOTROPIC)
+    logs = {n: rng.normal(0.0, 0.1, 1000) for n in names}
+    draws = {"omega": np.exp(rng.normal(-1.0, 0.1, 1000))}
+
+    def found(moved):
+        return SimpleNamespace(
+            law=inference.ORTHOTROPIC, draws=draws, worst_rhat=1.0, least_ess=900.0, divergences=0,
+            positions=np.zeros((1000, 3, 10)), theta=lambda name: np.exp(logs[name] + moved),
+        )  # fmt: skip
+
+    tested = np.arange(30)
+    return SimpleNamespace(
+        explored=found(0.0), on_mesh=found(0.1 * spread), tested=tested, tests=[0, 0, 0],
+        likelihood_differences=lambda: differences(logs, tested),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("differences", "spread", "verdict", "word"),
+    [
+        (lambda logs, rows: 0.05 * np.sin(rows), 1.0, "accepted", "no mean moves"),
+        # FEM's likelihood rises with a: its mean moves by a sd.
+        (lambda logs, rows: 10.0 * logs["a"][rows], 1.0, None, "mean of a"),
+        (lambda logs, rows: 3.0 * np.sin(5.0 * rows), 1.0, "not certified", "irregularly"),
+        (lambda logs, rows: np.where(rows < 3, np.nan, 0.0), 1.0, "not certified", "FEM fails"),
+        (lambda logs, rows: 0.0 * rows, 4.0, "not certified", "finer mesh"),
+    ],
+)
+def test_the_librarys_limits_judge_a_heart(differences, spread, verdict, word):
+    found = checked.certificate(checked_heart(differences, spread))
+    assert found.verdict == verdict if verdict else found.verdict != "accepted"
+    assert any(word in each for each in found.findings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
-from studies.common.output import Case
 from studies.sheep_myocardium.cube import CELLS
 from studies.sheep_myocardium.curves import (
     Cube,
     Emulated,
+    Fit,
     Runs,
     cubes,
     fit,
@@ -27,13 +28,14 @@ from studies.sheep_myocardium.inference import (
     ORTHOTROPIC,
     Found,
     log_likelihoods,
-    parameters,
     sample,
-    seen,
+    settled,
 )
+from studies.sheep_myocardium.process import next_runs
 
 from emulator.store import replacing
 
+LOG = logging.getLogger(__name__)
 FINER = 5
 """Cells along an edge of the finer mesh: 1331 nodes."""
 _ORDER = 1.2  # of the force's convergence: twice 0.595, the exponent at a glued edge
@@ -43,40 +45,60 @@ _ORDER = 1.2  # of the force's convergence: twice 0.595, the exponent at a glued
 class Plan:
     """Numbers of runs a cube.
 
-    wide : over the box. rounds : of ``each`` at draws of two laws' posteriors in turn. tests : at
-    draws of the last one. meshes : at which a finer mesh is solved, too.
+    wide : over the box. each : a round, where they tell most of q at draws of the posterior.
+    rounds : as many at least, at most; they end where q's sd at a tenth of the draws is below
+    :data:`ENOUGH`. tests : at draws of the posterior, without slopes. meshes : at which a finer
+    mesh is solved, too. draws : of each of four chains.
     """
 
     wide: int = 12
-    rounds: int = 6
-    each: int = 7
-    tests: int = 6
+    each: int = 9
+    rounds: tuple[int, int] = (3, 7)
+    tests: int = 30
     meshes: int = 2
     draws: int = 300
 
 
-QUICK = Plan(wide=4, rounds=1, each=2, tests=2, meshes=1, draws=50)
+QUICK = Plan(wide=4, each=2, rounds=(1, 1), tests=4, meshes=1, draws=50)
+ENOUGH = 0.01
+"""Of a force: what q may be unsure of at a tenth of the draws when rounds end."""
+_POOL = 80  # draws that next runs are chosen from
 
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
     """What FEM says of a heart.
 
-    coarse : emulator of its cubes. cubes : the same without the mesh's error. tests : runs that it
-    was not fitted to, at draws. omega : mean of these draws. seconds : it took.
+    fitted : what its runs say. cubes : emulator of the cubes without the mesh's error. on_mesh,
+    explored : the posteriors with the mesh's error and without. tests : runs that it was not
+    fitted to, at the draws ``tested`` (t,) of ``explored``. doubt : of q at a tenth of the draws,
+    by round. seconds : it took.
     """
 
     heart: Heart
-    coarse: Emulated
+    fitted: Fit
     cubes: Emulated
+    on_mesh: Found
+    explored: Found
+    tested: np.ndarray
     tests: tuple[Runs, ...]
-    omega: float
+    doubt: list[float]
     seconds: float
+
+    @property
+    def coarse(self) -> Emulated:
+        """Emulator of the cubes with the mesh's error."""
+        return self.fitted.emulated
+
+    @property
+    def omega(self) -> float:
+        """Mean of its draws."""
+        return float(self.explored.draws["omega"].mean())
 
     @property
     def runs(self) -> int:
         """Runs a cube, tests included."""
-        return self.coarse.at.shape[1] + len(self.tests[0].x)
+        return int(self.fitted.known[0].used.sum()) + len(self.tests[0].x)
 
     @property
     def by_fem(self) -> np.ndarray:
@@ -88,14 +110,25 @@ class Campaign:
     def by_map(self) -> np.ndarray:
         """Forces (t, 9, j) in N of the tests by the emulator."""
         x = jnp.asarray(np.stack([test.x for test in self.tests], axis=1))
-        each = jax.jit(jax.vmap(lambda x: forces(self.coarse, x)))(x)
+        each = jax.jit(jax.vmap(forces, (None, 0)))(self.coarse, x)
         return np.asarray(each).reshape(len(x), len(MODES), -1)
 
+    @property
+    def said(self) -> np.ndarray:
+        """What the processes say their sd is at the tests, (t, 3), a fraction of the force."""
+        each = [self.fitted.doubt(k, test.x) for k, test in enumerate(self.tests)]
+        return np.stack(each, axis=1)
+
     def likelihood_differences(self) -> np.ndarray:
-        """Log likelihoods (t,) of the data at the tests, FEM's less the emulators'."""
-        of = seen(self.heart, self.coarse)
-        each = jax.jit(jax.vmap(lambda m: log_likelihoods(of, m, jnp.asarray(self.omega)).sum()))
-        fem, cheap = (np.asarray(each(m)) for m in (self.by_fem, self.by_map))
+        """Log likelihoods (t,) of the data at the tests, FEM's less the emulators'.
+
+        Both without the mesh's error; NaN where FEM failed.
+        """
+        finer = np.asarray(self.cubes.finer).reshape(len(MODES), -1)
+        of = self.explored.of
+        each = jax.jit(jax.vmap(lambda of, m, o: log_likelihoods(of, m, o).sum(), (None, 0, 0)))
+        omega = jnp.asarray(self.explored.draws["omega"][self.tested])
+        fem, cheap = (np.asarray(each(of, m * finer, omega)) for m in (self.by_fem, self.by_map))
         return fem - cheap
 
 
@@ -117,48 +150,70 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
     """The runs of a heart. Those in the folder ``kept`` are not solved again."""
     began = perf_counter()
     bodies = cubes(heart)
-    size = {"draws": plan.draws, "warmup": plan.draws, "chains": 1}
+    rng = np.random.default_rng(seed)
     unknowns = bodies[0].unknowns
     boxes = [qmc.Sobol(unknowns, seed=seed + k).random_base2(4) for k in range(3)]
-    wide = [2.0 * box[: plan.wide] - 1.0 for box in boxes]
     runs = [
-        _kept(kept, f"{heart.name}_{k}_wide", body, x)
-        for k, (body, x) in enumerate(zip(bodies, wide, strict=True))
+        _kept(kept, f"{heart.name}_{k}_wide", body, 2.0 * box[: plan.wide] - 1.0)
+        for k, (body, box) in enumerate(zip(bodies, boxes, strict=True))
     ]
-    for number in range(plan.rounds):
-        law = "fibres" if number == 1 else ORTHOTROPIC
-        name = f"round{number}"
-        known = [_known(kept, f"{heart.name}_{k}_{name}") for k in range(3)]
-        if all(known):
-            new = [each for each in known if each]
-        else:
-            found = sample(heart, fit(bodies, runs), seed + number, law, **size)
-            x = _some(found, plan.each, seed + number)
-            new = [
-                _kept(kept, f"{heart.name}_{k}_{name}", body, x[:, k])
-                for k, body in enumerate(bodies)
-            ]
-        runs = [joined(pair) for pair in zip(runs, new, strict=True)]
     fitted = fit(bodies, runs)
-    found = sample(heart, fitted, seed + plan.rounds, **size)
-    x = _some(found, plan.tests, seed + plan.rounds)
-    tests = [_kept(kept, f"{heart.name}_{k}_tests", b, x[:, k]) for k, b in enumerate(bodies)]
-    omega = float(found.draws["omega"].mean())
-    fine = [
-        _kept(
-            kept, f"{heart.name}_{k}_finer", replace(body, cells=FINER), x.x[: plan.meshes],
-            slopes=False,
-        )
-        for k, (body, x) in enumerate(zip(bodies, tests, strict=True))
-    ]  # fmt: skip
-    cubes_there = without_mesh(fitted, tests, fine)
-    return Campaign(heart, fitted, cubes_there, tuple(tests), omega, perf_counter() - began)
+    size = {"draws": plan.draws, "warmup": plan.draws}
+    doubt: list[float] = []
+    least, most = plan.rounds
+    for number in range(most):
+        names = [f"{heart.name}_{k}_round{number}" for k in range(3)]
+        if (before := [_known(kept, name) for name in names]) and all(before):
+            new = [each for each in before if each]
+            runs = [joined(pair) for pair in zip(runs, new, strict=True)]
+            fitted = fit(bodies, runs, fitted)
+            continue
+        law = "fibres" if number == 1 else ORTHOTROPIC
+        found = sample(heart, fitted.emulated, seed + number, law, **size)
+        pool = _some(found, _POOL, rng)
+        each = [fitted.doubt(k, pool[:, k]) for k in range(3)]
+        doubt.append(float(np.quantile(np.max(each, axis=0), 0.9)))
+        LOG.info("%s, round %d: q is known to %.1f %%", heart.name, number, 100 * doubt[-1])
+        if number >= least and doubt[-1] < ENOUGH:
+            break
+        new = [
+            _kept(kept, names[k], body, _next(fitted, k, pool, plan.each))
+            for k, body in enumerate(bodies)
+        ]
+        runs = [joined(pair) for pair in zip(runs, new, strict=True)]
+        fitted = fit(bodies, runs, fitted)
+    coarse = settled(heart, fitted.emulated, seed + most, **size)
+    x = _some(coarse, plan.meshes, rng)
+    pairs = []
+    for cells in (CELLS, FINER):
+        bodies_there = [replace(body, cells=cells) for body in bodies]
+        pairs.append([
+            _kept(kept, f"{heart.name}_{k}_mesh{cells}", body, x[:, k], slopes=False)
+            for k, body in enumerate(bodies_there)
+        ])  # fmt: skip
+    cubes_there = without_mesh(fitted.emulated, *pairs)
+    explored = settled(heart, cubes_there, seed + most, times=4, **size)
+    tested = rng.choice(len(explored.positions), plan.tests, replace=False)
+    tests = [
+        _kept(kept, f"{heart.name}_{k}_tests", body, explored.positions[tested, k], slopes=False)
+        for k, body in enumerate(bodies)
+    ]
+    seconds = perf_counter() - began
+    return Campaign(
+        heart, fitted, cubes_there, coarse, explored, tested, tuple(tests), doubt, seconds
+    )
 
 
-def _some(found: Found, count: int, seed: int) -> np.ndarray:
+def _some(found: Found, count: int, rng: np.random.Generator) -> np.ndarray:
     """Positions (count, 3, p) of a posterior's draws."""
-    rows = np.random.default_rng(seed).choice(len(found.positions), count, replace=False)
-    return found.positions[rows]
+    return found.positions[rng.choice(len(found.positions), count, replace=False)]
+
+
+def _next(fitted: Fit, number: int, pool: np.ndarray, count: int) -> np.ndarray:
+    """The positions (count, p) of a cube, of the ``pool`` (m, 3, p), whose runs would tell most."""
+    x = pool[:, number]
+    covariance, _ = fitted.left(number, x)
+    return x[next_runs(covariance, len(x), count)]
 
 
 def _known(folder: Path | None, name: str) -> Runs | None:
@@ -173,8 +228,9 @@ def _known(folder: Path | None, name: str) -> Runs | None:
 def _kept(
     folder: Path | None, name: str, body: Cube, x: np.ndarray, *, slopes: bool = True
 ) -> Runs:
-    """FEM at positions (r, p), or what a file kept of a run before this one."""
-    if (known := _known(folder, name)) is not None:
+    """FEM at positions (r, p), or what a file kept of a run at these before this one."""
+    known = _known(folder, name)
+    if known is not None and known.x.shape == x.shape and np.allclose(known.x, x, atol=1e-9):
         return known
     found = body.runs(x, slopes=slopes)
     if folder is not None:
@@ -182,25 +238,4 @@ def _kept(
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **found._asdict())
-    return found
-
-
-def told(found: Campaign) -> Case:
-    """Errors of the emulators at draws of the posterior, and what FEM changes of it."""
-    errors = np.abs(found.by_map / found.by_fem - 1.0)
-    return {
-        "runs_a_cube": found.runs,
-        "seconds": found.seconds,
-        "error_median": float(np.nanmedian(errors)),
-        "error_90": float(np.nanquantile(errors, 0.9)),
-        "sd_of_log_likelihood_difference": float(np.nanstd(found.likelihood_differences())),
-    }
-
-
-def shifts(before: Found, after: Found) -> Case:
-    """Changes of posterior means of logarithms, in sd."""
-    found = {}
-    for name in parameters(before.law):
-        a, b = np.log(before.theta(name)), np.log(after.theta(name))
-        found[name] = float((b.mean() - a.mean()) / a.std())
     return found

@@ -3,12 +3,12 @@ r"""Forces along the curves of a heart, by FEM at some theta and by an emulator 
 What is emulated is how far glued plates take the force from the formula's of a homogeneous cube
 (:mod:`.cube`),
 
-.. math:: F_j(\theta) = F_j^\text{hom}(\theta)\, e^{q_j(x)}, \qquad
-          q_j \sim \mathrm{GP}\big(\bar q_j,\; e^{-|x - x'|^2 / 2 \ell^2}\big)
+.. math:: F_j(\theta) = F_j^\text{hom}(\theta)\, e^{q_j(x)}
 
-with the position :math:`x \in [-1, 1]^p` in the box, through FEM's values and slopes
-:math:`\partial q_j / \partial x_i`. The formula carries the exponentials. Runs go where the
-posterior is, round by round: over the whole box, fibres that switch on make too many shapes.
+with q a Gaussian process (:mod:`.process`) through FEM's values and slopes
+:math:`\partial q_j / \partial x_i` at positions :math:`x \in [-1, 1]^p` in the box. The formula
+carries the exponentials. Runs go where the posterior is, round by round: over the whole box,
+fibres that switch on make too many shapes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from studies.sheep_myocardium import cube
+from studies.sheep_myocardium import cube, process
 from studies.sheep_myocardium.experiment import Curve, Heart
+from studies.sheep_myocardium.process import Known, Process
 
 import emulator as em
 from emulator.errors import SolverError
@@ -30,8 +31,6 @@ from emulator.fem.support_force import SupportForce
 
 MODES_OF_A_CUBE = 3
 _AXES = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))  # along which each mode moves
-LENGTH = 1.0  # correlation length of q, in half widths of the box
-_NUGGET = 1e-6  # variance that neither forces nor slopes tell
 
 
 class Runs(NamedTuple):
@@ -100,7 +99,7 @@ class Cube:
     def _half(self, x: jax.Array, mode: int, amounts: np.ndarray, slopes: bool) -> list[np.ndarray]:
         """Forces, slopes and normal forces on the way from rest to the last of ``amounts``."""
         thetas = self.thetas(x, mode, jnp.asarray(amounts))
-        found = self._path(thetas)
+        found = self.simulator.path(thetas)
         converged = np.asarray(found.converged)
         told: list[list[np.ndarray]] = [[], [], []]
         for k in range(len(amounts)):
@@ -118,10 +117,6 @@ class Cube:
             for part, value in zip(told, self._each_force[mode](u, theta, moved), strict=True):
                 part.append(np.asarray(value))
         return [np.stack(part) for part in told]
-
-    @cached_property
-    def _path(self) -> Callable[[jax.Array], em.fem.Solution]:
-        return jax.jit(self.simulator.path)
 
     @cached_property
     def _each_force(self) -> list[Callable[..., tuple[jax.Array, ...]]]:
@@ -161,16 +156,14 @@ def cubes(heart: Heart, cells: int = cube.CELLS) -> list[Cube]:
 class Emulated(NamedTuple):
     """The emulator of a heart's forces, arrays only, so that one program serves all hearts.
 
-    at : (3, r, p) positions of FEM's runs of each cube. mean : (3, k) of a cube's points. weights :
-    (3, r, p + 1, k) of the kernel and its derivatives there. finer : (3, k) by which a finer mesh's
-    forces differ, a factor. amounts : (3, 3, j). H, C : as of :func:`.cube.homogeneous`. area :
-    (3,) mm2.
+    process : of each cube, arrays with a first axis of 3. finer : (3, k) by which a finer mesh's
+    forces differ, a factor. ends : (3, 2), see :func:`.process.ends`. amounts : (3, 3, j).
+    H, C : as of :func:`.cube.homogeneous`. area : (3,) mm2.
     """
 
-    at: jax.Array
-    mean: jax.Array
-    weights: jax.Array
+    process: Process
     finer: jax.Array
+    ends: jax.Array
     amounts: jax.Array
     H: jax.Array
     C: jax.Array
@@ -179,8 +172,8 @@ class Emulated(NamedTuple):
 
 def forces(emulated: Emulated, x: jax.Array) -> jax.Array:
     """Forces (3, k) in N of a heart's cubes at positions (3, p)."""
-    to_runs = jax.vmap(jax.vmap(_to_run, (None, 0)))(x, emulated.at)
-    q = emulated.mean + jnp.einsum("crd,crdk->ck", to_runs, emulated.weights)
+    phi = jax.vmap(process.features)(x, emulated.ends)
+    q = jax.vmap(process.correction)(emulated.process, phi)
     return emulated.finer * cube.formula(x, emulated.H, emulated.C, emulated.area) * jnp.exp(q)
 
 
@@ -201,42 +194,65 @@ def _formula_and_slopes(
     return value, jnp.concatenate([slopes[:, :, 0, :material], own], axis=-1)
 
 
-def _kernel(x: jax.Array, y: jax.Array) -> jax.Array:
-    return jnp.exp(-0.5 * jnp.sum((x - y) ** 2) / LENGTH**2)
-
-
-def _to_run(x: jax.Array, y: jax.Array) -> jax.Array:
-    """Covariance (p + 1,) of q at ``x`` with q and its slopes at a run ``y``, (p,) each."""
-    k = _kernel(x, y)
-    return jnp.concatenate([k[None], k * (x - y) / LENGTH**2])
-
-
-def _between_runs(x: jax.Array, y: jax.Array) -> jax.Array:
-    """Covariance (p + 1, p + 1) of q and its slopes at two runs (p,)."""
-    k, step = _kernel(x, y), (x - y) / LENGTH**2
-    slopes = k * (jnp.eye(len(x)) / LENGTH**2 - jnp.outer(step, step))
-    return jnp.block([[k[None, None], k * step[None]], [-k * step[:, None], slopes]])
-
-
 def joined(parts: Sequence[Runs]) -> Runs:
     """Runs one after the other."""
     return Runs(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def fit(bodies: Sequence[Cube], runs: Sequence[Runs]) -> Emulated:
-    """The processes through the logarithm of FEM's forces over the formula's, and its slopes."""
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What a heart's runs say: the emulator, and of each cube what it was made of."""
+
+    emulated: Emulated
+    known: list[Known]
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Of each cube's process, (3, f)."""
+        return np.asarray(self.emulated.process.lengths)
+
+    def left(self, number: int, x: np.ndarray) -> tuple[np.ndarray, float]:
+        """Covariance of a cube's q and slopes at (m, p), :func:`.process.left`, and its scale."""
+        phi, J = process.with_slopes(jnp.asarray(x), self.emulated.ends[number])
+        lengths = self.emulated.process.lengths[number]
+        covariance, sd = process.left(self.known[number], lengths, phi, J)
+        return np.asarray(covariance), float(sd)
+
+    def doubt(self, number: int, x: np.ndarray) -> np.ndarray:
+        """Sd (m,) of a cube's q at positions (m, p): a fraction of the force."""
+        covariance, sd = self.left(number, x)
+        rows = np.arange(len(x)) * (len(covariance) // len(x))
+        return sd * np.sqrt(np.maximum(covariance[rows, rows], 0.0))
+
+
+def fit(bodies: Sequence[Cube], runs: Sequence[Runs], before: Fit | None = None) -> Fit:
+    """The processes through the logarithm of FEM's forces over the formula's, and its slopes.
+
+    Lengths are sought from those ``before``.
+
+    Raises
+    ------
+    SolverError
+        Half of a cube's runs failed, or more.
+    """
     amounts = np.stack([body.amounts for body in bodies])
     H, C = (jnp.asarray(np.stack(p)) for p in zip(*map(cube.homogeneous, amounts), strict=True))
     area = jnp.asarray([body.area for body in bodies])
-    rows = [_fitted(k, each, H, C, area) for k, each in enumerate(runs)]
-    at, mean, weights = (jnp.asarray(np.stack(part)) for part in zip(*rows, strict=True))
-    return Emulated(at, mean, weights, jnp.ones(mean.shape), jnp.asarray(amounts), H, C, area)
+    ends = np.stack([process.ends(each) for each in amounts])
+    known = [_known(k, each, ends[k], H, C, area) for k, each in enumerate(runs)]
+    made = []
+    for k, told in enumerate(known):
+        start = None if before is None else before.lengths[k]
+        made.append(process.conditioned(told, jnp.asarray(process.likeliest(told, start))))
+    one = jax.tree.map(lambda *each: jnp.stack(each), *made)
+    rest = (jnp.asarray(ends), jnp.asarray(amounts), H, C, area)
+    return Fit(Emulated(one, jnp.ones(one.mean.shape), *rest), known)
 
 
-def _fitted(
-    k: int, runs: Runs, H: jax.Array, C: jax.Array, area: jax.Array
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, mean and weights of one cube's process."""
+def _known(
+    k: int, runs: Runs, ends: np.ndarray, H: jax.Array, C: jax.Array, area: jax.Array
+) -> Known:
+    """What one cube's runs say of its q."""
     told = []
     for row in runs.x:
         value, slopes = _formula_and_slopes(jnp.tile(jnp.asarray(row), (len(H), 1)), H, C, area)
@@ -246,15 +262,5 @@ def _fitted(
     sound = (np.isfinite(ratio) & (ratio > 0.0)).all(axis=1)
     if not sound.sum() > 0.5 * len(sound):
         raise SolverError(f"{(~sound).sum()} of {len(sound)} runs of cube {k + 1} failed")
-    q = np.log(ratio[sound])
     slopes = (runs.slopes / runs.force[..., None] - rising / formula[..., None])[sound]
-    known = np.concatenate([(q - q.mean(axis=0))[:, None], np.swapaxes(slopes, 1, 2)], axis=1)
-    count = known.shape[0] * known.shape[1]
-    x = runs.x[sound]
-    blocks = jax.vmap(lambda a: jax.vmap(lambda b: _between_runs(a, b))(x))(x)
-    gram = np.asarray(blocks).transpose(0, 2, 1, 3).reshape(count, count)
-    solved = np.linalg.solve(gram + _NUGGET * np.eye(count), known.reshape(count, -1))
-    # A run that failed keeps its place, with no weight: programs are of a number of runs.
-    weights = np.zeros((len(sound), *known.shape[1:]))
-    weights[sound] = solved.reshape(known.shape)
-    return runs.x, q.mean(axis=0), weights
+    return process.known(runs.x[sound], np.log(ratio[sound]), slopes, ends)

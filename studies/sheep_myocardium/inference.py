@@ -17,7 +17,7 @@ What differs between hearts is arrays, so that a law's program is compiled once 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -27,16 +27,21 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from numpyro.infer import MCMC, NUTS, init_to_value
+from jax.flatten_util import ravel_pytree
+from numpyro.infer import MCMC, NUTS, init_to_uniform
+from numpyro.infer.util import unconstrain_fn
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
+from studies.sheep_myocardium.moves import Modes, Moving, modes, unknown
 
+from calibrate.samplers.stopping import least_ess, r_hat
 from calibrate.statistical_model.curve import curve_covariance
 
 CELL = 3e-3  # N, noise of the load cell
 POINT = 0.03  # of a force, at each point for itself
 ANGLE = 15.0  # degrees
+AGREE = 1.02  # R-hat of chains that found the same
 OFF = 0.3  # scale of the half-normal prior of omega
 MEANS = {"a_f": 2.0, "a_s": 1.0, "a_fs": 0.5}
 """Means in kPa of the exponential priors of moduli that may be zero; logarithms are uniform."""
@@ -111,10 +116,10 @@ def _position(name: str, value: jax.Array) -> jax.Array:
     return 2.0 * parameter.to_unit(jnp.minimum(value, parameter.high)) - 1.0
 
 
-def program(law: str, *, angles: bool) -> Callable[[Seen], None]:
+def program(law: str, *, angles: bool) -> Callable[[Seen, Modes], None]:
     """The NumPyro program of a heart by a law; ``angles`` says whether the fibres' are unknown."""
 
-    def model(of: Seen) -> None:
+    def model(of: Seen, _: Modes) -> None:
         x = {name: jnp.asarray(-1.0) for name in MATERIAL}
         for name in parameters(law):
             if name in MEANS:
@@ -134,24 +139,24 @@ def program(law: str, *, angles: bool) -> Callable[[Seen], None]:
     return model
 
 
+def dimension(law: str, *, angles: bool) -> int:
+    """Number of a law's unknowns."""
+    return len(parameters(law)) + angles * _CUBES * len(cube.ANGLES) + 1
+
+
 @lru_cache
-def _sampler(law: str, angles: bool, draws: int, warmup: int, chains: int) -> MCMC:
-    """One for all hearts: its program takes them as arguments."""
-    start = {f"x_{n}": jnp.zeros(()) for n in parameters(law) if n not in MEANS}
-    start |= {n: jnp.asarray(0.5 * MEANS[n]) for n in parameters(law) if n in MEANS}
-    start["omega"] = jnp.asarray(0.2)
-    if angles:
-        start["angles"] = jnp.zeros((_CUBES, len(cube.ANGLES)))
+def _sampler(law: str, angles: bool, draws: int, warmup: int) -> MCMC:
+    """One for all hearts and chains: its program takes a heart and modes as arguments."""
     kernel = NUTS(
         program(law, angles=angles),
         target_accept_prob=0.9,
         max_tree_depth=8,
         dense_mass=True,
-        init_strategy=init_to_value(values=start),
+        init_strategy=init_to_uniform(radius=1.0),
     )
     return MCMC(
-        kernel, num_warmup=warmup, num_samples=draws, num_chains=chains,
-        chain_method="sequential", progress_bar=False, jit_model_args=True,
+        Moving(kernel, "angles"), num_warmup=warmup, num_samples=draws, progress_bar=False,
+        jit_model_args=True,
     )  # fmt: skip
 
 
@@ -163,7 +168,7 @@ def forget_programs() -> None:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Draws (d, ...) by name of a heart's posterior, with how sampling went.
+    """Draws (d, ...) by name of a heart's posterior, chain after chain, with how sampling went.
 
     ``x`` (d, 8) is the material's position in the box, ``means`` (d, 9, j) the forces in N.
     """
@@ -173,8 +178,8 @@ class Found:
     law: str
     draws: dict[str, np.ndarray]
     divergences: int
-    worst_rhat: float
-    least_ess: float
+    chains: int
+    log_density: np.ndarray
 
     @property
     def angles(self) -> np.ndarray:
@@ -200,6 +205,50 @@ class Found:
         unit = jnp.asarray(0.5 * (self.draws["x"][:, k] + 1.0))
         return np.asarray(cube.MATERIAL[k].from_unit(unit))
 
+    @cached_property
+    def unknowns(self) -> dict[str, np.ndarray]:
+        """Draws of what was sampled, by name of the site."""
+        return {name: v for name, v in self.draws.items() if name not in ("x", "means")}
+
+    def _by_chain(self) -> list[np.ndarray]:
+        flat = [v.reshape(len(v), -1) for v in self.unknowns.values()]
+        return list(
+            np.moveaxis(np.concatenate(flat, axis=1).reshape(self.chains, -1, self.size), 2, 0)
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return sum(v[0].size for v in self.unknowns.values())
+
+    @cached_property
+    def worst_rhat(self) -> float:
+        """Largest R-hat of an unknown."""
+        return max(r_hat(each) for each in self._by_chain())
+
+    @cached_property
+    def least_ess(self) -> float:
+        """Smallest effective number of draws of an unknown, in the bulk or in the tails."""
+        return min(least_ess(each) for each in self._by_chain())
+
+    def modes(self) -> Modes:
+        """A mode a chain."""
+        z = np.asarray(_unconstrained(self.law, "angles" in self.draws)(self.of, self.unknowns))
+        rows = (self.chains, -1)
+        return modes(z.reshape(*rows, z.shape[1]), self.log_density.reshape(rows))
+
+
+@lru_cache
+def _unconstrained(law: str, angles: bool) -> Callable[[Seen, dict[str, np.ndarray]], jax.Array]:
+    """Unconstrained positions (d, u) of draws, as the sampler flattens them."""
+    model = program(law, angles=angles)
+    none = unknown(dimension(law, angles=angles))
+
+    def one(of: Seen, draw: dict[str, jax.Array]) -> jax.Array:
+        return ravel_pytree(unconstrain_fn(model, (of, none), {}, draw))[0]
+
+    return jax.jit(jax.vmap(one, (None, 0)))
+
 
 def sample(
     heart: Heart,
@@ -209,23 +258,39 @@ def sample(
     *,
     angles: bool = True,
     left_out: tuple[str, ...] = (),
-    draws: int = 500,
-    warmup: int = 500,
-    chains: int = 2,
+    known: Modes | None = None,
+    draws: int = 300,
+    warmup: int = 300,
+    chains: int = 4,
 ) -> Found:
-    """Draws of a heart's posterior by NumPyro's NUTS."""
+    """Draws of a heart's posterior by NumPyro's NUTS, and moves between ``known`` modes.
+
+    Each chain begins at a place of its own; :data:`.moves.MODES` of them find modes.
+    """
     of = seen(heart, cubes, left_out)
-    run = _sampler(law, angles, draws, warmup, chains)
-    run.run(jax.random.key(seed), of, extra_fields=("diverging",))
-    by_chain: Mapping[str, Any] = run.get_samples(group_by_chain=True)
-    unknown = {name: v for name, v in by_chain.items() if name not in ("x", "means")}
-    told = numpyro.diagnostics.summary(unknown)
-    return Found(
-        heart,
-        of,
-        law,
-        {name: np.asarray(v) for name, v in run.get_samples().items()},
-        int(np.sum(run.get_extra_fields()["diverging"])),
-        float(max(np.nanmax(s["r_hat"]) for s in told.values())),
-        float(min(np.nanmin(s["n_eff"]) for s in told.values())),
-    )
+    given = unknown(dimension(law, angles=angles)) if known is None else known
+    run = _sampler(law, angles, draws, warmup)
+    told: list[dict[str, np.ndarray]] = []
+    energies, diverging = [], 0
+    for key in jax.random.split(jax.random.key(seed), chains):
+        run.run(key, of, given, extra_fields=("diverging", "potential_energy"))
+        fields = run.get_extra_fields()
+        told.append({name: np.asarray(v) for name, v in run.get_samples().items()})
+        energies.append(np.asarray(fields["potential_energy"]))
+        diverging += int(np.sum(fields["diverging"]))
+    joined = {name: np.concatenate([each[name] for each in told]) for name in told[0]}
+    return Found(heart, of, law, joined, diverging, chains, -np.concatenate(energies))
+
+
+def settled(
+    heart: Heart, cubes: Emulated, seed: int, law: str = ORTHOTROPIC, *, times: int = 1, **how: Any
+) -> Found:
+    """As :func:`sample`; chains that disagree are drawn again, with moves between their modes.
+
+    ``times`` as many draws then.
+    """
+    found = sample(heart, cubes, seed, law, **how)
+    if found.worst_rhat <= AGREE:
+        return found
+    longer = how | {"draws": times * how.get("draws", 300), "known": found.modes()}
+    return sample(heart, cubes, seed + 1, law, **longer)

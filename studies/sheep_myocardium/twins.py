@@ -20,6 +20,7 @@ from studies.sheep_myocardium.held_out import replicated
 from studies.sheep_myocardium.inference import ORTHOTROPIC, parameters, sample
 
 _OUTER = (0.05, 0.95)
+_A_HEART = 6
 
 
 def twin(found: Campaign, test: int, rng: np.random.Generator) -> Heart:
@@ -35,7 +36,7 @@ def twin(found: Campaign, test: int, rng: np.random.Generator) -> Heart:
 def ranks(found: Campaign, seed: int, draws: int) -> Iterator[dict[str, float]]:
     """Of each test, shares of its twin's posterior below the truth, by parameter."""
     rng = np.random.default_rng(seed)
-    for test in range(len(found.tests[0].x)):
+    for test in range(min(_A_HEART, len(found.tests[0].x))):
         made = twin(found, test, rng)
         size = {"draws": draws, "warmup": draws, "chains": 1}
         posterior = sample(made, found.coarse, seed + test, ORTHOTROPIC, **size)

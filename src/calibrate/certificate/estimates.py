@@ -185,7 +185,7 @@ def tail_of(pool: Pool, tests: Tests, missed: int, ends: int = 0) -> Tail:
     ratio = (log_fem - log_map)[both]
     spread = float(np.sqrt(share @ (ratio - share @ ratio) ** 2))
     return Tail(
-        _k_hat(log_fem[np.isfinite(log_fem)]),
+        k_hat(log_fem[np.isfinite(log_fem)]),
         threshold,
         effective(weights),
         float(weights.max() * len(weights)),
@@ -196,7 +196,7 @@ def tail_of(pool: Pool, tests: Tests, missed: int, ends: int = 0) -> Tail:
     )
 
 
-def _k_hat(log_weights: np.ndarray) -> float:
+def k_hat(log_weights: np.ndarray) -> float:
     """Pareto shape of the weights' tail; NaN of too few to have one."""
     if len(log_weights) < _FEWEST:
         return float("nan")

@@ -34,6 +34,13 @@ def r_hat(values: np.ndarray) -> float:
     return float(array_stats.rhat(values, **_AXES))
 
 
+def least_ess(values: np.ndarray) -> float:
+    """Effective number of draws of ``values`` (chains, draws), in the bulk or in the tails."""
+    bulk = array_stats.ess(values, method="bulk", **_AXES)
+    tail = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **_AXES)
+    return float(np.min([bulk, tail]))
+
+
 def converged(z: np.ndarray, largest_r_hat: float, smallest_ess: float) -> bool:
     """Whether the draws ``z`` (chains, draws, p) meet both limits in every coordinate.
 
@@ -41,10 +48,6 @@ def converged(z: np.ndarray, largest_r_hat: float, smallest_ess: float) -> bool:
     leaves them unchanged.
     """
     for values in np.moveaxis(z, -1, 0):
-        if not r_hat(values) <= largest_r_hat:
-            return False
-        bulk = array_stats.ess(values, method="bulk", **_AXES)
-        tail = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **_AXES)
-        if not min(bulk, tail) >= smallest_ess:
+        if not (r_hat(values) <= largest_r_hat and least_ess(values) >= smallest_ess):
             return False
     return True

@@ -98,6 +98,21 @@ def while_loop[S](wanted: Callable[[S], jax.Array], body: Callable[[S], S], stat
     return state
 
 
+def scan[S, X, Y](body: Callable[[S, X], tuple[S, Y]], state: S, xs: X) -> tuple[S, Y]:
+    """``jax.lax.scan``, or Python's loop where ``state`` and ``xs`` are numbers.
+
+    Python's compiles the parts of ``body`` alone, which other callers may have compiled already.
+    """
+    leaves, form = jax.tree.flatten(xs)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((state, xs))):
+        return jax.lax.scan(body, state, xs)
+    each = []
+    for k in range(len(leaves[0])):
+        state, found = body(state, jax.tree.unflatten(form, [leaf[k] for leaf in leaves]))
+        each.append(found)
+    return state, jax.tree.map(lambda *parts: jnp.stack(parts), *each)
+
+
 def one_by_one[R](function: Callable[..., R]) -> Callable[..., R]:
     """``function(*arrays)`` whose ``vmap`` takes one after the other.
 

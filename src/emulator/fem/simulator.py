@@ -17,6 +17,7 @@ from emulator.errors import InputError, SolverError
 from emulator.fem.implicit import Equations, Found, derivatives, differentiable
 from emulator.fem.linear import Outcome, find_solver
 from emulator.fem.loaded import LoadedEquilibrium
+from emulator.fem.loop import scan
 from emulator.fem.options import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
@@ -140,7 +141,7 @@ class Simulator(Shown):
             found = self.solve(theta, ahead)
             return (found.displacement, u), found
 
-        found: Solution = jax.lax.scan(onwards, (self.rest, self.rest), thetas)[1]
+        found: Solution = scan(onwards, (self.rest, self.rest), thetas)[1]
         return found
 
     def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:

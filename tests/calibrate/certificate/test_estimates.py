@@ -6,7 +6,7 @@ from scipy.stats import chi2, norm
 
 from calibrate.certificate import estimates
 from calibrate.certificate.correction import nothing
-from calibrate.certificate.estimates import _k_hat, missed_by
+from calibrate.certificate.estimates import k_hat, missed_by
 from calibrate.certificate.pool import search
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs
@@ -21,16 +21,16 @@ def log_likelihoods(forward, data, points):
 
 def test_a_tail_that_is_one_point_drawn_again_has_no_shape_and_no_traceback():
     log_weights = np.concatenate([np.linspace(-900.0, -300.0, 60), np.zeros(40)])
-    assert _k_hat(log_weights) == np.inf
+    assert k_hat(log_weights) == np.inf
 
 
 def test_equal_weights_have_no_tail():
-    assert _k_hat(np.zeros(50)) == 0.0
+    assert k_hat(np.zeros(50)) == 0.0
 
 
 def test_the_shape_of_pareto_weights_is_found():
     log_weights = -0.5 * np.log(np.random.default_rng(0).uniform(size=20_000))
-    assert abs(_k_hat(log_weights) - 0.5) < 0.1
+    assert abs(k_hat(log_weights) - 0.5) < 0.1
 
 
 def test_runs_that_fem_finds_likely_and_the_map_does_not_are_counted(beam):

@@ -32,7 +32,7 @@ def estimate(model, data, numbers):
 
     def density(theta):
         u = model.forward(theta)[None]
-        return model.log_likelihood(u, theta[None], {name: values}, checked)
+        return model.log_density(model.observe(u, theta[None]), {name: values}, checked)
 
     covariance = np.linalg.inv(-np.asarray(jax.hessian(density)(TRUTH)))
     return np.asarray(TRUTH) + covariance @ np.asarray(jax.grad(density)(TRUTH)), covariance
@@ -72,7 +72,8 @@ def test_its_size_is_inferred_and_vanishes_where_the_model_is_right(beam, bent):
             theta, _ = estimate(model, values, {"discrepancy_sd": sd})
             numbers = {"displacement": {"discrepancy_sd": jnp.asarray(sd)}}
             u = model.forward(jnp.asarray(theta))[None]
-            return float(model.log_likelihood(u, jnp.asarray(theta)[None], numbers, checked))
+            means = model.observe(u, jnp.asarray(theta)[None])
+            return float(model.log_density(means, numbers, checked))
 
         best[name] = sds[np.argmax([density(sd) for sd in sds])]
     assert best["right"] < 0.03 < 0.1 < best["wrong"] < 1.0

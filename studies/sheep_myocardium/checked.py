@@ -1,0 +1,130 @@
+"""The certificate of a heart: what FEM changes of its posterior, judged by the library's limits.
+
+FEM at draws of the posterior, which its emulator was not fitted to, weights these by the ratio of
+FEM's likelihood over the emulator's. What that changes of means and standard deviations, the tail
+of the weights and the chains are judged as :func:`calibrate.certify` judges (of correlations it
+also asks, which takes more runs than thirty). All is in logarithms of parameters.
+
+The mesh's error is taken off by its order (:func:`.campaign.without_mesh`); what may be left of it
+is three tenths of the correction, which an order of 1 or 2 in place of 1.2 would change of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+from scipy.special import softmax
+from studies.common.output import Case
+from studies.sheep_myocardium.campaign import FINER, Campaign
+from studies.sheep_myocardium.inference import Found, parameters
+
+from calibrate.certificate.estimates import k_hat
+from calibrate.certificate.evidence import (
+    Changes,
+    Evidence,
+    Figure,
+    MeshChange,
+    Physics,
+    Sampling,
+    Tail,
+)
+from calibrate.certificate.moments import jackknife, moments
+from calibrate.certificate.verdict import Certificate, judge
+
+_LEFT = 0.3  # of the mesh's correction
+_FEWEST = 25  # weights that have a tail
+
+
+def logarithms(found: Found) -> dict[str, np.ndarray]:
+    """Logarithms of parameters and omega, (d,) each."""
+    each = {name: np.log(found.theta(name)) for name in parameters(found.law)}
+    return each | {"omega": np.log(found.draws["omega"])}
+
+
+def certificate(found: Campaign) -> Certificate:
+    """FEM's at the tests, and the mesh's."""
+    explored, differences = found.explored, found.likelihood_differences()
+    sound = np.isfinite(differences)
+    named = logarithms(explored)
+    x = np.stack(list(named.values()), axis=1)[found.tested][sound]
+    log_ratio = differences[sound]
+    weights = softmax(log_ratio) * len(log_ratio)
+    p = len(named)
+
+    def change(used: np.ndarray) -> np.ndarray:
+        return moments(x, weights * used)[: 2 * p] - moments(x, 1.0 * used)[: 2 * p]
+
+    value, error = jackknife(change, len(x))
+    sd = np.stack(list(named.values()), axis=1).std(axis=0)
+    changes = Changes(
+        _figures(named, value[:p] / sd, error[:p] / sd), _figures(named, value[p:], error[p:]), {}
+    )
+    tail = Tail(
+        k_hat(log_ratio) if len(log_ratio) >= _FEWEST else float("nan"),
+        float(min(1.0 - 1.0 / np.log10(max(len(x), 10)), 0.7)),
+        float(weights.sum() ** 2 / (weights**2).sum()),
+        float(weights.max()),
+        float(log_ratio.std()),
+        explored.least_ess,
+        0,
+    )
+    failed = int((~sound).sum())
+    physics = Physics(len(sound), failed, failed / len(sound), float("nan"), 0, 0)
+    sampling = Sampling(
+        explored.worst_rhat, explored.least_ess, explored.least_ess, explored.divergences,
+        len(explored.positions),
+    )  # fmt: skip
+    mesh = MeshChange(
+        *_mesh(found), nodes=(2 * FINER + 1) ** 3, runs=3 * len(found.tests), failed=0
+    )
+    there = np.stack(list(named.values()), axis=1)
+    means = _figures(named, there.mean(axis=0), error[:p])
+    sds = _figures(named, sd, sd * error[p:])
+    return judge(Evidence(changes, changes, means, sds, sampling, physics, tail, {}, mesh))
+
+
+def _figures(
+    names: dict[str, np.ndarray], value: np.ndarray, error: np.ndarray
+) -> dict[str, Figure]:
+    return {n: Figure(float(v), float(e)) for n, v, e in zip(names, value, error, strict=True)}
+
+
+def _mesh(found: Campaign) -> tuple[dict[str, Figure], dict[str, Figure]]:
+    """What may be left of the mesh's error, of means and standard deviations of logarithms."""
+    moved, spread = {}, {}
+    before, after = logarithms(found.on_mesh), logarithms(found.explored)
+    for name, a in before.items():
+        b = after[name]
+        # Of two independent posteriors: errors of their means, by their effective draws.
+        error = np.sqrt(1.0 / found.on_mesh.least_ess + 1.0 / found.explored.least_ess)
+        moved[name] = Figure(_LEFT * float((b.mean() - a.mean()) / b.std()), _LEFT * error)
+        change = float(np.log(b.std() / a.std()))
+        spread[name] = Figure(_LEFT * change, _LEFT * error / np.sqrt(2.0))
+    return moved, spread
+
+
+def told(found: Campaign) -> Case:
+    """Errors of the emulators at draws of the posterior, and what FEM changes of it."""
+    errors = np.abs(found.by_map / found.by_fem - 1.0)
+    given = certificate(found)
+    return {
+        "fem": {
+            "runs_a_cube": found.runs,
+            "seconds": found.seconds,
+            "error_median": float(np.nanmedian(errors)),
+            "error_90": float(np.nanquantile(errors, 0.9)),
+            "said_90": float(np.quantile(found.said, 0.9)),
+            "doubt_by_round": found.doubt,
+            "sd_of_log_likelihood_difference": float(np.nanstd(found.likelihood_differences())),
+        },
+        "certificate": {
+            "verdict": given.verdict,
+            "reason": given.reason,
+            "findings": list(given.findings),
+            "shift": given.shift,
+            "mesh_shift": {n: f.value for n, f in given.evidence.mesh.shift.items()},
+            "sampling": asdict(given.evidence.sampling),
+            "tail": asdict(given.evidence.tail),
+        },
+    }

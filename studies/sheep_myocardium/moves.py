@@ -1,0 +1,158 @@
+r"""Moves between modes of a posterior, beside NUTS, which stays in one.
+
+*Transport.* Modes are Gaussians :math:`N(\mu_i, L_i L_i^T)` with weights :math:`w_i`, as exploring
+chains found them. At z one is taken to be in mode i with its responsibility :math:`p(i | z)`, goes
+to mode j, drawn by the weights, and keeps its place in it,
+
+.. math:: z' = \mu_j + L_j L_i^{-1} (z - \mu_i), \qquad
+          \alpha = \min\Big(1, \frac{\pi(z')\, p(j | z')\, w_i\, |L_j|}
+                                    {\pi(z)\, p(i | z)\, w_j\, |L_i|}\Big),
+
+which balances each pair of modes in detail (the map from i to j is undone by that from j to i, and
+its Jacobian is :math:`|L_j| / |L_i|`); wrong modes cost acceptance and nothing else.
+
+*Mirror.* One of a cube's angles changes its sign: forces of a cube whose fibres are turned to one
+side or the other are often nearly the same.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import solve_triangular
+from numpyro.infer import NUTS
+from numpyro.infer.mcmc import MCMCKernel
+
+MODES = 4
+"""As many as there are exploring chains."""
+_MOVES = 4  # of each kind a step of NUTS, which costs some thirty of them
+
+
+class Modes(NamedTuple):
+    """Gaussians of unconstrained positions: mean (m, d), factor (m, d, d), log_weight (m,)."""
+
+    mean: jax.Array
+    factor: jax.Array
+    log_weight: jax.Array
+
+
+def unknown(dimension: int) -> Modes:
+    """Modes of which nothing is known: all the same, so that a transport moves nothing."""
+    one = jnp.tile(jnp.eye(dimension), (MODES, 1, 1))
+    return Modes(jnp.zeros((MODES, dimension)), one, jnp.zeros(MODES))
+
+
+def modes(z: np.ndarray, log_density: np.ndarray) -> Modes:
+    r"""A mode a chain: z (m, s, d) and their log densities (m, s).
+
+    Weights are masses, :math:`\log w = E[\log \pi] + \log |L|` but for a constant: what a Gaussian
+    posterior's is.
+    """
+    mean = z.mean(axis=1)
+    floor = 1e-6 * np.eye(z.shape[2])
+    factor = np.stack([np.linalg.cholesky(np.cov(each.T) + floor) for each in z])
+    volume = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    mass = log_density.mean(axis=1) + volume
+    # No mode is left for good: a chain that explored little knows its own mass badly.
+    weight = np.maximum(mass - mass.max(), -3.0)
+    return Modes(*(jnp.asarray(a) for a in (mean, factor, weight - np.log(np.exp(weight).sum()))))
+
+
+def _log_shares(modes: Modes, z: jax.Array) -> jax.Array:
+    """Log responsibilities (m,) of modes for z (d,)."""
+
+    def of(mean: jax.Array, factor: jax.Array) -> jax.Array:
+        half = solve_triangular(factor, z - mean, lower=True)
+        return -0.5 * jnp.vdot(half, half) - jnp.sum(jnp.log(jnp.diag(factor)))
+
+    return jax.nn.log_softmax(modes.log_weight + jax.vmap(of)(modes.mean, modes.factor))
+
+
+def transported(
+    modes: Modes, z: jax.Array, i: jax.Array, j: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Where z (d,) in mode i is in mode j, and the logarithm of all but pi in alpha's ratio."""
+    place = solve_triangular(modes.factor[i], z - modes.mean[i], lower=True)
+    there = modes.mean[j] + modes.factor[j] @ place
+    volumes = jnp.sum(jnp.log(jnp.diagonal(modes.factor, axis1=1, axis2=2)), axis=1)
+    forth = _log_shares(modes, z)[i] + modes.log_weight[j] - volumes[j]
+    back = _log_shares(modes, there)[j] + modes.log_weight[i] - volumes[i]
+    return there, back - forth
+
+
+class Moving(MCMCKernel):
+    """NUTS with moves after each step. The model's last argument are its :class:`Modes`.
+
+    mirrored : the site whose entries change sign.
+    """
+
+    sample_field = "z"
+
+    def __init__(self, nuts: NUTS, mirrored: str) -> None:
+        self._nuts = nuts
+        self._mirrored = mirrored
+
+    @property
+    def model(self) -> Any:
+        """Of NUTS."""
+        return self._nuts.model
+
+    @property
+    def default_fields(self) -> tuple[str, ...]:
+        """Of NUTS."""
+        return self._nuts.default_fields
+
+    def postprocess_fn(self, args: Any, kwargs: Any) -> Any:
+        """Of NUTS."""
+        return self._nuts.postprocess_fn(args, kwargs)
+
+    def get_diagnostics_str(self, state: Any) -> str:
+        """Of NUTS."""
+        return self._nuts.get_diagnostics_str(state)
+
+    def init(self, *arguments: Any, **named: Any) -> Any:
+        """Of NUTS."""
+        return self._nuts.init(*arguments, **named)
+
+    def sample(self, state: Any, model_args: Any, model_kwargs: Any) -> Any:
+        """A step of NUTS, then moves."""
+        state = self._nuts.sample(state, model_args, model_kwargs)
+        given: Modes = model_args[-1]
+        potential = self._nuts.get_potential_fn(model_args, model_kwargs)
+        z, unravel = ravel_pytree(state.z)
+        marks = {n: jnp.full(v.shape, float(n == self._mirrored)) for n, v in state.z.items()}
+        log_marked = jnp.log(ravel_pytree(marks)[0])
+        key, moving = jax.random.split(state.rng_key)
+
+        def decided(
+            key: jax.Array, at: tuple[jax.Array, jax.Array], there: jax.Array, more: jax.Array
+        ) -> tuple[jax.Array, jax.Array]:
+            z, before = at
+            after = potential(unravel(there))
+            log_alpha = before - after + more
+            taken = jnp.log(jax.random.uniform(key)) < log_alpha  # false for NaN
+            return jnp.where(taken, there, z), jnp.where(taken, after, before)
+
+        def move(
+            at: tuple[jax.Array, jax.Array], key: jax.Array
+        ) -> tuple[tuple[jax.Array, jax.Array], None]:
+            first, second, third, fourth, fifth = jax.random.split(key, 5)
+            i = jax.random.categorical(first, _log_shares(given, at[0]))
+            j = jax.random.categorical(second, given.log_weight)
+            at = decided(third, at, *transported(given, at[0], i, j))
+            if self._mirrored in marks:
+                entry = jax.random.categorical(fourth, log_marked)
+                at = decided(fifth, at, at[0].at[entry].multiply(-1.0), jnp.zeros(()))
+            return at, None
+
+        at = (z, state.potential_energy)
+        keys = jax.random.split(moving, _MOVES)
+        z, energy = jax.lax.scan(move, at, keys)[0]
+        there = unravel(z)
+        return state._replace(
+            z=there, z_grad=jax.grad(potential)(there), potential_energy=energy, rng_key=key
+        )
