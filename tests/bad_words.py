@@ -219,7 +219,7 @@ COMMANDS = [
     ),
     ("infer left_ventricle --data negative.csv --out x", "volume is -120.0 mL; it must be above 0"),
     ("completion tcsh", "invalid choice: 'tcsh'"),
-    ("schema x", "unrecognized arguments: x"),
+    ("schema x", "invalid choice: 'x'"),
     ("init cut.msh", "cut.msh"),
     ("init block.vtu --unit km", "unit 'km' is unknown; known: mm, cm, m"),
     ("init block.vtu --out block.txt", "the file name must end in .toml"),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 
-# The section of parameters, and the entries in it.
-_SECTION = re.compile(r"Parameters\n\s*-+\n(.*?)(?:\n\s*\n|\Z)", re.DOTALL)
-_ENTRY = re.compile(r"^ {4}(\w[\w, ]*?) : (.*?)(?=^ {4}\w|\Z)", re.MULTILINE | re.DOTALL)
+# ``names : text``, with its further lines indented; under a heading of its section or without one.
+_ENTRY = re.compile(r"^(\w[\w, ]*?) : (.*?)(?=^\S|^\s*$|\Z)", re.MULTILINE | re.DOTALL)
 
 
 def summary(kind: type) -> str:
@@ -18,9 +18,8 @@ def documented(kind: type) -> dict[str, str]:
     """What the docstrings of a class and its bases say of each parameter, by name."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
-        for section in _SECTION.findall(base.__doc__ or ""):
-            for names, text in _ENTRY.findall(section):
-                found |= dict.fromkeys(names.split(", "), _plain(text))
+        for names, text in _ENTRY.findall(inspect.cleandoc(base.__doc__ or "")):
+            found |= dict.fromkeys(names.split(", "), _plain(text))
     return found
 
 

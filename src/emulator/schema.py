@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, dataclass, field, fields
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path as FilePath
 from typing import (
     Annotated,
@@ -118,14 +119,15 @@ class OneOf:
     choices: Mapping[str, type]
     default: str | None = None
 
+    @cached_property
+    def _tables(self) -> tuple[type[Table], ...]:
+        """A table of each choice, made once: a schema then has one definition of it."""
+        return tuple(table_of(choice, self.key, name) for name, choice in self.choices.items())
+
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         members = tuple(
-            Annotated[
-                table_of(choice, self.key, name),
-                AfterValidator(_builder(choice, self.key)),
-                Tag(name),
-            ]
-            for name, choice in self.choices.items()
+            Annotated[table, AfterValidator(_builder(choice, self.key)), Tag(name)]
+            for table, (name, choice) in zip(self._tables, self.choices.items(), strict=True)
         )
         tag = Discriminator(
             self._tag,
@@ -144,7 +146,8 @@ class OneOf:
             table = handler.resolve_ref_schema(member)
             table["properties"][self.key] = {"const": name, "description": table["description"]}
             if name != self.default:
-                table["required"] = [self.key, *table.get("required", ())]
+                # A table that stands in several places passes here as often.
+                table["required"] = list(dict.fromkeys([self.key, *table.get("required", ())]))
         return found
 
     def _tag(self, data: Any) -> str | None:
@@ -241,10 +244,13 @@ def read_as[Kind](
 
 
 def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:
-    """The model with the fields of a dataclass, and ``key`` whose only value is ``tag``."""
+    """The model with the fields of a dataclass, and ``key`` whose only value is ``tag``.
+
+    Fields with ``compare=False`` are left out: the program sets them, not a file.
+    """
     hints = get_type_hints(kind)
     entries: dict[str, Any] = {key: (Literal[tag], tag)} if key else {}
-    for entry in fields(kind):
+    for entry in (each for each in fields(kind) if each.compare):
         required = entry.default is MISSING and entry.default_factory is MISSING
         # np.ndarray stands for a vector in a file. Defaults are left to the dataclass.
         hint = tuple[float, float, float] if hints[entry.name] is np.ndarray else hints[entry.name]

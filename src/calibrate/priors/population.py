@@ -37,7 +37,8 @@ BOX = "box"
 class Population:
     """Correlated log-normals.
 
-    median : by parameter, in its unit. log_sd : sd of its logarithm, about its relative sd.
+    median : by parameter, in its unit.
+    log_sd : sd of its logarithm by parameter, about its relative sd.
     correlation : of the logarithms, by two names joined by a comma; 0 where none is given.
     source : where the numbers are from.
 
@@ -160,7 +161,7 @@ def prior_of(given: str | Mapping[str, Any], scene: Scene) -> JointPrior | None:
                 f"prior '{given}' is unknown; known: {', '.join((BOX, *POPULATIONS))}, or a file"
             )
         return POPULATIONS[given].prior(scene)
-    return Population(**given).prior(scene)
+    return schema.read_as(Population, given, "prior").prior(scene)
 
 
 def read_population(path: str | Path) -> Population:

@@ -15,7 +15,10 @@ from calibrate.samplers.run import ChainSampler
 
 @dataclass(frozen=True)
 class BlackJAXNUTSOptions(ChainOptions):
-    """Length of a run; ``target_accept`` in (0, 1), the acceptance rate step sizes adapt to."""
+    """Length of a run.
+
+    target_accept : acceptance rate in (0, 1) that the step size adapts to.
+    """
 
     target_accept: float = 0.85
 

@@ -45,8 +45,10 @@ from emulator.progress import counting
 
 @dataclass(frozen=True)
 class DelayedAcceptanceOptions(ChainOptions):
-    """Length of a run; ``warmup`` is the cheap sampler's, ``draws`` are decided by FEM.
+    """Length of a run.
 
+    warmup : adapting iterations of the cheap sampler.
+    draws : kept iterations of a round, each decided by FEM.
     transitions : of the cheap sampler between two FEM solves.
     power : of the cheap likelihood in proposals, in (0, 1]. At 0.8 a perfect map keeps three
         quarters of its effective draws in 5 dimensions and half in 17; a poor one gains.

@@ -89,7 +89,8 @@ class Shared:
 class Cohort:
     """Members of one population.
 
-    members : the run of each by itself, by name. population : what they share.
+    members : the run of each by itself, by name.
+    population : what they share.
     """
 
     members: Mapping[str, Run]

@@ -19,7 +19,8 @@ from emulator.surrogates import registry
 class Run:
     """What to calibrate and how.
 
-    scene, root : a scene's name or file; the folder of the published data.
+    scene : a scene's name or file.
+    root : the folder of the published data.
     data : a file, files by load state (:func:`calibrate.data.read_data`), or ``synthetic``: FEM at
         ``truth`` plus noise.
     truth : parameters of synthetic data by name, ``parameter@state`` in one of several load states
@@ -44,14 +45,20 @@ class Run:
         ``{"camera": {"kind": "rigid_motion", "of": "displacement", "shift": 2.0, "turn": 1.0}}``;
         synthetic data has none.
     check_scale : refuse data that is far from every prediction (:mod:`calibrate.data.magnitude`).
-    forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
-        options by name, e.g. ``{"fem_runs": 60}``; ``emulator`` a shipped name or folder.
+    forward : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`.
+    emulator : shipped name or folder of the emulator that the map is built from; by default the
+        one shipped for the scene.
+    forward_options : the map's options by name, e.g. ``{"fem_runs": 60}``.
     error_runs : FEM runs from which the forward map's own error is learned, so that the likelihood
         allows for it (``statistical_model/approximation_error``); 0 takes the map as exact.
     mesh_error_runs : the same on the next finer mesh, so that the mesh's error is allowed for, too.
     load_steps : in which every FEM solve follows the loading path from rest; 1 looks for its end.
-    sampler, sampler_options : a name of :data:`calibrate.samplers.SAMPLERS`, and its options by
-        name, e.g. ``{"target_accept": 0.95}``.
+    sampler : a name of :data:`calibrate.samplers.SAMPLERS`.
+    sampler_options : its options by name, e.g. ``{"target_accept": 0.95}``.
+    warmup : adapting iterations, not kept.
+    draws : kept iterations of a round, in each chain.
+    chains : independent chains.
+    seed : of synthetic data, of the design of FEM runs and of the sampler.
     """
 
     scene: str

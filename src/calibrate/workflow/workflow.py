@@ -26,7 +26,7 @@ from calibrate.observations import Observations, observations_from_json, parse_o
 from calibrate.observations.present import missing_values
 from calibrate.posterior import Posterior, read_tree, sample
 from calibrate.priors import prior_of
-from calibrate.samplers import find_sampler, options_from
+from calibrate.samplers import Sampler, find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, with_error
 from calibrate.statistical_model.build import model
@@ -129,8 +129,10 @@ def check_names(run: Run) -> None:
     Raises
     ------
     InputError
-        An observation, a parameter or a load state that is not there, by its name.
+        An observation, a parameter, a load state or an option of the sampler that is not there, by
+        its name.
     """
+    _sampler(run)
     scene, run = find_scene(run.scene, run.root), with_known(run)
     observe = observed(run, scene)
     run.noises(observe)
@@ -217,13 +219,18 @@ def _keep(
     posterior.save(folder / POSTERIOR)
 
 
+def _sampler(run: Run) -> tuple[Sampler, Any]:
+    """The sampler of a run and its options; :class:`InputError` for one that it does not have."""
+    sampler = find_sampler(run.sampler)
+    length = {"warmup": run.warmup, "draws": run.draws, "chains": run.chains}
+    return sampler, options_from(sampler, run.sampler_options, **length)
+
+
 def _sampled(
     run: Run, checkpoint: Path | None, *, progress: bool
 ) -> tuple[Posterior, Run, Observations, dict[str, np.ndarray]]:
     """The posterior of a run, the run with its noises by name, its observations and data."""
-    sampler = find_sampler(run.sampler)
-    length = {"warmup": run.warmup, "draws": run.draws, "chains": run.chains}
-    options = options_from(sampler, run.sampler_options, **length)
+    sampler, options = _sampler(run)
     scene = find_scene(run.scene, run.root)
     run = with_known(run)
     observe, data = make_data(run, scene)

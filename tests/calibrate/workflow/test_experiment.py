@@ -108,6 +108,11 @@ MISTAKES = [
     (('"once_clamped_beam"', "beam"), "is not valid TOML"),
     (("draws = 40", 'observe = "nodes:4"'), "observe has no effect beside data"),
     (("draws = 40", 'prior = "none.json"'), "none.json does not exist"),
+    (
+        ("draws = 40", "prior = {medians = {mu = 60.0}}"),
+        "prior: unknown key 'medians'; known: corr",
+    ),
+    (("draws = 40", "sampler_options = {jump = 2}"), "sampler 'nuts' has no option 'jump'; it has"),
     (("draws = 40", "truth = {mu = 60.0}"), "truth has no effect beside data file"),
     (("[noise]", "[population]\neta = 1.0\n[noise]"), "[population] is of members; give [member"),
 ]
