@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,35 @@ from calibrate.hierarchical_model import Hierarchy
 from calibrate.hierarchical_model.tree import ALONE
 
 _ALONE, _TOGETHER, _POPULATION = "0.55", BLUE, VERMILION
-_APART = 0.16  # of the rows' distance, between a member's two intervals
+APART = 0.16  # of the rows' distance, between a member's two intervals
+
+
+class Intervals(NamedTuple):
+    """Low end, median and high end of central intervals of a shared unknown.
+
+    alone, together : (3, n) of each member by its own data, and with the others. new : (3,) of a
+    member not seen.
+    """
+
+    alone: np.ndarray
+    together: np.ndarray
+    new: np.ndarray
+
+
+def intervals_of(found: Hierarchy, name: str, probability: float = 0.9) -> Intervals:
+    """Central intervals of ``probability`` of the shared unknown ``name``, in its unit."""
+    together = np.moveaxis(np.asarray(found.tree["posterior"][name]), -1, 0)
+    rows = together.reshape(len(found.members), -1)
+    alone, new = np.asarray(found.tree[ALONE][name]), found.new_member()[name]
+    edge = 0.5 * (1.0 - probability)
+    ends = [edge, 0.5, 1.0 - edge]
+    return Intervals(*(np.quantile(draws, ends, axis=-1) for draws in (alone, rows, new)))
+
+
+def label_of(found: Hierarchy, name: str) -> str:
+    """A shared unknown with its unit."""
+    unit = str(found.tree["posterior"][name].attrs.get("units", "1"))
+    return name if unit == "1" else f"{name} ({unit})"
 
 
 def draw(found: Hierarchy, path: str | Path, probability: float = 0.9) -> None:
@@ -28,17 +56,14 @@ def draw(found: Hierarchy, path: str | Path, probability: float = 0.9) -> None:
         1, len(names), figsize=(1.2 + 3.6 * len(names), 1.6 + 0.34 * len(members)), sharey=True,
         layout="constrained", squeeze=False,
     )  # fmt: skip
-    posterior, alone, rows = found.tree["posterior"], found.tree[ALONE], np.arange(len(members))
-    new = found.new_member()
+    rows = np.arange(len(members))
     for axes, name in zip(grid.flat, names, strict=True):
-        low, middle, high = _interval(new[name][None], probability)[:, 0]
+        alone, together, (low, middle, high) = intervals_of(found, name, probability)
         axes.axvspan(low, high, color=_POPULATION, alpha=0.14, lw=0, label="a member not seen")
         axes.axvline(middle, color=_POPULATION, lw=1.2)
-        together = np.moveaxis(np.asarray(posterior[name]), -1, 0).reshape(len(members), -1)
-        _intervals(axes, np.asarray(alone[name]), rows - _APART, probability, _ALONE, "alone")
-        _intervals(axes, together, rows + _APART, probability, _TOGETHER, "with the others")
-        unit = str(posterior[name].attrs.get("units", "1"))
-        axes.set_xlabel(name if unit == "1" else f"{name} ({unit})")
+        _intervals(axes, alone, rows - APART, _ALONE, "alone")
+        _intervals(axes, together, rows + APART, _TOGETHER, "with the others")
+        axes.set_xlabel(label_of(found, name))
         axes.spines[["top", "right"]].set_visible(False)
     grid[0, 0].set_yticks(rows, members)
     grid[0, 0].invert_yaxis()
@@ -50,16 +75,8 @@ def draw(found: Hierarchy, path: str | Path, probability: float = 0.9) -> None:
     save(figure, path)
 
 
-def _intervals(
-    axes: Any, draws: np.ndarray, rows: np.ndarray, probability: float, color: str, label: str
-) -> None:
-    """A line and a dot for each row of ``draws`` (n, s)."""
-    low, middle, high = _interval(draws, probability)
+def _intervals(axes: Any, ends: np.ndarray, rows: np.ndarray, color: str, label: str) -> None:
+    """A line and a dot for each of the intervals ``ends`` (3, n)."""
+    low, middle, high = ends
     axes.hlines(rows, low, high, color=color, lw=2.2, label=label)
     axes.plot(middle, rows, "o", color=color, ms=4)
-
-
-def _interval(draws: np.ndarray, probability: float) -> np.ndarray:
-    """Ends and middle (3, n) of the central interval of each row of ``draws`` (n, s)."""
-    edge = 0.5 * (1.0 - probability)
-    return np.quantile(draws, [edge, 0.5, 1.0 - edge], axis=1)

@@ -54,7 +54,7 @@ def make_tree(
     tree[NEW] = xr.DataTree(base.dict_to_dataset(by_chain(values(*population, new))))
     for name, parameter in model.shared.items():
         for group in ("posterior", NEW):
-            tree[group][name].attrs["units"] = parameter.unit or "1"
+            tree[group][name].attrs.update(units=parameter.unit or "1", scale=parameter.scale)
     return tree
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
 import numpy as np
+import numpyro.distributions as dist
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from scipy.stats import rankdata
@@ -21,7 +22,6 @@ from calibrate.state_names import split
 from emulator.scenes.loads import KPA_PER_MMHG
 
 _CHAINS = COLOURS[:6]
-_BAND = "rgba(0, 114, 178, 0.22)"
 _MOST_TRACED = 500  # draws of a chain in a trace
 _MOST_PAIRED = 800  # draws in a pair plot
 _CURVES = 60  # draws of a pressure-volume band
@@ -29,6 +29,20 @@ _VOLUMES = 400  # draws of volumes
 _CLOSER_AT_REST = (
     3  # power by which pressures of Klotz's curve, which rises from 0, lie closer there
 )
+
+
+def translucent(colour: str, opacity: float) -> str:
+    """The colour ``#rrggbb`` with an opacity from 0 to 1, for what fills an area."""
+    return f"rgba({int(colour[1:3], 16)}, {int(colour[3:5], 16)}, {int(colour[5:], 16)}, {opacity})"
+
+
+def inside(values: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Which of the data that is there lies within the central 90 % of predictions, (m,).
+
+    ``values`` (s, n) predicted, noise included; ``measured`` (n,), NaN where missing.
+    """
+    low, high = np.nanquantile(values, [0.05, 0.95], axis=0)
+    return ((measured >= low) & (measured <= high))[np.isfinite(measured)]
 
 
 def names_with_units(posterior: Posterior) -> dict[str, str]:
@@ -75,7 +89,7 @@ def _many_numbers(
 ) -> go.Figure:
     low, middle, high = np.nanquantile(values, [0.05, 0.5, 0.95], axis=0)
     there = np.isfinite(measured)
-    inside = float(np.mean(((measured >= low) & (measured <= high))[there]))
+    share = 100.0 * inside(values, measured).mean()
     ends = [float(np.nanmin(measured)), float(np.nanmax(measured))]
     figure = go.Figure()
     figure.add_scatter(
@@ -94,7 +108,7 @@ def _many_numbers(
             "arrayminus": (middle - low)[there],
             "thickness": 1,
         },
-        name=f"median and 90 %; {100 * inside:.0f} % of the data lie within",
+        name=f"median and 90 %; {share:.0f} % of the data lie within",
     )
     figure.update_layout(
         xaxis_title=f"{name} measured ({part.unit})", yaxis_title=f"predicted ({part.unit})"
@@ -105,12 +119,22 @@ def _many_numbers(
 def traces(posterior: Posterior) -> go.Figure:
     """Each unknown's draws by chain: their densities, their order, and their ranks."""
     labels = names_with_units(posterior)
+    draws = {name: np.asarray(posterior.tree["posterior"][name]) for name in labels}
+    return traces_of(labels, draws, posterior.model.sampled_priors)
+
+
+def traces_of(
+    labels: Mapping[str, str],
+    every: Mapping[str, np.ndarray],
+    priors: Mapping[str, dist.Distribution],
+) -> go.Figure:
+    """:func:`traces` of the draws (chains, draws) of those names that have labels."""
     figure = make_subplots(
         len(labels), 3, column_titles=["posterior", "trace", "ranks by chain"],
         horizontal_spacing=0.06, vertical_spacing=0.25 / max(len(labels), 2),
     )  # fmt: skip
     for row, (name, label) in enumerate(labels.items(), start=1):
-        draws = np.asarray(posterior.tree["posterior"][name])
+        draws = every[name]
         ranks = rankdata(draws).reshape(draws.shape)
         edges = np.linspace(0.5, draws.size + 0.5, 21)
         step = max(1, draws.shape[1] // _MOST_TRACED)
@@ -133,7 +157,7 @@ def traces(posterior: Posterior) -> go.Figure:
             rank = go.Scatter(x=edges, y=[*counts, counts[-1]], line_shape="hv", **line)
             for column, drawn in enumerate((density, trace, rank), start=1):
                 figure.add_trace(drawn, row, column)
-        _add_prior(figure, posterior, name, draws, row)
+        _add_prior(figure, priors.get(name), draws, row)
         even = draws.shape[1] / 20.0
         figure.add_hline(y=even, line={"color": "grey", "dash": "dot"}, row=row, col=3)
         figure.update_yaxes(title_text=label, showticklabels=False, row=row, col=1)
@@ -143,10 +167,9 @@ def traces(posterior: Posterior) -> go.Figure:
 
 
 def _add_prior(
-    figure: go.Figure, posterior: Posterior, name: str, draws: np.ndarray, row: int
+    figure: go.Figure, prior: dist.Distribution | None, draws: np.ndarray, row: int
 ) -> None:
     """The prior's density over the range of the draws, behind them."""
-    prior = posterior.model.sampled_priors.get(name)
     if prior is None or prior.shape():
         return
     x = np.linspace(draws.min(), draws.max(), 100)
@@ -158,13 +181,24 @@ def _add_prior(
 
 def pairs(posterior: Posterior) -> go.Figure:
     """Draws of every two unknowns."""
-    labels, draws = names_with_units(posterior), posterior.draws()
+    return pairs_of(names_with_units(posterior), posterior.draws())
+
+
+def pairs_of(labels: Mapping[str, str], draws: Mapping[str, np.ndarray]) -> go.Figure:
+    """Draws (s,) of every two names that have labels."""
     count = len(next(iter(draws.values())))
     rows = np.linspace(0, count - 1, min(count, _MOST_PAIRED)).astype(int)
+    marker = {"size": 3, "color": BLUE, "opacity": 0.35}
+    if len(labels) == 2:  # Plotly fails to draw a matrix of a single panel.
+        x, y = labels
+        figure = go.Figure(
+            go.Scatter(x=draws[x][rows], y=draws[y][rows], mode="markers", marker=marker)
+        )
+        return figure.update_layout(xaxis_title=labels[x], yaxis_title=labels[y])
     figure = go.Figure(
         go.Splom(
             dimensions=[{"label": labels[n], "values": draws[n][rows]} for n in labels],
-            marker={"size": 3, "color": BLUE, "opacity": 0.35},
+            marker=marker,
             showupperhalf=False,
             diagonal_visible=False,
         )
@@ -180,10 +214,10 @@ def stress(posterior: Posterior) -> go.Figure:
     for direction, colour in (("fibre", BLUE), ("cross-fibre", VERMILION))[: 2 if fibres else 1]:
         band = stress_band(posterior, direction)
         label = f"along the {direction}" if fibres else "in any direction"
-        fill = f"rgba({int(colour[1:3], 16)}, {int(colour[3:5], 16)}, {int(colour[5:], 16)}, 0.2)"
         figure.add_scatter(
             x=[*band.stretch, *band.stretch[::-1]], y=[*band.high, *band.low[::-1]], fill="toself",
-            fillcolor=fill, line_width=0, name=f"90 %, {label}", hoverinfo="skip",
+            fillcolor=translucent(colour, 0.2), line_width=0, name=f"90 %, {label}",
+            hoverinfo="skip",
         )  # fmt: skip
         figure.add_scatter(
             x=band.stretch, y=band.median, line_color=colour, name=f"median, {label}"
@@ -207,8 +241,9 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
     figure = go.Figure()
     _add_klotz(figure, curve, middle, measured)
     figure.add_scatter(
-        x=[*low, *high[::-1]], y=[*p, *p[::-1]], fill="toself", fillcolor=_BAND, line_width=0,
-        name="90 % of the posterior", hoverinfo="skip",
+        x=[*low, *high[::-1]], y=[*p, *p[::-1]], fill="toself",
+        fillcolor=translucent(BLUE, 0.22), line_width=0, name="90 % of the posterior",
+        hoverinfo="skip",
     )  # fmt: skip
     figure.add_scatter(
         x=middle, y=p, mode="lines", line_color=BLUE, name="median",

@@ -4,6 +4,7 @@ from calibrate.workflow.run import Run
 from calibrate.workflow.workflow import (
     by_fem,
     certify_and_keep,
+    holds_population,
     infer,
     load,
     make_data,
@@ -18,6 +19,7 @@ __all__ = [
     "Run",
     "by_fem",
     "certify_and_keep",
+    "holds_population",
     "infer",
     "load",
     "make_data",

@@ -15,32 +15,42 @@ import numpy as np
 import numpyro.distributions as dist
 
 from calibrate.figures import shrinkage
-from calibrate.hierarchical_model import Hierarchy, hierarchical_model, sample_hierarchy
+from calibrate.hierarchical_model import (
+    Hierarchy,
+    hierarchical_model,
+    read_hierarchy,
+    sample_hierarchy,
+)
 from calibrate.hierarchical_model.sample import TARGET_ACCEPT
 from calibrate.posterior import Posterior
 from calibrate.priors import log_normal
 from calibrate.samplers import find_sampler, options_from
 from calibrate.samplers.nuts import NUTS
 from calibrate.statistical_model import Model
-from calibrate.workflow.experiment import MEMBERS, Cohort, Shared
+from calibrate.workflow.experiment import POPULATION, Cohort, Shared
 from calibrate.workflow.restore import is_of
 from calibrate.workflow.run import Run
 from calibrate.workflow.workflow import (
     CERTIFICATE,
+    MEMBERS,
     POSTERIOR,
+    REPORT,
     RUN,
     SAMPLING,
     certify_and_keep,
+    holds_population,
     infer,
     make_data,
     read_posterior,
     with_known,
 )
+from emulator import schema
 from emulator.catalogue import find_scene
 from emulator.errors import InputError
 from emulator.store import exclusive, read_json, write_json
 
 SHRINKAGE = "shrinkage.png"
+NOT_CERTIFIED = "not certified"  # the verdict on a member that FEM has not checked
 _SAME = (
     "scene_fingerprint", "forward_fingerprint", "forward_error", "observe", "noise", "prior",
     "prior_dependence", "load_states",
@@ -75,7 +85,8 @@ def infer_cohort(
                 f"{folder} has results of an earlier run ({POSTERIOR}); replace them with --force "
                 "(in Python: force=True), or name another folder"
             )
-        done.unlink(missing_ok=True)
+        for name in (REPORT, POSTERIOR):
+            (folder / name).unlink(missing_ok=True)
         write_json(folder / RUN, asdict(cohort))
         alone: dict[str, Posterior] = {}
         verdicts: dict[str, str] = {}
@@ -88,6 +99,53 @@ def infer_cohort(
         shrinkage.draw(found, folder / SHRINKAGE)
         found.save(done)
     return found, verdicts
+
+
+def read_cohort(folder: str | Path) -> tuple[Cohort, Hierarchy]:
+    """The cohort kept in ``folder``, and the hierarchy of its members.
+
+    Raises
+    ------
+    InputError
+        The folder holds no population, one that is not sampled to its end, or one of other members.
+    """
+    folder = Path(folder)
+    if not holds_population(folder):
+        raise InputError(f"{folder} holds a single run; calibrate.load reads it")
+    cohort, done = _read_plan(folder / RUN), folder / POSTERIOR
+    if not done.exists():
+        ready = [name for name in cohort.members if (folder / MEMBERS / name / POSTERIOR).exists()]
+        raise InputError(
+            f"{folder} holds a population without {POSTERIOR}: {len(ready)} of its "
+            f"{len(cohort.members)} members are sampled; repeat calibrate infer, which goes on"
+        )
+    found = read_hierarchy(done)
+    if found.members != tuple(cohort.members):
+        raise InputError(
+            f"{done} is of members {', '.join(found.members)}, but {RUN} names "
+            f"{', '.join(cohort.members)}; infer again"
+        )
+    return cohort, found
+
+
+def _read_plan(path: Path) -> Cohort:
+    kept = read_json(path)
+    members = {
+        name: schema.read_as(Run, entries, f"{path}, member '{name}'")
+        for name, entries in kept[MEMBERS].items()
+    }
+    return Cohort(
+        members, schema.read_as(Shared, kept.get(POPULATION, {}), f"{path}, {POPULATION}")
+    )
+
+
+def kept_verdicts(cohort: Cohort, folder: str | Path) -> dict[str, str]:
+    """What FEM says of members in ``folder``, by name; those without a certificate are missing."""
+    found = {
+        name: _kept_verdict(run, Path(folder) / MEMBERS / name)
+        for name, run in cohort.members.items()
+    }
+    return {name: verdict for name, verdict in found.items() if verdict is not None}
 
 
 def _member(run: Run, folder: Path, *, force: bool, progress: bool) -> Posterior:
@@ -106,12 +164,17 @@ def _member(run: Run, folder: Path, *, force: bool, progress: bool) -> Posterior
 
 def _verdict(posterior: Posterior, folder: Path, run: Run, *, progress: bool) -> str:
     """What FEM says of a member; a certificate that is there is of this posterior."""
-    if find_sampler(run.sampler).solves_fem:
-        return "decided by FEM"
-    if (folder / CERTIFICATE).exists():
-        return str(read_json(folder / CERTIFICATE)["verdict"])
+    if (kept := _kept_verdict(run, folder)) is not None:
+        return kept
     certificate = certify_and_keep(posterior, folder, load_steps=run.load_steps, progress=progress)
     return certificate.verdict
+
+
+def _kept_verdict(run: Run, folder: Path) -> str | None:
+    if find_sampler(run.sampler).solves_fem:
+        return "decided by FEM"
+    path = folder / CERTIFICATE
+    return str(read_json(path)["verdict"]) if path.exists() else None
 
 
 def _together(
@@ -165,7 +228,7 @@ def cohort_report(found: Hierarchy, verdicts: Mapping[str, str]) -> dict[str, An
         "population": found.summary(),
         "members": {
             member: {
-                "verdict": verdicts.get(member, "not certified"),
+                "verdict": verdicts.get(member, NOT_CERTIFIED),
                 **{name: by[member]._asdict() for name, by in found.shrinkage().items()},
             }
             for member in found.members

@@ -53,14 +53,14 @@ from typing import Any
 
 from calibrate.places import absolute, emulator_place, prior_place, scene_place
 from calibrate.workflow.run import Run
-from calibrate.workflow.workflow import check_names
+from calibrate.workflow.workflow import MEMBERS, check_names
 from emulator import schema
 from emulator.errors import InputError
 from emulator.line_index import Path as Entry
 from emulator.line_index import toml_lines
 from emulator.surrogates.registry import forward_kind
 
-MEMBERS, POPULATION = "members", "population"
+POPULATION = "population"
 _OF_A_MEMBER = ("data", "truth", "known", "observe")
 
 

@@ -48,7 +48,9 @@ from emulator.surrogates.protocol import ForwardMap
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
 FORWARD, ERROR = "forward.safetensors", "error.safetensors"
 REPORT = "report.html"
+MEMBERS = "members"  # of a population: their entry in run.json, and the folder of their runs
 _RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # of a run that has ended
+_NAMED = 4  # files of a folder that an error names
 SAMPLING = "sampling.safetensors"  # of a run under way, or killed
 
 
@@ -263,6 +265,33 @@ def _sampled(
     return posterior, run, observe, data
 
 
+def holds_population(folder: str | Path) -> bool:
+    """Whether ``folder`` is a population's, instead of a run's.
+
+    Raises
+    ------
+    InputError
+        It is neither.
+    """
+    path = Path(folder) / RUN
+    if not path.is_file():
+        raise InputError(
+            f"{path} does not exist: {_found(path.parent)}; give a folder that calibrate infer "
+            "wrote, of a posterior or of a population"
+        )
+    kept = read_json(path)
+    return isinstance(kept, dict) and isinstance(kept.get(MEMBERS), dict)
+
+
+def _found(folder: Path) -> str:
+    """What is there instead of a folder of results, in a few words."""
+    if not folder.is_dir():
+        return f"{folder} is a file" if folder.exists() else "there is no such folder"
+    names = sorted(path.name for path in folder.iterdir())
+    more = ", ..." if len(names) > _NAMED else ""
+    return f"the folder holds {', '.join(names[:_NAMED]) or 'nothing'}{more}"
+
+
 def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     """The run kept in ``folder`` and its posterior, ready to be certified.
 
@@ -274,9 +303,9 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     """
     folder = Path(folder)
     path = folder / POSTERIOR
-    if "members" in read_json(folder / RUN):
+    if holds_population(folder):
         raise InputError(
-            f"{folder} holds a population; name one of its members, {folder / 'members'}/NAME"
+            f"{folder} holds a population; name one of its members, {folder / MEMBERS}/NAME"
         )
     run = schema.read_json_as(Run, folder / RUN)
     scene = find_scene(run.scene, run.root)
@@ -347,10 +376,18 @@ def certify_and_keep(
         progress=progress,
     )
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
-    (Path(folder) / REPORT).unlink(missing_ok=True)  # it tells an earlier verdict
+    _remove_pages(Path(folder).resolve())
     if reweight_to is not None and keeps(check.certificate):
         _keep_reweighted(reweighted(check), Path(folder), Path(reweight_to))
     return check.certificate
+
+
+def _remove_pages(folder: Path) -> None:
+    """Remove the pages that tell an earlier verdict: the run's, and its population's."""
+    (folder / REPORT).unlink(missing_ok=True)
+    above = folder.parent.parent
+    if folder.parent.name == MEMBERS and (above / RUN).is_file() and holds_population(above):
+        (above / REPORT).unlink(missing_ok=True)
 
 
 def _keep_reweighted(posterior: Posterior, source: Path, target: Path) -> None:

@@ -124,8 +124,7 @@ def _run_cohort(arguments: argparse.Namespace, plan: Cohort, folder: Path) -> in
         progress=show_progress(arguments),
     )
     result = cohort_report(found, verdicts)
-    text = f"{cohort_summary(result)}\nwritten to {folder}; a member's page: calibrate report "
-    text += f"{folder}/members/NAME"
+    text = f"{cohort_summary(result)}\nwritten to {folder}; its page: calibrate report {folder}"
     emit(result, as_json=arguments.json, text=text)
     good = all(verdict in ("accepted", "decided by FEM") for verdict in verdicts.values())
     return DONE if good else FAILED

@@ -1,4 +1,4 @@
-"""``calibrate report``: one page of a posterior."""
+"""``calibrate report``: one page of a posterior, or of a population."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ def register(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "report",
-        help="one HTML page of a posterior that opens anywhere",
+        help="one HTML page of a posterior, or of a population, that opens anywhere",
         description="Verdict, data against prediction, parameters, the body in three dimensions "
         "with a slider over draws, what the data determine, and how to repeat it, in one file "
-        "that needs no network.",
+        "that needs no network. Of a population: its medians and spreads, the members beside it, "
+        "one not seen, how sampling went, and links to pages of members.",
         epilog="example: calibrate report DIR",
     )
     parser.add_argument("folder", metavar="DIR", help="of calibrate infer")

@@ -1,0 +1,198 @@
+"""The page of a population: verdicts on its members, its medians and spreads, each member beside.
+
+A certificate is of a member, so the page says what FEM said of each, and nothing is solved here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from html import escape
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+import xarray as xr
+
+from calibrate.figures.shrinkage import label_of
+from calibrate.hierarchical_model import Hierarchy
+from calibrate.hierarchical_model.model import MEDIAN, SD
+from calibrate.hierarchical_model.tree import CORRELATION
+from calibrate.posterior import read_tree
+from calibrate.posterior.fit import misfits
+from calibrate.report import charts, parts
+from calibrate.report.shrinkage import shrinkage
+from calibrate.workflow.cohort import NOT_CERTIFIED, kept_verdicts
+from calibrate.workflow.experiment import POPULATION, Cohort, Shared
+from calibrate.workflow.workflow import MEMBERS, POSTERIOR, REPORT
+
+_FORM = ".4g"
+_UNTOLD = ("members", "alone")  # fingerprints, and what a cohort always says
+
+
+def html_of(cohort: Cohort, found: Hierarchy, folder: Path, beside: Path) -> str:
+    """The page as text.
+
+    Parameters
+    ----------
+    folder : of the cohort: certificates, posteriors and pages of its members are read there.
+    beside : the folder that the page is written to, which links start from.
+    """
+    verdicts = dict.fromkeys(found.members, NOT_CERTIFIED) | kept_verdicts(cohort, folder)
+    table, warnings = found.summary(), found.warnings()
+    sections = [
+        ("The population", _population(found, table)),
+        ("Members beside the population", _members(found, folder, beside, verdicts)),
+        ("A member not seen", _new_member(found)),
+        ("How sampling went", _sampling(found, table, warnings)),
+        ("Where this comes from, and how to repeat it", _provenance(cohort, found)),
+    ]
+    title = f"Population of {len(found.members)} members"
+    first = _verdict(verdicts, warnings)
+    return parts.frame(f"{title}: {', '.join(found.shared)}", title, first, sections)
+
+
+def _verdict(verdicts: Mapping[str, str], warnings: Sequence[str]) -> str:
+    """How many members FEM agrees with, which it does not, and what is wrong with the run."""
+    colours = [parts.colour_of(verdict) for verdict in verdicts.values()]
+    good = colours.count(parts.GOOD)
+    worst = max(colours, key=(parts.GOOD, parts.UNSURE, parts.BAD).index)
+    said = list(dict.fromkeys(verdicts.values()))
+    verdict = f"{good} of {len(verdicts)} members accepted"
+    if len(said) == 1:
+        verdict = f"all members: {said[0]}"
+    findings = [
+        f"{each}: {', '.join(name for name, own in verdicts.items() if own == each)}"
+        for each in said
+        if parts.colour_of(each) != parts.GOOD
+    ]
+    if NOT_CERTIFIED in verdicts.values():
+        findings.append(f"for a certificate: calibrate certify on {MEMBERS}/NAME in this folder")
+    return parts.verdict_box(
+        verdict,
+        worst,
+        findings,
+        "A certificate is of a member by itself, not of the population.",
+        warnings,
+    )
+
+
+def _labels(found: Hierarchy) -> dict[str, str]:
+    """What the numbers of the population are called, by their names in :meth:`Hierarchy.draws`."""
+    medians, spreads, correlations = {}, {}, {}
+    for k, name in enumerate(found.shared):
+        label = label_of(found, name)
+        log = found.tree["posterior"][name].attrs.get("scale") == "log"
+        medians[f"{MEDIAN}[{name}]"] = f"median of {label}"
+        spreads[f"{SD}[{name}]"] = f"spread of {f'ln {name}' if log else label}"
+        for earlier in found.shared[:k]:
+            correlations[f"{CORRELATION}[{earlier}, {name}]"] = f"correlation of {earlier}, {name}"
+    return medians | spreads | correlations
+
+
+def _population(found: Hierarchy, table: Mapping[str, Mapping[str, float]]) -> str:
+    labels = _labels(found)
+    rows = [(label, *parts.summary_cells(table[name])) for name, label in labels.items()]
+    return parts.table(("", *parts.SUMMARY), rows) + parts.note(
+        "Of the population before it is cut to the parameters' ranges. A spread is an sd; of a "
+        "logarithm it is about a relative sd. Few members tell little of it: it is then what its "
+        "prior says."
+    )
+
+
+def _members(found: Hierarchy, folder: Path, beside: Path, verdicts: Mapping[str, str]) -> str:
+    """The chart, a table, and what each member's own posterior does not fit."""
+    draws, rows, wrong = found.draws(), [], []
+    for member in found.members:
+        own = folder / MEMBERS / member
+        tree = read_tree(own / POSTERIOR) if (own / POSTERIOR).exists() else xr.DataTree()
+        inside = [_share(tree), verdicts[member], _page(own / REPORT, beside)]
+        values = [draws[f"{name}[{member}]"].ravel() for name in found.shared]
+        rows.append((member, *(parts.median_and_range(v, _FORM) for v in values), *inside))
+        wrong += [f"{member}: {sentence}" for sentence in misfits(tree)]
+    labels = [label_of(found, name) for name in found.shared]
+    head = ["", *labels, "own data within 90 %", "FEM says", "page"]
+    told = parts.note(
+        "Medians and 90 % of each member with the others, also in the chart's blue; grey is the "
+        "member by its own data. Its data is held against its own posterior's predictions, noise "
+        f"included. For a member's page: calibrate report on {MEMBERS}/NAME in this folder, then "
+        "on the folder again."
+    )
+    return parts.chart(shrinkage(found)) + parts.table(head, rows) + told + parts.as_warnings(wrong)
+
+
+def _share(tree: xr.DataTree) -> str:
+    """How much of a member's data lies within 90 % of what its posterior predicts."""
+    if "posterior_predictive" not in tree.children:
+        return "not kept"
+    observed = tree["observed_data"].to_dataset()
+    replicates = tree["posterior_predictive"].to_dataset()
+    there = np.concatenate(
+        [
+            charts.inside(
+                replicates[name].values.reshape(-1, measured.size), measured.values.ravel()
+            )
+            for name, measured in observed.data_vars.items()
+        ]
+    )
+    return f"{100.0 * there.mean():.0f} % of {len(there)}"
+
+
+def _page(path: Path, beside: Path) -> str:
+    """A link to a member's page from the folder ``beside``, where there is one."""
+    if not path.is_file():
+        return ""
+    there = Path(os.path.relpath(path.resolve(), beside.resolve())).as_posix()
+    return parts.Markup(f'<a href="{quote(there)}">open</a>')
+
+
+def _new_member(found: Hierarchy) -> str:
+    new = found.new_member()
+    rows = [(label_of(found, n), parts.median_and_range(v, _FORM)) for n, v in new.items()]
+    told = parts.note(
+        "What is not known of the population widens it. In Python, the hierarchy's predict(model) "
+        "gives the data of such a member, and as_prior() the prior of the next."
+    )
+    pairs = charts.pairs_of({n: label_of(found, n) for n in new}, new) if len(new) > 1 else None
+    shown = "" if pairs is None else parts.chart(pairs)
+    return parts.table(("", "median and 90 %"), rows) + told + shown
+
+
+def _sampling(
+    found: Hierarchy, table: Mapping[str, Mapping[str, float]], warnings: Sequence[str]
+) -> str:
+    """Draws, the worst R-hat and the fewest effective draws in words, and traces."""
+    labels = _labels(found)
+    sizes, statistics = found.tree["posterior"].sizes, found.tree["sample_stats"]
+    worst = max(table, key=lambda name: np.nan_to_num(table[name]["r_hat"], nan=np.inf))
+    fewest = {key: min(row[key] for row in table.values()) for key in ("ess_bulk", "ess_tail")}
+    diverging = int(statistics["diverging"].sum()) if "diverging" in statistics else 0
+    said = (
+        f"{sizes['chain']} chains of {sizes['draw']} draws, {diverging or 'no'} divergent "
+        f"transitions. R-hat is at most {table[worst]['r_hat']:.4f}, of "
+        f"{labels.get(worst, worst)}; effective draws are {fewest['ess_bulk']:.0f} or more in the "
+        f"bulk, {fewest['ess_tail']:.0f} or more in the tails, of population and members alike."
+    )
+    told = "Warnings are at the top." if warnings else "Nothing is wrong with the run."
+    traces = parts.chart(charts.traces_of(labels, found.draws(), {}))
+    return f"<p>{escape(said)} {told}</p>{traces}"
+
+
+def _provenance(cohort: Cohort, found: Hierarchy) -> str:
+    """Attributes, each member's scene and data, and settings as an experiment file has them."""
+    runs = {name: parts.not_as_usual(run) for name, run in cohort.members.items()}
+    first = next(iter(runs.values()))
+    common = {k: v for k, v in first.items() if all(run.get(k) == v for run in runs.values())}
+    own = {name: {k: v for k, v in run.items() if k not in common} for name, run in runs.items()}
+    usual, chosen = asdict(Shared()), asdict(cohort.population)
+    shared = {k: v for k, v in chosen.items() if v != usual[k]}
+    again = (
+        "from calibrate.workflow.cohort import infer_cohort, read_cohort\n\n"
+        'cohort, _ = read_cohort("THIS FOLDER")\n'
+        'infer_cohort(cohort, "ANOTHER FOLDER")  # the same draws'
+    )
+    settings = common | {MEMBERS: own, POPULATION: shared}
+    return parts.attributes(found.tree.attrs, _UNTOLD) + parts.how_to_repeat(
+        settings, "The runs of the members and what these share", again
+    )
