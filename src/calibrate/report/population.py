@@ -102,24 +102,30 @@ def _population(found: Hierarchy, table: Mapping[str, Mapping[str, float]]) -> s
 
 
 def _members(found: Hierarchy, folder: Path, beside: Path, verdicts: Mapping[str, str]) -> str:
-    """The chart, a table, and what each member's own posterior does not fit."""
-    draws, rows, wrong = found.draws(), [], []
+    """The chart, its numbers, checks of each member, and what its own posterior does not fit."""
+    draws, numbers, checks, wrong = found.draws(), [], [], []
     for member in found.members:
         own = folder / MEMBERS / member
         tree = read_tree(own / POSTERIOR) if (own / POSTERIOR).exists() else xr.DataTree()
-        inside = [_share(tree), verdicts[member], _page(own / REPORT, beside)]
-        values = [draws[f"{name}[{member}]"].ravel() for name in found.shared]
-        rows.append((member, *(parts.median_and_range(v, _FORM) for v in values), *inside))
+        values = [draws[f"{name}[{member}]"] for name in found.shared]
+        numbers.append((member, *(parts.median_and_range(v, _FORM) for v in values)))
+        checks.append((member, verdicts[member], _share(tree), _page(own / REPORT, beside)))
         wrong += [f"{member}: {sentence}" for sentence in misfits(tree)]
     labels = [label_of(found, name) for name in found.shared]
-    head = ["", *labels, "own data within 90 %", "FEM says", "page"]
-    told = parts.note(
-        "Medians and 90 % of each member with the others, also in the chart's blue; grey is the "
-        "member by its own data. Its data is held against its own posterior's predictions, noise "
-        f"included. For a member's page: calibrate report on {MEMBERS}/NAME in this folder, then "
-        "on the folder again."
+    return "".join(
+        [
+            parts.chart(shrinkage(found)),
+            parts.note("Medians and 90 % of each member with the others, the chart's blue:"),
+            parts.table(("", *labels), numbers),
+            parts.note(
+                "Each member by itself, the chart's grey: FEM's verdict, and how much of its data "
+                "lies within 90 % of what its posterior predicts, noise included. For a page: "
+                f"calibrate report on {MEMBERS}/NAME in this folder, then on the folder again."
+            ),
+            parts.table(("", "FEM says", "data within 90 %", "page"), checks),
+            parts.as_warnings(wrong),
+        ]
     )
-    return parts.chart(shrinkage(found)) + parts.table(head, rows) + told + parts.as_warnings(wrong)
 
 
 def _share(tree: xr.DataTree) -> str:

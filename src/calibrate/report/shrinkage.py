@@ -15,7 +15,7 @@ from calibrate.hierarchical_model import Hierarchy
 from calibrate.report.charts import translucent
 
 _GREY = "#8c8c8c"
-_COLUMNS = 3  # parameters beside each other
+_COLUMNS = 3  # parameters beside each other, at most
 _ROW, _MARGIN = 34, 110  # pixels: of a member, and around a row of parameters
 
 
@@ -25,12 +25,12 @@ def shrinkage(found: Hierarchy) -> go.Figure:
     Grey: by the member's own data. Blue: with the others. The band is a member not seen.
     """
     names, members = found.shared, found.members
-    columns = min(_COLUMNS, len(names))
-    lines = math.ceil(len(names) / columns)
+    lines = math.ceil(len(names) / _COLUMNS)
+    columns = math.ceil(len(names) / lines)  # four are two by two
     height = _ROW * len(members) + _MARGIN
     figure = make_subplots(
         lines, columns, shared_yaxes=True, horizontal_spacing=0.04,
-        vertical_spacing=0.0 if lines == 1 else 0.6 * _MARGIN / (height * lines),
+        vertical_spacing=0.0 if lines == 1 else 0.8 * _MARGIN / (height * lines),
     )  # fmt: skip
     edges = (len(members) - 0.4, -0.6)  # the first member on top
     for k, name in enumerate(names):

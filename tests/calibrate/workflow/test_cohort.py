@@ -184,7 +184,7 @@ def test_the_page_of_a_population(copy, capsys):
     ends = np.quantile(replicates, [0.05, 0.95], axis=0)
     measured = np.asarray(tree["observed_data"]["displacement"])
     share = 100.0 * np.mean((measured >= ends[0]) & (measured <= ends[1]))
-    assert f"<td>{share:.0f} % of 12</td><td>not certified</td><td></td>" in body
+    assert f"<td>stiff</td><td>not certified</td><td>{share:.0f} % of 12</td><td></td>" in body
     assert re.findall('href="([^"]*)"', body) == ["members/soft/report.html"]
     assert "infer_cohort(cohort, " in body
     assert str(copy) not in body
