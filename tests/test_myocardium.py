@@ -5,10 +5,8 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 import numpyro.distributions as dist
 import pytest
-from numpyro.infer import MCMC, NUTS
 from studies.sheep_myocardium import (
     campaign,
     checked,
@@ -233,23 +231,31 @@ def test_a_transport_between_modes_is_undone_and_keeps_its_balance():
 def test_moves_join_modes_that_nuts_does_not(known):
     """Two Gaussians of one and three quarters of the mass, 20 sd apart."""
 
-    def program(_):
-        apart = dist.MixtureSameFamily(
-            dist.Categorical(jnp.array([0.25, 0.75])),
-            dist.Normal(jnp.array([-10.0, 10.0]), jnp.array([1.0, 0.5])),
-        )
-        numpyro.sample("x", apart)
-
+    apart = dist.MixtureSameFamily(
+        dist.Categorical(jnp.array([0.25, 0.75])),
+        dist.Normal(jnp.array([-10.0, 10.0]), jnp.array([1.0, 0.5])),
+    )
     z = np.stack([np.linspace(-11.5, -8.5, 100), np.linspace(9.3, 10.7, 100)])[:, :, None]
-    z = np.concatenate([z, z])
-    given = moves.modes(z, np.zeros((4, 100))) if known else moves.unknown(1)
-    run = MCMC(
-        moves.Moving(NUTS(program), "angles"), num_warmup=100, num_samples=600,
-        progress_bar=False, jit_model_args=True,
+    given = moves.modes(np.concatenate([z, z]), np.zeros((4, 100))) if known else moves.unknown(1)
+    found = moves.chain(
+        lambda z: -apart.log_prob(z[0]), given, np.array([False]), jax.random.key(0),
+        warmup=100, draws=600,
     )  # fmt: skip
-    run.run(jax.random.key(0), given)
-    right = float((np.asarray(run.get_samples()["x"]) > 0.0).mean())
+    right = float((found.z > 0.0).mean())
     assert (0.65 < right < 0.85) if known else right in (0.0, 1.0)
+    np.testing.assert_allclose(found.log_density, apart.log_prob(found.z[:, 0]))
+
+
+def test_mirrored_entries_change_sign_where_that_is_as_likely():
+    def potential(z):
+        return 0.5 * (jnp.abs(z[0]) - 8.0) ** 2 + 0.5 * (z[1] - 8.0) ** 2
+
+    mirrored = np.array([True, True])
+    found = moves.chain(
+        potential, moves.unknown(2), mirrored, jax.random.key(1), warmup=100, draws=400
+    )
+    assert 0.35 < float((found.z[:, 0] > 0.0).mean()) < 0.65
+    assert float(found.z[:, 1].min()) > 0.0
 
 
 def test_the_emulator_goes_through_its_runs(tmp_path):

@@ -28,12 +28,11 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
-from numpyro.infer import MCMC, NUTS, init_to_uniform
-from numpyro.infer.util import unconstrain_fn
+from numpyro.infer.util import constrain_fn, potential_energy
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
-from studies.sheep_myocardium.moves import Modes, Moving, modes, unknown
+from studies.sheep_myocardium.moves import Chain, Modes, chain, modes, unknown
 
 from calibrate.samplers.stopping import least_ess, r_hat
 from calibrate.statistical_model.curve import curve_covariance
@@ -116,10 +115,10 @@ def _position(name: str, value: jax.Array) -> jax.Array:
     return 2.0 * parameter.to_unit(jnp.minimum(value, parameter.high)) - 1.0
 
 
-def program(law: str, *, angles: bool) -> Callable[[Seen, Modes], None]:
+def program(law: str, *, angles: bool) -> Callable[[Seen], None]:
     """The NumPyro program of a heart by a law; ``angles`` says whether the fibres' are unknown."""
 
-    def model(of: Seen, _: Modes) -> None:
+    def model(of: Seen) -> None:
         x = {name: jnp.asarray(-1.0) for name in MATERIAL}
         for name in parameters(law):
             if name in MEANS:
@@ -139,25 +138,43 @@ def program(law: str, *, angles: bool) -> Callable[[Seen, Modes], None]:
     return model
 
 
-def dimension(law: str, *, angles: bool) -> int:
-    """Number of a law's unknowns."""
-    return len(parameters(law)) + angles * _CUBES * len(cube.ANGLES) + 1
+def _sites(law: str, *, angles: bool) -> dict[str, jax.Array]:
+    """Zeros like each unknown of a law's program, by its site."""
+    sites = {n if n in MEANS else f"x_{n}": jnp.zeros(()) for n in parameters(law)}
+    turned = {"angles": jnp.zeros((_CUBES, len(cube.ANGLES)))} if angles else {}
+    return sites | turned | {"omega": jnp.zeros(())}
+
+
+class Drawn(NamedTuple):
+    """A chain: draws by site, of deterministic ones too, with how it went."""
+
+    draws: dict[str, jax.Array]
+    chain: Chain
 
 
 @lru_cache
-def _sampler(law: str, angles: bool, draws: int, warmup: int) -> MCMC:
-    """One for all hearts and chains: its program takes a heart and modes as arguments."""
-    kernel = NUTS(
-        program(law, angles=angles),
-        target_accept_prob=0.9,
-        max_tree_depth=8,
-        dense_mass=True,
-        init_strategy=init_to_uniform(radius=1.0),
-    )
-    return MCMC(
-        Moving(kernel, "angles"), num_warmup=warmup, num_samples=draws, progress_bar=False,
-        jit_model_args=True,
-    )  # fmt: skip
+def _sampler(
+    law: str, angles: bool, draws: int, warmup: int
+) -> Callable[[jax.Array, Seen, Modes], Drawn]:
+    """One program for all hearts, chains and modes."""
+    model = program(law, angles=angles)
+    sites = _sites(law, angles=angles)
+    unravel = ravel_pytree(sites)[1]
+    marks = {name: jnp.full(v.shape, name == "angles") for name, v in sites.items()}
+    mirrored = np.asarray(ravel_pytree(marks)[0])
+
+    def run(key: jax.Array, of: Seen, given: Modes) -> Drawn:
+        def potential(z: jax.Array) -> jax.Array:
+            return potential_energy(model, (of,), {}, unravel(z))
+
+        found = chain(potential, given, mirrored, key, warmup=warmup, draws=draws)
+
+        def told(z: jax.Array) -> dict[str, jax.Array]:
+            return constrain_fn(model, (of,), {}, unravel(z), return_deterministic=True)
+
+        return Drawn(jax.lax.map(told, found.z), found)
+
+    return jax.jit(run)
 
 
 def forget_programs() -> None:
@@ -170,13 +187,15 @@ def forget_programs() -> None:
 class Found:
     """Draws (d, ...) by name of a heart's posterior, chain after chain, with how sampling went.
 
-    ``x`` (d, 8) is the material's position in the box, ``means`` (d, 9, j) the forces in N.
+    draws : by site; ``x`` (d, 8) is the material's position in the box, ``means`` (d, 9, j) the
+    forces in N. z : (d, u) unconstrained. log_density : (d,) there.
     """
 
     heart: Heart
     of: Seen
     law: str
     draws: dict[str, np.ndarray]
+    z: np.ndarray
     divergences: int
     chains: int
     log_density: np.ndarray
@@ -205,21 +224,13 @@ class Found:
         unit = jnp.asarray(0.5 * (self.draws["x"][:, k] + 1.0))
         return np.asarray(cube.MATERIAL[k].from_unit(unit))
 
-    @cached_property
-    def unknowns(self) -> dict[str, np.ndarray]:
-        """Draws of what was sampled, by name of the site."""
-        return {name: v for name, v in self.draws.items() if name not in ("x", "means")}
-
-    def _by_chain(self) -> list[np.ndarray]:
-        flat = [v.reshape(len(v), -1) for v in self.unknowns.values()]
-        return list(
-            np.moveaxis(np.concatenate(flat, axis=1).reshape(self.chains, -1, self.size), 2, 0)
-        )
-
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return sum(v[0].size for v in self.unknowns.values())
+        return self.z.shape[1]
+
+    def _by_chain(self) -> np.ndarray:
+        return np.moveaxis(self.z.reshape(self.chains, -1, self.size), 2, 0)
 
     @cached_property
     def worst_rhat(self) -> float:
@@ -233,21 +244,8 @@ class Found:
 
     def modes(self) -> Modes:
         """A mode a chain."""
-        z = np.asarray(_unconstrained(self.law, "angles" in self.draws)(self.of, self.unknowns))
         rows = (self.chains, -1)
-        return modes(z.reshape(*rows, z.shape[1]), self.log_density.reshape(rows))
-
-
-@lru_cache
-def _unconstrained(law: str, angles: bool) -> Callable[[Seen, dict[str, np.ndarray]], jax.Array]:
-    """Unconstrained positions (d, u) of draws, as the sampler flattens them."""
-    model = program(law, angles=angles)
-    none = unknown(dimension(law, angles=angles))
-
-    def one(of: Seen, draw: dict[str, jax.Array]) -> jax.Array:
-        return ravel_pytree(unconstrain_fn(model, (of, none), {}, draw))[0]
-
-    return jax.jit(jax.vmap(one, (None, 0)))
+        return modes(self.z.reshape(*rows, self.size), self.log_density.reshape(rows))
 
 
 def sample(
@@ -268,18 +266,13 @@ def sample(
     Each chain begins at a place of its own; :data:`.moves.MODES` of them find modes.
     """
     of = seen(heart, cubes, left_out)
-    given = unknown(dimension(law, angles=angles)) if known is None else known
+    size = sum(site.size for site in _sites(law, angles=angles).values())
+    given = unknown(size) if known is None else known
     run = _sampler(law, angles, draws, warmup)
-    told: list[dict[str, np.ndarray]] = []
-    energies, diverging = [], 0
-    for key in jax.random.split(jax.random.key(seed), chains):
-        run.run(key, of, given, extra_fields=("diverging", "potential_energy"))
-        fields = run.get_extra_fields()
-        told.append({name: np.asarray(v) for name, v in run.get_samples().items()})
-        energies.append(np.asarray(fields["potential_energy"]))
-        diverging += int(np.sum(fields["diverging"]))
-    joined = {name: np.concatenate([each[name] for each in told]) for name in told[0]}
-    return Found(heart, of, law, joined, diverging, chains, -np.concatenate(energies))
+    told = [run(key, of, given) for key in jax.random.split(jax.random.key(seed), chains)]
+    every = jax.tree.map(lambda *parts: np.concatenate(parts), *told)
+    diverged, density = int(every.chain.diverging.sum()), every.chain.log_density
+    return Found(heart, of, law, every.draws, every.chain.z, diverged, chains, density)
 
 
 def settled(

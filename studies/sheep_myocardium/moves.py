@@ -17,19 +17,20 @@ side or the other are often nearly the same.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
-from numpyro.infer import NUTS
-from numpyro.infer.mcmc import MCMCKernel
+from numpyro.infer.hmc import HMCState, hmc
 
 MODES = 4
 """As many as there are exploring chains."""
 _MOVES = 4  # of each kind a step of NUTS, which costs some thirty of them
+_PLACES = 4  # of which a chain begins at the likeliest
+_ACCEPTED, _DEPTH = 0.9, 8  # of NUTS: acceptance its step size adapts to, doublings of a trajectory
 
 
 class Modes(NamedTuple):
@@ -84,75 +85,84 @@ def transported(
     return there, back - forth
 
 
-class Moving(MCMCKernel):
-    """NUTS with moves after each step. The model's last argument are its :class:`Modes`.
+def moved(
+    potential: Callable[[jax.Array], jax.Array],
+    given: Modes,
+    mirrored: np.ndarray,
+    at: tuple[jax.Array, jax.Array],
+    key: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Position (d,) and potential () after some transports and mirrors of ``at``, such a pair.
 
-    mirrored : the site whose entries change sign.
+    potential : minus the log density of a position (d,). mirrored : (d,) whether an entry may
+    change its sign.
     """
 
-    sample_field = "z"
+    def decided(
+        key: jax.Array, at: tuple[jax.Array, jax.Array], there: jax.Array, more: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        z, before = at
+        after = potential(there)
+        taken = jnp.log(jax.random.uniform(key)) < before - after + more  # false for NaN
+        return jnp.where(taken, there, z), jnp.where(taken, after, before)
 
-    def __init__(self, nuts: NUTS, mirrored: str) -> None:
-        self._nuts = nuts
-        self._mirrored = mirrored
+    def move(
+        at: tuple[jax.Array, jax.Array], key: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array], None]:
+        first, second, third, fourth, fifth = jax.random.split(key, 5)
+        i = jax.random.categorical(first, _log_shares(given, at[0]))
+        j = jax.random.categorical(second, given.log_weight)
+        at = decided(third, at, *transported(given, at[0], i, j))
+        if mirrored.any():
+            entry = jax.random.choice(fourth, np.flatnonzero(mirrored))
+            at = decided(fifth, at, at[0].at[entry].multiply(-1.0), jnp.zeros(()))
+        return at, None
 
-    @property
-    def model(self) -> Any:
-        """Of NUTS."""
-        return self._nuts.model
+    found: tuple[jax.Array, jax.Array] = jax.lax.scan(move, at, jax.random.split(key, _MOVES))[0]
+    return found
 
-    @property
-    def default_fields(self) -> tuple[str, ...]:
-        """Of NUTS."""
-        return self._nuts.default_fields
 
-    def postprocess_fn(self, args: Any, kwargs: Any) -> Any:
-        """Of NUTS."""
-        return self._nuts.postprocess_fn(args, kwargs)
+class Chain(NamedTuple):
+    """Draws z (d, u) of unconstrained positions, their log densities (d,), and divergences (d,)."""
 
-    def get_diagnostics_str(self, state: Any) -> str:
-        """Of NUTS."""
-        return self._nuts.get_diagnostics_str(state)
+    z: jax.Array
+    log_density: jax.Array
+    diverging: jax.Array
 
-    def init(self, *arguments: Any, **named: Any) -> Any:
-        """Of NUTS."""
-        return self._nuts.init(*arguments, **named)
 
-    def sample(self, state: Any, model_args: Any, model_kwargs: Any) -> Any:
-        """A step of NUTS, then moves."""
-        state = self._nuts.sample(state, model_args, model_kwargs)
-        given: Modes = model_args[-1]
-        potential = self._nuts.get_potential_fn(model_args, model_kwargs)
-        z, unravel = ravel_pytree(state.z)
-        marks = {n: jnp.full(v.shape, float(n == self._mirrored)) for n, v in state.z.items()}
-        log_marked = jnp.log(ravel_pytree(marks)[0])
-        key, moving = jax.random.split(state.rng_key)
+def chain(
+    potential: Callable[[jax.Array], jax.Array],
+    given: Modes,
+    mirrored: np.ndarray,
+    key: jax.Array,
+    *,
+    warmup: int,
+    draws: int,
+) -> Chain:
+    """One chain of NumPyro's NUTS from somewhere, with moves after each step; under ``jit``.
 
-        def decided(
-            key: jax.Array, at: tuple[jax.Array, jax.Array], there: jax.Array, more: jax.Array
-        ) -> tuple[jax.Array, jax.Array]:
-            z, before = at
-            after = potential(unravel(there))
-            log_alpha = before - after + more
-            taken = jnp.log(jax.random.uniform(key)) < log_alpha  # false for NaN
-            return jnp.where(taken, there, z), jnp.where(taken, after, before)
+    It is the kernel alone, since ``numpyro.infer.MCMC`` compiles a model's start anew for every
+    chain, and a process can map only so many programs.
+    """
+    begin, step = hmc(potential, algo="NUTS")
+    places, first, then = jax.random.split(key, 3)
+    somewhere = jax.random.uniform(places, (_PLACES, len(mirrored)), minval=-1.0, maxval=1.0)
+    energies = jax.lax.map(potential, somewhere)
+    start = somewhere[jnp.argmin(jnp.where(jnp.isfinite(energies), energies, jnp.inf))]
+    state = begin(
+        start,
+        warmup,
+        dense_mass=True,
+        target_accept_prob=_ACCEPTED,
+        max_tree_depth=_DEPTH,
+        rng_key=first,
+    )
 
-        def move(
-            at: tuple[jax.Array, jax.Array], key: jax.Array
-        ) -> tuple[tuple[jax.Array, jax.Array], None]:
-            first, second, third, fourth, fifth = jax.random.split(key, 5)
-            i = jax.random.categorical(first, _log_shares(given, at[0]))
-            j = jax.random.categorical(second, given.log_weight)
-            at = decided(third, at, *transported(given, at[0], i, j))
-            if self._mirrored in marks:
-                entry = jax.random.categorical(fourth, log_marked)
-                at = decided(fifth, at, at[0].at[entry].multiply(-1.0), jnp.zeros(()))
-            return at, None
+    def onwards(state: HMCState, key: jax.Array) -> tuple[HMCState, Chain]:
+        state = step(state)
+        z, energy = moved(potential, given, mirrored, (state.z, state.potential_energy), key)
+        state = state._replace(z=z, potential_energy=energy, z_grad=jax.grad(potential)(z))
+        return state, Chain(z, -energy, state.diverging)
 
-        at = (z, state.potential_energy)
-        keys = jax.random.split(moving, _MOVES)
-        z, energy = jax.lax.scan(move, at, keys)[0]
-        there = unravel(z)
-        return state._replace(
-            z=there, z_grad=jax.grad(potential)(there), potential_energy=energy, rng_key=key
-        )
+    every: Chain = jax.lax.scan(onwards, state, jax.random.split(then, warmup + draws))[1]
+    return jax.tree.map(lambda part: part[warmup:], every)
