@@ -5,16 +5,22 @@ of its posterior :math:`p(x \mid y_r)` is found by importance sampling, from dra
 of a Student's t about a Newton step from :math:`x_r`,
 
 .. math:: w_i \propto \frac{p(x_i)\, p(y_r \mid x_i)}
-                           {\alpha\, p(x_i) + (1 - \alpha)\, t_5(x_i;\, \hat x, S)},
-          \qquad S = (F + P^{-1})^{-1},
+                           {\beta\, p(x_i) + (1 - \beta)\, t_5(x_i;\, \hat x, Q)},
+          \qquad Q = (F + P^{-1})^{-1},
 
 with the Fisher information F of :mod:`calibrate.identifiability.fisher`, the prior's covariance P
-and the share :math:`\alpha` of draws from the prior; :math:`\hat x` and S are then those of the
+and the share :math:`\beta` of draws from the prior; :math:`\hat x` and Q are then those of the
 weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000). Where too few draws
-carry the weight the covariance is S. Posteriors are
+carry the weight the covariance is Q. Posteriors are
 averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
 the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
 :math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
+
+Errors that many numbers share are in the data and in :math:`p(y \mid x)`, which marginalises them
+(:mod:`calibrate.identifiability.errors_of_sets`). Where the size of one is inferred, each data set
+has another quantile of its prior, and F is that of x at this size: about x and the size together
+Gaussian data has no information in common, so that not to know the size widens x in second order
+only.
 """
 
 from __future__ import annotations
@@ -30,9 +36,11 @@ from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import gammaln
 
 from calibrate.identifiability.combinations import combinations, prior_table
-from calibrate.identifiability.fisher import informations, sensitivities
-from calibrate.noise.information import information_about_means
+from calibrate.identifiability.errors_of_sets import Errors, log_ratio, of_each, sizes_of
+from calibrate.identifiability.fisher import information_at
 from calibrate.statistical_model import Model
+from calibrate.statistical_model.error_modes import ErrorModes
+from calibrate.statistical_model.shared_errors import errors_of_data
 from emulator.errors import InputError
 
 _DATA_SETS = 64
@@ -48,6 +56,7 @@ def expected_precision(
     model: Model,
     at: Mapping[str, float] | None = None,
     *,
+    systematic: Mapping[str, Mapping[str, Any]] | None = None,
     data_sets: int = _DATA_SETS,
     seed: int = 0,
 ) -> dict[str, Any]:
@@ -57,6 +66,9 @@ def expected_precision(
     ----------
     at : unknowns by name where the map is taken as linear and the prior as normal; posteriors of
         ``data_sets`` draws of the prior and its data by default.
+    systematic : errors that many numbers share, by name, as in an experiment file
+        (:mod:`~calibrate.statistical_model.shared_errors`), made for each data set. Those of
+        :func:`calibrate.with_systematic` are the model's already, the same for all data.
 
     Returns
     -------
@@ -69,25 +81,21 @@ def expected_precision(
     Raises
     ------
     InputError
-        The forward map has no answer at any of the draws, or noise has no known sd.
+        The forward map has no answer at any of the draws, noise has no known sd, or an error that
+        does not fit.
     """
-    if model.error is not None:
-        raise InputError(
-            "identify before measuring: the model allows for errors besides noise, which the data "
-            "drawn here would not have; leave them out, or infer from synthetic data"
-        )
     if any(model.noise_sites.values()):
         raise InputError(
             "identifiability: give every noise a known sd, as in GaussianNoise(sd=...)"
         )
+    errors: Errors = errors_of_data(model, systematic) if systematic else lambda _: model.error
     names, prior = model.states.unknowns, prior_table(model)
     log = bool((prior > 0.0).all())
     before = np.atleast_2d(np.cov(np.log(prior) if log else prior, rowvar=False))
     if at is None:
-        covariances = _posterior_covariances(model, prior, before, data_sets, seed, log=log)
+        covariances = _posterior_covariances(model, errors, prior, before, data_sets, seed, log=log)
     else:
-        where = np.array([[at[name] for name in names]])
-        information = informations(model, where, log=log)
+        information = _informations(model, errors, np.array([at[name] for name in names]), log=log)
         covariances = np.linalg.inv(information + np.linalg.inv(before))
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     ratio = sd / np.sqrt(np.diagonal(before))
@@ -121,14 +129,35 @@ class _Around(NamedTuple):
         return constant - logs - 0.5 * (_DOF + q) * jnp.log1p(jnp.sum(z**2, axis=0) / _DOF)
 
 
+def _informations(model: Model, errors: Errors, theta: np.ndarray, *, log: bool) -> np.ndarray:
+    """F (k, q, q) at ``theta`` (q,), for each size that errors of unknown size may have."""
+    means, valid = model.predict(dict(zip(model.states.unknowns, theta, strict=True)))
+    _some(valid)
+    error = errors(means)
+    told = information_at(model, model.observe, model.noise, log=log)
+    x = jnp.asarray(np.log(theta) if log else theta)
+    found, _ = jax.jit(jax.vmap(lambda sizes: told(x, error, sizes)))(sizes_of(error))
+    return np.asarray(found)
+
+
 def _posterior_covariances(
-    model: Model, prior: np.ndarray, before: np.ndarray, count: int, seed: int, *, log: bool
+    model: Model,
+    errors: Errors,
+    prior: np.ndarray,
+    before: np.ndarray,
+    count: int,
+    seed: int,
+    *,
+    log: bool,
 ) -> np.ndarray:
     """Covariances (r, q, q) of the posteriors of data made at draws of the prior (s, q)."""
     names = model.states.unknowns
 
+    def thetas(x: jax.Array) -> jax.Array:
+        return jnp.exp(x) if log else x
+
     def values(x: jax.Array) -> dict[str, jax.Array]:
-        return dict(zip(names, jnp.exp(x) if log else x, strict=True))
+        return dict(zip(names, thetas(x), strict=True))
 
     def log_prior(x: jax.Array) -> jax.Array:
         found = model.log_prior(values(x)) + (jnp.sum(x) if log else 0.0)
@@ -138,64 +167,93 @@ def _posterior_covariances(
         return model.predict(values(x))
 
     def log_likelihood(
-        means: dict[str, jax.Array], valid: jax.Array, data: dict[str, jax.Array]
+        x: jax.Array,
+        answer: tuple[dict[str, jax.Array], jax.Array],
+        data: dict[str, jax.Array],
+        error: ErrorModes | None,
     ) -> jax.Array:
+        means, valid = answer
         found = model.log_density(means, model.noise_values({}), data)
+        if error is not None:
+            residual = {name: data[name] - mean for name, mean in means.items()}
+            found += log_ratio(error, thetas(x), residual)
         return jnp.where(valid & jnp.isfinite(found), found, -jnp.inf)
 
-    sensitivity = sensitivities(model, model.observe, log=log)
+    told = information_at(model, model.observe, model.noise, log=log)
     shared = jnp.asarray(np.log(prior[count:]) if log else prior[count:])[:_FROM_PRIOR]
     precision = jnp.asarray(np.linalg.inv(before))
-    ahead, answers = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))(shared)
+    ask = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))
+    ahead = ask(shared)
     p_shared = jax.vmap(log_prior)(shared)
     share = len(shared) / (len(shared) + _AROUND)
 
-    def first(x: jax.Array, data: dict[str, jax.Array]) -> _Around:
+    def first(
+        x: jax.Array, sizes: jax.Array, data: dict[str, jax.Array], error: ErrorModes | None
+    ) -> _Around:
         """A Newton step from where the data was made, in the linear map with a normal prior."""
-        means, J, _ = sensitivity(x)
-        S = _inverse(J.T @ information_about_means(model.noise, means) @ J + precision)
-        score = jax.grad(lambda x: log_likelihood(*predicted(x), data))(x)
+        Q = _inverse(told(x, error, sizes)[0] + precision)
+        score = jax.grad(lambda x: log_likelihood(x, predicted(x), data, error))(x)
         score -= precision @ (x - shared.mean(axis=0))
         step = jnp.where(jnp.isfinite(score), score, 0.0)
-        return _Around(x + S @ step, _WIDER * jnp.linalg.cholesky(S))
+        return _Around(x + Q @ step, _WIDER * jnp.linalg.cholesky(Q))
 
-    def covariance(x: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        means, valid = model.predict(values(x))
-        noise, *keys = jax.random.split(key, 1 + _ROUNDS)
+    def covariance(
+        x: jax.Array,
+        sizes: jax.Array,
+        keys: jax.Array,
+        means: dict[str, jax.Array],
+        error: ErrorModes | None,
+    ) -> jax.Array:
+        noise, *rounds, own = keys
+        if error is not None:
+            means = error.draw(own, jnp.concatenate([thetas(x), sizes]), means)
         parts = model.distributions(means, model.noise_values({}))
         each = jax.random.split(noise, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
-        told = jax.vmap(log_likelihood, in_axes=(0, 0, None))(ahead, answers, data)
-        around = start = first(x, data)
+        likely_shared = jax.vmap(log_likelihood, in_axes=(0, 0, None, None))(
+            shared, ahead, data, error
+        )
+        around = start = first(x, sizes, data, error)
         C = normal = start.root @ start.root.T / _WIDER**2
-        for k in keys:
+        for k in rounds:
             drawn = around.draw(k, _AROUND)
             inside = jax.vmap(log_prior)(drawn)
             # Where the prior is nothing the map is not asked.
             asked = jnp.where(jnp.isfinite(inside)[:, None], drawn, x)
             likely = jax.lax.map(
-                lambda x: log_likelihood(*predicted(x), data), asked, batch_size=_BATCH
+                lambda x: log_likelihood(x, predicted(x), data, error), asked, batch_size=_BATCH
             )
             points = jnp.concatenate([shared, drawn])
             p = jnp.concatenate([p_shared, inside])
             mixture = jnp.logaddexp(
                 jnp.log(share) + p, jnp.log1p(-share) + around.log_density(points)
             )
-            weights = jax.nn.softmax(p + jnp.concatenate([told, likely]) - mixture)
+            weights = jax.nn.softmax(p + jnp.concatenate([likely_shared, likely]) - mixture)
             mean = weights @ points
             off = points - mean
             # A few draws that carry all weight have next to no spread, and would promise too much.
             enough = 1.0 / jnp.sum(weights**2) >= _EFFECTIVE
             C = jnp.where(enough, (weights[:, None] * off).T @ off, normal)
             around = _Around(mean, _WIDER * jnp.linalg.cholesky(C))
-        return C, valid & jnp.isfinite(C).all()
+        return C
 
     truths = jnp.asarray(np.log(prior[:count]) if log else prior[:count])
-    keys = jax.random.split(jax.random.key(seed), count)
-    found, valid = jax.jit(partial(jax.lax.map, lambda pair: covariance(*pair)))((truths, keys))
-    if not valid.any():
+    means, valid = ask(truths)
+    kept = _some(valid)
+    truths, means = truths[kept], {name: mean[kept] for name, mean in means.items()}
+    keys = jax.random.split(jax.random.key(seed), count)[kept]
+    keys = jax.vmap(lambda key: jax.random.split(key, 2 + _ROUNDS))(keys)
+    made = of_each(errors, means)
+    sets = truths, sizes_of(made, count)[kept], keys, means, made
+    found = np.asarray(jax.jit(partial(jax.lax.map, lambda each: covariance(*each)))(sets))
+    return found[_some(np.isfinite(found).all(axis=(1, 2)))]
+
+
+def _some(valid: Any) -> np.ndarray:
+    """Where it is true; :class:`InputError` where it is nowhere."""
+    if not np.any(valid):
         raise InputError("identifiability: the forward map has no valid answer at any draw")
-    return np.asarray(found)[np.asarray(valid)]
+    return np.flatnonzero(valid)
 
 
 def _inverse(A: jax.Array) -> jax.Array:

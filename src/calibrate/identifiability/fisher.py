@@ -1,65 +1,54 @@
 r"""Fisher information of the data about the unknowns.
 
 With :math:`g(x)` the data without noise as a function of the unknowns :math:`x = \log\theta`
-(:math:`\theta` itself where it may be 0 or below), and :math:`I_\varepsilon` the information of the
-noise about its mean, the data hold the information
+(:math:`\theta` itself where it may be 0 or below), and S the covariance of the data about it, the
+data hold the information
 
-.. math:: F = J^T I_\varepsilon J, \qquad J = \partial g / \partial x, \qquad
-          I_\varepsilon = -\partial^2_\mu \log p(y \mid \mu)\big|_{y = \mu}
+.. math:: F = J^T S^{-1} J, \qquad J = \partial g / \partial x, \qquad S = C + \alpha^2 V V^T
 
-about x, and with a normal prior of covariance P the posterior's covariance is about
-:math:`(F + P^{-1})^{-1}`. Gaussian noise of covariance C has :math:`I_\varepsilon = C^{-1}`; for
-Student's t this is the curvature at its centre, somewhat more than its information.
+about x, with the noise's covariance C and, where many numbers share errors, the modes V and the
+size :math:`\alpha` of these (:mod:`calibrate.statistical_model.error_modes`, which has
+:math:`S^{-1}` by Woodbury's identity). With a normal prior of covariance P the posterior's
+covariance is about :math:`(F + P^{-1})^{-1}`. S is in the data's units squared, F in one over
+those of x squared: none for :math:`\log\theta`. How S changes with x is left out of F.
+
+For noise that is not Gaussian :math:`C^{-1}` is the curvature
+:math:`-\partial^2_\mu \log p(y \mid \mu)` at :math:`y = \mu`: for Student's t somewhat more than
+its information.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from calibrate.noise import Noise
 from calibrate.noise.information import information_about_means
 from calibrate.observations import Observations
 from calibrate.statistical_model import Model
+from calibrate.statistical_model.error_modes import ErrorModes
 from emulator.errors import InputError
 
-
-def informations(model: Model, values: np.ndarray, *, log: bool) -> np.ndarray:
-    """Fisher information (s, q, q) of the model's data at ``values`` (s, q), valid ones only."""
-    sensitivity = sensitivities(model, model.observe, log=log)
-    curvature = jax.jit(partial(_information, model))
-    found = []
-    for x in np.log(values) if log else values:
-        means, J, valid = sensitivity(jnp.asarray(x))
-        if valid:
-            found.append(np.asarray(J.T @ curvature(means, np.exp(x) if log else x) @ J))
-    if not found:
-        raise InputError("identifiability: the forward map has no valid answer at any draw")
-    return np.stack(found)
+At = Callable[[jax.Array, ErrorModes | None, jax.Array], tuple[jax.Array, jax.Array]]
+"""From x (q,), the errors that numbers share, if any, and the unknowns (m,) of these: F (q, q), and
+whether the map is valid there."""
 
 
-def _information(model: Model, means: dict[str, jax.Array], unknowns: jax.Array) -> jax.Array:
-    """Information (d, d) of the data about its means, less what errors besides noise take of it.
+def information_at(
+    model: Model, observe: Observations, noise: Mapping[str, Noise], *, log: bool
+) -> At:
+    """F of data ``observe`` with ``noise`` of known sd, as a function of x.
 
-    An error of unknown size has its prior's mean.
-    """
-    found = information_about_means(model.noise, means)
-    if model.error is None:
-        return found
-    sizes = [jnp.asarray(prior.mean) for prior in model.error.priors.values()]
-    return model.error.information_left(found, jnp.concatenate([unknowns, jnp.array(sizes)]))
+    Both may be other than the model's: a measurement to add, in all of its load states or some.
 
-
-def sensitivities(
-    model: Model, observe: Observations, *, log: bool
-) -> Callable[[jax.Array], tuple[dict[str, jax.Array], jax.Array, jax.Array]]:
-    """Data by name, its Jacobian (d, q) over all data, and its validity, from x (q,); compiled.
-
-    ``observe`` may be other observations than the model's, of all of its load states or some.
+    Raises
+    ------
+    InputError
+        A load state that the model does not have.
     """
     names, known = model.states.unknowns, model.states.states
     for state in observe.states:
@@ -77,8 +66,12 @@ def sensitivities(
         valid = jnp.all(jnp.stack([p.valid for p in predictions]))
         return ravel_pytree(means)[0], (means, valid)
 
-    def both(x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
+    def at(x: jax.Array, error: ErrorModes | None, sizes: jax.Array) -> tuple[jax.Array, jax.Array]:
         J, (means, valid) = jax.jacfwd(data, has_aux=True)(x)
-        return means, J, valid
+        about_means = information_about_means(noise, means)
+        if error is not None:
+            unknowns = jnp.concatenate([jnp.exp(x) if log else x, sizes])
+            about_means = error.information_left(about_means, unknowns)
+        return J.T @ about_means @ J, valid
 
-    return jax.jit(both)
+    return at

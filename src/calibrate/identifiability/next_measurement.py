@@ -1,13 +1,13 @@
 r"""Which measurement to add next: expected information gain from the forward map's Jacobians.
 
-A candidate measurement :math:`y' = g'(x) + \varepsilon'` with information :math:`I_{\varepsilon'}`
-about its mean would tell about x, whose posterior covariance is C now,
+A candidate measurement :math:`y' = g'(x) + \varepsilon'` with the information F' about x
+(:mod:`calibrate.identifiability.fisher`) would tell about x, whose posterior covariance is C now,
 
-.. math:: \Delta = \tfrac12 \log_2 \det\left(1 + C\, J'^T I_{\varepsilon'} J'\right) \text{ bits},
-          \qquad J' = \partial g' / \partial x,
+.. math:: \Delta = \tfrac12 \log_2 \det\left(1 + C F'\right) \text{ bits},
 
 where the map is linear over the posterior (Lindley 1956; Chaloner and Verdinelli 1995). The gain is
-averaged over draws of the posterior. No data is made and no posterior sampled.
+averaged over draws of the posterior. No data is made and no posterior sampled. A candidate has its
+noise alone: an error that it would share with what was measured is not counted.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.identifiability.fisher import sensitivities
+from calibrate.identifiability.fisher import information_at
 from calibrate.noise import Noise
-from calibrate.noise.information import information_about_means
 from calibrate.observations import Observation, Observations
 from calibrate.posterior import Posterior
 
@@ -57,11 +56,11 @@ def next_measurement(
     rows = np.linspace(0, len(x) - 1, min(_DRAWS, len(x))).astype(int)
     found = {}
     for name, (part, noise) in candidates.items():
-        sensitivity = sensitivities(model, Observations({name: part}), log=log)
+        told = jax.jit(information_at(model, Observations({name: part}), {name: noise}, log=log))
         gains, ratios = [], []
         for k in rows:
-            means, jacobian, _ = sensitivity(jnp.asarray(x[k]))
-            gain, ratio = _gain(covariance, np.asarray(jacobian), _information(noise, means))
+            information, _ = told(jnp.asarray(x[k]), None, jnp.zeros(0))
+            gain, ratio = _gain(covariance, np.asarray(information))
             gains.append(gain)
             ratios.append(ratio)
         sd = dict(zip(model.states.unknowns, np.mean(ratios, axis=0).tolist(), strict=True))
@@ -69,14 +68,10 @@ def next_measurement(
     return dict(sorted(found.items(), key=lambda item: -item[1].bits))
 
 
-def _information(noise: Noise, means: Mapping[str, jax.Array]) -> np.ndarray:
-    return np.asarray(information_about_means(dict.fromkeys(means, noise), means))
-
-
-def _gain(C: np.ndarray, J: np.ndarray, information: np.ndarray) -> tuple[float, np.ndarray]:
+def _gain(C: np.ndarray, information: np.ndarray) -> tuple[float, np.ndarray]:
     """Bits, and sd afterwards relative to now (q,)."""
     root = np.linalg.cholesky(C)
-    told = np.eye(len(C)) + root.T @ J.T @ information @ J @ root
+    told = np.eye(len(C)) + root.T @ information @ root
     after = root @ np.linalg.solve(told, root.T)
     bits = 0.5 * np.linalg.slogdet(told)[1] / np.log(2.0)
     return float(bits), np.sqrt(np.diagonal(after) / np.diagonal(C))

@@ -90,6 +90,13 @@ class ApproximationError(ErrorModes):
         return cls(**{**values, "width": float(values["width"])}, of_mesh="of_mesh" in arrays)
 
 
+jax.tree_util.register_dataclass(
+    ApproximationError,
+    ["weights", "strength", "modes", "x", "log_sizes", "width", "centre", "scale"],
+    ["of_mesh"],
+)
+
+
 def fit(
     unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray, *, of_mesh: bool = False
 ) -> ApproximationError:

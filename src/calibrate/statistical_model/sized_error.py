@@ -50,3 +50,6 @@ class SizedError(ErrorModes):
         """All that changes a likelihood, by name."""
         names = ("weights", "strength", "modes", "scale")
         return {name: np.asarray(getattr(self, name)) for name in names}
+
+
+jax.tree_util.register_dataclass(SizedError, ["weights", "strength", "modes"], ["name", "scale"])

@@ -186,6 +186,11 @@ class SystematicError(ErrorModes):
         return cls(**known, names=tuple(words["names"]), sized=sized)
 
 
+jax.tree_util.register_dataclass(
+    SystematicError, ["weights", "strength", "modes", "mixing", "sized"], ["names"]
+)
+
+
 def with_systematic(model: Model, *errors: Systematic) -> Model:
     """``model`` whose data has these errors besides its noise.
 
@@ -197,6 +202,17 @@ def with_systematic(model: Model, *errors: Systematic) -> Model:
     """
     if not errors:
         raise InputError("systematic errors: give one or more")
+    return replace(model, error=systematic_error(model, errors, noise_information(model)))
+
+
+def noise_information(model: Model) -> np.ndarray:
+    """Information (d, d) of noise about the data's means, beside which there may be such errors.
+
+    Raises
+    ------
+    InputError
+        Noise that is not Gaussian or of unknown sd, or a model that has another error.
+    """
     if model.error is not None:
         raise InputError("systematic errors: the model's likelihood has an error already")
     for name, noise in model.noise.items():
@@ -204,16 +220,28 @@ def with_systematic(model: Model, *errors: Systematic) -> Model:
             raise InputError(
                 f"systematic errors: the noise of {name} must be Gaussian and of known sd"
             )
+    means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
+    return np.asarray(jax.jit(lambda m: information_about_means(model.noise, m))(means))
+
+
+def systematic_error(
+    model: Model, errors: Sequence[Systematic], information: np.ndarray
+) -> SystematicError:
+    """All ``errors`` of the model's data together, beside noise of this ``information`` (d, d).
+
+    Raises
+    ------
+    InputError
+        An observation that the model does not have, or modes of another shape than its data.
+    """
     for error in errors:
         _check_modes(model, error)
     known = [error for error in errors if error.size is None]
-    means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
-    information = np.asarray(jax.jit(lambda m: information_about_means(model.noise, m))(means))
     weights, strength, modes, mixing = diagonal(_rows(model, known), information)
     names = tuple(name for error in known for name in error.names)
     found = SystematicError(weights, strength, modes, names, mixing)
     left = np.asarray(found.information_left(jnp.asarray(information), jnp.zeros(0)))
-    return replace(model, error=replace(found, sized=_sized(model, errors, left)))
+    return replace(found, sized=_sized(model, errors, left))
 
 
 def _sized(
@@ -258,10 +286,7 @@ def _rows(model: Model, errors: Sequence[Systematic]) -> np.ndarray:
     shapes = model.observe.shapes
     rows = [np.zeros((0, sum(int(np.prod(shape)) for shape in shapes.values())))]
     for error in errors:
-        for k in range(len(error.names)):
-            each = {
-                name: jnp.asarray(error.modes[name][k]) if name in error.modes else jnp.zeros(shape)
-                for name, shape in shapes.items()
-            }
-            rows.append(np.asarray(ravel_pytree(each)[0])[None])
+        s = len(error.names)
+        each = {name: np.zeros((s, *shape)) for name, shape in shapes.items()} | dict(error.modes)
+        rows.append(np.hstack([np.reshape(e, (s, -1)) for e in jax.tree.leaves(each)]))
     return np.vstack(rows)

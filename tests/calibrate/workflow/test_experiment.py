@@ -186,6 +186,18 @@ def test_one_member_is_no_population_and_data_are_of_one(file, capsys, tmp_path)
     assert "has members of a population" in complaint(capsys, *words)
 
 
+def test_identify_before_knows_the_errors_of_a_file(file, capsys):
+    """A camera that moved by millimetres: far less is told of a beam that bends by nine."""
+
+    def sds(text):
+        assert main(["identify", "before", str(file(text)), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)["sd"]
+
+    alone, moved = sds(ONE.split("[systematic")[0]), sds(ONE.replace("shift = 0.5", "shift = 5.0"))
+    assert moved["mu"] > 2.0 * alone["mu"]
+    assert all(alone[name] < moved[name] < 1.02 for name in alone)
+
+
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
     """What ``infer`` leaves of an experiment."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from typing import Any
 
 from calibrate.cli.common import DONE, answer, emit, table
@@ -38,8 +39,10 @@ def run_before(arguments: argparse.Namespace) -> int:
     from calibrate.identifiability.combinations import products_in_words
     from calibrate.workflow import model_before_data
 
-    model = model_before_data(run_of(arguments, seed=arguments.seed))
-    found = expected_precision(model)
+    run = run_of(arguments, seed=arguments.seed)
+    # Errors that many numbers share are made for each data set, not at one draw of the prior.
+    model = model_before_data(replace(run, systematic={}))
+    found = expected_precision(model, systematic=run.systematic)
     rows = [(name, f"{100 * ratio:.3g} %") for name, ratio in found["sd"].items()]
     lines = [table(("parameter", "expected sd / prior sd"), rows)]
     lines += products_in_words(found["combinations"], len(rows))
