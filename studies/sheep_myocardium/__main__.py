@@ -15,7 +15,7 @@ import numpy as np
 from studies.common.output import Case, Results, parser
 from studies.sheep_myocardium import cube, figures, population, twins
 from studies.sheep_myocardium.campaign import QUICK, Campaign, Plan, campaign
-from studies.sheep_myocardium.checked import told
+from studies.sheep_myocardium.checked import decided, told
 from studies.sheep_myocardium.curves import cubes
 from studies.sheep_myocardium.experiment import MODES, Heart, heart, hearts
 from studies.sheep_myocardium.held_out import Prediction, held_out, replicated, summed
@@ -173,7 +173,7 @@ def main() -> None:
     given = given[:2] if words.quick else given
     campaigns = []
     for each in given:
-        found = campaign(each, plan, words.runs, SEED)
+        found = decided(campaign(each, plan, words.runs, SEED), plan, words.runs, SEED)
         campaigns.append(found)
         results.case(each.name, lambda found=found: of_heart(found, plan))
         results.case(f"{each.name}, twins", lambda found=found: of_twins(found, plan))

@@ -47,19 +47,21 @@ class Plan:
 
     wide : over the box. each : a round, where they tell most of q at draws of the posterior.
     rounds : as many at least, at most; they end where q's sd at a tenth of the draws is below
-    :data:`ENOUGH`. tests : at draws of the posterior, without slopes. meshes : at which a finer
-    mesh is solved, too. draws : of each of four chains.
+    :data:`ENOUGH`. tests : at draws of the posterior, without slopes; as many again while these
+    leave the verdict open, up to ``tests_at_most``. meshes : at which a finer mesh is solved, too.
+    draws : of each of four chains.
     """
 
     wide: int = 12
     each: int = 9
     rounds: tuple[int, int] = (3, 7)
     tests: int = 30
+    tests_at_most: int = 120
     meshes: int = 2
     draws: int = 300
 
 
-QUICK = Plan(wide=4, each=2, rounds=(1, 1), tests=4, meshes=1, draws=50)
+QUICK = Plan(wide=4, each=2, rounds=(1, 1), tests=4, tests_at_most=4, meshes=1, draws=50)
 ENOUGH = 0.01
 """Of a force: what q may be unsure of at a tenth of the draws when rounds end."""
 _POOL = 80  # draws that next runs are chosen from
@@ -69,13 +71,14 @@ _POOL = 80  # draws that next runs are chosen from
 class Campaign:
     """What FEM says of a heart.
 
-    fitted : what its runs say. cubes : emulator of the cubes without the mesh's error. on_mesh,
-    explored : the posteriors with the mesh's error and without. tests : runs that it was not
-    fitted to, at the draws ``tested`` (t,) of ``explored``. doubt : of q at a tenth of the draws,
-    by round. seconds : it took.
+    bodies : its cubes. fitted : what their runs say. cubes : emulator of the cubes without the
+    mesh's error. on_mesh, explored : the posteriors with the mesh's error and without. tests : runs
+    that it was not fitted to, at the draws ``tested`` (t,) of ``explored``. doubt : of q at a tenth
+    of the draws, by round. seconds : it took.
     """
 
     heart: Heart
+    bodies: list[Cube]
     fitted: Fit
     cubes: Emulated
     on_mesh: Found
@@ -193,14 +196,30 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
         ])  # fmt: skip
     cubes_there = without_mesh(fitted.emulated, *pairs)
     explored = settled(heart, cubes_there, seed + most, times=4, **size)
-    tested = rng.choice(len(explored.positions), plan.tests, replace=False)
-    tests = [
-        _kept(kept, f"{heart.name}_{k}_tests", body, explored.positions[tested, k], slopes=False)
-        for k, body in enumerate(bodies)
-    ]
-    seconds = perf_counter() - began
-    return Campaign(
-        heart, fitted, cubes_there, coarse, explored, tested, tuple(tests), doubt, seconds
+    untested = Campaign(
+        heart, bodies, fitted, cubes_there, coarse, explored, np.zeros(0, dtype=int), (), doubt, 0.0
+    )
+    tested = tested_more(untested, plan.tests, kept, seed)
+    return replace(tested, seconds=perf_counter() - began)
+
+
+def tested_more(found: Campaign, count: int, kept: Path | None, seed: int) -> Campaign:
+    """FEM at ``count`` more draws of the posterior."""
+    began, before = perf_counter(), found.tested
+    order = np.random.default_rng(seed).permutation(len(found.explored.positions))
+    rows = order[len(before) : len(before) + count]
+    number = len(before) // count
+    new = [
+        _kept(
+            kept, f"{found.heart.name}_{k}_tests{number}", body,
+            found.explored.positions[rows, k], slopes=False,
+        )
+        for k, body in enumerate(found.bodies)
+    ]  # fmt: skip
+    every = [joined(pair) for pair in zip(found.tests, new, strict=True)] if found.tests else new
+    seconds = found.seconds + perf_counter() - began
+    return replace(
+        found, tested=np.concatenate([before, rows]), tests=tuple(every), seconds=seconds
     )
 
 

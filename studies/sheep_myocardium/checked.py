@@ -12,11 +12,12 @@ is three tenths of the correction, which an order of 1 or 2 in place of 1.2 woul
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 from scipy.special import softmax
 from studies.common.output import Case
-from studies.sheep_myocardium.campaign import FINER, Campaign
+from studies.sheep_myocardium.campaign import FINER, Campaign, Plan, tested_more
 from studies.sheep_myocardium.inference import Found, parameters
 
 from calibrate.certificate.estimates import k_hat
@@ -82,6 +83,16 @@ def certificate(found: Campaign) -> Certificate:
     means = _figures(named, there.mean(axis=0), error[:p])
     sds = _figures(named, sd, sd * error[p:])
     return judge(Evidence(changes, changes, means, sds, sampling, physics, tail, {}, mesh))
+
+
+def decided(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign:
+    """With more tests while those there are leave the verdict open."""
+    while (
+        certificate(found).verdict == "undecided"
+        and len(found.tested) + plan.tests <= plan.tests_at_most
+    ):
+        found = tested_more(found, plan.tests, kept, seed)
+    return found
 
 
 def _figures(

@@ -1,15 +1,14 @@
 r"""Errors that many numbers share, in data sets that are not measured yet.
 
-Data sets differ in them: modes that depend on what the body does, as a gain's, are made of the mean
-:math:`g(x_r)` of each set, and errors of all sets are then one, with a leading axis. They are
+Data sets differ in them: modes that depend on where points were seen, as pins', are made of the
+mean :math:`g(x_r)` of each set, and errors of all sets are then one, with a leading axis. They are
 marginalised (:mod:`calibrate.statistical_model.error_modes`): y is Gaussian about g(x) with
 
 .. math:: S_r(\alpha) = C + V_r V_r^T + \alpha^2 U_r U_r^T, \qquad V_r = V(g(x_r)),
 
 the covariance of the noise, of errors of known size and of those whose size :math:`\alpha` is
 inferred, in the data's units squared. Fitting measured data knows no :math:`g(x_r)` and takes the
-data for it (:mod:`calibrate.statistical_model.shared_errors`): sds are about the same where a share
-s of n numbers has :math:`n s^2 \ll 1`.
+data for it where points were seen (:mod:`calibrate.statistical_model.shared_errors`).
 
 Before data a size that is inferred is integrated over its prior, with distribution function
 :math:`\Phi`, by K values that are equally probable:
@@ -64,8 +63,12 @@ def sizes_of(error: ErrorModes | None, count: int = _SIZES) -> jax.Array:
     return prior.icdf((jnp.arange(count) + 0.5) / count)[:, None]
 
 
-def log_ratio(error: ErrorModes, theta: jax.Array, residual: Means) -> jax.Array:
+def log_ratio(error: ErrorModes, theta: jax.Array, residual: Means, means: Means) -> jax.Array:
     """What an error adds to the log likelihood of ``residual`` at ``theta`` (q,), shape ()."""
     sizes = sizes_of(error) if error.priors else jnp.zeros((1, 0))
-    each = jax.vmap(lambda size: error.log_ratio(jnp.concatenate([theta, size]), residual))(sizes)
+
+    def at(size: jax.Array) -> jax.Array:
+        return error.log_ratio(jnp.concatenate([theta, size]), residual, means)
+
+    each = jax.vmap(at)(sizes)
     return logsumexp(each) - jnp.log(len(sizes))

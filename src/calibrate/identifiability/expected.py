@@ -176,7 +176,7 @@ def _posterior_covariances(
         found = model.log_density(means, model.noise_values({}), data)
         if error is not None:
             residual = {name: data[name] - mean for name, mean in means.items()}
-            found += log_ratio(error, thetas(x), residual)
+            found += log_ratio(error, thetas(x), residual, means)
         return jnp.where(valid & jnp.isfinite(found), found, -jnp.inf)
 
     told = information_at(model, model.observe, model.noise, log=log)

@@ -71,7 +71,7 @@ def information_at(
         about_means = information_about_means(noise, means)
         if error is not None:
             unknowns = jnp.concatenate([jnp.exp(x) if log else x, sizes])
-            about_means = error.information_left(about_means, unknowns)
+            about_means = error.information_left(about_means, unknowns, means)
         return J.T @ about_means @ J, valid
 
     return at

@@ -46,9 +46,10 @@ def curve_covariance(
     return (share**2 * values[..., :, None] * values[..., None, :] + sd**2) * shape
 
 
-def curve_modes(at: np.ndarray, values: np.ndarray, length: float, **sizes: float) -> np.ndarray:
-    """Modes (r, n) of :func:`curve_covariance`, :math:`C = V^T V`: what one sd of each changes."""
-    C = curve_covariance(jnp.asarray(at), jnp.asarray(values), length, **sizes)
+def curve_modes(at: np.ndarray, length: float, *, constant: float = 0.0) -> np.ndarray:
+    """Modes (r, n) of :func:`curve_covariance` with sd 1, :math:`C = V^T V`."""
+    none = jnp.zeros(len(at))
+    C = curve_covariance(jnp.asarray(at), none, length, sd=1.0, constant=constant)
     variances, vectors = np.linalg.eigh(np.asarray(C))
     kept = variances > _LEAST * max(float(variances.max()), 1e-300)
     return np.sqrt(variances[kept])[::-1, None] * vectors.T[kept][::-1]

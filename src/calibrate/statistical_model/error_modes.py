@@ -61,20 +61,24 @@ class ErrorModes(ABC):
         """Of its own unknown numbers, by their names in the posterior."""
         return {}
 
-    @property
-    def largest(self) -> np.ndarray:
-        """Modes (r, d) at their largest plausible size."""
+    def largest(self, means: Means) -> np.ndarray:
+        """Modes (r, d) at their largest plausible size, beside data like ``means``."""
+        del means
         return self.modes
 
-    def log_ratio(self, unknowns: jax.Array, residual: Means) -> jax.Array:
-        """What the error adds to the log likelihood of ``residual``, data less prediction."""
+    def log_ratio(self, unknowns: jax.Array, residual: Means, means: Means) -> jax.Array:
+        """What the error adds to the log likelihood of ``residual``, data less ``means``."""
+        del means
         flat, _ = ravel_pytree(dict(residual))
         variance = self.size(unknowns) ** 2
         b, inflated = self.weights @ flat, 1.0 + variance * self.strength
         return 0.5 * jnp.sum(variance * b**2 / inflated - jnp.log(inflated))
 
-    def information_left(self, information: jax.Array, unknowns: jax.Array) -> jax.Array:
-        """What is left of the noise's ``information`` (d, d) about the means at ``unknowns``."""
+    def information_left(
+        self, information: jax.Array, unknowns: jax.Array, means: Means
+    ) -> jax.Array:
+        """What is left of the noise's ``information`` (d, d) about ``means`` at ``unknowns``."""
+        del means
         variance = self.size(unknowns) ** 2
         share = variance / (1.0 + variance * self.strength)
         return information - (self.weights.T * share) @ self.weights

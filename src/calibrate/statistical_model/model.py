@@ -224,7 +224,7 @@ class Model:
     def _error_ratio(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
         assert self.error is not None
         residual = {name: data[name] - mean for name, mean in means.items()}
-        return self.error.log_ratio(self._stacked(draw), residual)
+        return self.error.log_ratio(self._stacked(draw), residual, means)
 
     def _stacked(self, draw: Mapping[str, Any]) -> jax.Array:
         own = () if self.error is None else self.error.priors
@@ -283,15 +283,15 @@ class Model:
         if self.check_scale:
             draws = jax.jit(lambda key: self.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))
             stacked = np.stack([np.asarray(draws[n]) for n in self.states.unknowns], axis=1)
-            check_magnitudes(self._predict_stacked, self.observe, self._sds(), stacked, named)
+            check_magnitudes(self._predict_stacked, self.observe, self._sds(named), stacked, named)
         return {name: jnp.asarray(values) for name, values in named.items()}
 
-    def _sds(self) -> dict[str, float]:
+    def _sds(self, data: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Largest plausible sd of each observation's noise and what else data has, in its unit."""
         found = {name: noise.upper_sd for name, noise in self.noise.items()}
-        if self.error is not None and self.error.of_fem and self.error.largest.size:
-            shapes = {name: jnp.zeros(shape) for name, shape in self.observe.shapes.items()}
-            each = jax.vmap(ravel_pytree(shapes)[1])(jnp.asarray(self.error.largest))
+        if self.error is not None and self.error.of_fem:
+            like = {name: jnp.asarray(values) for name, values in data.items()}
+            each = jax.vmap(ravel_pytree(like)[1])(jnp.asarray(self.error.largest(like)))
             for name, modes in each.items():
                 most = np.linalg.norm(np.reshape(modes, (len(modes), -1)), 2)
                 found[name] = float(np.hypot(found[name], most))

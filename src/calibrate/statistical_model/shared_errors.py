@@ -1,13 +1,10 @@
 r"""Systematic errors in words: each is a table of an experiment file, kept in ``run.json``.
 
 A kind says what is unknown of a measurement in the terms of who measured; from the observations and
-their data it makes a :class:`~calibrate.statistical_model.systematic.Systematic`. Modes are fixed
-numbers, so where one depends on what the body does (where a marker was seen, how large a force is),
-the data says it: a mode is off by the noise of a datum then. In a share s of the values of n
-numbers that err together (a gain, or a curve within a length) this adds up: smaller predictions
-scale the noise in the modes down, too, and a scale of the data is fitted too low, by the factor
-:math:`1 / (1 + (n - 1)\,s^2)` for a gain, however small the noise (Peelle's puzzle; D'Agostini
-1994). It is small beside the sd s where :math:`n s \ll 1`.
+their data it makes a :class:`~calibrate.statistical_model.systematic.Systematic`. What is a share,
+a gain's or a curve's, is one of the prediction. Modes are else fixed numbers, so where one depends
+on what the body does (where a marker was seen), the data says it, and it is off by the noise of a
+datum: an angle of a degree makes a sixtieth of the noise of that.
 """
 
 from __future__ import annotations
@@ -77,12 +74,16 @@ class Seen:
 
     def present(self, error: Systematic) -> Systematic:
         """``error`` in the entries that are not missing."""
-        modes = dict(error.modes)
-        for name, each in modes.items():
-            part = self.model.observe.parts[name]
-            if isinstance(part, Present):
-                modes[name] = each.reshape(len(each), -1)[:, part.entries]
-        return replace(error, modes=modes)
+
+        def kept(modes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+            left = dict(modes)
+            for name, each in modes.items():
+                part = self.model.observe.parts[name]
+                if isinstance(part, Present):
+                    left[name] = each.reshape(len(each), -1)[:, part.entries]
+            return left
+
+        return replace(error, modes=kept(error.modes), shares=kept(error.shares))
 
 
 class SharedError(Protocol):
@@ -198,9 +199,9 @@ class Gain:
 
     def systematic(self, name: str, seen: Seen) -> Systematic:
         """One factor."""
-        whole = {each: seen.whole(each)[1] for each in seen.named(self.of)}
-        modes = {each: self.share * np.nan_to_num(data)[None] for each, data in whole.items()}
-        return Systematic((name,), modes)
+        shapes = {each: np.shape(seen.whole(each)[1]) for each in seen.named(self.of)}
+        shares = {each: np.full((1, *shape), self.share) for each, shape in shapes.items()}
+        return Systematic((name,), {}, shares=shares)
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ class Curve:
     of : a single number in several load states, as ``reaction:top:x``.
     along : parameter that is known in each state and says where on the curve it is.
     length : over which the error changes, in the unit of ``along``.
-    share : sd of the error as a share of what was measured, known.
+    share : sd of the error as a share of what is predicted, known.
     share_scale : instead, the scale of the share's half-normal prior: it is inferred, as
         ``curve_share``, one for all curves.
     sd : sd of the rest of it, in the unit of the data.
@@ -241,14 +242,21 @@ class Curve:
             if np.shape(seen.whole(each)[1]) != ():
                 raise InputError(f"of: '{each}' is not a single number, as a force is")
         at = np.array([seen.known(self.along, each) for each in observed])
-        values = np.array([float(seen.whole(each)[1]) for each in observed])
         size = None if self.share_scale is None else (CURVE_SHARE, self.share_scale)
+        alike = curve_modes(at, self.length, constant=self.constant)
         share = self.share if size is None else 1.0
-        modes = curve_modes(
-            at, values, self.length, share=share, sd=self.sd, constant=self.constant
+        # Shares, then what is off beside them: unknowns of their own.
+        none = np.zeros_like(alike)
+        shares, modes = np.vstack([share * alike, none]), np.vstack([none, self.sd * alike])
+        used = np.abs(shares + modes).max(axis=1) > 0.0
+        names = tuple(f"{name} {k + 1}" for k in range(int(used.sum())))
+        each_of = dict(enumerate(observed))
+        return Systematic(
+            names,
+            {each: modes[used, k] for k, each in each_of.items()},
+            size,
+            {each: shares[used, k] for k, each in each_of.items()},
         )
-        names = tuple(f"{name} {k + 1}" for k in range(len(modes)))
-        return Systematic(names, {each: modes[:, k] for k, each in enumerate(observed)}, size)
 
 
 SHARED_ERRORS: dict[str, type[Any]] = {

@@ -4,7 +4,9 @@ Such an error is the same in many numbers: a camera that was moved between two l
 turns all markers of one state together. Left out, it passes for material. It is a
 :class:`Systematic`, with the unknowns of which it consists in units of their sd, and a change of
 the data for each; :func:`with_systematic` marginalises all of them
-(:mod:`calibrate.statistical_model.error_modes`), so that sampling has no more unknowns than before.
+(:mod:`calibrate.statistical_model.error_modes`; those that are shares of what is predicted, or of a
+size that is inferred, by :mod:`calibrate.statistical_model.varying_error`), so that sampling has no
+more unknowns than before.
 Small rotations are linear: an angle :math:`\omega` moves a point at x by
 :math:`\omega \times (x - c)`, to second order in the angle.
 """
@@ -12,7 +14,7 @@ Small rotations are linear: an angle :math:`\omega` moves a point at x by
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import jax
@@ -24,11 +26,11 @@ from jax.flatten_util import ravel_pytree
 from calibrate.noise.information import information_about_means
 from calibrate.statistical_model.error_modes import ErrorModes, Means, diagonal
 from calibrate.statistical_model.model import Model
-from calibrate.statistical_model.sized_error import SizedError
+from calibrate.statistical_model.varying_error import VaryingError
 from emulator.errors import InputError
 
 _AXES = "xyz"
-_SIZED = "sized_"  # before names of arrays
+_VARYING, _OLD = "varying_", "sized_"  # before names of arrays; as they were
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +41,19 @@ class Systematic:
     modes : by the observation's name, what one sd of each changes of its data, (s, *shape).
     size : where the size of the error is inferred, its name in the posterior and the scale of its
         half-normal prior; modes are then those of size 1. Errors with one name have one size.
+    shares : as modes, but each as a share of the data that is predicted; what one sd changes is the
+        sum of both.
     """
 
     names: tuple[str, ...]
     modes: Mapping[str, np.ndarray]
     size: tuple[str, float] | None = None
+    shares: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def varies(self) -> bool:
+        """Whether what it changes depends on what is unknown."""
+        return self.size is not None or any(np.any(each) for each in self.shares.values())
 
 
 def rigid_motion(
@@ -108,15 +118,15 @@ def placement(name: str, observed: Sequence[str], sd: np.ndarray) -> Systematic:
 class SystematicError(ErrorModes):
     """All systematic errors of a model together; :func:`with_systematic` makes it.
 
-    names : of their s unknowns.
+    names : of their s unknowns that change known numbers by known amounts.
     mixing : (r, s), what the diagonal modes are made of.
-    sized : those whose size is inferred, if there are any. Its weights are those of the information
-        that the others leave, so that one after the other is exact.
+    varying : the others, if there are any. Its information is what these leave, so that one after
+        the other is exact.
     """
 
     names: tuple[str, ...]
     mixing: np.ndarray
-    sized: SizedError | None = None
+    varying: VaryingError | None = None
 
     of_fem: ClassVar[bool] = True
     with_mesh: ClassVar[bool] = False
@@ -124,38 +134,49 @@ class SystematicError(ErrorModes):
     @property
     def priors(self) -> dict[str, dist.Distribution]:
         """Of the size that is inferred."""
-        return {} if self.sized is None else self.sized.priors
+        return {} if self.varying is None else self.varying.priors
 
-    @property
-    def largest(self) -> np.ndarray:
+    def largest(self, means: Means) -> np.ndarray:
         """Modes of both kinds at their largest plausible size."""
-        return self.modes if self.sized is None else np.vstack([self.modes, self.sized.largest])
+        own = self.modes
+        return own if self.varying is None else np.vstack([own, self.varying.largest(means)])
 
-    def log_ratio(self, unknowns: jax.Array, residual: Means) -> jax.Array:
+    def log_ratio(self, unknowns: jax.Array, residual: Means, means: Means) -> jax.Array:
         """What both kinds add to the log likelihood of ``residual``."""
-        found = super().log_ratio(unknowns, residual)
-        return found if self.sized is None else found + self.sized.log_ratio(unknowns, residual)
+        found = super().log_ratio(unknowns, residual, means)
+        if self.varying is None:
+            return found
+        # Those of known numbers are in the other's information; what they say, they have said.
+        return found + self.varying.log_ratio(unknowns, residual, means)
 
-    def information_left(self, information: jax.Array, unknowns: jax.Array) -> jax.Array:
+    def information_left(
+        self, information: jax.Array, unknowns: jax.Array, means: Means
+    ) -> jax.Array:
         """What both kinds leave of the noise's ``information`` (d, d)."""
-        left = super().information_left(information, unknowns)
-        return left if self.sized is None else self.sized.information_left(left, unknowns)
+        left = super().information_left(information, unknowns, means)
+        if self.varying is None:
+            return left
+        return self.varying.information_left(left, unknowns, means)
 
     def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
         """``means`` plus a draw of both kinds."""
-        if self.sized is None:
+        if self.varying is None:
             return super().draw(rng_key, unknowns, means)
         key, own = jax.random.split(rng_key)
-        return self.sized.draw(own, unknowns, super().draw(key, unknowns, means))
+        both = self.varying.draw(own, unknowns, means)
+        alone = super().draw(key, unknowns, means)
+        return {name: both[name] + alone[name] - means[name] for name in both}
 
     def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
         """Mean (s,) and covariance (s, s) of the unknowns, in their sds, given ``residual``.
 
-        ``residual`` is data less prediction at one draw of the parameters. Of errors of known sds
-        alone: :class:`InputError` where the size of one is inferred.
+        ``residual`` is data less prediction at one draw of the parameters. Of errors that change
+        known numbers alone: :class:`InputError` where one varies.
         """
-        if self.sized is not None:
-            raise InputError(f"what is known of errors: the size '{self.sized.name}' is inferred")
+        if self.varying is not None:
+            of_size = f"the size '{self.varying.name}' is inferred"
+            why = of_size if self.varying.name else "some are shares of what is predicted"
+            raise InputError(f"what is known of errors: {why}")
         flat = np.asarray(ravel_pytree(dict(residual))[0])
         inflated = 1.0 + self.strength
         mean = self.mixing.T @ ((self.weights @ flat) / inflated)
@@ -166,28 +187,37 @@ class SystematicError(ErrorModes):
         """All that changes a likelihood, by name."""
         names = ("weights", "strength", "modes", "mixing")
         found = {name: getattr(self, name) for name in names}
-        own = {} if self.sized is None else self.sized.arrays()
-        return found | {f"{_SIZED}{name}": array for name, array in own.items()}
+        own = {} if self.varying is None else self.varying.arrays()
+        return found | {f"{_VARYING}{name}": array for name, array in own.items()}
 
     @property
     def words(self) -> dict[str, Any]:
         """What :meth:`restore` needs besides the arrays; plain JSON."""
-        return {"names": self.names, "size": self.sized and self.sized.name}
+        return {"names": self.names, "size": self.varying and self.varying.name}
 
     @classmethod
     def restore(cls, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> SystematicError:
-        """The error of these :meth:`arrays` and :attr:`words`."""
-        own = {n.removeprefix(_SIZED): a for n, a in arrays.items() if n.startswith(_SIZED)}
-        known: dict[str, Any] = {n: a for n, a in arrays.items() if not n.startswith(_SIZED)}
-        sized = None
-        if own:
-            numbers: dict[str, Any] = {**own, "scale": float(own["scale"])}
-            sized = SizedError(**numbers, name=words["size"])
-        return cls(**known, names=tuple(words["names"]), sized=sized)
+        """The error of these :meth:`arrays` and :attr:`words`.
+
+        Raises
+        ------
+        InputError
+            It was kept when shares were of the data.
+        """
+        if f"{_OLD}weights" in arrays:
+            raise InputError(
+                "the posterior's systematic errors were shares of the data; they are of "
+                "predictions now: infer again"
+            )
+        begins = len(_VARYING)
+        own = {n[begins:]: a for n, a in arrays.items() if n.startswith(_VARYING)}
+        known: dict[str, Any] = {n: a for n, a in arrays.items() if not n.startswith(_VARYING)}
+        varying = VaryingError.restore(own, words["size"]) if own else None
+        return cls(**known, names=tuple(words["names"]), varying=varying)
 
 
 jax.tree_util.register_dataclass(
-    SystematicError, ["weights", "strength", "modes", "mixing", "sized"], ["names"]
+    SystematicError, ["weights", "strength", "modes", "mixing", "varying"], ["names"]
 )
 
 
@@ -236,40 +266,43 @@ def systematic_error(
     """
     for error in errors:
         _check_modes(model, error)
-    known = [error for error in errors if error.size is None]
-    weights, strength, modes, mixing = diagonal(_rows(model, known), information)
+    known = [error for error in errors if not error.varies]
+    weights, strength, modes, mixing = diagonal(_rows(model, known, "modes"), information)
     names = tuple(name for error in known for name in error.names)
     found = SystematicError(weights, strength, modes, names, mixing)
-    left = np.asarray(found.information_left(jnp.asarray(information), jnp.zeros(0)))
-    return replace(found, sized=_sized(model, errors, left))
+    left = found.information_left(jnp.asarray(information), jnp.zeros(0), {})
+    return replace(found, varying=_varying(model, errors, np.asarray(left)))
 
 
-def _sized(
+def _varying(
     model: Model, errors: Sequence[Systematic], information: np.ndarray
-) -> SizedError | None:
-    """Those of ``errors`` whose size is inferred."""
-    those = [error for error in errors if error.size is not None]
-    sizes = list(dict.fromkeys(error.size for error in those if error.size is not None))
-    if not sizes:
+) -> VaryingError | None:
+    """Those of ``errors`` that vary, beside what leaves this ``information`` (d, d)."""
+    those = [error for error in errors if error.varies]
+    if not those:
         return None
+    sizes = list(dict.fromkeys(error.size for error in those if error.size is not None))
     if len(sizes) > 1:
         raise InputError(
             f"systematic errors: sizes {sizes[0]} and {sizes[1]} are to be inferred; only one can "
             "be, by one name and scale"
         )
-    (name, scale) = sizes[0]
+    (name, scale) = sizes[0] if sizes else ("", 0.0)
     if name in model.names:
         raise InputError(
             f"systematic errors: a size is called '{name}', as an unknown of the model"
         )
-    weights, strength, modes, _ = diagonal(_rows(model, those), information)
-    return SizedError(weights, strength, modes, name, scale)
+    sized = np.concatenate([np.full(len(e.names), float(e.size is not None)) for e in those])
+    of_each = np.diagonal(information)
+    alone = np.array_equal(information, np.diag(of_each))
+    modes, shares = (_rows(model, those, kind) for kind in ("modes", "shares"))
+    return VaryingError(modes, shares, sized, of_each if alone else information, name, scale)
 
 
 def _check_modes(model: Model, error: Systematic) -> None:
     """:class:`InputError` where an error does not fit the model's observations."""
     parts = model.observe.parts
-    for name, modes in error.modes.items():
+    for name, modes in (*error.modes.items(), *error.shares.items()):
         if name not in parts:
             raise InputError(
                 f"{error.names[0]}: '{name}' is not observed; observed: {', '.join(parts)}"
@@ -281,12 +314,13 @@ def _check_modes(model: Model, error: Systematic) -> None:
             )
 
 
-def _rows(model: Model, errors: Sequence[Systematic]) -> np.ndarray:
-    """Modes (s, d) of all data, raveled."""
+def _rows(model: Model, errors: Sequence[Systematic], kind: str) -> np.ndarray:
+    """Modes or shares (s, d) of all data, raveled."""
     shapes = model.observe.shapes
     rows = [np.zeros((0, sum(int(np.prod(shape)) for shape in shapes.values())))]
     for error in errors:
         s = len(error.names)
-        each = {name: np.zeros((s, *shape)) for name, shape in shapes.items()} | dict(error.modes)
+        each = {name: np.zeros((s, *shape)) for name, shape in shapes.items()}
+        each |= dict(getattr(error, kind))
         rows.append(np.hstack([np.reshape(e, (s, -1)) for e in jax.tree.leaves(each)]))
     return np.vstack(rows)

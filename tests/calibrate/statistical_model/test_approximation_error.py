@@ -66,7 +66,7 @@ def test_what_is_left_of_the_information_is_that_of_the_sum(aware):
     at = jnp.array([70.0, 81.0])
     modes, size = aware.error.modes, float(aware.error.size(at))
     noise = NOISE**2 * np.eye(modes.shape[1])
-    found = aware.error.information_left(jnp.asarray(np.linalg.inv(noise)), at)
+    found = aware.error.information_left(jnp.asarray(np.linalg.inv(noise)), at, {})
     wanted = np.linalg.inv(noise + size**2 * modes.T @ modes)
     np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
 

@@ -101,7 +101,8 @@ def test_information_left_is_the_inverse_of_the_dense_covariance(model, errors):
     whole = cal.with_systematic(model, *errors)
     means, _ = model.predict(DRAW)
     C, _ = dense(model, errors)
-    left = whole.error.information_left(information_about_means(model.noise, means), jnp.ones(2))
+    information = information_about_means(model.noise, means)
+    left = whole.error.information_left(information, jnp.ones(2), means)
     np.testing.assert_allclose(left, np.linalg.inv(C), atol=1e-8)
 
 
