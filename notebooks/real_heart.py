@@ -119,7 +119,7 @@ for mode, (axis, most) in MODES.items():
 # %% [markdown]
 # ## Two experiments
 #
-# The same data and law. One knows of the cell's noise only. The other says that each curve may be off by a share of what was measured, half of it the same along the curve and half changing; how large the share is, the curves tell together. Nine points are then three curves, not nine facts. Laplace's approximation is a first look that takes seconds; `nuts` is the sampler for what one publishes.
+# The same data and law. One knows of the cell's noise only. The other says that each curve may be off by a share of what is predicted, half of it the same along the curve and half changing; how large the share is, the curves tell together. Nine points are then three curves, not nine facts. Laplace's approximation is a first look that takes seconds; `nuts` is the sampler for what one publishes.
 
 # %%
 common = """
