@@ -27,6 +27,7 @@ from studies.sheep_myocardium.process import Known, Process
 
 import emulator as em
 from emulator.errors import SolverError
+from emulator.fem.campaign.threads import at_once, in_order
 from emulator.fem.support_force import SupportForce
 
 MODES_OF_A_CUBE = 3
@@ -81,8 +82,15 @@ class Cube:
         return jnp.tile(theta, (len(amounts), 1)).at[:, column].set(amounts)
 
     def runs(self, x: np.ndarray, *, slopes: bool = True) -> Runs:
-        """FEM at positions (r, p); without ``slopes`` these are NaN."""
-        each = [self._run(jnp.asarray(row), slopes) for row in x]
+        """FEM at positions (r, p), as many at once as there are cores.
+
+        Without ``slopes`` these are NaN.
+        """
+
+        def run(row: np.ndarray) -> tuple[np.ndarray, ...]:
+            return self._run(jnp.asarray(row), slopes)
+
+        each = in_order(run, iter(x), at_once(self.simulator))
         force, rising, normal = (np.stack(part) for part in zip(*each, strict=True))
         return Runs(x, force, rising, normal)
 

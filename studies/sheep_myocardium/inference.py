@@ -36,6 +36,8 @@ from studies.sheep_myocardium.moves import Chain, Modes, chain, modes, unknown
 
 from calibrate.samplers.stopping import least_ess, r_hat
 from calibrate.statistical_model.curve import curve_covariance
+from emulator.fem.campaign.threads import in_order
+from emulator.machine import cores
 
 CELL = 3e-3  # N, noise of the load cell
 POINT = 0.03  # of a force, at each point for itself
@@ -263,13 +265,19 @@ def sample(
 ) -> Found:
     """Draws of a heart's posterior by NumPyro's NUTS, and moves between ``known`` modes.
 
-    Each chain begins at a place of its own; :data:`.moves.MODES` of them find modes.
+    Each chain begins at a place of its own; :data:`.moves.MODES` of them find modes. As many are
+    drawn at once as there are cores.
     """
     of = seen(heart, cubes, left_out)
     size = sum(site.size for site in _sites(law, angles=angles).values())
     given = unknown(size) if known is None else known
     run = _sampler(law, angles, draws, warmup)
-    told = [run(key, of, given) for key in jax.random.split(jax.random.key(seed), chains)]
+
+    def one(key: jax.Array) -> Drawn:
+        return jax.block_until_ready(run(key, of, given))
+
+    keys = iter(jax.random.split(jax.random.key(seed), chains))
+    told = in_order(one, keys, min(cores(), chains))
     every = jax.tree.map(lambda *parts: np.concatenate(parts), *told)
     diverged, density = int(every.chain.diverging.sum()), every.chain.log_density
     return Found(heart, of, law, every.draws, every.chain.z, diverged, chains, density)
