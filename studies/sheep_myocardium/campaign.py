@@ -119,7 +119,7 @@ class Campaign:
     @property
     def said(self) -> np.ndarray:
         """What the processes say their sd is at the tests, (t, 3), a fraction of the force."""
-        each = [self.fitted.doubt(k, test.x) for k, test in enumerate(self.tests)]
+        each = [self.fitted.left(k, test.x)[1] for k, test in enumerate(self.tests)]
         return np.stack(each, axis=1)
 
     def likelihood_differences(self) -> np.ndarray:
@@ -153,7 +153,6 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
     """The runs of a heart. Those in the folder ``kept`` are not solved again."""
     began = perf_counter()
     bodies = cubes(heart)
-    rng = np.random.default_rng(seed)
     unknowns = bodies[0].unknowns
     boxes = [qmc.Sobol(unknowns, seed=seed + k).random_base2(4) for k in range(3)]
     runs = [
@@ -173,20 +172,20 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
             continue
         law = "fibres" if number == 1 else ORTHOTROPIC
         found = sample(heart, fitted.emulated, seed + number, law, **size)
-        pool = _some(found, _POOL, rng)
-        each = [fitted.doubt(k, pool[:, k]) for k in range(3)]
-        doubt.append(float(np.quantile(np.max(each, axis=0), 0.9)))
+        pool = _some(found, _POOL, seed + number)
+        left, sds = zip(*(fitted.left(k, pool[:, k]) for k in range(3)), strict=True)
+        doubt.append(float(np.quantile(np.max(sds, axis=0), 0.9)))
         LOG.info("%s, round %d: q is known to %.1f %%", heart.name, number, 100 * doubt[-1])
         if number >= least and doubt[-1] < ENOUGH:
             break
         new = [
-            _kept(kept, names[k], body, _next(fitted, k, pool, plan.each))
+            _kept(kept, names[k], body, pool[next_runs(left[k], len(pool), plan.each), k])
             for k, body in enumerate(bodies)
         ]
         runs = [joined(pair) for pair in zip(runs, new, strict=True)]
         fitted = fit(bodies, runs, fitted)
     coarse = settled(heart, fitted.emulated, seed + most, **size)
-    x = _some(coarse, plan.meshes, rng)
+    x = _some(coarse, plan.meshes, seed + most)
     pairs = []
     for cells in (CELLS, FINER):
         bodies_there = [replace(body, cells=cells) for body in bodies]
@@ -223,16 +222,13 @@ def tested_more(found: Campaign, count: int, kept: Path | None, seed: int) -> Ca
     )
 
 
-def _some(found: Found, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Positions (count, 3, p) of a posterior's draws."""
-    return found.positions[rng.choice(len(found.positions), count, replace=False)]
+def _some(found: Found, count: int, seed: int) -> np.ndarray:
+    """Positions (count, 3, p) of a posterior's draws.
 
-
-def _next(fitted: Fit, number: int, pool: np.ndarray, count: int) -> np.ndarray:
-    """The positions (count, p) of a cube, of the ``pool`` (m, 3, p), whose runs would tell most."""
-    x = pool[:, number]
-    covariance, _ = fitted.left(number, x)
-    return x[next_runs(covariance, len(x), count)]
+    By a seed of its own, so that runs that are taken up again do not change later choices.
+    """
+    rows = np.random.default_rng(seed).choice(len(found.positions), count, replace=False)
+    return found.positions[rows]
 
 
 def _known(folder: Path | None, name: str) -> Runs | None:

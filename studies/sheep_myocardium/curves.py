@@ -219,18 +219,17 @@ class Fit:
         """Of each cube's process, (3, f)."""
         return np.asarray(self.emulated.process.lengths)
 
-    def left(self, number: int, x: np.ndarray) -> tuple[np.ndarray, float]:
-        """Covariance of a cube's q and slopes at (m, p), :func:`.process.left`, and its scale."""
+    def left(self, number: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What a cube's runs leave at positions (m, p).
+
+        Covariance of q and its slopes, :func:`.process.left`, and the sd (m,) of q: a fraction of
+        the force.
+        """
         phi, J = process.with_slopes(jnp.asarray(x), self.emulated.ends[number])
         lengths = self.emulated.process.lengths[number]
         covariance, sd = process.left(self.known[number], lengths, phi, J)
-        return np.asarray(covariance), float(sd)
-
-    def doubt(self, number: int, x: np.ndarray) -> np.ndarray:
-        """Sd (m,) of a cube's q at positions (m, p): a fraction of the force."""
-        covariance, sd = self.left(number, x)
-        rows = np.arange(len(x)) * (len(covariance) // len(x))
-        return sd * np.sqrt(np.maximum(covariance[rows, rows], 0.0))
+        variance = np.diagonal(covariance)[:: len(covariance) // len(x)]
+        return np.asarray(covariance), float(sd) * np.sqrt(np.maximum(variance, 0.0))
 
 
 def fit(bodies: Sequence[Cube], runs: Sequence[Runs], before: Fit | None = None) -> Fit:

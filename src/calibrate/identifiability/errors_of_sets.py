@@ -7,8 +7,9 @@ marginalised (:mod:`calibrate.statistical_model.error_modes`): y is Gaussian abo
 .. math:: S_r(\alpha) = C + V_r V_r^T + \alpha^2 U_r U_r^T, \qquad V_r = V(g(x_r)),
 
 the covariance of the noise, of errors of known size and of those whose size :math:`\alpha` is
-inferred, in the data's units squared. Fitting measured data knows no :math:`g(x_r)` and takes the
-data for it where points were seen (:mod:`calibrate.statistical_model.shared_errors`).
+inferred, in the data's units squared; what is a share of the prediction follows x itself. Fitting
+measured data knows no :math:`g(x_r)` and takes the data for it where points were seen
+(:mod:`calibrate.statistical_model.shared_errors`).
 
 Before data a size that is inferred is integrated over its prior, with distribution function
 :math:`\Phi`, by K values that are equally probable:

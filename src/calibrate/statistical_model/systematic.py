@@ -30,7 +30,8 @@ from calibrate.statistical_model.varying_error import VaryingError
 from emulator.errors import InputError
 
 _AXES = "xyz"
-_VARYING, _OLD = "varying_", "sized_"  # before names of arrays; as they were
+_VARYING = "varying_"  # before names of arrays
+_SHARES = "of the prediction"  # in the words of what is kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +194,8 @@ class SystematicError(ErrorModes):
     @property
     def words(self) -> dict[str, Any]:
         """What :meth:`restore` needs besides the arrays; plain JSON."""
-        return {"names": self.names, "size": self.varying and self.varying.name}
+        size = self.varying and self.varying.name
+        return {"names": self.names, "size": size, "shares": _SHARES}
 
     @classmethod
     def restore(cls, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> SystematicError:
@@ -202,12 +204,12 @@ class SystematicError(ErrorModes):
         Raises
         ------
         InputError
-            It was kept when shares were of the data.
+            It was kept when shares were of the data, which its arrays do not tell from others.
         """
-        if f"{_OLD}weights" in arrays:
+        if words.get("shares") != _SHARES:
             raise InputError(
-                "the posterior's systematic errors were shares of the data; they are of "
-                "predictions now: infer again"
+                "the posterior is older than systematic errors that are shares of predictions; "
+                "infer again"
             )
         begins = len(_VARYING)
         own = {n[begins:]: a for n, a in arrays.items() if n.startswith(_VARYING)}

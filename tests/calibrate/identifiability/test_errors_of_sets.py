@@ -129,7 +129,7 @@ def test_sds_are_those_of_posteriors_whose_share_is_inferred():
         weight *= np.exp(-0.5 * ((log_lam - np.log(5.0)) / 0.5) ** 2)
         weight /= weight.sum()
         sds.append(np.sqrt(weight @ (log_lam - weight @ log_lam) ** 2))
-    # The grid's covariance follows lam, the one told is that at the lam of the data.
+    # Told: importance sampling about the lam of each data set, sizes by quantiles.
     assert found == pytest.approx(np.mean(sds) / 0.5, rel=0.1)
     # Noise alone would promise a sd of half a percent.
     assert np.mean(sds) > 0.05

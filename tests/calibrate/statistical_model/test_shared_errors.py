@@ -327,7 +327,11 @@ def test_intervals_hold_the_truth_of_data_with_a_gain():
     assert 125 <= low <= 175
 
 
-def test_a_posterior_kept_with_shares_of_data_is_refused_in_one_line():
-    old = {name: np.zeros((1, 1)) for name in ("weights", "strength", "modes", "mixing")}
-    with pytest.raises(InputError, match="shares of the data; they are of predictions now: infer"):
-        SystematicError.restore(old | {"sized_weights": np.zeros((1, 1))}, {"names": ["e"]})
+def test_a_posterior_kept_with_shares_of_data_is_refused_in_one_line(model, data):
+    """Of a gain nothing in its arrays says what it is a share of; what was kept says it now."""
+    words = {"e": {"kind": "gain", "of": "displacement", "share": 0.1}}
+    error = with_shared_errors(model, data, words)[0].error
+    assert SystematicError.restore(error.arrays(), error.words).fingerprint == error.fingerprint
+    old = {name: value for name, value in error.words.items() if name != "shares"}
+    with pytest.raises(InputError, match="older than systematic errors that are shares of pred"):
+        SystematicError.restore(error.arrays(), old)
