@@ -143,7 +143,7 @@ def test_a_term_that_is_off_has_no_exponent():
 
 def test_the_processs_correlations_are_the_kernels_derivatives():
     x, y = 0.5 * jax.random.normal(jax.random.key(0), (2, 10))
-    lengths = jnp.linspace(0.5, 2.0, process.FEATURES)
+    lengths = np.linspace(0.5, 2.0, process.FEATURES)
 
     def kernel(x, y):
         step = (
@@ -151,8 +151,8 @@ def test_the_processs_correlations_are_the_kernels_derivatives():
         ) / lengths
         return jnp.exp(-0.5 * step @ step)
 
-    phi, J = process.with_slopes(jnp.stack([x, y]), jnp.asarray(ENDS))
-    found = process.correlations(phi[:1], J[:1], phi[1:], J[1:], lengths)[0, :, 0]
+    one, other = (process.values_and_slopes(np.asarray(at)[None], ENDS)[0] for at in (x, y))
+    found = process.correlations(one, other, lengths)
     np.testing.assert_allclose(found[0, 0], kernel(x, y), rtol=1e-12)
     np.testing.assert_allclose(found[0, 1:], jax.grad(kernel, 1)(x, y), atol=1e-12)
     np.testing.assert_allclose(found[1:, 0], jax.grad(kernel, 0)(x, y), atol=1e-12)
@@ -177,21 +177,30 @@ def told():
     return process.known(x, *made_up(x), ENDS)
 
 
+def test_the_slopes_of_likelihood_are_its_differences(told):
+    logs, step = np.log(np.linspace(0.8, 3.0, process.FEATURES)), 1e-5
+    rising = process._unlikely(logs, told)[1]
+    for k, row in enumerate(step * np.eye(len(logs))):
+        ahead, behind = (process._unlikely(at, told)[0] for at in (logs + row, logs - row))
+        assert rising[k] == pytest.approx((ahead - behind) / (2.0 * step), rel=1e-5, abs=1e-6)
+
+
 def test_a_process_goes_through_its_runs_and_says_what_it_leaves(told):
     lengths = process.likeliest(told)
-    made = process.conditioned(told, jnp.asarray(lengths))
-    there = jax.vmap(process.correction, (None, 0))(made, told.phi[:12])
-    np.testing.assert_allclose(there, told.y[:12, 0] + told.mean, atol=1e-3)
+    made = process.conditioned(told, lengths)
+    assert len(made.at) == process.room(told.runs) == process.ROOM
+    value = told.told.value == 1.0
+    there = jax.vmap(process.correction, (None, 0))(made, told.told.at[value])
+    np.testing.assert_allclose(there, told.y[value] + told.mean, atol=1e-3)
     # Features that q does not read have longer lengths than those it does.
     assert lengths[2] < lengths[[3, 4, 9]].min()
     x = np.random.default_rng(1).uniform(-0.6, 0.6, (60, 10))
-    phi, J = process.with_slopes(jnp.asarray(x), jnp.asarray(ENDS))
-    covariance, sd = process.left(told, jnp.asarray(lengths), phi, J)
-    rows = np.arange(60) * 11
-    said = float(sd) * np.sqrt(np.maximum(np.asarray(covariance)[rows, rows], 0.0))
-    wrong = (
-        np.asarray(jax.vmap(process.correction, (None, 0))(made, phi))[:, 0] - made_up(x)[0][:, 0]
-    )
+    points, _ = process.values_and_slopes(x, ENDS)
+    covariance, sd = process.left(told, lengths, points)
+    rows = points.value == 1.0
+    said = sd * np.sqrt(np.maximum(np.diagonal(covariance)[rows], 0.0))
+    made_there = jax.vmap(process.correction, (None, 0))(made, points.at[rows])
+    wrong = np.asarray(made_there)[:, 0] - made_up(x)[0][:, 0]
     assert np.abs(wrong).max() < 0.03
     assert 0.3 < np.sqrt(np.mean((wrong / (said + 1e-5)) ** 2)) < 3.0
 
@@ -272,7 +281,7 @@ def test_the_emulator_goes_through_its_runs(tmp_path):
     x = jax.random.uniform(jax.random.key(1), (6, 10), minval=-0.5, maxval=0.5)
     # At angles zero the cut is the frame, so that only the first cube is like this formula.
     force, slopes = jax.jit(jax.vmap(made))(x), jax.jit(jax.vmap(jax.jacfwd(made)))(x)
-    runs = curves.Runs(*(np.asarray(a) for a in (x, force, slopes, force)))
+    runs = curves.Runs(*(np.asarray(a) for a in (x, force, slopes)))
     emulated = curves.fit(bodies[:1], [runs]).emulated
     again = jax.jit(jax.vmap(lambda x: curves.forces(emulated, x[None])[0]))(x)
     np.testing.assert_allclose(again, force, rtol=1e-4)
@@ -283,9 +292,9 @@ def test_a_meshs_error_is_taken_off_by_its_order():
     right = np.full((2, 4), 2.0)
     by = {n: right * (1.0 + 0.2 * n**-1.2) for n in (3, 5)}
     empty = np.zeros((2, 10))
-    tests, fine = ([curves.Runs(empty, by[n], empty, empty)] for n in (3, 5))
+    there, fine = ([curves.Runs(empty, by[n], empty)] for n in (3, 5))
     arrays = {name: jnp.zeros(1) for name in curves.Emulated._fields}
-    found = campaign.without_mesh(curves.Emulated(**arrays), tests, fine)
+    found = campaign.without_mesh(curves.Emulated(**arrays), there, fine)
     np.testing.assert_allclose(by[3][0] * found.finer[0], right[0], rtol=1e-3)
 
 
@@ -316,9 +325,28 @@ def checked_heart(differences, spread=1.0):
 
     tested = np.arange(30)
     return SimpleNamespace(
-        explored=found(0.0), on_mesh=found(0.1 * spread), tested=tested, tests=[0, 0, 0],
+        explored=found(0.0), on_mesh=found(0.1 * spread), tested=tested, meshes=([], []),
         likelihood_differences=lambda: differences(logs, tested),
     )  # fmt: skip
+
+
+def test_tests_that_leave_the_verdict_open_become_runs(monkeypatch):
+    """Until it is accepted, or as often as the plan says."""
+    asked = []
+
+    def after(verdicts):
+        told = iter(verdicts)
+        monkeypatch.setattr(checked, "campaign", lambda *_: asked.append("first") or 0)
+        monkeypatch.setattr(checked, "again", lambda found, *_: asked.append("again") or found + 1)
+        monkeypatch.setattr(checked, "certificate", lambda _: SimpleNamespace(verdict=next(told)))
+        asked.clear()
+        return checked.decided(SimpleNamespace(name="TSL9"), campaign.Plan(again=2), None, 0)
+
+    assert after(["undecided", "accepted"]) == 1
+    assert asked == ["first", "again"]
+    assert after(["undecided", "not certified"]) == 2
+    assert after(["accepted"]) == 0
+    assert asked == ["first"]
 
 
 @pytest.mark.parametrize(

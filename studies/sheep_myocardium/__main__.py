@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results, parser
 from studies.sheep_myocardium import cube, figures, population, twins
-from studies.sheep_myocardium.campaign import QUICK, Campaign, Plan, campaign
+from studies.sheep_myocardium.campaign import QUICK, Campaign, Plan
 from studies.sheep_myocardium.checked import decided, told
 from studies.sheep_myocardium.curves import cubes
 from studies.sheep_myocardium.experiment import MODES, Heart, heart, hearts
@@ -143,7 +143,7 @@ def _judged(one: Heart, draws: np.ndarray, rng: np.random.Generator) -> Case:
     for body in cubes(one):
         x = np.asarray([population.positions(jnp.log(row[:-1])) for row in draws])
         turned = np.clip(rng.normal(0.0, ANGLE_SD, (len(draws), 2)), -1.0, 1.0)
-        forces = body.runs(np.concatenate([x, turned], axis=1), slopes=False).force
+        forces = body.runs(np.concatenate([x, turned], axis=1)).force
         modes = MODES[3 * body.number : 3 * body.number + 3]
         for mode, mean in zip(modes, np.split(forces, 3, axis=1), strict=True):
             curve = one.curves[mode]
@@ -173,7 +173,7 @@ def main() -> None:
     given = given[:2] if words.quick else given
     campaigns = []
     for each in given:
-        found = decided(campaign(each, plan, words.runs, SEED), plan, words.runs, SEED)
+        found = decided(each, plan, words.runs, SEED)
         campaigns.append(found)
         results.case(each.name, lambda found=found: of_heart(found, plan))
         results.case(f"{each.name}, twins", lambda found=found: of_twins(found, plan))

@@ -45,25 +45,22 @@ _ORDER = 1.2  # of the force's convergence: twice 0.595, the exponent at a glued
 class Plan:
     """Numbers of runs a cube.
 
-    wide : over the box. each : a round, where they tell most of q at draws of the posterior.
-    rounds : as many at least, at most; they end where q's sd at a tenth of the draws is below
-    :data:`ENOUGH`. tests : at draws of the posterior, without slopes; as many again while these
-    leave the verdict open, up to ``tests_at_most``. meshes : at which a finer mesh is solved, too.
-    draws : of each of four chains.
+    wide : over the box. rounds, each : after them, so many times so many, where they tell most of q
+    at draws of the posterior. tests : at draws of the posterior. again : times that tests become
+    runs, with one more round, and others are made, while the verdict is open. meshes : at which a
+    finer mesh is solved, too. draws : of each of four chains.
     """
 
     wide: int = 12
+    rounds: int = 4
     each: int = 9
-    rounds: tuple[int, int] = (3, 7)
     tests: int = 30
-    tests_at_most: int = 120
+    again: int = 5
     meshes: int = 2
     draws: int = 300
 
 
-QUICK = Plan(wide=4, each=2, rounds=(1, 1), tests=4, tests_at_most=4, meshes=1, draws=50)
-ENOUGH = 0.01
-"""Of a force: what q may be unsure of at a tenth of the draws when rounds end."""
+QUICK = Plan(wide=4, rounds=1, each=2, tests=4, again=0, meshes=1, draws=50)
 _POOL = 80  # draws that next runs are chosen from
 
 
@@ -71,20 +68,23 @@ _POOL = 80  # draws that next runs are chosen from
 class Campaign:
     """What FEM says of a heart.
 
-    bodies : its cubes. fitted : what their runs say. cubes : emulator of the cubes without the
-    mesh's error. on_mesh, explored : the posteriors with the mesh's error and without. tests : runs
-    that it was not fitted to, at the draws ``tested`` (t,) of ``explored``. doubt : of q at a tenth
-    of the draws, by round. seconds : it took.
+    bodies : its cubes. runs : of each. fitted : what they say. meshes : runs at the same positions
+    on the mesh and on a finer one. cubes : emulator of the cubes without the mesh's error. on_mesh,
+    explored : the posteriors with the mesh's error and without. tests : runs that it was not fitted
+    to, at the draws ``tested`` (t,) of ``explored``. doubt : of q at nine draws of ten, by round.
+    seconds : it took.
     """
 
     heart: Heart
     bodies: list[Cube]
+    runs: list[Runs]
     fitted: Fit
+    meshes: tuple[list[Runs], list[Runs]]
     cubes: Emulated
     on_mesh: Found
     explored: Found
     tested: np.ndarray
-    tests: tuple[Runs, ...]
+    tests: list[Runs]
     doubt: list[float]
     seconds: float
 
@@ -99,9 +99,9 @@ class Campaign:
         return float(self.explored.draws["omega"].mean())
 
     @property
-    def runs(self) -> int:
-        """Runs a cube, tests included."""
-        return int(self.fitted.known[0].used.sum()) + len(self.tests[0].x)
+    def runs_a_cube(self) -> int:
+        """With tests."""
+        return len(self.runs[0].x) + len(self.tests[0].x)
 
     @property
     def by_fem(self) -> np.ndarray:
@@ -135,121 +135,142 @@ class Campaign:
         return fem - cheap
 
 
-def without_mesh(coarse: Emulated, tests: Sequence[Runs], fine: Sequence[Runs]) -> Emulated:
-    """The emulator of forces without the mesh's error, by ``fine`` runs at some of the tests.
+def without_mesh(coarse: Emulated, there: Sequence[Runs], fine: Sequence[Runs]) -> Emulated:
+    """The emulator of forces without the mesh's error, by runs ``there`` and ``fine`` ones.
 
     The displacement at the edge of a glued face goes as :math:`r^{0.595}` in an incompressible
     body (Williams 1952, a right angle), the force therefore as :math:`h^{1.19}`: a factor
     :math:`1 + c` from 3 to 5 cells is :math:`1 + c / (1 - (3/5)^{1.2})` to none.
     """
     factors = []
-    for test, finer in zip(tests, fine, strict=True):
-        change = np.nanmean(finer.force / test.force[: len(finer.x)], axis=0) - 1.0
+    for test, finer in zip(there, fine, strict=True):
+        change = np.nanmean(finer.force / test.force, axis=0) - 1.0
         factors.append(1.0 + change / (1.0 - (CELLS / FINER) ** _ORDER))
     return coarse._replace(finer=jnp.asarray(np.stack(factors)))
 
 
+@dataclass(frozen=True)
+class Solver:
+    """FEM of a heart's cubes. Runs in the folder ``kept`` are not solved again."""
+
+    heart: Heart
+    bodies: list[Cube]
+    kept: Path | None
+
+    def __call__(self, name: str, x: Sequence[np.ndarray]) -> list[Runs]:
+        """Runs named ``name`` at positions (r, p) of each cube."""
+        return [
+            _kept(self.kept, f"{self.heart.name}_{k}_{name}", body, at)
+            for k, (body, at) in enumerate(zip(self.bodies, x, strict=True))
+        ]
+
+    @property
+    def finer(self) -> Solver:
+        """Of the finer mesh."""
+        return replace(self, bodies=[replace(body, cells=FINER) for body in self.bodies])
+
+
 def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign:
-    """The runs of a heart. Those in the folder ``kept`` are not solved again."""
+    """The runs of a heart up to its first tests. Those in the folder ``kept`` are not solved again.
+
+    Choices do not depend on what was kept.
+    """
     began = perf_counter()
     bodies = cubes(heart)
-    unknowns = bodies[0].unknowns
-    boxes = [qmc.Sobol(unknowns, seed=seed + k).random_base2(4) for k in range(3)]
-    runs = [
-        _kept(kept, f"{heart.name}_{k}_wide", body, 2.0 * box[: plan.wide] - 1.0)
-        for k, (body, box) in enumerate(zip(bodies, boxes, strict=True))
-    ]
+    fem = Solver(heart, bodies, kept)
+    boxes = [qmc.Sobol(bodies[0].unknowns, seed=seed + k).random_base2(4) for k in range(3)]
+    runs = fem("wide", [2.0 * box[: plan.wide] - 1.0 for box in boxes])
     fitted = fit(bodies, runs)
-    size = {"draws": plan.draws, "warmup": plan.draws}
     doubt: list[float] = []
-    least, most = plan.rounds
-    for number in range(most):
-        names = [f"{heart.name}_{k}_round{number}" for k in range(3)]
-        if (before := [_known(kept, name) for name in names]) and all(before):
-            new = [each for each in before if each]
-            runs = [joined(pair) for pair in zip(runs, new, strict=True)]
-            fitted = fit(bodies, runs, fitted)
-            continue
+    for number in range(plan.rounds):
+        # Of a posterior with fewer terms, too: a term that is off is a corner of its own.
         law = "fibres" if number == 1 else ORTHOTROPIC
-        found = sample(heart, fitted.emulated, seed + number, law, **size)
-        pool = _some(found, _POOL, seed + number)
-        left, sds = zip(*(fitted.left(k, pool[:, k]) for k in range(3)), strict=True)
-        doubt.append(float(np.quantile(np.max(sds, axis=0), 0.9)))
-        LOG.info("%s, round %d: q is known to %.1f %%", heart.name, number, 100 * doubt[-1])
-        if number >= least and doubt[-1] < ENOUGH:
-            break
-        new = [
-            _kept(kept, names[k], body, pool[next_runs(left[k], len(pool), plan.each), k])
-            for k, body in enumerate(bodies)
-        ]
-        runs = [joined(pair) for pair in zip(runs, new, strict=True)]
-        fitted = fit(bodies, runs, fitted)
-    coarse = settled(heart, fitted.emulated, seed + most, **size)
-    x = _some(coarse, plan.meshes, seed + most)
-    pairs = []
-    for cells in (CELLS, FINER):
-        bodies_there = [replace(body, cells=cells) for body in bodies]
-        pairs.append([
-            _kept(kept, f"{heart.name}_{k}_mesh{cells}", body, x[:, k], slopes=False)
-            for k, body in enumerate(bodies_there)
-        ])  # fmt: skip
-    cubes_there = without_mesh(fitted.emulated, *pairs)
-    explored = settled(heart, cubes_there, seed + most, times=4, **size)
-    untested = Campaign(
-        heart, bodies, fitted, cubes_there, coarse, explored, np.zeros(0, dtype=int), (), doubt, 0.0
-    )
-    tested = tested_more(untested, plan.tests, kept, seed)
-    return replace(tested, seconds=perf_counter() - began)
+        found = sample(heart, fitted.emulated, seed + number, law, **_size(plan))
+        runs, fitted = _round(fem, runs, fitted, found, plan, seed, doubt)
+    on_mesh = settled(heart, fitted.emulated, seed, **_size(plan))
+    x = np.moveaxis(_some(on_mesh, plan.meshes, seed), 1, 0)
+    meshes = fem("mesh", x), fem.finer("mesh_finer", x)
+    return _tested(fem, runs, fitted, meshes, on_mesh, plan, seed, doubt, perf_counter() - began)
 
 
-def tested_more(found: Campaign, count: int, kept: Path | None, seed: int) -> Campaign:
-    """FEM at ``count`` more draws of the posterior."""
-    began, before = perf_counter(), found.tested
-    order = np.random.default_rng(seed).permutation(len(found.explored.positions))
-    rows = order[len(before) : len(before) + count]
-    number = len(before) // count
-    new = [
-        _kept(
-            kept, f"{found.heart.name}_{k}_tests{number}", body,
-            found.explored.positions[rows, k], slopes=False,
-        )
-        for k, body in enumerate(found.bodies)
-    ]  # fmt: skip
-    every = [joined(pair) for pair in zip(found.tests, new, strict=True)] if found.tests else new
+def again(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign:
+    """Its tests become runs, with one more round; others are made at draws of the new posterior."""
+    began = perf_counter()
+    fem = Solver(found.heart, found.bodies, kept)
+    runs = [joined(pair) for pair in zip(found.runs, found.tests, strict=True)]
+    fitted = fit(found.bodies, runs, found.fitted)
+    doubt = list(found.doubt)
+    runs, fitted = _round(fem, runs, fitted, found.explored, plan, seed, doubt)
+    on_mesh = settled(found.heart, fitted.emulated, seed + len(doubt), **_size(plan))
     seconds = found.seconds + perf_counter() - began
-    return replace(
-        found, tested=np.concatenate([before, rows]), tests=tuple(every), seconds=seconds
-    )
+    return _tested(fem, runs, fitted, found.meshes, on_mesh, plan, seed, doubt, seconds)
+
+
+def _size(plan: Plan) -> dict[str, int]:
+    return {"draws": plan.draws, "warmup": plan.draws}
+
+
+def _round(
+    fem: Solver,
+    runs: list[Runs],
+    fitted: Fit,
+    found: Found,
+    plan: Plan,
+    seed: int,
+    doubt: list[float],
+) -> tuple[list[Runs], Fit]:
+    """With runs where they tell most of q at draws of ``found``; its doubt is added."""
+    number = len(doubt)
+    pool = np.moveaxis(_some(found, _POOL, seed + number), 1, 0)
+    left, sds = zip(*(fitted.left(k, pool[k]) for k in range(3)), strict=True)
+    doubt.append(float(np.quantile(np.max(sds, axis=0), 0.9)))
+    LOG.info("%s, round %d: q is known to %.1f %%", fem.heart.name, number, 100 * doubt[-1])
+    chosen = [at[next_runs(C, _POOL, plan.each)] for at, C in zip(pool, left, strict=True)]
+    new = fem(f"round{number}", chosen)
+    runs = [joined(pair) for pair in zip(runs, new, strict=True)]
+    return runs, fit(fem.bodies, runs, fitted)
+
+
+def _tested(
+    fem: Solver,
+    runs: list[Runs],
+    fitted: Fit,
+    meshes: tuple[list[Runs], list[Runs]],
+    on_mesh: Found,
+    plan: Plan,
+    seed: int,
+    doubt: list[float],
+    seconds: float,
+) -> Campaign:
+    """The posterior without the mesh's error, and FEM at some of its draws."""
+    began, number = perf_counter(), len(doubt)
+    cubes_there = without_mesh(fitted.emulated, *meshes)
+    explored = settled(fem.heart, cubes_there, seed + number, times=4, **_size(plan))
+    rows = np.random.default_rng(seed + number).permutation(len(explored.positions))[: plan.tests]
+    tests = fem(f"tests{number}", np.moveaxis(explored.positions[rows], 1, 0))
+    seconds += perf_counter() - began
+    return Campaign(
+        fem.heart, fem.bodies, runs, fitted, meshes, cubes_there, on_mesh, explored, rows, tests,
+        doubt, seconds,
+    )  # fmt: skip
 
 
 def _some(found: Found, count: int, seed: int) -> np.ndarray:
-    """Positions (count, 3, p) of a posterior's draws.
-
-    By a seed of its own, so that runs that are taken up again do not change later choices.
-    """
+    """Positions (count, 3, p) of a posterior's draws, by a seed of their own."""
     rows = np.random.default_rng(seed).choice(len(found.positions), count, replace=False)
     return found.positions[rows]
 
 
-def _known(folder: Path | None, name: str) -> Runs | None:
-    """What a file kept of a run before this one."""
-    path = None if folder is None else folder / f"{name}.npz"
-    if path is None or not path.is_file():
-        return None
-    with np.load(path, allow_pickle=False) as arrays:
-        return Runs(*(arrays[field] for field in Runs._fields))
-
-
-def _kept(
-    folder: Path | None, name: str, body: Cube, x: np.ndarray, *, slopes: bool = True
-) -> Runs:
+def _kept(folder: Path | None, name: str, body: Cube, x: np.ndarray) -> Runs:
     """FEM at positions (r, p), or what a file kept of a run at these before this one."""
-    known = _known(folder, name)
-    if known is not None and known.x.shape == x.shape and np.allclose(known.x, x, atol=1e-9):
-        return known
-    found = body.runs(x, slopes=slopes)
-    if folder is not None:
-        path = folder / f"{name}.npz"
+    path = None if folder is None else folder / f"{name}.npz"
+    if path is not None and path.is_file():
+        with np.load(path, allow_pickle=False) as arrays:
+            known = Runs(*(arrays[field] for field in Runs._fields))
+        if known.x.shape == x.shape and np.allclose(known.x, x, atol=1e-9):
+            return known
+    found = body.runs(x)
+    if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **found._asdict())

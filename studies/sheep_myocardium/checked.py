@@ -11,13 +11,15 @@ is three tenths of the correction, which an order of 1 or 2 in place of 1.2 woul
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from scipy.special import softmax
 from studies.common.output import Case
-from studies.sheep_myocardium.campaign import FINER, Campaign, Plan, tested_more
+from studies.sheep_myocardium.campaign import FINER, Campaign, Plan, again, campaign
+from studies.sheep_myocardium.experiment import Heart
 from studies.sheep_myocardium.inference import Found, parameters
 
 from calibrate.certificate.estimates import k_hat
@@ -33,6 +35,7 @@ from calibrate.certificate.evidence import (
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.verdict import Certificate, judge
 
+LOG = logging.getLogger(__name__)
 _LEFT = 0.3  # of the mesh's correction
 _FEWEST = 25  # weights that have a tail
 
@@ -77,7 +80,7 @@ def certificate(found: Campaign) -> Certificate:
         len(explored.positions),
     )  # fmt: skip
     mesh = MeshChange(
-        *_mesh(found), nodes=(2 * FINER + 1) ** 3, runs=3 * len(found.tests), failed=0
+        *_mesh(found), nodes=(2 * FINER + 1) ** 3, runs=sum(len(r.x) for r in found.meshes[1])
     )
     there = np.stack(list(named.values()), axis=1)
     means = _figures(named, there.mean(axis=0), error[:p])
@@ -85,13 +88,15 @@ def certificate(found: Campaign) -> Certificate:
     return judge(Evidence(changes, changes, means, sds, sampling, physics, tail, {}, mesh))
 
 
-def decided(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign:
-    """With more tests while those there are leave the verdict open."""
-    while (
-        certificate(found).verdict == "undecided"
-        and len(found.tested) + plan.tests <= plan.tests_at_most
-    ):
-        found = tested_more(found, plan.tests, kept, seed)
+def decided(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign:
+    """A heart's campaign, until its certificate is accepted or it was tested often enough."""
+    found = campaign(heart, plan, kept, seed)
+    for _ in range(plan.again):
+        verdict = certificate(found)
+        LOG.info("%s: %s", heart.name, verdict)
+        if verdict.verdict == "accepted":
+            break
+        found = again(found, plan, kept, seed)
     return found
 
 
@@ -121,7 +126,7 @@ def told(found: Campaign) -> Case:
     given = certificate(found)
     return {
         "fem": {
-            "runs_a_cube": found.runs,
+            "runs_a_cube": found.runs_a_cube,
             "seconds": found.seconds,
             "error_median": float(np.nanmedian(errors)),
             "error_90": float(np.nanquantile(errors, 0.9)),

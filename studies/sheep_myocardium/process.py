@@ -16,8 +16,15 @@ sheep"). Lengths :math:`\ell` are most likely given the runs, with :math:`\sigma
 
 .. math:: L(\ell) = \tfrac{k}{2} \log |K| + \tfrac{n}{2} \sum_j \log (y_j^T K^{-1} y_j / n),
 
-K the correlation of n values and slopes, y what FEM says of them. Slopes in x are slopes in
-features times the features' own (chain rule), so that a prediction costs as much as one of values:
+K the correlation of n values and slopes, y what FEM says of them. Each of these numbers is
+:math:`v\, q + d \cdot \nabla_\phi q` at a run's features: a value (v = 1, d = 0), or a slope in x
+(v = 0, d the features' own slope, by the chain rule). With
+:math:`\Lambda = \mathrm{diag}\,\ell^{-2}` and :math:`\Delta = \phi - \phi'` two of them have the
+correlation
+
+.. math:: \kappa\, [(v - d^T \Lambda \Delta)(v' + d'^T \Lambda \Delta) + d^T \Lambda\, d'],
+
+and a prediction costs as much as one of values:
 
 .. math:: q_j(x) = \bar q_j + \sum_r \kappa_r \Big[w_{rj} + \sum_f \frac{\phi_f - \phi_{rf}}
           {\ell_f^2}\, v_{rfj}\Big].
@@ -30,11 +37,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 from studies.sheep_myocardium import cube
 
-ROWS = 75
-"""Runs of a cube that a process has room for: programs are of a number of runs."""
+ROOM = 75
+"""Runs of a cube that a process has room for, or a multiple: programs are of a number of runs."""
 _NUGGET = 1e-6  # variance, of one, that neither forces nor slopes tell
 _SHORTEST, _LONGEST, _FIRST = 0.1, 30.0, 2.0  # lengths
 _MATERIAL = tuple(p.name for p in cube.MATERIAL)
@@ -87,109 +96,130 @@ def correction(process: Process, phi: jax.Array) -> jax.Array:
     return process.mean + kernel @ (process.values + rising)
 
 
-def correlations(
-    phi: jax.Array, J: jax.Array, other: jax.Array, J_other: jax.Array, lengths: jax.Array
-) -> jax.Array:
-    """Of values and slopes at points with those at others, (n, p + 1, m, p + 1).
+class Told(NamedTuple):
+    """Numbers that are each a value or a slope of q.
 
-    Parameters
-    ----------
-    phi, J : features (n, f) and their slopes (n, f, p). other, J_other : (m, f), (m, f, p).
-    """
-    step = (phi[:, None] - other[None]) / lengths**2
-    kernel = jnp.exp(-0.5 * jnp.sum((lengths * step) ** 2, axis=2))
-    of_value = jnp.einsum("nmf,mfp->nmp", step, J_other)
-    of_slope = -jnp.einsum("nmf,nfp->nmp", step, J)
-    between = jnp.einsum("nfp,f,mfq->nmpq", J, lengths**-2, J_other)
-    between += of_slope[..., :, None] * of_value[..., None, :]
-    top = jnp.concatenate([jnp.ones_like(kernel)[..., None], of_value], axis=-1)
-    below = jnp.concatenate([of_slope[..., None], between], axis=-1)
-    full = kernel[..., None, None] * jnp.concatenate([top[..., None, :], below], axis=-2)
-    return full.transpose(0, 2, 1, 3)
-
-
-class Known(NamedTuple):
-    """What FEM says of a cube, with room for :data:`ROWS` runs.
-
-    x : (r, p). phi : (r, f). J : (r, f, p). y : (r, p + 1, k) of q less its mean, and its slopes;
-    zero where nothing is known. used : (r,) 1 or 0. mean : (k,).
+    at : (n, f) features. value : (n,) v. along : (n, f) d.
     """
 
-    x: jax.Array
-    phi: jax.Array
-    J: jax.Array
-    y: jax.Array
-    used: jax.Array
-    mean: jax.Array
+    at: np.ndarray
+    value: np.ndarray
+    along: np.ndarray
 
     @property
-    def total(self) -> jax.Array:
-        """Number of values and slopes of a point."""
-        return self.used.sum() * self.y.shape[1]
+    def size(self) -> int:
+        """How many."""
+        return len(self.at)
 
 
 @jax.jit
-def with_slopes(x: jax.Array, ends: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Features (n, f) of positions (n, p) in the box, and their slopes (n, f, p)."""
+def _with_slopes(x: jax.Array, ends: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Features (f,) of a position (p,) in the box, and their slopes (f, p)."""
+    return features(x, ends), jax.jacfwd(features)(x, ends)
 
-    def of(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        phi = features(x, ends)
-        return phi, phi
 
-    J, phi = jax.vmap(jax.jacfwd(of, has_aux=True))(x)
-    return phi, J
+def values_and_slopes(x: np.ndarray, ends: np.ndarray) -> tuple[Told, np.ndarray]:
+    """Of positions (n, p) in the box, each a value and its p slopes; and features' (n, f, p)."""
+    phi, J = map(np.stack, zip(*(_with_slopes(row, ends) for row in x), strict=True))
+    count, p = x.shape
+    along = np.concatenate([np.zeros((count, 1, FEATURES)), np.swapaxes(J, 1, 2)], axis=1)
+    value = np.tile(np.arange(p + 1) == 0, count).astype(float)
+    return Told(np.repeat(phi, p + 1, axis=0), value, along.reshape(-1, FEATURES)), J
+
+
+class _Parts(NamedTuple):
+    """Of a correlation (n, m): the kernel, and v - d L D and v' + d' L D that it multiplies."""
+
+    kernel: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+
+
+def _correlations(a: Told, b: Told, lengths: np.ndarray) -> tuple[np.ndarray, _Parts]:
+    scaled_a, scaled_b = a.at / lengths, b.at / lengths
+    along_a, along_b = a.along / lengths, b.along / lengths
+    squares = (scaled_a**2).sum(axis=1)[:, None] + (scaled_b**2).sum(axis=1)
+    kernel = np.exp(scaled_a @ scaled_b.T - 0.5 * squares)
+    first = (a.value - (along_a * scaled_a).sum(axis=1))[:, None] + along_a @ scaled_b.T
+    second = b.value - (along_b * scaled_b).sum(axis=1) + scaled_a @ along_b.T
+    return kernel * (first * second + along_a @ along_b.T), _Parts(kernel, first, second)
+
+
+def correlations(a: Told, b: Told, lengths: np.ndarray) -> np.ndarray:
+    """Of numbers (n,) with others (m,), (n, m)."""
+    return _correlations(a, b, lengths)[0]
+
+
+def _pulled_back(told: Told, weights: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Slopes (f,) in logarithms of lengths of the sum of ``weights`` (n, n) times correlations."""
+    K, (kernel, first, second) = _correlations(told, told, lengths)
+    at, along = told.at, told.along
+    B = weights * kernel
+    M, P, Q = weights * K, B * first, B * second
+
+    def moved(W: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Sum over pairs of W_ij left_i right_j, by feature."""
+        return (left * (W @ right)).sum(axis=0)
+
+    one = np.ones_like(at)
+    by_squares = -0.5 * (moved(M, at**2, one) - 2.0 * moved(M, at, at) + moved(M, one, at**2))
+    by_first = -moved(Q, along * at, one) + moved(Q, along, at)
+    by_second = moved(P, at, along) - moved(P, one, along * at)
+    return -2.0 * (by_squares + by_first + by_second + moved(B, along, along)) / lengths**2
+
+
+class Known(NamedTuple):
+    """What FEM says of a cube: ``told`` numbers are ``y`` (n, k), less the mean (k,) if values.
+
+    J : (r, f, p) slopes of features at its runs.
+    """
+
+    told: Told
+    y: np.ndarray
+    mean: np.ndarray
+    J: np.ndarray
+
+    @property
+    def runs(self) -> int:
+        """How many."""
+        return len(self.J)
 
 
 def known(x: np.ndarray, q: np.ndarray, slopes: np.ndarray, ends: np.ndarray) -> Known:
     """What runs say: positions (n, p), q (n, k) and its slopes (n, k, p)."""
-    left = ROWS - len(x)
-    if left < 0:
-        raise ValueError(f"a process has room for {ROWS} runs, not for {len(x)}")
     mean = q.mean(axis=0)
     y = np.concatenate([(q - mean)[:, None], np.swapaxes(slopes, 1, 2)], axis=1)
-    padded = [np.concatenate([a, np.zeros((left, *a.shape[1:]))]) for a in (x, y)]
-    used = np.arange(ROWS) < len(x)
-    phi, J = with_slopes(jnp.asarray(padded[0]), jnp.asarray(ends))
-    rest = (jnp.asarray(a) for a in (padded[1], used.astype(float), mean))
-    return Known(jnp.asarray(padded[0]), phi, J, *rest)
+    told, J = values_and_slopes(x, ends)
+    return Known(told, y.reshape(told.size, -1), mean, J)
 
 
-def _factor(told: Known, lengths: jax.Array) -> jax.Array:
-    """Cholesky factor (n, n) of the correlation of all that is known; one where nothing is."""
-    count = told.y.shape[0] * told.y.shape[1]
-    full = correlations(told.phi, told.J, told.phi, told.J, lengths).reshape(count, count)
-    used = jnp.repeat(told.used, told.y.shape[1])
-    full = full * used[:, None] * used[None, :]
-    return jnp.linalg.cholesky(full + jnp.diag(_NUGGET * used + 1.0 - used))
+def _factor(told: Told, lengths: np.ndarray) -> np.ndarray:
+    """Cholesky factor (n, n) of the correlation of numbers."""
+    full = correlations(told, told, lengths)
+    full[np.diag_indices(told.size)] += _NUGGET
+    return cholesky(full, lower=True, overwrite_a=True)
 
 
-def _variances(told: Known, factor: jax.Array) -> jax.Array:
-    """Most likely variances (k,), given lengths."""
-    y = told.y.reshape(len(factor), -1)
-    half = jax.scipy.linalg.solve_triangular(factor, y, lower=True)
-    return jnp.sum(half**2, axis=0) / told.total
-
-
-@jax.jit
-def _unlikely(logs: jax.Array, told: Known) -> tuple[jax.Array, jax.Array]:
+def _unlikely(logs: np.ndarray, known: Known) -> tuple[float, np.ndarray]:
     """L / n of logarithms of lengths (f,), and its slopes."""
+    lengths, (n, k) = np.exp(logs), known.y.shape
+    factor = _factor(known.told, lengths)
+    weights = cho_solve((factor, True), known.y)
+    misfits = (known.y * weights).sum(axis=0)
+    value = k * np.log(np.diag(factor)).sum() + 0.5 * n * np.log(misfits / n).sum()
+    lower = np.tril(dpotri(factor, lower=True)[0])
+    inverse = lower + np.tril(lower, -1).T
+    by_K = 0.5 * k * inverse - 0.5 * n * (weights / misfits) @ weights.T
+    return value / n, _pulled_back(known.told, by_K, lengths) / n
 
-    def of(logs: jax.Array) -> jax.Array:
-        factor = _factor(told, jnp.exp(logs))
-        variances = _variances(told, factor)
-        volume = 2.0 * jnp.sum(jnp.log(jnp.diag(factor)))
-        each = 0.5 * told.total * jnp.log(variances)
-        return (0.5 * len(variances) * volume + each.sum()) / told.total
 
-    return jax.value_and_grad(of)(logs)
-
-
-def likeliest(told: Known, start: np.ndarray | None = None, *, steps: int = 12) -> np.ndarray:
+def likeliest(known: Known, start: np.ndarray | None = None, *, steps: int = 12) -> np.ndarray:
     """Most likely lengths (f,), or as near as ``steps`` of L-BFGS come."""
     first = np.full(FEATURES, _FIRST) if start is None else start
     found = minimize(
-        lambda logs: tuple(map(np.asarray, _unlikely(jnp.asarray(logs), told))),
+        _unlikely,
         np.log(first),
+        args=(known,),
         jac=True,
         method="L-BFGS-B",
         bounds=[(np.log(_SHORTEST), np.log(_LONGEST))] * FEATURES,
@@ -198,34 +228,32 @@ def likeliest(told: Known, start: np.ndarray | None = None, *, steps: int = 12) 
     return np.exp(found.x) if np.isfinite(found.fun) else first
 
 
-@jax.jit
-def conditioned(told: Known, lengths: jax.Array) -> Process:
-    """The process of what is known."""
-    factor = _factor(told, lengths)
-    y = told.y.reshape(len(factor), -1)
-    weights = jax.scipy.linalg.cho_solve((factor, True), y).reshape(told.y.shape)
-    weights = weights * told.used[:, None, None]
-    slopes = jnp.einsum("rfp,rpk->rfk", told.J, weights[:, 1:])
-    return Process(told.phi, weights[:, 0], slopes, lengths, told.mean)
+def room(runs: int) -> int:
+    """Runs that a process of ``runs`` has room for."""
+    return ROOM * max(1, -(-runs // ROOM))
 
 
-@jax.jit
-def left(
-    told: Known, lengths: jax.Array, phi: jax.Array, J: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Correlation (m (p + 1), m (p + 1)) of values and slopes at points that runs leave.
+def conditioned(known: Known, lengths: np.ndarray, rows: int | None = None) -> Process:
+    """The process of what is known, with room for as many runs as ``rows``."""
+    factor = _factor(known.told, lengths)
+    count, _, p = known.J.shape
+    weights = cho_solve((factor, True), known.y).reshape(count, p + 1, -1)
+    slopes = np.einsum("rfp,rpk->rfk", known.J, weights[:, 1:])
+    parts = known.told.at[:: p + 1], weights[:, 0], slopes
+    empty = (rows or room(count)) - count
+    padded = (np.concatenate([a, np.zeros((empty, *a.shape[1:]))]) for a in parts)
+    return Process(*map(jnp.asarray, (*padded, lengths, known.mean)))
 
-    The second is the largest sd of q over the points of the curves.
-    """
-    factor = _factor(told, lengths)
-    used = jnp.repeat(told.used, told.y.shape[1])
-    between = correlations(phi, J, told.phi, told.J, lengths)
-    size = between.shape[0] * between.shape[1]
-    half = jax.scipy.linalg.solve_triangular(
-        factor, (between.reshape(size, len(used)) * used).T, lower=True
-    )
-    prior = correlations(phi, J, phi, J, lengths).reshape(size, size)
-    return prior - half.T @ half, jnp.sqrt(_variances(told, factor).max())
+
+def left(known: Known, lengths: np.ndarray, points: Told) -> tuple[np.ndarray, float]:
+    """Correlation (m, m) of numbers that runs leave, and q's largest sd over the curves' points."""
+    factor = _factor(known.told, lengths)
+    between = correlations(known.told, points, lengths)
+    half = solve_triangular(factor, between, lower=True)
+    explained = solve_triangular(factor, known.y, lower=True)
+    variances = (explained**2).mean(axis=0)
+    remains = correlations(points, points, lengths) - half.T @ half
+    return remains, float(np.sqrt(variances.max()))
 
 
 def next_runs(covariance: np.ndarray, points: int, count: int) -> list[int]:

@@ -6,7 +6,15 @@ Where :math:`r(u(\theta), \theta) = 0`,
     K\, \frac{\partial u}{\partial \theta} = -\frac{\partial r}{\partial \theta}
 
 (where free; the derivative of r has what the supports pull, where theta moves them)
-gives forward derivatives by one more solve with the tangent, and reverse ones by its transpose.
+gives forward derivatives by one more solve with the tangent, and reverse ones by its transpose:
+of a quantity :math:`q(u(\theta), \theta)`
+
+.. math::
+    \frac{dq}{d\theta} = \frac{\partial q}{\partial \theta}
+        - \lambda^T \frac{\partial r}{\partial \theta}, \qquad
+    K^T \lambda = \frac{\partial q}{\partial u}
+
+whatever the number of parameters (:func:`adjoint`).
 A displacement may be a sum of several, each the root of equations that depend on those before
 (:class:`Equations`).
 """
@@ -28,6 +36,8 @@ from emulator.fem.system import System
 
 Find = Callable[[System, NewtonOptions, jax.Array, jax.Array], Solution]
 Found = Callable[[jax.Array, jax.Array], Solution]
+Quantity = Callable[[jax.Array, jax.Array], jax.Array]
+"""A number () of an equilibrium (n, 3) mm and theta (p,)."""
 
 
 class Equations(NamedTuple):
@@ -93,6 +103,23 @@ def derivatives(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Arr
     forces, held = jax.jacfwd(system.moved_supports(u))(theta)
     moved = jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
     return moved + jnp.moveaxis(held, -1, 0)
+
+
+def adjoint(
+    system: System, quantity: Quantity
+) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    """``(u, theta) -> (value, gradient (p,))`` of ``quantity`` at equilibria, one program."""
+
+    @jit
+    def along_theta(u: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value, (by_u, by_theta) = jax.value_and_grad(quantity, (0, 1))(u, theta)
+        tangent = system.safe_tangent(u, theta, 1.0)[0]
+        wanted = system.restrict(by_u)
+        (weights,) = jax.linear_transpose(partial(system.solve, tangent), wanted)(wanted)
+        back = jax.vjp(system.moved_supports(u), theta)[1]
+        return value, by_theta + back((-weights, by_u))[0]
+
+    return along_theta
 
 
 def inert(solution: Solution) -> Solution:

@@ -5,13 +5,18 @@ and compiling it takes longer than a hundred solves. So what costs time to run i
 itself, once for each system (:func:`compiled`), and the decisions between are taken by
 :func:`cond` and :func:`while_loop`: in Python where the numbers are known, by ``jax.lax`` where
 they are traced. The same code serves both.
+
+Bodies that differ in numbers only (three cubes of a heart, the members of a population) have the
+same programs, to the letter; the first one compiles them for all.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from functools import partial, wraps
 from typing import Any, Concatenate, Protocol
+from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -68,16 +73,42 @@ def with_arrays[R](function: Callable[..., R], arguments: Any, named: Any) -> Ca
     """The program of :func:`jit` for arguments like these: of the arrays, and of their leaves."""
     traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments, **named)
     form = jax.tree.structure(shapes)
-    arrays = traced.consts
-    if not any(isinstance(array, jax.core.Tracer) for array in arrays):
+    jaxpr, arrays = traced.jaxpr, traced.consts
+    inside = any(isinstance(array, jax.core.Tracer) for array in arrays)
+    if not inside:
         with jax.ensure_compile_time_eval():
             arrays = jax.device_put(arrays)  # as jnp.asarray, without a program for each shape
 
     def evaluate(arrays: list[jax.Array], leaves: list[jax.Array]) -> Any:
-        return jax.tree.unflatten(form, jax.core.eval_jaxpr(traced.jaxpr, arrays, *leaves))
+        return jax.tree.unflatten(form, jax.core.eval_jaxpr(jaxpr, arrays, *leaves))
 
     evaluate.__name__ = getattr(function, "__name__", getattr(function, "func", evaluate).__name__)
-    return partial(jax.jit(evaluate), arrays)
+    program = jax.jit(evaluate)
+    return partial(program if inside else _Shared(program), arrays)
+
+
+_programs: WeakValueDictionary[bytes, Callable[..., Any]] = WeakValueDictionary()
+
+
+class _Shared:
+    """A program, or an earlier one that computes the same for numbers.
+
+    The same is what has the same text before XLA compiles it. Derivatives and ``vmap`` are not in
+    that text (rules of one's own close over arrays), so that what is traced has its own program.
+    """
+
+    def __init__(self, program: Callable[..., Any]) -> None:
+        self.own = program
+        self._for_numbers: Callable[..., Any] | None = None
+
+    def __call__(self, arrays: list[jax.Array], leaves: list[jax.Array]) -> Any:
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return self.own(arrays, leaves)
+        if self._for_numbers is None:
+            text = self.own.lower(arrays, leaves).as_text()  # type: ignore[attr-defined]
+            key = hashlib.sha256(text.encode()).digest()
+            self._for_numbers = _programs.setdefault(key, self.own)
+        return self._for_numbers(arrays, leaves)
 
 
 def cond[S](decision: jax.Array, yes: Callable[..., S], no: Callable[..., S], *operands: Any) -> S:

@@ -100,6 +100,8 @@ def test_derivatives_follow_by_the_chain_rule(dilatation):
     weights = jnp.asarray(np.random.default_rng(0).normal(size=along.shape))
     slope = jax.jit(jax.grad(lambda theta: jnp.vdot(weights, u(theta))))(theta)
     assert float(slope @ direction) == pytest.approx(float(jnp.vdot(weights, along)), rel=1e-8)
+    _, gradient = simulator.gradient_of(lambda u, _: jnp.vdot(weights, u))(u(theta), theta)
+    np.testing.assert_allclose(gradient, slope, rtol=1e-7, atol=1e-9 * float(jnp.abs(slope).max()))
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Programs of a system: compiled once, and put together alike by Python and inside ``jit``."""
 
 import logging
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 
 import emulator as em
 from emulator.fem.loop import compiled, cond, jit, while_loop, with_arrays
+from emulator.fem.options import NewtonOptions
 
 
 class Spring:
@@ -69,7 +71,8 @@ def test_what_a_function_closes_over_is_not_in_its_program():
 
     x = jnp.linspace(-1.0, 1.0, 1000)
     program = with_arrays(outer, (x,), {"shift": 2.0})
-    written = program.func.lower(*program.args, jax.tree.leaves(((x,), {"shift": 2.0}))).as_text()
+    leaves = jax.tree.leaves(((x,), {"shift": 2.0}))
+    written = program.func.own.lower(*program.args, leaves).as_text()
     assert len(written) < len(jax.jit(outer).lower(x, shift=2.0).as_text()) / 10
     np.testing.assert_array_equal(jit(outer)(x, shift=2.0), outer(x, shift=2.0))
 
@@ -89,6 +92,54 @@ def test_transformations_go_through_and_shapes_have_programs_of_their_own(counte
     np.testing.assert_array_equal(jax.grad(total)(x), 2.0 * table[:3])
     np.testing.assert_array_equal(jax.jit(jax.hessian(total))(x), np.diag(2.0 * table[:3]))
     np.testing.assert_array_equal(jax.vmap(total)(jnp.stack([x, 2.0 * x])), [3.0, 12.0])
+
+
+def test_bodies_that_differ_in_numbers_share_a_program(counted):
+    def program(table, factor=2.0):
+        return jit(lambda x: factor * jnp.vdot(table, x))
+
+    one, ramp = np.ones(7), np.arange(7.0)
+    first, second = program(one), program(ramp)
+    assert (first(one), second(one)) == (14.0, 42.0)
+    assert counted().count("jit(<lambda>)") == 1
+    # A number in the program's text is another program; so is what a trace goes through.
+    assert program(ramp, 3.0)(one) == 63.0
+    assert counted().count("jit(<lambda>)") == 2
+    np.testing.assert_array_equal(jax.grad(second)(one), 2.0 * ramp)
+    del first  # the program stays for the second
+    assert second(ramp) == 182.0
+
+
+def test_a_derivatives_rule_is_its_own_bodys():
+    """The same value, so the same program; the rules close over what differs."""
+
+    def program(slope):
+        @jax.custom_jvp
+        def value(x):
+            return 2.0 * x
+
+        value.defjvp(lambda primals, tangents: (value(*primals), slope * tangents[0]))
+        return jit(value)
+
+    first, second = program(2.0), program(5.0)
+    assert first(1.0) == second(1.0) == 2.0
+    assert (jax.grad(first)(1.0), jax.grad(second)(1.0)) == (2.0, 5.0)
+
+
+def test_a_body_of_another_size_is_solved_by_the_same_program(beam, counted):
+    """A beam and one twice as long: other numbers, the same mesh but for them."""
+    mesh = beam.mesh
+    longer = replace(mesh, nodes=mesh.nodes * np.array([2.0, 1.0, 1.0]))
+    alone, other = (em.Simulator(replace(beam, mesh=m)) for m in (mesh, longer))
+    u = alone.solve(beam.centre)
+    before = counted().count("jit(closed)")
+    found = other.solve(beam.centre)
+    assert counted().count("jit(closed)") == before
+    assert found.converged
+    assert float(jnp.abs(found.displacement - u.displacement).max()) > 0.1
+    np.testing.assert_allclose(
+        other.system.residual(found.displacement, beam.centre), 0.0, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("decision", [True, False])
@@ -125,7 +176,8 @@ def test_a_loop_is_the_same_in_python_and_inside_jit():
 
 
 def test_a_solve_is_one_program_compiled_once(beam, counted):
-    simulator = em.Simulator(beam)
+    # Of constants of its own, so that no other test's program is this one.
+    simulator = em.Simulator(beam, NewtonOptions(level_iterations=37))
     cold = simulator.solve(beam.centre)
     assert simulator.solve(1.01 * beam.centre).converged
     assert simulator.solve(1.01 * beam.centre, cold.displacement).converged

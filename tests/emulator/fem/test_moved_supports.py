@@ -132,6 +132,31 @@ def test_a_curve_of_forces_is_differentiable(simulator):
     np.testing.assert_allclose(slope[1:], by_differences[1:], rtol=1e-6)
 
 
+def test_a_path_leaves_rest_as_a_solve_does(simulator):
+    """Supports that jump, alone, are no start: a path's first point is a cold solve."""
+    thetas = curve(simulator)[2:4]
+    found = simulator.path(thetas)
+    assert int(found.iterations[0]) == int(simulator.solve(thetas[0]).iterations)
+    traced = jax.jit(simulator.path)(thetas)
+    np.testing.assert_allclose(traced.displacement, found.displacement, atol=1e-12)
+
+
+def test_a_forces_gradient_is_that_of_its_solve(simulator):
+    """By one adjoint solve, where theta moves the support, too."""
+    force = SupportForce(simulator.scene, "top", (1.0, 0.0, 0.0))
+
+    def of(u, theta):
+        return force(u[force.nodes], theta)
+
+    u = simulator(THETA)
+    value, gradient = simulator.gradient_of(of)(u, THETA)
+    assert float(value) == pytest.approx(float(of(u, THETA)), rel=1e-14)
+    expected = jax.grad(lambda theta: of(simulator(theta), theta))(THETA)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-10, atol=1e-12)
+    along = jnp.tensordot(simulator.sensitivities(u, THETA), jax.grad(of)(u, THETA), 2)
+    np.testing.assert_allclose(gradient, along + jax.grad(of, 1)(u, THETA), rtol=1e-10, atol=1e-12)
+
+
 def test_a_path_that_is_none(simulator):
     with pytest.raises(InputError, match=r"path has shape \(3,\); expected \(m, 3\)"):
         simulator.path(THETA)
