@@ -122,23 +122,36 @@ def test_angles_turn_fibres_towards_sheet_and_normal():
             np.testing.assert_allclose(turned, np.sqrt(0.75) * f + 0.5 * towards, atol=1e-12)
 
 
-ENDS = process.ends(np.array([[-0.3, 0.35], [-0.4, 0.3], [-0.1, 0.12]]))
+H = jnp.asarray(
+    cube.homogeneous(np.array([[-0.3, 0.1, 0.35], [-0.4, 0.1, 0.3], [-0.1, 0.05, 0.12]]))[0]
+)
 
 
-def test_features_are_ratios_of_moduli():
-    x = position(a=0.8, b=7.0, a_f=1.6, b_f=10.0, in_plane=9.0)
-    found = process.features(x, jnp.asarray(ENDS))
-    np.testing.assert_allclose(ENDS, [0.16, 0.24**2])
-    np.testing.assert_allclose(found[2:5], np.log1p([1.6 / 0.8, 0.001 / 0.8, 0.001 / 0.8]))
-    grown = 1.6 * np.exp(10.0 * 0.24**2) / (0.8 * np.exp(7.0 * 0.16))
-    assert float(found[5]) == pytest.approx(np.log1p(grown))
-    np.testing.assert_allclose(found[8:], [0.2, 0.0], atol=1e-12)
+def test_features_are_shares_of_terms_at_rest_and_where_curves_end():
+    x = position(a=0.8, b=7.0, a_f=1.6, b_f=10.0, a_fs=0.4, b_fs=3.0)
+    found = process.features(0, x, H)
+    assert found.shape == (process.FEATURES,)
+    np.testing.assert_allclose(found[2:5], np.log1p([1.6 / 0.8, 0.001 / 0.8, 0.4 / 0.8]))
+    ends = np.asarray(found[5:23]).reshape(6, 3)
+    # Sheared by -0.3 from the fibres' plane towards the sheet: I4f = 1.09, I1 = 3.09, I8 = -0.3.
+    shares = [
+        1.6 / 0.8 * 0.09**2 / 0.09 * np.exp(10.0 * 0.09**2 - 7.0 * 0.09),
+        0.0,
+        0.4 / 0.8 * 0.09 / 0.09 * np.exp(3.0 * 0.09 - 7.0 * 0.09),
+    ]
+    np.testing.assert_allclose(ends[0], np.log1p(shares), rtol=1e-10, atol=1e-12)
+    # Fibres that are pushed together carry nothing.
+    np.testing.assert_allclose(ends[4][0], 0.0, atol=1e-12)
+    # Turned by 30 degrees they are pulled at one end of a shear more than at the other.
+    turned = x.at[8].set(30.0 / 45.0)
+    one, other = np.asarray(process.features(0, turned, H)[5:23]).reshape(6, 3)[:2, 0]
+    assert other > 2.0 * one
 
 
 def test_a_term_that_is_off_has_no_exponent():
-    x = jnp.stack([position(a=1.0, b=5.0, b_f=b_f) for b_f in (0.5, 20.0)])
-    phi = jax.vmap(process.features, (0, None))(x, jnp.asarray(ENDS))
-    assert float(jnp.abs(phi[1] - phi[0]).max()) < 2e-3
+    x = [position(a=1.0, b=5.0, b_f=b_f) for b_f in (0.5, 20.0)]
+    phi = [process.features(0, each, H) for each in x]
+    assert float(jnp.abs(phi[1] - phi[0]).max()) < 5e-3
 
 
 def test_the_processs_correlations_are_the_kernels_derivatives():
@@ -146,12 +159,10 @@ def test_the_processs_correlations_are_the_kernels_derivatives():
     lengths = np.linspace(0.5, 2.0, process.FEATURES)
 
     def kernel(x, y):
-        step = (
-            process.features(x, jnp.asarray(ENDS)) - process.features(y, jnp.asarray(ENDS))
-        ) / lengths
+        step = (process.features(1, x, H) - process.features(1, y, H)) / lengths
         return jnp.exp(-0.5 * step @ step)
 
-    one, other = (process.values_and_slopes(np.asarray(at)[None], ENDS)[0] for at in (x, y))
+    one, other = (process.values_and_slopes(1, np.asarray(at)[None], H)[0] for at in (x, y))
     found = process.correlations(one, other, lengths)
     np.testing.assert_allclose(found[0, 0], kernel(x, y), rtol=1e-12)
     np.testing.assert_allclose(found[0, 1:], jax.grad(kernel, 1)(x, y), atol=1e-12)
@@ -164,8 +175,8 @@ def made_up(x):
     """A q of one point, smooth in features: (n, 1) and its slopes (n, 1, p)."""
 
     def q(x):
-        phi = process.features(x, jnp.asarray(ENDS))
-        return jnp.array([0.3 * jnp.sin(phi[2]) + 0.1 * phi[8] ** 2])
+        phi = process.features(0, x, H)
+        return jnp.array([0.3 * jnp.sin(phi[2]) + 0.1 * phi[-2] ** 2])
 
     x = jnp.asarray(x)
     return np.asarray(jax.vmap(q)(x)), np.asarray(jax.vmap(jax.jacfwd(q))(x))
@@ -174,7 +185,7 @@ def made_up(x):
 @pytest.fixture(scope="module")
 def told():
     x = np.random.default_rng(0).uniform(-0.6, 0.6, (12, 10))
-    return process.known(x, *made_up(x), ENDS)
+    return process.known(0, x, *made_up(x), H)
 
 
 def test_the_slopes_of_likelihood_are_its_differences(told):
@@ -195,7 +206,7 @@ def test_a_process_goes_through_its_runs_and_says_what_it_leaves(told):
     # Features that q does not read have longer lengths than those it does.
     assert lengths[2] < lengths[[3, 4, 9]].min()
     x = np.random.default_rng(1).uniform(-0.6, 0.6, (60, 10))
-    points, _ = process.values_and_slopes(x, ENDS)
+    points, _ = process.values_and_slopes(0, x, H)
     covariance, sd = process.left(told, lengths, points)
     rows = points.value == 1.0
     said = sd * np.sqrt(np.maximum(np.diagonal(covariance)[rows], 0.0))

@@ -88,7 +88,7 @@ def _law_of() -> Scene:
     return scene(0, np.ones(3), cells=1)
 
 
-def _turned(number: int, x: jax.Array) -> jax.Array:
+def turned_to(number: int, x: jax.Array) -> jax.Array:
     """Fibre and sheet (2, 3) of a cube at a position (p,) in the box."""
     f, s, across, along = (v[None, None] for v in _frame(number))
     one = np.ones((1, 1))
@@ -140,7 +140,7 @@ def formula(x: jax.Array, H: jax.Array, C: jax.Array, area: jax.Array) -> jax.Ar
     """
     stress = jax.grad(point_energy(_law_of(), theta_of(x[0])))
     count = H.shape[1] * H.shape[2]
-    directions = jnp.stack([_turned(k, x[k]) for k in range(len(x))])
+    directions = jnp.stack([turned_to(k, x[k]) for k in range(len(x))])
     each = jnp.repeat(directions, count, axis=0)
     P = jax.vmap(lambda h, d: stress(h, Tissue(d)))(H.reshape(-1, 3, 3), each)
     forces = jnp.einsum("kij,kij->k", C.reshape(-1, 3, 3), P).reshape(len(x), count)

@@ -142,13 +142,12 @@ class Emulated(NamedTuple):
     """The emulator of a heart's forces, arrays only, so that one program serves all hearts.
 
     process : of each cube, arrays with a first axis of 3. finer : (3, k) by which a finer mesh's
-    forces differ, a factor. ends : (3, 2), see :func:`.process.ends`. amounts : (3, 3, j).
-    H, C : as of :func:`.cube.homogeneous`. area : (3,) mm2.
+    forces differ, a factor. amounts : (3, 3, j). H, C : as of
+    :func:`.cube.homogeneous`. area : (3,) mm2.
     """
 
     process: Process
     finer: jax.Array
-    ends: jax.Array
     amounts: jax.Array
     H: jax.Array
     C: jax.Array
@@ -157,7 +156,7 @@ class Emulated(NamedTuple):
 
 def forces(emulated: Emulated, x: jax.Array) -> jax.Array:
     """Forces (3, k) in N of a heart's cubes at positions (3, p)."""
-    phi = jax.vmap(process.features)(x, emulated.ends)
+    phi = jnp.stack([process.features(k, x[k], H) for k, H in enumerate(emulated.H)])
     q = jax.vmap(process.correction)(emulated.process, phi)
     return emulated.finer * cube.formula(x, emulated.H, emulated.C, emulated.area) * jnp.exp(q)
 
@@ -202,7 +201,7 @@ class Fit:
         Covariance of q and its slopes, :func:`.process.left`, and the sd (m,) of q: a fraction of
         the force.
         """
-        points, _ = process.values_and_slopes(x, np.asarray(self.emulated.ends[number]))
+        points, _ = process.values_and_slopes(number, x, self.emulated.H[number])
         covariance, sd = process.left(self.known[number], self.lengths[number], points)
         variance = np.diagonal(covariance)[:: len(covariance) // len(x)]
         return covariance, sd * np.sqrt(np.maximum(variance, 0.0))
@@ -221,8 +220,7 @@ def fit(bodies: Sequence[Cube], runs: Sequence[Runs], before: Fit | None = None)
     amounts = np.stack([body.amounts for body in bodies])
     H, C = (jnp.asarray(np.stack(p)) for p in zip(*map(cube.homogeneous, amounts), strict=True))
     area = jnp.asarray([body.area for body in bodies])
-    ends = np.stack([process.ends(each) for each in amounts])
-    known = [_known(k, each, ends[k], H, C, area) for k, each in enumerate(runs)]
+    known = [_known(k, each, H, C, area) for k, each in enumerate(runs)]
     rows = process.room(max(told.runs for told in known))
     starts = [None] * len(known) if before is None else list(before.lengths)
 
@@ -233,13 +231,11 @@ def fit(bodies: Sequence[Cube], runs: Sequence[Runs], before: Fit | None = None)
     with threadpool_limits(1), ThreadPoolExecutor(cores()) as pool:
         made = list(pool.map(made_of, known, starts))
     one = jax.tree.map(lambda *each: jnp.stack(each), *made)
-    rest = (jnp.asarray(ends), jnp.asarray(amounts), H, C, area)
+    rest = (jnp.asarray(amounts), H, C, area)
     return Fit(Emulated(one, jnp.ones(one.mean.shape), *rest), known)
 
 
-def _known(
-    k: int, runs: Runs, ends: np.ndarray, H: jax.Array, C: jax.Array, area: jax.Array
-) -> Known:
+def _known(k: int, runs: Runs, H: jax.Array, C: jax.Array, area: jax.Array) -> Known:
     """What one cube's runs say of its q."""
     told = []
     for row in runs.x:
@@ -251,4 +247,4 @@ def _known(
     if not sound.sum() > 0.5 * len(sound):
         raise SolverError(f"{(~sound).sum()} of {len(sound)} runs of cube {k + 1} failed")
     slopes = (runs.slopes / runs.force[..., None] - rising / formula[..., None])[sound]
-    return process.known(runs.x[sound], np.log(ratio[sound]), slopes, ends)
+    return process.known(k, runs.x[sound], np.log(ratio[sound]), slopes, H[k])
