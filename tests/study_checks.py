@@ -5,10 +5,11 @@ import pytest
 
 def accuracy_vs_time(results):  # the study asserts its fronts
     cases = {case["rung"]: case for case in results["cases"]}
-    names = ("network alone", "emulator, full field", "emulator + 1 Newton step")
-    network, emulator, polished = (cases[name]["own_mm"]["median"] for name in names)
+    # The network alone has a mesh of its own, on which the study measures nothing but the truth.
+    names = ("emulator, full field", "emulator + 1 Newton step")
+    emulator, polished = (cases[name]["own_mm"]["median"] for name in names)
     assert polished < 0.01 * emulator
-    assert max(emulator, network) < 1e-3
+    assert emulator < 1e-3
 
 
 def certificate(results):
