@@ -107,7 +107,9 @@ class _Shared:
         if self._for_numbers is None:
             text = self.own.lower(arrays, leaves).as_text()  # type: ignore[attr-defined]
             key = hashlib.sha256(text.encode()).digest()
-            self._for_numbers = _programs.setdefault(key, self.own)
+            # A function of Python's is an address in the text, where another may lie later.
+            shared = "callback" not in text
+            self._for_numbers = _programs.setdefault(key, self.own) if shared else self.own
         return self._for_numbers(arrays, leaves)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.loop import compiled, cond, jit, while_loop, with_arrays
+from emulator.fem.loop import _programs, compiled, cond, jit, while_loop, with_arrays
 from emulator.fem.options import NewtonOptions
 
 
@@ -124,6 +124,15 @@ def test_a_derivatives_rule_is_its_own_bodys():
     first, second = program(2.0), program(5.0)
     assert first(1.0) == second(1.0) == 2.0
     assert (jax.grad(first)(1.0), jax.grad(second)(1.0)) == (2.0, 5.0)
+
+
+def test_functions_of_python_are_not_shared():
+    programs = set(_programs)
+    for factor in (2.0, 3.0):
+        shape = jax.ShapeDtypeStruct((), float)
+        host = jit(lambda x, k=factor, s=shape: jax.pure_callback(lambda y: k * y, s, x))
+        assert host(jnp.asarray(5.0)) == 5.0 * factor
+    assert set(_programs) <= programs
 
 
 def test_a_body_of_another_size_is_solved_by_the_same_program(beam, counted):
