@@ -198,8 +198,9 @@ def test_the_slopes_of_likelihood_are_its_differences(told):
 
 def test_a_process_goes_through_its_runs_and_says_what_it_leaves(told):
     lengths = process.likeliest(told)
-    made = process.conditioned(told, lengths)
-    assert len(made.at) == process.room(told.runs) == process.ROOM
+    made = process.conditioned(told, lengths, process.room(told.runs))
+    assert len(made.at) == process.ROOM
+    assert process.room(process.ROOM + 1) == 2 * process.ROOM
     value = told.told.value == 1.0
     there = jax.vmap(process.correction, (None, 0))(made, told.told.at[value])
     np.testing.assert_allclose(there, told.y[value] + told.mean, atol=1e-3)

@@ -74,10 +74,6 @@ class Cube:
         """Material parameters and angles, p; the rest of theta are the amounts."""
         return len(self.body.parameters) - len(cube.AMOUNTS)
 
-    def material(self, x: jax.Array) -> jax.Array:
-        """Material parameters and angles (p,) at the position ``x`` (p,)."""
-        return self.thetas(x, 0, jnp.zeros(1))[0, : self.unknowns]
-
     def thetas(self, x: jax.Array, mode: int, amounts: jax.Array) -> jax.Array:
         """Theta (k, p + 3) at the position ``x`` (p,) and ``amounts`` (k,) of a mode."""
         rest = jnp.full(len(cube.AMOUNTS), 0.5)

@@ -163,9 +163,11 @@ def correlations(a: Told, b: Told, lengths: np.ndarray) -> np.ndarray:
     return _correlations(a, b, lengths)[0]
 
 
-def _pulled_back(told: Told, weights: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Slopes (f,) in logarithms of lengths of the sum of ``weights`` (n, n) times correlations."""
-    K, (kernel, first, second) = _correlations(told, told, lengths)
+def _pulled_back(
+    told: Told, weights: np.ndarray, K: np.ndarray, parts: _Parts, lengths: np.ndarray
+) -> np.ndarray:
+    """Slopes (f,) in logarithms of lengths of the sum of ``weights`` (n, n) times K (n, n)."""
+    kernel, first, second = parts
     at, along = told.at, told.along
     B = weights * kernel
     M, P, Q = weights * K, B * first, B * second
@@ -206,24 +208,27 @@ def known(number: int, x: np.ndarray, q: np.ndarray, slopes: np.ndarray, H: jax.
     return Known(told, y.reshape(told.size, -1), mean, J)
 
 
-def _factor(told: Told, lengths: np.ndarray) -> np.ndarray:
-    """Cholesky factor (n, n) of the correlation of numbers."""
-    full = correlations(told, told, lengths)
-    full[np.diag_indices(told.size)] += _NUGGET
-    return cholesky(full, lower=True, overwrite_a=True)
+def _factored(K: np.ndarray) -> np.ndarray:
+    """Cholesky factor (n, n) of a correlation, with the nugget."""
+    return cholesky(K + _NUGGET * np.eye(len(K)), lower=True, overwrite_a=True)
+
+
+def _factor(known: Known, lengths: np.ndarray) -> np.ndarray:
+    return _factored(correlations(known.told, known.told, lengths))
 
 
 def _unlikely(logs: np.ndarray, known: Known) -> tuple[float, np.ndarray]:
     """L / n of logarithms of lengths (f,), and its slopes."""
     lengths, (n, k) = np.exp(logs), known.y.shape
-    factor = _factor(known.told, lengths)
+    K, parts = _correlations(known.told, known.told, lengths)
+    factor = _factored(K)
     weights = cho_solve((factor, True), known.y)
     misfits = (known.y * weights).sum(axis=0)
     value = k * np.log(np.diag(factor)).sum() + 0.5 * n * np.log(misfits / n).sum()
     lower = np.tril(dpotri(factor, lower=True)[0])
     inverse = lower + np.tril(lower, -1).T
     by_K = 0.5 * k * inverse - 0.5 * n * (weights / misfits) @ weights.T
-    return value / n, _pulled_back(known.told, by_K, lengths) / n
+    return value / n, _pulled_back(known.told, by_K, K, parts, lengths) / n
 
 
 def likeliest(known: Known, start: np.ndarray | None = None, *, steps: int = 12) -> np.ndarray:
@@ -246,21 +251,21 @@ def room(runs: int) -> int:
     return ROOM * max(1, -(-runs // ROOM))
 
 
-def conditioned(known: Known, lengths: np.ndarray, rows: int | None = None) -> Process:
+def conditioned(known: Known, lengths: np.ndarray, rows: int) -> Process:
     """The process of what is known, with room for as many runs as ``rows``."""
-    factor = _factor(known.told, lengths)
+    factor = _factor(known, lengths)
     count, _, p = known.J.shape
     weights = cho_solve((factor, True), known.y).reshape(count, p + 1, -1)
     slopes = np.einsum("rfp,rpk->rfk", known.J, weights[:, 1:])
     parts = known.told.at[:: p + 1], weights[:, 0], slopes
-    empty = (rows or room(count)) - count
+    empty = rows - count
     padded = (np.concatenate([a, np.zeros((empty, *a.shape[1:]))]) for a in parts)
     return Process(*map(jnp.asarray, (*padded, lengths, known.mean)))
 
 
 def left(known: Known, lengths: np.ndarray, points: Told) -> tuple[np.ndarray, float]:
     """Correlation (m, m) of numbers that runs leave, and q's largest sd over the curves' points."""
-    factor = _factor(known.told, lengths)
+    factor = _factor(known, lengths)
     between = correlations(known.told, points, lengths)
     half = solve_triangular(factor, between, lower=True)
     explained = solve_triangular(factor, known.y, lower=True)
