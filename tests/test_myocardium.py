@@ -260,7 +260,7 @@ def test_moves_join_modes_that_nuts_does_not(known):
     given = moves.modes(np.concatenate([z, z]), np.zeros((4, 100))) if known else moves.unknown(1)
     found = moves.chain(
         lambda z: -apart.log_prob(z[0]), given, np.array([False]), jax.random.key(0),
-        warmup=100, draws=600,
+        warmup=100, draws=600, room=600,
     )  # fmt: skip
     right = float((found.z > 0.0).mean())
     assert (0.65 < right < 0.85) if known else right in (0.0, 1.0)
@@ -273,7 +273,7 @@ def test_mirrored_entries_change_sign_where_that_is_as_likely():
 
     mirrored = np.array([True, True])
     found = moves.chain(
-        potential, moves.unknown(2), mirrored, jax.random.key(1), warmup=100, draws=400
+        potential, moves.unknown(2), mirrored, jax.random.key(1), warmup=100, draws=400, room=400
     )
     assert 0.35 < float((found.z[:, 0] > 0.0).mean()) < 0.65
     assert float(found.z[:, 1].min()) > 0.0
@@ -348,15 +348,21 @@ def test_tests_that_leave_the_verdict_open_become_runs(monkeypatch):
 
     def after(verdicts):
         told = iter(verdicts)
-        monkeypatch.setattr(checked, "campaign", lambda *_: asked.append("first") or 0)
-        monkeypatch.setattr(checked, "again", lambda found, *_: asked.append("again") or found + 1)
+
+        def made(word, seconds):
+            asked.append(word)
+            return SimpleNamespace(seconds=seconds)
+
+        monkeypatch.setattr(checked, "campaign", lambda *_: made("first", 0))
+        monkeypatch.setattr(checked, "again", lambda found, *_: made("again", found.seconds + 1))
         monkeypatch.setattr(checked, "certificate", lambda _: SimpleNamespace(verdict=next(told)))
         asked.clear()
-        return checked.decided(SimpleNamespace(name="TSL9"), campaign.Plan(again=2), None, 0)
+        heart = SimpleNamespace(name="TSL9")
+        return checked.decided(heart, campaign.Plan(again=2), None, 0).seconds
 
     assert after(["undecided", "accepted"]) == 1
     assert asked == ["first", "again"]
-    assert after(["undecided", "not certified"]) == 2
+    assert after(["undecided", "not certified", "undecided"]) == 2
     assert after(["accepted"]) == 0
     assert asked == ["first"]
 

@@ -24,7 +24,6 @@ from studies.sheep_myocardium.inference import (
     LAWS,
     ORTHOTROPIC,
     Found,
-    forget_programs,
     parameters,
     settled,
 )
@@ -51,8 +50,8 @@ def described(found: Found, apart: dict[str, Prediction]) -> Case:
         "held_out": summed(apart),
         "R2": _explained(found),
     }
-    if "angles" in found.draws:
-        degrees = cube.ANGLES[0].high * found.draws["angles"]
+    if found.of.turned:
+        degrees = cube.ANGLES[0].high * found.draws["turned"]
         case["angles_deg"] = {
             "mean": degrees.mean(axis=0).round(1).tolist(),
             "sd": degrees.std(axis=0).round(1).tolist(),
@@ -71,7 +70,7 @@ def _explained(found: Found) -> dict[str, float]:
 def of_heart(found: Campaign, plan: Plan) -> Case:
     """Laws, angles known and unknown, held-out modes, FEM's check and the mesh's."""
     began = perf_counter()
-    size = {"draws": plan.draws, "warmup": plan.draws}
+    size = {"steps": plan.steps}
     laws: Case = {}
     for law in LAWS:
         main = law == ORTHOTROPIC
@@ -93,8 +92,7 @@ def of_heart(found: Campaign, plan: Plan) -> Case:
 
 def of_twins(found: Campaign, plan: Plan) -> Case:
     """Coverage of a heart's twins."""
-    draws = 50 if plan is QUICK else 300
-    return twins.covered(list(twins.ranks(found, SEED, draws)))
+    return twins.covered(list(twins.ranks(found, SEED, plan.steps)))
 
 
 def of_population(found: list[Campaign], quick: bool) -> Case:
@@ -177,7 +175,6 @@ def main() -> None:
         campaigns.append(found)
         results.case(each.name, lambda found=found: of_heart(found, plan))
         results.case(f"{each.name}, twins", lambda found=found: of_twins(found, plan))
-        forget_programs()
     results.case("population", lambda: of_population(campaigns, words.quick))
     results.write(**_together(results.cases))
     figures.modes(given, results.cases, words.out / "held_out_modes.png")

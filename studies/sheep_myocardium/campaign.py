@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,8 +25,9 @@ from studies.sheep_myocardium.curves import (
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.inference import (
     ORTHOTROPIC,
+    TIMES,
     Found,
-    log_likelihoods,
+    of_draws,
     sample,
     settled,
 )
@@ -35,7 +35,6 @@ from studies.sheep_myocardium.process import next_runs
 
 from emulator.store import replacing
 
-LOG = logging.getLogger(__name__)
 FINER = 5
 """Cells along an edge of the finer mesh: 1331 nodes."""
 _ORDER = 1.2  # of the force's convergence: twice 0.595, the exponent at a glued edge
@@ -48,7 +47,7 @@ class Plan:
     wide : over the box. rounds, each : after them, so many times so many, where they tell most of q
     at draws of the posterior. tests : at draws of the posterior. again : times that tests become
     runs, with one more round, and others are made, while the verdict is open. meshes : at which a
-    finer mesh is solved, too. draws : of each of four chains.
+    finer mesh is solved, too. steps : of a chain's warm-up, and of its draws.
     """
 
     wide: int = 12
@@ -57,11 +56,12 @@ class Plan:
     tests: int = 30
     again: int = 5
     meshes: int = 2
-    draws: int = 300
+    steps: int = 300
 
 
-QUICK = Plan(wide=4, rounds=1, each=2, tests=4, again=0, meshes=1, draws=50)
+QUICK = Plan(wide=4, rounds=1, each=2, tests=4, again=0, meshes=1, steps=50)
 _POOL = 80  # draws that next runs are chosen from
+_forces = jax.jit(jax.vmap(forces, (None, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +113,7 @@ class Campaign:
     def by_map(self) -> np.ndarray:
         """Forces (t, 9, j) in N of the tests by the emulator."""
         x = jnp.asarray(np.stack([test.x for test in self.tests], axis=1))
-        each = jax.jit(jax.vmap(forces, (None, 0)))(self.coarse, x)
-        return np.asarray(each).reshape(len(x), len(MODES), -1)
+        return np.asarray(_forces(self.coarse, x)).reshape(len(x), len(MODES), -1)
 
     @property
     def said(self) -> np.ndarray:
@@ -129,9 +128,9 @@ class Campaign:
         """
         finer = np.asarray(self.cubes.finer).reshape(len(MODES), -1)
         of = self.explored.of
-        each = jax.jit(jax.vmap(lambda of, m, o: log_likelihoods(of, m, o).sum(), (None, 0, 0)))
-        omega = jnp.asarray(self.explored.draws["omega"][self.tested])
-        fem, cheap = (np.asarray(each(of, m * finer, omega)) for m in (self.by_fem, self.by_map))
+        omega = self.explored.draws["omega"][self.tested]
+        by = (self.by_fem, self.by_map)
+        fem, cheap = (of_draws(of, m * finer, omega).sum(axis=1) for m in by)
         return fem - cheap
 
 
@@ -185,9 +184,9 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
     for number in range(plan.rounds):
         # Of a posterior with fewer terms, too: a term that is off is a corner of its own.
         law = "fibres" if number == 1 else ORTHOTROPIC
-        found = sample(heart, fitted.emulated, seed + number, law, **_size(plan))
+        found = sample(heart, fitted.emulated, seed + number, law, steps=plan.steps)
         runs, fitted = _round(fem, runs, fitted, found, plan, seed, doubt)
-    on_mesh = settled(heart, fitted.emulated, seed, **_size(plan))
+    on_mesh = settled(heart, fitted.emulated, seed, steps=plan.steps)
     x = np.moveaxis(_some(on_mesh, plan.meshes, seed), 1, 0)
     meshes = fem("mesh", x), fem.finer("mesh_finer", x)
     return _tested(fem, runs, fitted, meshes, on_mesh, plan, seed, doubt, perf_counter() - began)
@@ -201,13 +200,10 @@ def again(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign
     fitted = fit(found.bodies, runs, found.fitted)
     doubt = list(found.doubt)
     runs, fitted = _round(fem, runs, fitted, found.explored, plan, seed, doubt)
-    on_mesh = settled(found.heart, fitted.emulated, seed + len(doubt), **_size(plan))
+    how = {"known": found.on_mesh.modes, "steps": plan.steps}
+    on_mesh = settled(found.heart, fitted.emulated, seed + len(doubt), **how)
     seconds = found.seconds + perf_counter() - began
     return _tested(fem, runs, fitted, found.meshes, on_mesh, plan, seed, doubt, seconds)
-
-
-def _size(plan: Plan) -> dict[str, int]:
-    return {"draws": plan.draws, "warmup": plan.draws}
 
 
 def _round(
@@ -224,7 +220,8 @@ def _round(
     pool = np.moveaxis(_some(found, _POOL, seed + number), 1, 0)
     left, sds = zip(*(fitted.left(k, pool[k]) for k in range(3)), strict=True)
     doubt.append(float(np.quantile(np.max(sds, axis=0), 0.9)))
-    LOG.info("%s, round %d: q is known to %.1f %%", fem.heart.name, number, 100 * doubt[-1])
+    told = f"{fem.heart.name}, round {number + 1}: q is known to {100 * doubt[-1]:.1f} %"
+    print(told, flush=True)
     chosen = [at[next_runs(C, _POOL, plan.each)] for at, C in zip(pool, left, strict=True)]
     new = fem(f"round{number}", chosen)
     runs = [joined(pair) for pair in zip(runs, new, strict=True)]
@@ -245,7 +242,8 @@ def _tested(
     """The posterior without the mesh's error, and FEM at some of its draws."""
     began, number = perf_counter(), len(doubt)
     cubes_there = without_mesh(fitted.emulated, *meshes)
-    explored = settled(fem.heart, cubes_there, seed + number, times=4, **_size(plan))
+    how = {"known": on_mesh.modes, "steps": plan.steps, "times": TIMES}
+    explored = settled(fem.heart, cubes_there, seed + number, **how)
     rows = np.random.default_rng(seed + number).permutation(len(explored.positions))[: plan.tests]
     tests = fem(f"tests{number}", np.moveaxis(explored.positions[rows], 1, 0))
     seconds += perf_counter() - began

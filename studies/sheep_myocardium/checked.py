@@ -11,7 +11,6 @@ is three tenths of the correction, which an order of 1 or 2 in place of 1.2 woul
 
 from __future__ import annotations
 
-import logging
 from dataclasses import asdict
 from pathlib import Path
 
@@ -35,7 +34,6 @@ from calibrate.certificate.evidence import (
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.verdict import Certificate, judge
 
-LOG = logging.getLogger(__name__)
 _LEFT = 0.3  # of the mesh's correction
 _FEWEST = 25  # weights that have a tail
 
@@ -91,10 +89,10 @@ def certificate(found: Campaign) -> Certificate:
 def decided(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign:
     """A heart's campaign, until its certificate is accepted or it was tested often enough."""
     found = campaign(heart, plan, kept, seed)
-    for _ in range(plan.again):
-        verdict = certificate(found)
-        LOG.info("%s: %s", heart.name, verdict)
-        if verdict.verdict == "accepted":
+    for left in reversed(range(plan.again + 1)):
+        given = certificate(found)
+        print(f"{heart.name}, {found.seconds:.0f} s: {given}", flush=True)
+        if given.verdict == "accepted" or not left:
             break
         found = again(found, plan, kept, seed)
     return found

@@ -45,10 +45,8 @@ def held_out(found: Found, seed: int, *, refit: bool = True) -> dict[str, Predic
         log_weights, shape = array_stats.psislw(-(densities - densities.max()))
         heavy, used = bool(shape > _HEAVIEST), found
         if heavy and refit:
-            size = {"draws": 300, "warmup": 300, "chains": 1}
-            used = sample(
-                found.heart, found.of.cubes, seed + k, found.law, left_out=(mode,), **size
-            )
+            how = {"left_out": (mode,), "known": found.modes, "chains": 1}
+            used = sample(found.heart, found.of.cubes, seed + k, found.law, **how)
             densities, log_weights = used.log_likelihoods[:, k], np.zeros(len(used.positions))
         log_weights = log_weights - logsumexp(log_weights)
         bands = predicted(used, k, np.exp(log_weights), np.random.default_rng(seed + k))

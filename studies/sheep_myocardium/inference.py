@@ -12,7 +12,8 @@ hundred facts; 3 % of each point are its own, for what the emulator is
 off. :math:`\omega` is inferred, the load cell's noise is 3 mN. Each cube has fibre angles of its
 own, 15 degrees about the direction it was cut along.
 
-What differs between hearts is arrays, so that a law's program is compiled once for all of them.
+What differs between hearts and between laws is arrays: one program is compiled for all of them. A
+parameter that a law leaves out is drawn from its prior and not looked at.
 """
 
 from __future__ import annotations
@@ -58,18 +59,25 @@ ORTHOTROPIC = "fibres, sheets, shear"
 MATERIAL = tuple(p.name for p in cube.MATERIAL)
 _EXPONENT = {"a_f": "b_f", "a_s": "b_s", "a_fs": "b_fs"}
 _CUBES = 3
+_ANGLES = (_CUBES, len(cube.ANGLES))
+TIMES = 4
+"""As many draws as steps of warm-up, at most."""
 ANGLE_SD = ANGLE / cube.ANGLES[0].high  # in half widths of the box
 
 
 class Seen(NamedTuple):
-    """What a program is given of a heart.
+    """What the program is given of a heart and a law.
 
     cubes : the emulator. data : (9, j) N. used : (9,) 1 for modes whose data is used, else 0.
+    acting : (8,) whether the law has a parameter. turned : () 1 where fibre angles are unknown, 0
+    where fibres are along the cut.
     """
 
     cubes: Emulated
     data: jax.Array
     used: jax.Array
+    acting: jax.Array
+    turned: jax.Array
 
     @property
     def amounts(self) -> jax.Array:
@@ -77,18 +85,26 @@ class Seen(NamedTuple):
         return self.cubes.amounts.reshape(len(MODES), -1)
 
 
-def seen(heart: Heart, cubes: Emulated, left_out: tuple[str, ...] = ()) -> Seen:
-    """A heart's forces and data; modes may be left out."""
-    data = np.stack([heart.curves[mode].force for mode in MODES])
-    used = np.array([float(mode not in left_out) for mode in MODES])
-    return Seen(cubes, jnp.asarray(data), jnp.asarray(used))
-
-
 def parameters(law: str) -> tuple[str, ...]:
     """Names of a law's parameters."""
     absent = LAWS[law]
     dead = {*absent, *(_EXPONENT[name] for name in absent)}
     return tuple(name for name in MATERIAL if name not in dead)
+
+
+def seen(
+    heart: Heart,
+    cubes: Emulated,
+    law: str = ORTHOTROPIC,
+    *,
+    angles: bool = True,
+    left_out: tuple[str, ...] = (),
+) -> Seen:
+    """A heart's forces and data by a law, with fibre ``angles`` unknown; modes may be left out."""
+    data = np.stack([heart.curves[mode].force for mode in MODES])
+    used = np.array([float(mode not in left_out) for mode in MODES])
+    acting = np.array([name in parameters(law) for name in MATERIAL])
+    return Seen(cubes, *map(jnp.asarray, (data, used, acting, float(angles))))
 
 
 def means(of: Seen, material: jax.Array, turned: jax.Array) -> jax.Array:
@@ -111,40 +127,51 @@ def log_likelihoods(of: Seen, mean: jax.Array, omega: jax.Array) -> jax.Array:
     return dist.MultivariateNormal(mean, covariance).log_prob(of.data)
 
 
+_of_draws = jax.jit(jax.vmap(log_likelihoods, (None, 0, 0)))
+
+
+def of_draws(of: Seen, mean: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Log densities (d, 9) of the modes' data at draws: mean (d, 9, j) in N, omega (d,)."""
+    return np.asarray(_of_draws(of, jnp.asarray(mean), jnp.asarray(omega)))
+
+
 def _position(name: str, value: jax.Array) -> jax.Array:
     """Position of a modulus in the box, at its wall beyond it."""
     parameter = cube.MATERIAL[MATERIAL.index(name)]
     return 2.0 * parameter.to_unit(jnp.minimum(value, parameter.high)) - 1.0
 
 
-def program(law: str, *, angles: bool) -> Callable[[Seen], None]:
-    """The NumPyro program of a heart by a law; ``angles`` says whether the fibres' are unknown."""
-
-    def model(of: Seen) -> None:
-        x = {name: jnp.asarray(-1.0) for name in MATERIAL}
-        for name in parameters(law):
-            if name in MEANS:
-                value = numpyro.sample(name, dist.Exponential(1.0 / MEANS[name]))
-                x[name] = _position(name, value)
-            else:
-                x[name] = numpyro.sample(f"x_{name}", dist.Uniform(-1.0, 1.0))
-        turned = jnp.zeros((_CUBES, len(cube.ANGLES)))
-        if angles:
-            normal = dist.TruncatedNormal(0.0, ANGLE_SD, low=-1.0, high=1.0)
-            turned = numpyro.sample("angles", normal.expand(turned.shape).to_event(2))
-        omega = numpyro.sample("omega", dist.HalfNormal(OFF))
-        material = numpyro.deterministic("x", jnp.stack(list(x.values())))
-        mean = numpyro.deterministic("means", means(of, material, turned))
-        numpyro.factor("data", jnp.vdot(of.used, log_likelihoods(of, mean, omega)))
-
-    return model
+def program(of: Seen) -> None:
+    """The NumPyro program of a heart by a law."""
+    x = []
+    for k, name in enumerate(MATERIAL):
+        if name in MEANS:
+            value = numpyro.sample(name, dist.Exponential(1.0 / MEANS[name]))
+            at = _position(name, value)
+        else:
+            at = numpyro.sample(f"x_{name}", dist.Uniform(-1.0, 1.0))
+        x.append(jnp.where(of.acting[k], at, -1.0))
+    normal = dist.TruncatedNormal(0.0, ANGLE_SD, low=-1.0, high=1.0)
+    turned = of.turned * numpyro.sample("angles", normal.expand(_ANGLES).to_event(2))
+    omega = numpyro.sample("omega", dist.HalfNormal(OFF))
+    material = numpyro.deterministic("x", jnp.stack(x))
+    numpyro.deterministic("turned", turned)
+    mean = numpyro.deterministic("means", means(of, material, turned))
+    numpyro.factor("data", jnp.vdot(of.used, log_likelihoods(of, mean, omega)))
 
 
-def _sites(law: str, *, angles: bool) -> dict[str, jax.Array]:
-    """Zeros like each unknown of a law's program, by its site."""
-    sites = {n if n in MEANS else f"x_{n}": jnp.zeros(()) for n in parameters(law)}
-    turned = {"angles": jnp.zeros((_CUBES, len(cube.ANGLES)))} if angles else {}
-    return sites | turned | {"omega": jnp.zeros(())}
+_SITES = {
+    **{name if name in MEANS else f"x_{name}": jnp.zeros(()) for name in MATERIAL},
+    "angles": jnp.zeros(_ANGLES),
+    "omega": jnp.zeros(()),
+}
+"""Zeros like each unknown, by its site."""
+
+
+def _marked(marks: dict[str, bool]) -> np.ndarray:
+    """Whether each unconstrained position (u,) is of a marked site."""
+    each = {site: jnp.full(zero.shape, marks.get(site, False)) for site, zero in _SITES.items()}
+    return np.asarray(ravel_pytree(each)[0])
 
 
 class Drawn(NamedTuple):
@@ -155,42 +182,34 @@ class Drawn(NamedTuple):
 
 
 @lru_cache
-def _sampler(
-    law: str, angles: bool, draws: int, warmup: int
-) -> Callable[[jax.Array, Seen, Modes], Drawn]:
-    """One program for all hearts, chains and modes."""
-    model = program(law, angles=angles)
-    sites = _sites(law, angles=angles)
-    unravel = ravel_pytree(sites)[1]
-    marks = {name: jnp.full(v.shape, name == "angles") for name, v in sites.items()}
-    mirrored = np.asarray(ravel_pytree(marks)[0])
+def _sampler(steps: int) -> Callable[[jax.Array, Seen, Modes, int], Drawn]:
+    """One program for all hearts, laws, chains and modes; the last argument is how many draws."""
+    unravel = ravel_pytree(_SITES)[1]
+    mirrored = _marked({"angles": True})
 
-    def run(key: jax.Array, of: Seen, given: Modes) -> Drawn:
+    def run(key: jax.Array, of: Seen, given: Modes, draws: int) -> Drawn:
         def potential(z: jax.Array) -> jax.Array:
-            return potential_energy(model, (of,), {}, unravel(z))
+            return potential_energy(program, (of,), {}, unravel(z))
 
-        found = chain(potential, given, mirrored, key, warmup=warmup, draws=draws)
+        length = {"warmup": steps, "draws": draws, "room": TIMES * steps}
+        found = chain(potential, given, mirrored, key, **length)
 
         def told(z: jax.Array) -> dict[str, jax.Array]:
-            return constrain_fn(model, (of,), {}, unravel(z), return_deterministic=True)
+            return constrain_fn(program, (of,), {}, unravel(z), return_deterministic=True)
 
         return Drawn(jax.lax.map(told, found.z), found)
 
     return jax.jit(run)
 
 
-def forget_programs() -> None:
-    """Free all compiled programs: those of several hearts are more than a process can map."""
-    _sampler.cache_clear()
-    jax.clear_caches()
-
-
 @dataclass(frozen=True, eq=False)
 class Found:
     """Draws (d, ...) by name of a heart's posterior, chain after chain, with how sampling went.
 
-    draws : by site; ``x`` (d, 8) is the material's position in the box, ``means`` (d, 9, j) the
-    forces in N. z : (d, u) unconstrained. log_density : (d,) there.
+    draws : by site; ``x`` (d, 8) is the material's position in the box, ``turned`` (d, 3, 2) that
+    of the angles in theirs, ``means`` (d, 9, j) the forces in N. z : (d, u) unconstrained.
+    log_density : (d,) there. modes : between which it was drawn, or, where none were known, those
+    its chains found.
     """
 
     heart: Heart
@@ -201,24 +220,18 @@ class Found:
     divergences: int
     chains: int
     log_density: np.ndarray
-
-    @property
-    def angles(self) -> np.ndarray:
-        """Positions (d, 3, 2) of the angles in their box."""
-        known = np.zeros((len(self.draws["x"]), _CUBES, len(cube.ANGLES)))
-        return self.draws.get("angles", known)
+    modes: Modes
 
     @property
     def positions(self) -> np.ndarray:
         """Of each cube in its box, (d, 3, p)."""
         material = np.repeat(self.draws["x"][:, None], _CUBES, axis=1)
-        return np.concatenate([material, self.angles], axis=2)
+        return np.concatenate([material, self.draws["turned"]], axis=2)
 
     @cached_property
     def log_likelihoods(self) -> np.ndarray:
         """Log densities (d, 9) of the modes' data."""
-        each = jax.jit(jax.vmap(log_likelihoods, (None, 0, 0)))
-        return np.asarray(each(self.of, self.draws["means"], self.draws["omega"]))
+        return of_draws(self.of, self.draws["means"], self.draws["omega"])
 
     def theta(self, name: str) -> np.ndarray:
         """A parameter (d,) in its unit."""
@@ -226,28 +239,26 @@ class Found:
         unit = jnp.asarray(0.5 * (self.draws["x"][:, k] + 1.0))
         return np.asarray(cube.MATERIAL[k].from_unit(unit))
 
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.z.shape[1]
-
-    def _by_chain(self) -> np.ndarray:
-        return np.moveaxis(self.z.reshape(self.chains, -1, self.size), 2, 0)
+    def _unknowns(self) -> np.ndarray:
+        """Unconstrained positions of what acts, by unknown and chain."""
+        marks = {"angles": bool(self.of.turned), "omega": True}
+        for name in parameters(self.law):
+            marks[name if name in MEANS else f"x_{name}"] = True
+        return np.moveaxis(_by_chain(self.z, self.chains)[..., _marked(marks)], 2, 0)
 
     @cached_property
     def worst_rhat(self) -> float:
         """Largest R-hat of an unknown."""
-        return max(r_hat(each) for each in self._by_chain())
+        return max(r_hat(each) for each in self._unknowns())
 
     @cached_property
     def least_ess(self) -> float:
         """Smallest effective number of draws of an unknown, in the bulk or in the tails."""
-        return min(least_ess(each) for each in self._by_chain())
+        return min(least_ess(each) for each in self._unknowns())
 
-    def modes(self) -> Modes:
-        """A mode a chain."""
-        rows = (self.chains, -1)
-        return modes(self.z.reshape(*rows, self.size), self.log_density.reshape(rows))
+
+def _by_chain(values: np.ndarray, chains: int) -> np.ndarray:
+    return values.reshape(chains, -1, *values.shape[1:])
 
 
 def sample(
@@ -259,39 +270,53 @@ def sample(
     angles: bool = True,
     left_out: tuple[str, ...] = (),
     known: Modes | None = None,
-    draws: int = 300,
-    warmup: int = 300,
+    steps: int = 300,
+    times: int = 1,
     chains: int = 4,
 ) -> Found:
     """Draws of a heart's posterior by NumPyro's NUTS, and moves between ``known`` modes.
 
-    Each chain begins at a place of its own; :data:`.moves.MODES` of them find modes. As many are
-    drawn at once as there are cores.
+    Each chain begins at a place of its own, and warms up for ``steps``; ``times`` as many, at most
+    :data:`TIMES`, are kept. Chains that know no modes find them: :data:`.moves.MODES` of them. As
+    many are drawn at once as there are cores.
     """
-    of = seen(heart, cubes, left_out)
-    size = sum(site.size for site in _sites(law, angles=angles).values())
-    given = unknown(size) if known is None else known
-    run = _sampler(law, angles, draws, warmup)
+    of = seen(heart, cubes, law, angles=angles, left_out=left_out)
+    given = unknown(len(_marked({}))) if known is None else known
+    run, draws = _sampler(steps), times * steps
 
     def one(key: jax.Array) -> Drawn:
-        return jax.block_until_ready(run(key, of, given))
+        return jax.block_until_ready(run(key, of, given, draws))
 
     keys = iter(jax.random.split(jax.random.key(seed), chains))
     told = in_order(one, keys, min(cores(), chains))
-    every = jax.tree.map(lambda *parts: np.concatenate(parts), *told)
-    diverged, density = int(every.chain.diverging.sum()), every.chain.log_density
-    return Found(heart, of, law, every.draws, every.chain.z, diverged, chains, density)
+    every = jax.tree.map(lambda *parts: np.concatenate([p[:draws] for p in parts]), *told)
+    z, density, diverging = every.chain
+    if known is None and chains > 1:
+        given = modes(_by_chain(z, chains), _by_chain(density, chains))
+    diverged = int(diverging.sum())
+    return Found(heart, of, law, every.draws, z, diverged, chains, density, given)
 
 
 def settled(
-    heart: Heart, cubes: Emulated, seed: int, law: str = ORTHOTROPIC, *, times: int = 1, **how: Any
+    heart: Heart,
+    cubes: Emulated,
+    seed: int,
+    law: str = ORTHOTROPIC,
+    *,
+    known: Modes | None = None,
+    times: int = 1,
+    **how: Any,
 ) -> Found:
-    """As :func:`sample`; chains that disagree are drawn again, with moves between their modes.
+    """As :func:`sample`, until chains agree.
 
-    ``times`` as many draws then.
+    Drawn with moves between ``known`` modes; where these are not or chains disagree, modes are
+    sought first, and where there are several it is drawn with moves between these.
     """
+    if known is not None:
+        found = sample(heart, cubes, seed, law, known=known, times=times, **how)
+        if found.worst_rhat <= AGREE:
+            return found
     found = sample(heart, cubes, seed, law, **how)
     if found.worst_rhat <= AGREE:
         return found
-    longer = how | {"draws": times * how.get("draws", 300), "known": found.modes()}
-    return sample(heart, cubes, seed + 1, law, **longer)
+    return sample(heart, cubes, seed + 1, law, known=found.modes, times=times, **how)

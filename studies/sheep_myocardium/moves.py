@@ -138,8 +138,12 @@ def chain(
     *,
     warmup: int,
     draws: int,
+    room: int,
 ) -> Chain:
     """One chain of NumPyro's NUTS from somewhere, with moves after each step; under ``jit``.
+
+    Its arrays have ``room`` for draws; ``draws`` of them are made, a number that may be traced, so
+    that short chains and long ones are one program.
 
     It is the kernel alone, since ``numpyro.infer.MCMC`` compiles a model's start anew for every
     chain, and a process can map only so many programs.
@@ -158,11 +162,16 @@ def chain(
         rng_key=first,
     )
 
-    def onwards(state: HMCState, key: jax.Array) -> tuple[HMCState, Chain]:
-        state = step(state)
-        z, energy = moved(potential, given, mirrored, (state.z, state.potential_energy), key)
+    def onwards(k: jax.Array, at: tuple[HMCState, Chain]) -> tuple[HMCState, Chain]:
+        state, kept = step(at[0]), at[1]
+        place = (state.z, state.potential_energy)
+        z, energy = moved(potential, given, mirrored, place, jax.random.fold_in(then, k))
         state = state._replace(z=z, potential_energy=energy, z_grad=jax.grad(potential)(z))
-        return state, Chain(z, -energy, state.diverging)
+        # Steps of warm-up write where the first draw will be.
+        row = jnp.maximum(k - warmup, 0)
+        found = Chain(z, -energy, state.diverging)
+        return state, jax.tree.map(lambda all, one: all.at[row].set(one), kept, found)
 
-    every: Chain = jax.lax.scan(onwards, state, jax.random.split(then, warmup + draws))[1]
-    return jax.tree.map(lambda part: part[warmup:], every)
+    kept = Chain(jnp.zeros((room, len(start))), jnp.zeros(room), jnp.zeros(room, bool))
+    every: Chain = jax.lax.fori_loop(0, warmup + draws, onwards, (state, kept))[1]
+    return every

@@ -33,13 +33,13 @@ def twin(found: Campaign, test: int, rng: np.random.Generator) -> Heart:
     return replace(heart, curves=curves)
 
 
-def ranks(found: Campaign, seed: int, draws: int) -> Iterator[dict[str, float]]:
+def ranks(found: Campaign, seed: int, steps: int) -> Iterator[dict[str, float]]:
     """Of each test, shares of its twin's posterior below the truth, by parameter."""
     rng = np.random.default_rng(seed)
     for test in range(min(_A_HEART, len(found.tests[0].x))):
         made = twin(found, test, rng)
-        size = {"draws": draws, "warmup": draws, "chains": 1}
-        posterior = sample(made, found.coarse, seed + test, ORTHOTROPIC, **size)
+        how = {"known": found.explored.modes, "steps": steps, "chains": 1}
+        posterior = sample(made, found.coarse, seed + test, **how)
         at = 0.5 * (found.tests[0].x[test, : len(cube.MATERIAL)] + 1.0)
         truth = {
             p.name: float(p.from_unit(jnp.asarray(v)))
