@@ -98,7 +98,8 @@ def of_twins(found: Campaign, plan: Plan) -> Case:
 def of_population(found: list[Campaign], quick: bool) -> Case:
     """The population, its hearts, and an eighth."""
     size = {"draws": 20, "warmup": 20} if quick else {}
-    draws, diverging = population.sampled(found, SEED, **size)
+    of = population.sampled(found, SEED, **size)
+    draws = of.draws
     new = population.eighth(draws, SEED)
     logs = draws["mean"][:, None] + draws["spread"][:, None] * draws["z"]
     rows = np.linspace(0, len(new) - 1, min(_KEPT, len(new))).astype(int)
@@ -115,7 +116,9 @@ def of_population(found: list[Campaign], quick: bool) -> Case:
             for k, each in enumerate(found)
         },
         "eighth": new[rows].tolist(),
-        "divergences": diverging,
+        "divergences": of.divergences,
+        "rhat": of.worst_rhat,
+        "ess": of.least_ess,
     }
 
 

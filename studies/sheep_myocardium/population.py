@@ -10,6 +10,7 @@ likewise. Sampled jointly with all hearts, angles included. An eighth heart is a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,8 @@ from numpyro.infer import MCMC, NUTS, init_to_median
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.campaign import Campaign
 from studies.sheep_myocardium.inference import ANGLE_SD, Seen, log_likelihoods, means, seen
+
+from calibrate.samplers.stopping import least_ess, r_hat
 
 NAMES = (*(p.name for p in cube.MATERIAL), "omega")
 _CENTRE = np.log([0.5, 8.0, 0.8, 8.0, 0.8, 8.0, 0.3, 8.0, 0.25])
@@ -49,10 +52,23 @@ def program(hearts: Sequence[Seen]) -> None:
         numpyro.factor(f"heart {k}", jnp.vdot(of.used, told))
 
 
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Draws (d, ...) of mean, spread, z and angles, with how their chains went.
+
+    worst_rhat, least_ess : of mean and spread, which the population is.
+    """
+
+    draws: dict[str, np.ndarray]
+    divergences: int
+    worst_rhat: float
+    least_ess: float
+
+
 def sampled(
     found: Sequence[Campaign], seed: int, *, draws: int = 400, warmup: int = 400
-) -> tuple[dict[str, np.ndarray], int]:
-    """Draws (d, ...) of mean, spread, z and angles, and the number of divergences."""
+) -> Sampled:
+    """Draws of the population and its hearts."""
     models = [seen(each.heart, each.cubes) for each in found]
     kernel = NUTS(program, target_accept_prob=0.9, max_tree_depth=7, init_strategy=init_to_median())
     run = MCMC(
@@ -61,7 +77,12 @@ def sampled(
     )  # fmt: skip
     run.run(jax.random.key(seed), models, extra_fields=("diverging",))
     diverging = int(np.sum(run.get_extra_fields()["diverging"]))
-    return {name: np.asarray(v) for name, v in run.get_samples().items()}, diverging
+    chains = run.get_samples(group_by_chain=True)
+    each = [
+        np.asarray(chains[name])[..., k] for name in ("mean", "spread") for k in range(len(NAMES))
+    ]
+    told = {name: np.asarray(v) for name, v in run.get_samples().items()}
+    return Sampled(told, diverging, max(map(r_hat, each)), min(map(least_ess, each)))
 
 
 def eighth(draws: dict[str, np.ndarray], seed: int) -> np.ndarray:
