@@ -19,6 +19,7 @@ parameter that a law leaves out is drawn from its prior and not looked at.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -37,7 +38,6 @@ from studies.sheep_myocardium.moves import Chain, Modes, chain, modes, unknown
 
 from calibrate.samplers.stopping import least_ess, r_hat
 from calibrate.statistical_model.curve import curve_covariance
-from emulator.fem.campaign.threads import in_order
 from emulator.machine import cores
 
 CELL = 3e-3  # N, noise of the load cell
@@ -287,8 +287,10 @@ def sample(
     def one(key: jax.Array) -> Drawn:
         return jax.block_until_ready(run(key, of, given, draws))
 
-    keys = iter(jax.random.split(jax.random.key(seed), chains))
-    told = in_order(one, keys, min(cores(), chains))
+    keys = jax.random.split(jax.random.key(seed), chains)
+    # JAX compiles once: other threads wait for the one that does.
+    with ThreadPoolExecutor(min(cores(), chains)) as pool:
+        told = list(pool.map(one, keys))
     every = jax.tree.map(lambda *parts: np.concatenate([p[:draws] for p in parts]), *told)
     z, density, diverging = every.chain
     if known is None and chains > 1:
