@@ -248,6 +248,47 @@ def test_a_transport_between_modes_is_undone_and_keeps_its_balance():
     assert float(more) == pytest.approx(expected)
 
 
+def some_modes(at):
+    return moves.modes(np.random.default_rng(5).normal(at, 1.0, (4, 50, 2)), np.zeros((4, 50)))
+
+
+def test_modes_of_the_last_two_searches_are_kept():
+    searches = [some_modes(at) for at in (0.0, 10.0, 20.0)]
+    once = moves.joined(None, searches[0])
+    assert len(once.mean) == moves.MODES
+    np.testing.assert_array_equal(once.mean[:4], once.mean[4:])
+    every = moves.joined(moves.joined(once, searches[1]), searches[2])
+    np.testing.assert_array_equal(every.mean[:4], searches[1].mean)
+    np.testing.assert_array_equal(every.mean[4:], searches[2].mean)
+    assert float(jnp.exp(every.log_weight).sum()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("known", "rhats", "asked"),
+    [
+        (False, [1.0], [(False, 1)]),
+        (False, [1.5, 1.0], [(False, 1), (True, 4)]),
+        (True, [1.0], [(True, 4)]),
+        # Others are sought, and what was known is not forgotten.
+        (True, [1.5, 1.0, 1.0], [(True, 4), (False, 1), (True, 4)]),
+    ],
+)
+def test_chains_that_disagree_are_drawn_between_more_modes(monkeypatch, known, rhats, asked):
+    told, seen = iter(rhats), []
+
+    def sample(*_, known=None, times=1):
+        seen.append((known is not None, times))
+        kept = moves.joined(None, some_modes(7.0)) if known is None else known
+        return SimpleNamespace(worst_rhat=next(told), modes=kept)
+
+    monkeypatch.setattr(inference, "sample", sample)
+    given = moves.joined(None, some_modes(0.0)) if known else None
+    found = inference.settled(None, None, 0, known=given, times=4)
+    assert seen == asked
+    if known:
+        np.testing.assert_array_equal(found.modes.mean[:4], given.mean[:4])
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_moves_join_modes_that_nuts_does_not(known):
     """Two Gaussians of one and three quarters of the mass, 20 sd apart."""

@@ -186,7 +186,7 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
         law = "fibres" if number == 1 else ORTHOTROPIC
         found = sample(heart, fitted.emulated, seed + number, law, steps=plan.steps)
         runs, fitted = _round(fem, runs, fitted, found, plan, seed, doubt)
-    on_mesh = settled(heart, fitted.emulated, seed, steps=plan.steps)
+    on_mesh = settled(heart, fitted.emulated, seed, known=found.modes, steps=plan.steps)
     x = np.moveaxis(_some(on_mesh, plan.meshes, seed), 1, 0)
     meshes = fem("mesh", x), fem.finer("mesh_finer", x)
     return _tested(fem, runs, fitted, meshes, on_mesh, plan, seed, doubt, perf_counter() - began)
@@ -200,7 +200,7 @@ def again(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign
     fitted = fit(found.bodies, runs, found.fitted)
     doubt = list(found.doubt)
     runs, fitted = _round(fem, runs, fitted, found.explored, plan, seed, doubt)
-    how = {"known": found.on_mesh.modes, "steps": plan.steps}
+    how = {"known": found.explored.modes, "steps": plan.steps}
     on_mesh = settled(found.heart, fitted.emulated, seed + len(doubt), **how)
     seconds = found.seconds + perf_counter() - began
     return _tested(fem, runs, fitted, found.meshes, on_mesh, plan, seed, doubt, seconds)

@@ -34,7 +34,15 @@ from numpyro.infer.util import constrain_fn, potential_energy
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
-from studies.sheep_myocardium.moves import Chain, Modes, chain, modes, unknown
+from studies.sheep_myocardium.moves import (
+    EXPLORING,
+    Chain,
+    Modes,
+    chain,
+    joined,
+    modes,
+    unknown,
+)
 
 from calibrate.samplers.stopping import least_ess, r_hat
 from calibrate.statistical_model.curve import curve_covariance
@@ -209,7 +217,7 @@ class Found:
     draws : by site; ``x`` (d, 8) is the material's position in the box, ``turned`` (d, 3, 2) that
     of the angles in theirs, ``means`` (d, 9, j) the forces in N. z : (d, u) unconstrained.
     log_density : (d,) there. modes : between which it was drawn, or, where none were known, those
-    its chains found.
+    that its chains found.
     """
 
     heart: Heart
@@ -272,13 +280,13 @@ def sample(
     known: Modes | None = None,
     steps: int = 300,
     times: int = 1,
-    chains: int = 4,
+    chains: int = EXPLORING,
 ) -> Found:
     """Draws of a heart's posterior by NumPyro's NUTS, and moves between ``known`` modes.
 
     Each chain begins at a place of its own, and warms up for ``steps``; ``times`` as many, at most
-    :data:`TIMES`, are kept. Chains that know no modes find them: :data:`.moves.MODES` of them. As
-    many are drawn at once as there are cores.
+    :data:`TIMES`, are kept. Chains that know no modes find one each. As many are drawn at once as
+    there are cores.
     """
     of = seen(heart, cubes, law, angles=angles, left_out=left_out)
     given = unknown(len(_marked({}))) if known is None else known
@@ -293,8 +301,8 @@ def sample(
         told = list(pool.map(one, keys))
     every = jax.tree.map(lambda *parts: np.concatenate([p[:draws] for p in parts]), *told)
     z, density, diverging = every.chain
-    if known is None and chains > 1:
-        given = modes(_by_chain(z, chains), _by_chain(density, chains))
+    if known is None and chains == EXPLORING:
+        given = joined(None, modes(_by_chain(z, chains), _by_chain(density, chains)))
     diverged = int(diverging.sum())
     return Found(heart, of, law, every.draws, z, diverged, chains, density, given)
 
@@ -309,16 +317,16 @@ def settled(
     times: int = 1,
     **how: Any,
 ) -> Found:
-    """As :func:`sample`, until chains agree.
+    """As :func:`sample`; where chains disagree, again, with moves between more modes.
 
-    Drawn with moves between ``known`` modes; where these are not or chains disagree, modes are
-    sought first, and where there are several it is drawn with moves between these.
+    Without ``known`` modes the chains, one each, have found some; with them others are sought, and
+    those that were known are kept: chains that find the same mode say nothing of another.
     """
-    if known is not None:
-        found = sample(heart, cubes, seed, law, known=known, times=times, **how)
-        if found.worst_rhat <= AGREE:
-            return found
-    found = sample(heart, cubes, seed, law, **how)
+    first = 1 if known is None else times
+    found = sample(heart, cubes, seed, law, known=known, times=first, **how)
     if found.worst_rhat <= AGREE:
         return found
-    return sample(heart, cubes, seed + 1, law, known=found.modes, times=times, **how)
+    between = found.modes
+    if known is not None:
+        between = joined(known, sample(heart, cubes, seed + 2, law, **how).modes)
+    return sample(heart, cubes, seed + 1, law, known=between, times=times, **how)

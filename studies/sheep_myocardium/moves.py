@@ -24,10 +24,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
+from jax.scipy.special import logsumexp
 from numpyro.infer.hmc import HMCState, hmc
 
-MODES = 4
-"""As many as there are exploring chains."""
+EXPLORING = 4
+"""Chains that seek modes, one each."""
+MODES = 2 * EXPLORING
+"""That transports go between: of two searches."""
 _MOVES = 4  # of each kind a step of NUTS, which costs some thirty of them
 _PLACES = 4  # of which a chain begins at the likeliest
 _ACCEPTED, _DEPTH = 0.9, 8  # of NUTS: acceptance its step size adapts to, doublings of a trajectory
@@ -60,7 +63,18 @@ def modes(z: np.ndarray, log_density: np.ndarray) -> Modes:
     mass = log_density.mean(axis=1) + volume
     # No mode is left for good: a chain that explored little knows its own mass badly.
     weight = np.maximum(mass - mass.max(), -3.0)
-    return Modes(*(jnp.asarray(a) for a in (mean, factor, weight - np.log(np.exp(weight).sum()))))
+    return Modes(*(jnp.asarray(a) for a in (mean, factor, weight - logsumexp(weight))))
+
+
+def joined(before: Modes | None, found: Modes) -> Modes:
+    """Modes of the last of the searches ``before`` and of a new one, which count the same.
+
+    Without an earlier one each of the new ones is there twice, which changes nothing.
+    """
+    older = found if before is None else Modes(*(part[-EXPLORING:] for part in before))
+    weight = [part.log_weight - logsumexp(part.log_weight) for part in (older, found)]
+    two = Modes(*(jnp.concatenate(pair) for pair in zip(older, found, strict=True)))
+    return two._replace(log_weight=jnp.concatenate(weight) - jnp.log(2.0))
 
 
 def _log_shares(modes: Modes, z: jax.Array) -> jax.Array:
