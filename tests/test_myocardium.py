@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+from studies.common.output import run
 from studies.sheep_myocardium import (
     campaign,
     checked,
@@ -17,6 +18,7 @@ from studies.sheep_myocardium import (
     moves,
     process,
 )
+from studies.sheep_myocardium.__main__ import main
 
 from emulator.errors import InputError
 
@@ -82,6 +84,18 @@ def test_bad_files_get_one_line(tmp_path, spoil, message):
 def test_no_hearts(tmp_path):
     with pytest.raises(InputError, match="no folders TSL1"):
         experiment.hearts(tmp_path)
+
+
+def test_the_studys_words_end_in_one_line(tmp_path, monkeypatch):
+    folder = write_heart(tmp_path / "TSL9")
+    (folder / "ForceStrain_M4.csv").unlink()
+    words = ["sheep_myocardium/__main__.py", "--data", str(tmp_path), "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(SystemExit) as told:
+        run(main)
+    assert str(told.value).startswith("sheep_myocardium: ")
+    assert "ForceStrain_M4.csv is missing" in str(told.value)
+    assert "\n" not in str(told.value)
 
 
 def position(**values):

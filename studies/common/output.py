@@ -5,12 +5,14 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
+from emulator.errors import InputError, SolverError
 from emulator.store import replacing, write_json
 
 Case = dict[str, Any]
@@ -25,6 +27,14 @@ def parser(doc: str | None, folder: Path) -> argparse.ArgumentParser:
     found.add_argument("--again", action="store_true", help="repeat cases that results.json has")
     found.add_argument("--out", type=Path, default=folder)
     return found
+
+
+def run(main: Callable[[], None]) -> None:
+    """A study that reads what a user gives: what is wrong with it is told in one line."""
+    try:
+        main()
+    except (InputError, SolverError, OSError) as error:
+        raise SystemExit(f"{Path(sys.argv[0]).parent.name}: {error}") from None
 
 
 class Results:

@@ -12,7 +12,7 @@ from time import perf_counter
 
 import jax.numpy as jnp
 import numpy as np
-from studies.common.output import Case, Results, parser
+from studies.common.output import Case, Results, parser, run
 from studies.sheep_myocardium import cube, figures, population, twins
 from studies.sheep_myocardium.campaign import QUICK, Campaign, Plan
 from studies.sheep_myocardium.checked import decided, told
@@ -202,4 +202,4 @@ def _together(cases: list[Case]) -> Case:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from studies.common.output import Case, Results, parser, save
+from studies.common.output import Case, Results, parser, run, save
 from studies.silicone_beam import beam
 from studies.silicone_beam.experiment import BLIND, FORCE, Measured, measured, recordings
 
@@ -222,4 +222,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)
