@@ -1,7 +1,6 @@
 """Supports whose displacement is a parameter, and the forces they take."""
 
 from dataclasses import replace
-from time import perf_counter
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import emulator as em
 from emulator.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.fem.support_force import SupportForce
-from emulator.geometry.bodies.box import box, toward_ends
+from emulator.geometry.bodies.box import box
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
@@ -156,51 +155,6 @@ def test_a_forces_gradient_is_that_of_its_solve(simulator):
     np.testing.assert_allclose(gradient, expected, rtol=1e-10, atol=1e-12)
     along = jnp.tensordot(simulator.sensitivities(u, THETA), jax.grad(of)(u, THETA), 2)
     np.testing.assert_allclose(gradient, along + jax.grad(of, 1)(u, THETA), rtol=1e-10, atol=1e-12)
-
-
-def glued_cube(cells):
-    """Orthotropic tissue of 1 cm between glued plates, sheared; cells are shorter at the plates."""
-    values = {"b": 9.0, "a_f": 1.0, "b_f": 16.0, "a_s": 0.5, "b_s": 9.0, "a_fs": 0.3, "b_fs": 9.0}
-    mesh = box((10.0,) * 3, (cells,) * 3, 2, toward_ends(cells, 1.5, ("left", "right")))
-    along = (np.tile(axis, (len(mesh.elements), 1)) for axis in np.eye(3)[:2])
-    return Scene(
-        "glued cube",
-        mesh,
-        find_law("holzapfel_ogden_orthotropic"),
-        (Parameter("a", "kPa", 0.1, 5.0, "log"), Parameter("shear", "", -0.5, 0.5)),
-        constants=values | {"kappa": 100.0},
-        supports=(
-            Support("left"),
-            Support("right", components="xz"),
-            Support("right", (0.0, 10.0, 0.0), "y", amount="shear"),
-        ),
-        **dict(zip(("fibres", "sheets"), along, strict=True)),
-        dilatation="mean",
-    )
-
-
-@pytest.mark.slow
-def test_a_hundred_points_of_a_glued_cube(capsys):
-    """To 1 % of the force by 343 nodes, in less than 30 s."""
-    forces = {}
-    for cells in (3, 6):
-        simulator = em.Simulator(glued_cube(cells))
-        force = SupportForce(simulator.scene, "right", (0.0, 1.0, 0.0))
-        amounts = jnp.linspace(0.0, 0.4, 101 if cells == 3 else 11)
-        thetas = jnp.stack([jnp.full_like(amounts, 0.8), amounts], axis=1)
-        simulator.path(thetas[:2])  # compiles
-        began = perf_counter()
-        found = simulator.path(thetas)
-        seconds = perf_counter() - began
-        assert found.converged.all()
-        forces[cells] = np.asarray(force(found.displacement[:, force.nodes], thetas))
-        with capsys.disabled():
-            told = (
-                f"{len(simulator.scene.mesh.nodes)} nodes: {len(amounts)} points in {seconds:.1f} s"
-            )
-            print(f"\n{told}, {forces[cells][-1]:.2f} mN at 0.4")
-        assert seconds < 30.0 or cells != 3
-    np.testing.assert_allclose(forces[3][10::10], forces[6][1:], rtol=0.01)
 
 
 def test_a_path_that_is_none(simulator):
