@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from studies.sheep_myocardium.curves import (
     forces,
     joined,
 )
+from studies.sheep_myocardium.doubts import doubts
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.inference import (
     ORTHOTROPIC,
@@ -31,6 +33,7 @@ from studies.sheep_myocardium.inference import (
     sample,
     settled,
 )
+from studies.sheep_myocardium.moves import Modes
 from studies.sheep_myocardium.process import next_runs
 
 from emulator.store import replacing
@@ -44,54 +47,98 @@ _ORDER = 1.2  # of the force's convergence: twice 0.595, the exponent at a glued
 class Plan:
     """Numbers of runs a cube.
 
-    wide : over the box. rounds, each : after them, so many times so many, where they tell most of q
-    at draws of the posterior. tests : at draws of the posterior. again : times that tests become
-    runs, with one more round, and others are made, while the verdict is open. meshes : at which a
-    finer mesh is solved, too. steps : of a chain's warm-up, and of its draws.
+    wide : over the box. rounds, each : after them, so many times so many in all, of cubes that are
+    not known at draws of the posterior, where they tell most of q. closer : more such rounds at
+    most, until all cubes are. tests : at draws of the posterior. again : times that tests become
+    runs and others are made, while the verdict is open. meshes : at which a finer mesh is solved,
+    too. steps : of a chain's warm-up, and of its draws.
     """
 
     wide: int = 12
     rounds: int = 4
-    each: int = 9
+    each: int = 27
+    closer: int = 6
     tests: int = 30
     again: int = 5
     meshes: int = 2
     steps: int = 300
 
 
-QUICK = Plan(wide=4, rounds=1, each=2, tests=4, again=0, meshes=1, steps=50)
+QUICK = Plan(wide=4, rounds=1, each=6, closer=0, tests=4, again=0, meshes=1, steps=50)
+KNOWN = 0.3
+"""Root mean square of :func:`.doubts` at draws of a posterior, of a cube whose forces are known."""
 _POOL = 80  # draws that next runs are chosen from
 _forces = jax.jit(jax.vmap(forces, (None, 0)))
+
+
+@dataclass(frozen=True)
+class Solver:
+    """FEM of a heart's cubes. Runs in the folder ``kept`` are not solved again."""
+
+    heart: Heart
+    bodies: list[Cube]
+    kept: Path | None
+
+    def __call__(self, name: str, x: Sequence[np.ndarray]) -> list[Runs]:
+        """Runs named ``name`` at positions (r, p) of each cube."""
+        return [
+            _kept(self.kept, f"{self.heart.name}_{k}_{name}", body, at)
+            for k, (body, at) in enumerate(zip(self.bodies, x, strict=True))
+        ]
+
+    @property
+    def finer(self) -> Solver:
+        """Of the finer mesh."""
+        return replace(self, bodies=[replace(body, cells=FINER) for body in self.bodies])
+
+
+class Learned(NamedTuple):
+    """Runs of a heart's cubes, and what they say.
+
+    doubt : before each round, the root mean square of :func:`.doubts` at draws, of the cube that is
+    known least.
+    """
+
+    runs: list[Runs]
+    fitted: Fit
+    doubt: tuple[float, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Runs of all cubes."""
+        return sum(len(each.x) for each in self.runs)
+
+    def more(self, fem: Solver, new: list[Runs]) -> Learned:
+        """With ``new`` runs."""
+        runs = [joined(pair) for pair in zip(self.runs, new, strict=True)]
+        return Learned(runs, fit(fem.bodies, runs, self.fitted), self.doubt)
 
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
     """What FEM says of a heart.
 
-    bodies : its cubes. runs : of each. fitted : what they say. meshes : runs at the same positions
+    bodies : its cubes. learned : what their runs say. meshes : runs at the same positions
     on the mesh and on a finer one. cubes : emulator of the cubes without the mesh's error. on_mesh,
     explored : the posteriors with the mesh's error and without. tests : runs that it was not fitted
-    to, at the draws ``tested`` (t,) of ``explored``. doubt : of q at nine draws of ten, by round.
-    seconds : it took.
+    to, at the draws ``tested`` (t,) of ``explored``. seconds : it took.
     """
 
     heart: Heart
     bodies: list[Cube]
-    runs: list[Runs]
-    fitted: Fit
+    learned: Learned
     meshes: tuple[list[Runs], list[Runs]]
     cubes: Emulated
     on_mesh: Found
     explored: Found
     tested: np.ndarray
     tests: list[Runs]
-    doubt: list[float]
     seconds: float
 
     @property
     def coarse(self) -> Emulated:
         """Emulator of the cubes with the mesh's error."""
-        return self.fitted.emulated
+        return self.learned.fitted.emulated
 
     @property
     def omega(self) -> float:
@@ -100,8 +147,8 @@ class Campaign:
 
     @property
     def runs_a_cube(self) -> int:
-        """With tests."""
-        return len(self.runs[0].x) + len(self.tests[0].x)
+        """Of the cube that has most, with tests."""
+        return max(len(runs.x) for runs in self.learned.runs) + len(self.tests[0].x)
 
     @property
     def by_fem(self) -> np.ndarray:
@@ -114,12 +161,6 @@ class Campaign:
         """Forces (t, 9, j) in N of the tests by the emulator."""
         x = jnp.asarray(np.stack([test.x for test in self.tests], axis=1))
         return np.asarray(_forces(self.coarse, x)).reshape(len(x), len(MODES), -1)
-
-    @property
-    def said(self) -> np.ndarray:
-        """What the processes say their sd is at the tests, (t, 3), a fraction of the force."""
-        each = [self.fitted.left(k, test.x)[1] for k, test in enumerate(self.tests)]
-        return np.stack(each, axis=1)
 
     def likelihood_differences(self) -> np.ndarray:
         """Log likelihoods (t,) of the data at the tests, FEM's less the emulators'.
@@ -148,27 +189,6 @@ def without_mesh(coarse: Emulated, there: Sequence[Runs], fine: Sequence[Runs]) 
     return coarse._replace(finer=jnp.asarray(np.stack(factors)))
 
 
-@dataclass(frozen=True)
-class Solver:
-    """FEM of a heart's cubes. Runs in the folder ``kept`` are not solved again."""
-
-    heart: Heart
-    bodies: list[Cube]
-    kept: Path | None
-
-    def __call__(self, name: str, x: Sequence[np.ndarray]) -> list[Runs]:
-        """Runs named ``name`` at positions (r, p) of each cube."""
-        return [
-            _kept(self.kept, f"{self.heart.name}_{k}_{name}", body, at)
-            for k, (body, at) in enumerate(zip(self.bodies, x, strict=True))
-        ]
-
-    @property
-    def finer(self) -> Solver:
-        """Of the finer mesh."""
-        return replace(self, bodies=[replace(body, cells=FINER) for body in self.bodies])
-
-
 def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign:
     """The runs of a heart up to its first tests. Those in the folder ``kept`` are not solved again.
 
@@ -179,84 +199,95 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
     fem = Solver(heart, bodies, kept)
     boxes = [qmc.Sobol(bodies[0].unknowns, seed=seed + k).random_base2(4) for k in range(3)]
     runs = fem("wide", [2.0 * box[: plan.wide] - 1.0 for box in boxes])
-    fitted = fit(bodies, runs)
-    doubt: list[float] = []
+    learned = Learned(runs, fit(bodies, runs))
     for number in range(plan.rounds):
         # Of a posterior with fewer terms, too: a term that is off is a corner of its own.
         law = "fibres" if number == 1 else ORTHOTROPIC
-        found = sample(heart, fitted.emulated, seed + number, law, steps=plan.steps)
-        runs, fitted = _round(fem, runs, fitted, found, plan, seed, doubt)
-    on_mesh = settled(heart, fitted.emulated, seed, known=found.modes, steps=plan.steps)
-    x = np.moveaxis(_some(on_mesh, plan.meshes, seed), 1, 0)
+        found = sample(heart, learned.fitted.emulated, seed + number, law, steps=plan.steps)
+        learned = _round(fem, learned, found, plan, seed)
+    rows = np.random.default_rng(seed).choice(len(found.positions), plan.meshes, replace=False)
+    x = np.moveaxis(found.positions[rows], 1, 0)
     meshes = fem("mesh", x), fem.finer("mesh_finer", x)
-    return _tested(fem, runs, fitted, meshes, on_mesh, plan, seed, doubt, perf_counter() - began)
+    return _tested(fem, learned, meshes, found.modes, plan, seed, began)
 
 
 def again(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign:
-    """Its tests become runs, with one more round; others are made at draws of the new posterior."""
-    began = perf_counter()
+    """Its tests become runs; others are made at draws of the new posterior."""
+    began = perf_counter() - found.seconds
     fem = Solver(found.heart, found.bodies, kept)
-    runs = [joined(pair) for pair in zip(found.runs, found.tests, strict=True)]
-    fitted = fit(found.bodies, runs, found.fitted)
-    doubt = list(found.doubt)
-    runs, fitted = _round(fem, runs, fitted, found.explored, plan, seed, doubt)
-    how = {"known": found.explored.modes, "steps": plan.steps}
-    on_mesh = settled(found.heart, fitted.emulated, seed + len(doubt), **how)
-    seconds = found.seconds + perf_counter() - began
-    return _tested(fem, runs, fitted, found.meshes, on_mesh, plan, seed, doubt, seconds)
+    learned = found.learned.more(fem, found.tests)
+    return _tested(fem, learned, found.meshes, found.explored.modes, plan, seed, began)
 
 
-def _round(
+def _closed(
     fem: Solver,
-    runs: list[Runs],
-    fitted: Fit,
-    found: Found,
+    learned: Learned,
+    meshes: tuple[list[Runs], list[Runs]],
+    known: Modes,
     plan: Plan,
     seed: int,
-    doubt: list[float],
-) -> tuple[list[Runs], Fit]:
-    """With runs where they tell most of q at draws of ``found``; its doubt is added."""
-    number = len(doubt)
-    pool = np.moveaxis(_some(found, _POOL, seed + number), 1, 0)
-    left, sds = zip(*(fitted.left(k, pool[k]) for k in range(3)), strict=True)
-    doubt.append(float(np.quantile(np.max(sds, axis=0), 0.9)))
-    told = f"{fem.heart.name}, round {number + 1}: q is known to {100 * doubt[-1]:.1f} %"
-    print(told, flush=True)
-    chosen = [at[next_runs(C, _POOL, plan.each)] for at, C in zip(pool, left, strict=True)]
-    new = fem(f"round{number}", chosen)
-    runs = [joined(pair) for pair in zip(runs, new, strict=True)]
-    return runs, fit(fem.bodies, runs, fitted)
+) -> tuple[Learned, Found]:
+    """The posterior without the mesh's error, after rounds until its draws are known."""
+    for more in reversed(range(plan.closer + 1)):
+        how = {"known": known, "steps": plan.steps, "times": TIMES}
+        emulated = without_mesh(learned.fitted.emulated, *meshes)
+        found = settled(fem.heart, emulated, seed + learned.size, **how)
+        after = _round(fem, learned, found, plan, seed) if more else learned
+        if after is learned:
+            break
+        learned, known = after, found.modes
+    return learned, found
+
+
+def _round(fem: Solver, learned: Learned, found: Found, plan: Plan, seed: int) -> Learned:
+    """With runs of cubes that are not known at draws of ``found``, where they tell most of q."""
+    every = doubts(learned.fitted, found)
+    doubt = np.sqrt((every**2).mean(axis=0))
+    told = ", ".join(f"{value:.2f}" for value in doubt)
+    print(f"{fem.heart.name}, {learned.size} runs: log likelihood known to {told}", flush=True)
+    unknown = doubt > KNOWN
+    if not unknown.any():
+        return learned
+    each = plan.each // int(unknown.sum())
+    chosen = []
+    for k, asked in enumerate(unknown):
+        rows = _pool(every[:, k], seed + learned.size)
+        x = found.positions[rows, k]
+        told_most = next_runs(learned.fitted.left(k, x), len(x), each) if asked else []
+        chosen.append(x[told_most])
+    made = learned.more(fem, fem(f"round_{learned.size}", chosen))
+    return made._replace(doubt=(*learned.doubt, float(doubt.max())))
+
+
+def _pool(doubt: np.ndarray, seed: int) -> np.ndarray:
+    """Draws that runs are chosen from: half of them those that are known least, the others any."""
+    order = np.argsort(-doubt)
+    half = _POOL // 2
+    return np.concatenate(
+        [order[:half], np.random.default_rng(seed).permutation(order[half:])[:half]]
+    )
 
 
 def _tested(
     fem: Solver,
-    runs: list[Runs],
-    fitted: Fit,
+    learned: Learned,
     meshes: tuple[list[Runs], list[Runs]],
-    on_mesh: Found,
+    known: Modes,
     plan: Plan,
     seed: int,
-    doubt: list[float],
-    seconds: float,
+    began: float,
 ) -> Campaign:
-    """The posterior without the mesh's error, and FEM at some of its draws."""
-    began, number = perf_counter(), len(doubt)
-    cubes_there = without_mesh(fitted.emulated, *meshes)
-    how = {"known": on_mesh.modes, "steps": plan.steps, "times": TIMES}
-    explored = settled(fem.heart, cubes_there, seed + number, **how)
-    rows = np.random.default_rng(seed + number).permutation(len(explored.positions))[: plan.tests]
-    tests = fem(f"tests{number}", np.moveaxis(explored.positions[rows], 1, 0))
-    seconds += perf_counter() - began
+    """The posteriors, and FEM at some draws of the one without the mesh's error."""
+    learned, explored = _closed(fem, learned, meshes, known, plan, seed)
+    number = seed + learned.size
+    how = {"known": explored.modes, "steps": plan.steps}
+    on_mesh = settled(fem.heart, learned.fitted.emulated, number + 1, **how)
+    rows = np.random.default_rng(number).permutation(len(explored.positions))[: plan.tests]
+    tests = fem(f"tests_{learned.size}", np.moveaxis(explored.positions[rows], 1, 0))
     return Campaign(
-        fem.heart, fem.bodies, runs, fitted, meshes, cubes_there, on_mesh, explored, rows, tests,
-        doubt, seconds,
+        fem.heart, fem.bodies, learned, meshes, explored.of.cubes, on_mesh, explored, rows, tests,
+        perf_counter() - began,
     )  # fmt: skip
-
-
-def _some(found: Found, count: int, seed: int) -> np.ndarray:
-    """Positions (count, 3, p) of a posterior's draws, by a seed of their own."""
-    rows = np.random.default_rng(seed).choice(len(found.positions), count, replace=False)
-    return found.positions[rows]
 
 
 def _kept(folder: Path | None, name: str, body: Cube, x: np.ndarray) -> Runs:

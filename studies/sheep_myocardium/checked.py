@@ -128,8 +128,7 @@ def told(found: Campaign) -> Case:
             "seconds": found.seconds,
             "error_median": float(np.nanmedian(errors)),
             "error_90": float(np.nanquantile(errors, 0.9)),
-            "said_90": float(np.quantile(found.said, 0.9)),
-            "doubt_by_round": found.doubt,
+            "doubt_by_round": list(found.learned.doubt),
             "sd_of_log_likelihood_difference": float(np.nanstd(found.likelihood_differences())),
         },
         "certificate": {

@@ -83,6 +83,9 @@ class Cube:
 
     def runs(self, x: np.ndarray) -> Runs:
         """FEM at positions (r, p), as many at once as there are cores."""
+        if not len(x):
+            j = self.amounts.size
+            return Runs(x, np.empty((0, j)), np.empty((0, j, self.unknowns)))
         each = in_order(lambda row: self._run(jnp.asarray(row)), iter(x), at_once(self.simulator))
         return Runs(x, *(np.stack(part) for part in zip(*each, strict=True)))
 
@@ -191,16 +194,15 @@ class Fit:
         """Of each cube's process, (3, f)."""
         return np.asarray(self.emulated.process.lengths)
 
-    def left(self, number: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What a cube's runs leave at positions (m, p).
-
-        Covariance of q and its slopes, :func:`.process.left`, and the sd (m,) of q: a fraction of
-        the force.
-        """
+    def left(self, number: int, x: np.ndarray) -> np.ndarray:
+        """Correlation that a cube's runs leave of q and its slopes at positions (m, p)."""
         points, _ = process.values_and_slopes(number, x, self.emulated.H[number])
-        covariance, sd = process.left(self.known[number], self.lengths[number], points)
-        variance = np.diagonal(covariance)[:: len(covariance) // len(x)]
-        return covariance, sd * np.sqrt(np.maximum(variance, 0.0))
+        return process.left(self.known[number], self.lengths[number], points)
+
+    def unknown(self, number: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Share (m,) of q's variance that a cube's runs leave at positions (m, p), and B (k, k)."""
+        points = process.values(number, x, self.emulated.H[number])
+        return process.shares(self.known[number], self.lengths[number], points)
 
 
 def fit(bodies: Sequence[Cube], runs: Sequence[Runs], before: Fit | None = None) -> Fit:

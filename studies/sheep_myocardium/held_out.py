@@ -15,7 +15,7 @@ from arviz_stats.base import array_stats
 from scipy.special import logsumexp
 from studies.common.output import Case
 from studies.sheep_myocardium.experiment import MODES
-from studies.sheep_myocardium.inference import CELL, Found, covariances, sample
+from studies.sheep_myocardium.inference import Found, covariances, sample
 
 _HEAVIEST = 0.7  # Pareto shape of the weights' tail
 _LEVELS = (0.05, 0.5, 0.95)
@@ -71,11 +71,9 @@ def replicated(
     amounts: np.ndarray, mean: np.ndarray, omega: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """What would be measured (d, j) in N, of forces ``mean`` (d, j) off by ``omega`` (d,)."""
-    one = jnp.ones(len(amounts))
-    shape = np.asarray(covariances(jnp.asarray(amounts), one, jnp.ones(())))
-    half = np.linalg.cholesky(shape)
-    off = omega[:, None] * (rng.normal(size=mean.shape) @ half.T)
-    return mean * (1.0 + off) + rng.normal(0.0, CELL, mean.shape)
+    covariance = covariances(*map(jnp.asarray, (amounts, mean, omega[:, None, None])))
+    half = np.linalg.cholesky(np.asarray(covariance))
+    return mean + (half @ rng.normal(size=mean.shape)[..., None])[..., 0]
 
 
 def summed(told: dict[str, Prediction]) -> Case:

@@ -1,0 +1,180 @@
+"""The study of sheep myocardium: what is not known, rounds of runs, and the certificate."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from studies.sheep_myocardium import campaign, checked, curves, inference
+from studies.sheep_myocardium.doubts import doubts
+
+
+def test_a_meshs_error_is_taken_off_by_its_order():
+    """Forces that are too large by 0.2 h^1.2, on 3 and on 5 cells."""
+    right = np.full((2, 4), 2.0)
+    by = {n: right * (1.0 + 0.2 * n**-1.2) for n in (3, 5)}
+    empty = np.zeros((2, 10))
+    there, fine = ([curves.Runs(empty, by[n], empty)] for n in (3, 5))
+    arrays = {name: jnp.zeros(1) for name in curves.Emulated._fields}
+    found = campaign.without_mesh(curves.Emulated(**arrays), there, fine)
+    np.testing.assert_allclose(by[3][0] * found.finer[0], right[0], rtol=1e-3)
+
+
+def test_half_of_what_a_mode_is_off_is_the_same_along_its_curve():
+    amounts = jnp.linspace(-0.3, 0.3, 10)
+    covariance = np.asarray(inference.covariances(amounts, jnp.ones(10), jnp.asarray(0.2)))
+    assert covariance[0, 0] == pytest.approx(0.04 + inference.POINT**2 + inference.CELL**2)
+    assert 0.02 < covariance[0, -1] < 0.025
+
+
+def posterior(share, seed):
+    """A posterior of 100 draws, and what cubes of 3 x 2 points say that they do not know there."""
+    rng = np.random.default_rng(seed)
+    half = rng.normal(0.0, 0.3, (3, 6, 6))
+    B = half @ np.swapaxes(half, 1, 2)
+    amounts = jnp.tile(jnp.linspace(-0.3, 0.3, 2), (3, 3, 1))
+    fitted = SimpleNamespace(
+        known=[None] * 3, emulated=SimpleNamespace(amounts=amounts),
+        unknown=lambda k, x: (np.full(len(x), share[k]), B[k]),
+        left=lambda k, x: np.eye(11 * len(x)),
+    )  # fmt: skip
+    draws = {"means": np.full((100, 9, 2), 0.9), "omega": np.full(100, 0.4)}
+    found = SimpleNamespace(draws=draws, positions=rng.uniform(-1.0, 1.0, (100, 3, 10)))
+    return fitted, found, B
+
+
+def test_doubts_are_the_misfit_that_is_not_known():
+    """Its mean over forces as they may be, cube by cube."""
+    share = (0.0, 0.2, 0.4)
+    fitted, found, B = posterior(share, 8)
+    told = doubts(fitted, found)
+    assert told.shape == (100, 3)
+    assert (told[:, 0] == 0.0).all()
+    rng = np.random.default_rng(9)
+    C = inference.covariances(fitted.emulated.amounts[0, 0], jnp.full(2, 0.9), jnp.asarray(0.4))
+    half = np.linalg.cholesky(np.asarray(C))
+    for k in (1, 2):
+        q = rng.multivariate_normal(np.zeros(6), share[k] * B[k], 40_000)
+        squares = sum(
+            np.square(np.linalg.solve(half, 0.9 * q[:, 2 * mode : 2 * mode + 2].T)).sum(axis=0)
+            for mode in range(3)
+        )
+        assert told[0, k] == pytest.approx(np.sqrt(squares.mean()), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("least", "rounds"), [([0.2], 0), ([9.0, 2.0, 0.2], 2), ([9.0, 2.0, 2.0, 2.0], 2)]
+)
+def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, least, rounds):
+    """Until its cubes are known at all draws, or as often as the plan says."""
+    told, asked = iter(least), []
+
+    def settled(heart, emulated, seed, *, known, steps, times):
+        asked.append(known)
+        return SimpleNamespace(modes=f"of {len(asked)}")
+
+    def a_round(fem, learned, found, plan, seed):
+        if next(told) < campaign.KNOWN:
+            return learned
+        return learned._replace(doubt=(*learned.doubt, 1.0))
+
+    monkeypatch.setattr(campaign, "settled", settled)
+    monkeypatch.setattr(campaign, "_round", a_round)
+    monkeypatch.setattr(campaign, "without_mesh", lambda emulated, *_: emulated)
+    learned = campaign.Learned([], SimpleNamespace(emulated=None))
+    plan = campaign.Plan(closer=2)
+    fem = SimpleNamespace(heart=None)
+    made, found = campaign._closed(fem, learned, ("coarse", "fine"), "before", plan, 0)
+    assert len(made.doubt) == rounds
+    assert asked == ["before", "of 1", "of 2"][: rounds + 1]
+    assert found.modes == f"of {rounds + 1}"
+
+
+@pytest.mark.parametrize(
+    ("share", "runs"), [((0.9, 0.9, 0.9), [9, 9, 9]), ((0.0, 0.0, 0.9), [0, 0, 27])]
+)
+def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):
+    fitted, found, _ = posterior(share, 10)
+    asked = {}
+
+    def fem(name, x):
+        asked[name] = [len(at) for at in x]
+        return [curves.Runs(at, np.zeros((len(at), 1)), np.zeros((len(at), 1, 10))) for at in x]
+
+    fem.heart, fem.bodies = SimpleNamespace(name="TSL9"), None
+    monkeypatch.setattr(campaign, "fit", lambda bodies, runs, before: before)
+    learned = campaign.Learned(fem("wide", [np.zeros((2, 10))] * 3), fitted)
+    made = campaign._round(fem, learned, found, campaign.Plan(), 0)
+    assert asked["round_6"] == runs
+    assert made.size == 6 + 27
+    assert len(made.doubt) == 1
+    known = learned._replace(fitted=posterior((0.0, 0.0, 1e-4), 10)[0])
+    assert campaign._round(fem, known, found, campaign.Plan(), 0) is known
+
+
+def test_runs_are_chosen_from_draws_that_are_known_least_and_others():
+    rows = campaign._pool(np.arange(200.0), 0)
+    assert len(set(rows.tolist())) == 80
+    assert set(range(160, 200)) <= set(rows.tolist())
+
+
+def checked_heart(differences, spread=1.0):
+    """A heart whose draws are Gaussian in logarithms, tested at 30 of them."""
+    rng = np.random.default_rng(4)
+    names = inference.parameters(inference.ORTHOTROPIC)
+    logs = {n: rng.normal(0.0, 0.1, 1000) for n in names}
+    draws = {"omega": np.exp(rng.normal(-1.0, 0.1, 1000))}
+
+    def found(moved):
+        return SimpleNamespace(
+            law=inference.ORTHOTROPIC, draws=draws, worst_rhat=1.0, least_ess=900.0, divergences=0,
+            positions=np.zeros((1000, 3, 10)), theta=lambda name: np.exp(logs[name] + moved),
+        )  # fmt: skip
+
+    tested = np.arange(30)
+    return SimpleNamespace(
+        explored=found(0.0), on_mesh=found(0.1 * spread), tested=tested, meshes=([], []),
+        likelihood_differences=lambda: differences(logs, tested),
+    )  # fmt: skip
+
+
+def test_tests_that_leave_the_verdict_open_become_runs(monkeypatch):
+    """Until it is accepted, or as often as the plan says."""
+    asked = []
+
+    def after(verdicts):
+        told = iter(verdicts)
+
+        def made(word, seconds):
+            asked.append(word)
+            return SimpleNamespace(seconds=seconds)
+
+        monkeypatch.setattr(checked, "campaign", lambda *_: made("first", 0))
+        monkeypatch.setattr(checked, "again", lambda found, *_: made("again", found.seconds + 1))
+        monkeypatch.setattr(checked, "certificate", lambda _: SimpleNamespace(verdict=next(told)))
+        asked.clear()
+        heart = SimpleNamespace(name="TSL9")
+        return checked.decided(heart, campaign.Plan(again=2), None, 0).seconds
+
+    assert after(["undecided", "accepted"]) == 1
+    assert asked == ["first", "again"]
+    assert after(["undecided", "not certified", "undecided"]) == 2
+    assert after(["accepted"]) == 0
+    assert asked == ["first"]
+
+
+@pytest.mark.parametrize(
+    ("differences", "spread", "verdict", "word"),
+    [
+        (lambda logs, rows: 0.05 * np.sin(rows), 1.0, "accepted", "no mean moves"),
+        # FEM's likelihood rises with a: its mean moves by a sd.
+        (lambda logs, rows: 10.0 * logs["a"][rows], 1.0, None, "mean of a"),
+        (lambda logs, rows: 3.0 * np.sin(5.0 * rows), 1.0, "not certified", "irregularly"),
+        (lambda logs, rows: np.where(rows < 3, np.nan, 0.0), 1.0, "not certified", "FEM fails"),
+        (lambda logs, rows: 0.0 * rows, 4.0, "not certified", "finer mesh"),
+    ],
+)
+def test_the_librarys_limits_judge_a_heart(differences, spread, verdict, word):
+    found = checked.certificate(checked_heart(differences, spread))
+    assert found.verdict == verdict if verdict else found.verdict != "accepted"
+    assert any(word in each for each in found.findings)

@@ -1,0 +1,157 @@
+"""The study of sheep myocardium: a cube's formula, its features and its process."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from studies.sheep_myocardium import cube, process
+
+
+def position(**values):
+    """Position (p,) in the box of these values, of others the lowest."""
+    lowest = {p.name: p.low for p in cube.MATERIAL} | dict.fromkeys(
+        ("in_plane", "out_of_plane"), 0.0
+    )
+    given = lowest | values
+    unit = [p.to_unit(jnp.asarray(given[p.name])) for p in (*cube.MATERIAL, *cube.ANGLES)]
+    return 2.0 * jnp.stack(unit) - 1.0
+
+
+def test_formula_of_an_isotropic_cube():
+    r"""Simple shear of W(I1): :math:`F = A\, a\, \gamma\, e^{b \gamma^2}`."""
+    x = position(a=1.2, b=6.0, in_plane=7.0, out_of_plane=-3.0)
+    H, C = (jnp.asarray(a)[None] for a in cube.homogeneous(np.array([[0.2], [0.2], [0.1]])))
+    along_y, along_z, stretched = cube.formula(x[None], H, C, jnp.array([90.0]))[0]
+    expected = 1e-3 * 90.0 * 1.2 * 0.2 * np.exp(6.0 * 0.04)
+    assert float(along_y) == pytest.approx(expected, rel=2e-3)
+    assert float(along_z) == pytest.approx(expected, rel=2e-3)
+    # Stretched: sigma = a exp(b (I1 - 3)) (l^2 - 1/l), force A sigma / l.
+    stretch, I1 = 1.1, 1.1**2 + 2.0 / 1.1
+    sigma = 1.2 * np.exp(6.0 * (I1 - 3.0)) * (stretch**2 - 1.0 / stretch)
+    assert float(stretched) == pytest.approx(1e-3 * 90.0 * sigma / stretch, rel=5e-3)
+
+
+def test_angles_turn_fibres_towards_sheet_and_normal():
+    for number in range(3):
+        scene = cube.scene(number, np.array([9.0, 10.0, 8.0]), cells=1)
+        f, s, across, along = cube._frame(number)
+        n = np.eye(3)[np.argsort(cube._CUT[number])][2]
+        np.testing.assert_allclose(np.cross(across, f), s)
+        np.testing.assert_allclose(np.cross(along, f), n)
+        middle = scene.centre
+        for name, towards in (("in_plane", s), ("out_of_plane", n)):
+            k = scene.parameter_names.index(name)
+            turned = np.asarray(scene.tissue_at(middle.at[k].set(30.0)).directions)[0, 0, 0]
+            np.testing.assert_allclose(turned, np.sqrt(0.75) * f + 0.5 * towards, atol=1e-12)
+
+
+H = jnp.asarray(
+    cube.homogeneous(np.array([[-0.3, 0.1, 0.35], [-0.4, 0.1, 0.3], [-0.1, 0.05, 0.12]]))[0]
+)
+
+
+def test_features_are_shares_of_terms_at_rest_and_where_curves_end():
+    x = position(a=0.8, b=7.0, a_f=1.6, b_f=10.0, a_fs=0.4, b_fs=3.0)
+    found = process.features(0, x, H)
+    assert found.shape == (process.FEATURES,)
+    np.testing.assert_allclose(found[2:5], np.log1p([1.6 / 0.8, 0.001 / 0.8, 0.4 / 0.8]))
+    ends = np.asarray(found[5:23]).reshape(6, 3)
+    # Sheared by -0.3 from the fibres' plane towards the sheet: I4f = 1.09, I1 = 3.09, I8 = -0.3.
+    shares = [
+        1.6 / 0.8 * 0.09**2 / 0.09 * np.exp(10.0 * 0.09**2 - 7.0 * 0.09),
+        0.0,
+        0.4 / 0.8 * 0.09 / 0.09 * np.exp(3.0 * 0.09 - 7.0 * 0.09),
+    ]
+    np.testing.assert_allclose(ends[0], np.log1p(shares), rtol=1e-10, atol=1e-12)
+    # Fibres that are pushed together carry nothing.
+    np.testing.assert_allclose(ends[4][0], 0.0, atol=1e-12)
+    # Turned by 30 degrees they are pulled at one end of a shear more than at the other.
+    turned = x.at[8].set(30.0 / 45.0)
+    one, other = np.asarray(process.features(0, turned, H)[5:23]).reshape(6, 3)[:2, 0]
+    assert other > 2.0 * one
+
+
+def test_a_term_that_is_off_has_no_exponent():
+    x = [position(a=1.0, b=5.0, b_f=b_f) for b_f in (0.5, 20.0)]
+    phi = [process.features(0, each, H) for each in x]
+    assert float(jnp.abs(phi[1] - phi[0]).max()) < 5e-3
+
+
+def test_the_processs_correlations_are_the_kernels_derivatives():
+    x, y = 0.5 * jax.random.normal(jax.random.key(0), (2, 10))
+    lengths = np.linspace(0.5, 2.0, process.FEATURES)
+
+    def kernel(x, y):
+        step = (process.features(1, x, H) - process.features(1, y, H)) / lengths
+        return jnp.exp(-0.5 * step @ step)
+
+    one, other = (process.values_and_slopes(1, np.asarray(at)[None], H)[0] for at in (x, y))
+    found = process.correlations(one, other, lengths)
+    np.testing.assert_allclose(found[0, 0], kernel(x, y), rtol=1e-12)
+    np.testing.assert_allclose(found[0, 1:], jax.grad(kernel, 1)(x, y), atol=1e-12)
+    np.testing.assert_allclose(found[1:, 0], jax.grad(kernel, 0)(x, y), atol=1e-12)
+    cross = jax.jacfwd(jax.grad(kernel, 0), 1)(x, y)
+    np.testing.assert_allclose(found[1:, 1:], cross, atol=1e-12)
+
+
+def made_up(x):
+    """A q of one point, smooth in features: (n, 1) and its slopes (n, 1, p)."""
+
+    def q(x):
+        phi = process.features(0, x, H)
+        return jnp.array([0.3 * jnp.sin(phi[2]) + 0.1 * phi[-2] ** 2])
+
+    x = jnp.asarray(x)
+    return np.asarray(jax.vmap(q)(x)), np.asarray(jax.vmap(jax.jacfwd(q))(x))
+
+
+@pytest.fixture(scope="module")
+def told():
+    x = np.random.default_rng(0).uniform(-0.6, 0.6, (12, 10))
+    return process.known(0, x, *made_up(x), H)
+
+
+def test_the_slopes_of_likelihood_are_its_differences(told):
+    logs, step = np.log(np.linspace(0.8, 3.0, process.FEATURES)), 1e-5
+    rising = process._unlikely(logs, told)[1]
+    for k, row in enumerate(step * np.eye(len(logs))):
+        ahead, behind = (process._unlikely(at, told)[0] for at in (logs + row, logs - row))
+        assert rising[k] == pytest.approx((ahead - behind) / (2.0 * step), rel=1e-5, abs=1e-6)
+
+
+def test_a_process_goes_through_its_runs_and_says_what_it_leaves(told):
+    lengths = process.likeliest(told)
+    made = process.conditioned(told, lengths, process.room(told.runs))
+    assert len(made.at) == process.ROOM
+    assert process.room(process.ROOM + 1) == 2 * process.ROOM
+    value = told.told.value == 1.0
+    there = jax.vmap(process.correction, (None, 0))(made, told.told.at[value])
+    np.testing.assert_allclose(there, told.y[value] + told.mean, atol=1e-3)
+    # Features that q does not read have longer lengths than those it does.
+    assert lengths[2] < lengths[[3, 4, 9]].min()
+    x = np.random.default_rng(1).uniform(-0.6, 0.6, (60, 10))
+    share, B = process.shares(told, lengths, process.values(0, x, H))
+    said = np.sqrt(B[0, 0] * share)
+    made_there = jax.vmap(process.correction, (None, 0))(made, process.values(0, x, H).at)
+    wrong = np.asarray(made_there)[:, 0] - made_up(x)[0][:, 0]
+    assert np.abs(wrong).max() < 0.03
+    assert 0.3 < np.sqrt(np.mean((wrong / (said + 1e-5)) ** 2)) < 3.0
+    # What is left of values is the same beside their slopes.
+    points, _ = process.values_and_slopes(0, x, H)
+    remains = np.diagonal(process.left(told, lengths, points))[points.value == 1.0]
+    np.testing.assert_allclose(share, np.maximum(remains, 0.0), atol=1e-12)
+
+
+def test_next_runs_take_the_most_variance_away():
+    """Against conditioning on each run by hand."""
+    half = np.random.default_rng(2).normal(size=(12, 12))
+    C = half @ half.T
+    values = np.arange(0, 12, 3)
+    left = []
+    for i in range(4):
+        rows = np.arange(3 * i, 3 * i + 3)
+        after = C - C[:, rows] @ np.linalg.inv(C[np.ix_(rows, rows)]) @ C[rows]
+        left.append(np.trace(after[np.ix_(values, values)]))
+    first, second = process.next_runs(C, 4, 2)
+    assert first == int(np.argmin(left))
+    assert second != first
