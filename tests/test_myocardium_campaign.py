@@ -138,29 +138,50 @@ def checked_heart(differences, spread=1.0):
     )  # fmt: skip
 
 
-def test_tests_that_leave_the_verdict_open_become_runs(monkeypatch):
-    """Until it is accepted, or as often as the plan says."""
+@pytest.mark.parametrize(
+    ("verdicts", "asked"),
+    [
+        (["accepted"], ["campaign"]),
+        (["undecided", "accepted"], ["campaign", "further"]),
+        (["not certified", "accepted"], ["campaign", "again"]),
+        # Three sets of one posterior at most, and four more in all.
+        (["undecided"] * 5, ["campaign", "further", "further", "again", "further"]),
+    ],
+)
+def test_there_are_more_tests_while_the_verdict_is_open(monkeypatch, verdicts, asked):
+    told, made = iter(verdicts), []
+
+    def after(name):
+        def found(before, *_):
+            made.append(name)
+            done = len(before.tested) if name == "further" else 0
+            return SimpleNamespace(seconds=0, tested=np.zeros(done + 30))
+
+        return found
+
+    for name in ("campaign", "further", "again"):
+        monkeypatch.setattr(checked, name, after(name))
+    monkeypatch.setattr(checked, "certificate", lambda _: SimpleNamespace(verdict=next(told)))
+    checked.decided(SimpleNamespace(name="TSL9"), campaign.Plan(again=4), None, 0)
+    assert made == asked
+
+
+def test_more_tests_are_of_the_same_posterior():
+    """At draws that were not tested before."""
+    rng = np.random.default_rng(11)
+    explored = SimpleNamespace(positions=rng.uniform(-1.0, 1.0, (100, 3, 10)))
+    learned = campaign.Learned([], None)
     asked = []
 
-    def after(verdicts):
-        told = iter(verdicts)
+    def fem(name, x):
+        asked.append(name)
+        return [curves.Runs(at, np.zeros((len(at), 1)), np.zeros((len(at), 1, 10))) for at in x]
 
-        def made(word, seconds):
-            asked.append(word)
-            return SimpleNamespace(seconds=seconds)
-
-        monkeypatch.setattr(checked, "campaign", lambda *_: made("first", 0))
-        monkeypatch.setattr(checked, "again", lambda found, *_: made("again", found.seconds + 1))
-        monkeypatch.setattr(checked, "certificate", lambda _: SimpleNamespace(verdict=next(told)))
-        asked.clear()
-        heart = SimpleNamespace(name="TSL9")
-        return checked.decided(heart, campaign.Plan(again=2), None, 0).seconds
-
-    assert after(["undecided", "accepted"]) == 1
-    assert asked == ["first", "again"]
-    assert after(["undecided", "not certified", "undecided"]) == 2
-    assert after(["accepted"]) == 0
-    assert asked == ["first"]
+    first, tests = campaign._tests(fem, learned, explored, campaign.Plan(), 0, 0)
+    second, _ = campaign._tests(fem, learned, explored, campaign.Plan(), 0, 30)
+    assert len(set(first) | set(second)) == 60
+    np.testing.assert_array_equal(tests[2].x, explored.positions[first, 2])
+    assert asked == ["tests_0_0", "tests_0_30"]
 
 
 @pytest.mark.parametrize(

@@ -49,8 +49,8 @@ class Plan:
 
     wide : over the box. rounds, each : after them, so many times so many in all, of cubes that are
     not known at draws of the posterior, where they tell most of q. closer : more such rounds at
-    most, until all cubes are. tests : at draws of the posterior. again : times that tests become
-    runs and others are made, while the verdict is open. meshes : at which a finer mesh is solved,
+    most, until all cubes are. tests : at draws of the posterior. again : times that there are more
+    of them while the verdict is open, at most. meshes : at which a finer mesh is solved,
     too. steps : of a chain's warm-up, and of its draws.
     """
 
@@ -211,6 +211,19 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
     return _tested(fem, learned, meshes, found.modes, plan, seed, began)
 
 
+def further(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign:
+    """With more tests, at other draws of the same posterior."""
+    began = perf_counter() - found.seconds
+    fem = Solver(found.heart, found.bodies, kept)
+    rows, new = _tests(fem, found.learned, found.explored, plan, seed, len(found.tested))
+    return replace(
+        found,
+        tested=np.concatenate([found.tested, rows]),
+        tests=[joined(pair) for pair in zip(found.tests, new, strict=True)],
+        seconds=perf_counter() - began,
+    )
+
+
 def again(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign:
     """Its tests become runs; others are made at draws of the new posterior."""
     began = perf_counter() - found.seconds
@@ -279,15 +292,23 @@ def _tested(
 ) -> Campaign:
     """The posteriors, and FEM at some draws of the one without the mesh's error."""
     learned, explored = _closed(fem, learned, meshes, known, plan, seed)
-    number = seed + learned.size
     how = {"known": explored.modes, "steps": plan.steps}
-    on_mesh = settled(fem.heart, learned.fitted.emulated, number + 1, **how)
-    rows = np.random.default_rng(number).permutation(len(explored.positions))[: plan.tests]
-    tests = fem(f"tests_{learned.size}", np.moveaxis(explored.positions[rows], 1, 0))
+    on_mesh = settled(fem.heart, learned.fitted.emulated, seed + learned.size + 1, **how)
+    rows, tests = _tests(fem, learned, explored, plan, seed, 0)
     return Campaign(
         fem.heart, fem.bodies, learned, meshes, explored.of.cubes, on_mesh, explored, rows, tests,
         perf_counter() - began,
     )  # fmt: skip
+
+
+def _tests(
+    fem: Solver, learned: Learned, explored: Found, plan: Plan, seed: int, done: int
+) -> tuple[np.ndarray, list[Runs]]:
+    """Draws (t,) behind those that are ``done``, and FEM there."""
+    order = np.random.default_rng(seed + learned.size).permutation(len(explored.positions))
+    rows = order[done : done + plan.tests]
+    x = np.moveaxis(explored.positions[rows], 1, 0)
+    return rows, fem(f"tests_{learned.size}_{done}", x)
 
 
 def _kept(folder: Path | None, name: str, body: Cube, x: np.ndarray) -> Runs:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import softmax
 from studies.common.output import Case
-from studies.sheep_myocardium.campaign import FINER, Campaign, Plan, again, campaign
+from studies.sheep_myocardium.campaign import FINER, Campaign, Plan, again, campaign, further
 from studies.sheep_myocardium.experiment import Heart
 from studies.sheep_myocardium.inference import Found, parameters
 
@@ -36,6 +36,7 @@ from calibrate.certificate.verdict import Certificate, judge
 
 _LEFT = 0.3  # of the mesh's correction
 _FEWEST = 25  # weights that have a tail
+_MOST = 3  # sets of tests of one posterior
 
 
 def logarithms(found: Found) -> dict[str, np.ndarray]:
@@ -87,14 +88,19 @@ def certificate(found: Campaign) -> Certificate:
 
 
 def decided(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign:
-    """A heart's campaign, until its certificate is accepted or it was tested often enough."""
+    """A heart's campaign, until its certificate is accepted or it was tested often enough.
+
+    Where too few tests leave the verdict open there are more of the same posterior; where these
+    leave it open too, or say that the map is wrong, they become runs of another.
+    """
     found = campaign(heart, plan, kept, seed)
     for left in reversed(range(plan.again + 1)):
         given = certificate(found)
         print(f"{heart.name}, {found.seconds:.0f} s: {given}", flush=True)
         if given.verdict == "accepted" or not left:
             break
-        found = again(found, plan, kept, seed)
+        few = given.verdict == "undecided" and len(found.tested) < _MOST * plan.tests
+        found = (further if few else again)(found, plan, kept, seed)
     return found
 
 
