@@ -31,6 +31,26 @@ def test_formula_of_an_isotropic_cube():
     assert float(stretched) == pytest.approx(1e-3 * 90.0 * sigma / stretch, rel=5e-3)
 
 
+def test_the_formulas_fibres_miss_their_angles():
+    """By Gauss-Hermite's rule with many nodes, where the force is smooth; and it is continuous."""
+    amounts = np.full((3, 1), 0.3)
+    H, C = (jnp.asarray(a)[None] for a in cube.homogeneous(amounts))
+    x = position(a=1.0, b=5.0, a_f=2.0, b_f=3.0).at[8:].set(jnp.array([0.6, 0.3]))
+    found = cube.formula(x[None], H, C, jnp.array([90.0]))[0]
+    stress = jax.grad(cube.point_energy(cube._law_of(), cube.theta_of(x)))
+
+    def alone(x):
+        P = jax.vmap(stress, (0, None))(H.reshape(-1, 3, 3), cube.Tissue(cube.turned_to(0, x)))
+        return 0.09 * jnp.einsum("kij,kij->k", C.reshape(-1, 3, 3), P)
+
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
+    at = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2) * cube.SPREAD / 45.0
+    weight = np.outer(weights, weights).ravel() / weights.sum() ** 2
+    every = jax.vmap(lambda more: alone(x.at[8:].add(more)))(jnp.asarray(at))
+    np.testing.assert_allclose(found, weight @ every, rtol=2e-4)
+    assert float(np.abs(alone(x) / found - 1.0).max()) > 2e-3
+
+
 def test_angles_turn_fibres_towards_sheet_and_normal():
     for number in range(3):
         scene = cube.scene(number, np.array([9.0, 10.0, 8.0]), cells=1)
