@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from studies.sheep_myocardium import campaign, checked, curves, inference
+from studies.sheep_myocardium import campaign, checked, curves, held_out, inference
 from studies.sheep_myocardium.doubts import doubts
 
 
@@ -25,6 +25,18 @@ def test_half_of_what_a_mode_is_off_is_the_same_along_its_curve():
     covariance = np.asarray(inference.covariances(amounts, jnp.ones(10), jnp.asarray(0.2)))
     assert covariance[0, 0] == pytest.approx(0.04 + inference.POINT**2 + inference.CELL**2)
     assert 0.02 < covariance[0, -1] < 0.025
+
+
+def test_what_would_be_measured_is_off_as_the_data_is():
+    """Each by its own omega, with 3 % of a point's own whatever omega is, and the cell's noise."""
+    amounts, omega = np.linspace(-0.3, 0.3, 4), np.repeat([0.05, 0.5], 40_000)
+    mean = np.tile([0.1, 0.5, 0.8, 1.0], (len(omega), 1))
+    made = held_out.replicated(amounts, mean, omega, np.random.default_rng(12))
+    for share in (0.05, 0.5):
+        C = inference.covariances(*map(jnp.asarray, (amounts, mean[0], share)))
+        found = np.cov(made[omega == share].T)
+        np.testing.assert_allclose(found, C, atol=0.03 * float(C.max()))
+    np.testing.assert_allclose(made.mean(axis=0), mean[0], atol=0.01)
 
 
 def posterior(share, seed):

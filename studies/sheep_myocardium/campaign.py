@@ -50,8 +50,8 @@ class Plan:
     wide : over the box. rounds, each : after them, so many times so many in all, of cubes that are
     not known at draws of the posterior, where they tell most of q. closer : more such rounds at
     most, until all cubes are. tests : at draws of the posterior. again : times that there are more
-    of them while the verdict is open, at most. meshes : at which a finer mesh is solved,
-    too. steps : of a chain's warm-up, and of its draws.
+    of them while the verdict is open, at most. meshes : at which a finer mesh is solved, too.
+    steps : of a chain's warm-up, and of its draws.
     """
 
     wide: int = 12

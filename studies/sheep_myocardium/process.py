@@ -30,7 +30,7 @@ correlation
 
 .. math:: \kappa\, [(v - d^T \Lambda \Delta)(v' + d'^T \Lambda \Delta) + d^T \Lambda\, d'],
 
-and a value at x has with them, c(x), which makes
+and c(x) is that of a value at x with all n, which makes
 
 .. math:: E\, q_j = \bar q_j + c^T K^{-1} y_j, \qquad
           \mathrm{cov}(q_i, q_j) = B_{ij}\, \lambda, \quad \lambda = 1 - c^T K^{-1} c, \quad
