@@ -74,6 +74,11 @@ def test_doubts_are_the_misfit_that_is_not_known():
         assert told[0, k] == pytest.approx(np.sqrt(squares.mean()), rel=0.02)
 
 
+def runs_at(x):
+    """Runs of one point without force at positions (r, 10) of each cube."""
+    return [curves.Runs(at, np.zeros((len(at), 1)), np.zeros((len(at), 1, 10))) for at in x]
+
+
 @pytest.mark.parametrize(
     ("least", "rounds"), [([0.2], 0), ([9.0, 2.0, 0.2], 2), ([9.0, 2.0, 2.0, 2.0], 2)]
 )
@@ -111,7 +116,7 @@ def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):
 
     def fem(name, x):
         asked[name] = [len(at) for at in x]
-        return [curves.Runs(at, np.zeros((len(at), 1)), np.zeros((len(at), 1, 10))) for at in x]
+        return runs_at(x)
 
     fem.heart, fem.bodies = SimpleNamespace(name="TSL9"), None
     monkeypatch.setattr(campaign, "fit", lambda bodies, runs, before: before)
@@ -187,7 +192,7 @@ def test_more_tests_are_of_the_same_posterior():
 
     def fem(name, x):
         asked.append(name)
-        return [curves.Runs(at, np.zeros((len(at), 1)), np.zeros((len(at), 1, 10))) for at in x]
+        return runs_at(x)
 
     first, tests = campaign._tests(fem, learned, explored, campaign.Plan(), 0, 0)
     second, _ = campaign._tests(fem, learned, explored, campaign.Plan(), 0, 30)
