@@ -80,7 +80,7 @@ def runs_at(x):
 
 
 @pytest.mark.parametrize(
-    ("least", "rounds"), [([0.2], 0), ([9.0, 2.0, 0.2], 2), ([9.0, 2.0, 2.0, 2.0], 2)]
+    ("least", "rounds"), [([0.1], 0), ([9.0, 2.0, 0.1], 2), ([9.0, 2.0, 2.0, 2.0], 2)]
 )
 def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, least, rounds):
     """Until its cubes are known at all draws, or as often as the plan says."""
@@ -112,7 +112,7 @@ def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, least, 
 )
 def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):
     fitted, found, _ = posterior(share, 10)
-    asked = {}
+    asked, plan = {}, campaign.Plan(each=27)
 
     def fem(name, x):
         asked[name] = [len(at) for at in x]
@@ -121,12 +121,12 @@ def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):
     fem.heart, fem.bodies = SimpleNamespace(name="TSL9"), None
     monkeypatch.setattr(campaign, "fit", lambda bodies, runs, before: before)
     learned = campaign.Learned(fem("wide", [np.zeros((2, 10))] * 3), fitted)
-    made = campaign._round(fem, learned, found, campaign.Plan(), 0)
+    made = campaign._round(fem, learned, found, plan, 0)
     assert asked["round_6"] == runs
     assert made.size == 6 + 27
     assert len(made.doubt) == 1
     known = learned._replace(fitted=posterior((0.0, 0.0, 1e-4), 10)[0])
-    assert campaign._round(fem, known, found, campaign.Plan(), 0) is known
+    assert campaign._round(fem, known, found, plan, 0) is known
 
 
 def test_runs_are_chosen_from_draws_that_are_known_least_and_others():

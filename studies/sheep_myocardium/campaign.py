@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import softmax
 from scipy.stats import qmc
 from studies.sheep_myocardium.cube import CELLS
 from studies.sheep_myocardium.curves import (
@@ -48,15 +49,17 @@ class Plan:
     """Numbers of runs a cube.
 
     wide : over the box. rounds, each : after them, so many times so many in all, of cubes that are
-    not known at draws of the posterior, where they tell most of q. closer : more such rounds at
-    most, until all cubes are. tests : at draws of the posterior. again : times that there are more
-    of them while the verdict is open, at most. meshes : at which a finer mesh is solved, too.
-    steps : of a chain's warm-up, and of its draws.
+    not known at draws of the posterior, where they tell most of q. power : that the likelihood is
+    taken to meanwhile, so that runs reach beyond the posterior. closer : more such rounds at most,
+    of the posterior itself, until all cubes are known. tests : at draws of it. again : times that
+    there are more of them while the verdict is open, at most. meshes : at which a finer mesh is
+    solved, too. steps : of a chain's warm-up, and of its draws.
     """
 
     wide: int = 12
     rounds: int = 4
-    each: int = 27
+    each: int = 45
+    power: float = 0.5
     closer: int = 6
     tests: int = 30
     again: int = 5
@@ -65,7 +68,7 @@ class Plan:
 
 
 QUICK = Plan(wide=4, rounds=1, each=6, closer=0, tests=4, again=0, meshes=1, steps=50)
-KNOWN = 0.3
+KNOWN = 0.2
 """Root mean square of :func:`.doubts` at draws of a posterior, of a cube whose forces are known."""
 _POOL = 80  # draws that next runs are chosen from
 _forces = jax.jit(jax.vmap(forces, (None, 0)))
@@ -203,9 +206,12 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
     for number in range(plan.rounds):
         # Of a posterior with fewer terms, too: a term that is off is a corner of its own.
         law = "fibres" if number == 1 else ORTHOTROPIC
-        found = sample(heart, learned.fitted.emulated, seed + number, law, steps=plan.steps)
+        how = {"power": plan.power, "steps": plan.steps}
+        found = sample(heart, learned.fitted.emulated, seed + number, law, **how)
         learned = _round(fem, learned, found, plan, seed)
-    rows = np.random.default_rng(seed).choice(len(found.positions), plan.meshes, replace=False)
+    share = softmax((1.0 - plan.power) * found.log_likelihoods.sum(axis=1))
+    rng = np.random.default_rng(seed)
+    rows = rng.choice(len(share), plan.meshes, replace=False, p=share)
     x = np.moveaxis(found.positions[rows], 1, 0)
     meshes = fem("mesh", x), fem.finer("mesh_finer", x)
     return _tested(fem, learned, meshes, found.modes, plan, seed, began)

@@ -76,7 +76,8 @@ ANGLE_SD = ANGLE / cube.ANGLES[0].high  # in half widths of the box
 class Seen(NamedTuple):
     """What the program is given of a heart and a law.
 
-    cubes : the emulator. data : (9, j) N. used : (9,) 1 for modes whose data is used, else 0.
+    cubes : the emulator. data : (9, j) N. used : (9,) power that a mode's likelihood is taken to,
+    0 for one that is left out.
     acting : (8,) whether the law has a parameter. turned : () 1 where fibre angles are unknown, 0
     where fibres are along the cut.
     """
@@ -107,10 +108,14 @@ def seen(
     *,
     angles: bool = True,
     left_out: tuple[str, ...] = (),
+    power: float = 1.0,
 ) -> Seen:
-    """A heart's forces and data by a law, with fibre ``angles`` unknown; modes may be left out."""
+    """A heart's forces and data by a law, with fibre ``angles`` unknown; modes may be left out.
+
+    The likelihood is taken to a ``power``.
+    """
     data = np.stack([heart.curves[mode].force for mode in MODES])
-    used = np.array([float(mode not in left_out) for mode in MODES])
+    used = power * np.array([float(mode not in left_out) for mode in MODES])
     acting = np.array([name in parameters(law) for name in MATERIAL])
     return Seen(cubes, *map(jnp.asarray, (data, used, acting, float(angles))))
 
@@ -277,6 +282,7 @@ def sample(
     *,
     angles: bool = True,
     left_out: tuple[str, ...] = (),
+    power: float = 1.0,
     known: Modes | None = None,
     steps: int = 300,
     times: int = 1,
@@ -288,7 +294,7 @@ def sample(
     :data:`TIMES`, are kept. Chains that know no modes find one each. As many are drawn at once as
     there are cores.
     """
-    of = seen(heart, cubes, law, angles=angles, left_out=left_out)
+    of = seen(heart, cubes, law, angles=angles, left_out=left_out, power=power)
     given = unknown(len(_marked({}))) if known is None else known
     run, draws = _sampler(steps), times * steps
 
