@@ -8,7 +8,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 from numpyro import handlers
-from studies.sheep_myocardium import inference, moves
+from studies.sheep_myocardium import chains, inference, moves
 
 
 def test_a_law_leaves_out_moduli_and_their_exponents():
@@ -97,7 +97,7 @@ def test_moves_join_modes_that_nuts_does_not(known):
     )
     z = np.stack([np.linspace(-11.5, -8.5, 100), np.linspace(9.3, 10.7, 100)])[:, :, None]
     given = moves.modes(np.concatenate([z, z]), np.zeros((4, 100))) if known else moves.unknown(1)
-    found = moves.chain(
+    found = chains.chain(
         lambda z: -apart.log_prob(z[0]), given, np.array([False]), jax.random.key(0),
         warmup=100, draws=600, room=600,
     )  # fmt: skip
@@ -111,7 +111,7 @@ def test_mirrored_entries_change_sign_where_that_is_as_likely():
         return 0.5 * (jnp.abs(z[0]) - 8.0) ** 2 + 0.5 * (z[1] - 8.0) ** 2
 
     mirrored = np.array([True, True])
-    found = moves.chain(
+    found = chains.chain(
         potential, moves.unknown(2), mirrored, jax.random.key(1), warmup=100, draws=400, room=400
     )
     assert 0.35 < float((found.z[:, 0] > 0.0).mean()) < 0.65

@@ -92,7 +92,7 @@ def of_heart(found: Campaign, plan: Plan) -> Case:
 
 def of_twins(found: Campaign, plan: Plan) -> Case:
     """Coverage of a heart's twins."""
-    return twins.covered(list(twins.ranks(found, SEED, plan.steps)))
+    return twins.covered(twins.ranks(found, SEED, plan.steps))
 
 
 def of_population(found: list[Campaign], quick: bool) -> Case:

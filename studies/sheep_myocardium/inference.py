@@ -19,7 +19,6 @@ parameter that a law leaves out is drawn from its prior and not looked at.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -29,24 +28,14 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from jax.flatten_util import ravel_pytree
-from numpyro.infer.util import constrain_fn, potential_energy
 from studies.sheep_myocardium import cube
+from studies.sheep_myocardium.chains import Drawn, by_chain, marked, sampler, side_by_side
 from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
-from studies.sheep_myocardium.moves import (
-    EXPLORING,
-    Chain,
-    Modes,
-    chain,
-    joined,
-    modes,
-    unknown,
-)
+from studies.sheep_myocardium.moves import EXPLORING, Modes, joined, modes, unknown
 
 from calibrate.samplers.stopping import least_ess, r_hat
 from calibrate.statistical_model.curve import curve_covariance
-from emulator.machine import cores
 
 CELL = 3e-3  # N, noise of the load cell
 POINT = 0.03  # of a force, at each point for itself
@@ -181,38 +170,11 @@ _SITES = {
 """Zeros like each unknown, by its site."""
 
 
-def _marked(marks: dict[str, bool]) -> np.ndarray:
-    """Whether each unconstrained position (u,) is of a marked site."""
-    each = {site: jnp.full(zero.shape, marks.get(site, False)) for site, zero in _SITES.items()}
-    return np.asarray(ravel_pytree(each)[0])
-
-
-class Drawn(NamedTuple):
-    """A chain: draws by site, of deterministic ones too, with how it went."""
-
-    draws: dict[str, jax.Array]
-    chain: Chain
-
-
 @lru_cache
 def _sampler(steps: int) -> Callable[[jax.Array, Seen, Modes, int], Drawn]:
     """One program for all hearts, laws, chains and modes; the last argument is how many draws."""
-    unravel = ravel_pytree(_SITES)[1]
-    mirrored = _marked({"angles": True})
-
-    def run(key: jax.Array, of: Seen, given: Modes, draws: int) -> Drawn:
-        def potential(z: jax.Array) -> jax.Array:
-            return potential_energy(program, (of,), {}, unravel(z))
-
-        length = {"warmup": steps, "draws": draws, "room": TIMES * steps}
-        found = chain(potential, given, mirrored, key, **length)
-
-        def told(z: jax.Array) -> dict[str, jax.Array]:
-            return constrain_fn(program, (of,), {}, unravel(z), return_deterministic=True)
-
-        return Drawn(jax.lax.map(told, found.z), found)
-
-    return jax.jit(run)
+    mirrored = marked(_SITES, {"angles": True})
+    return sampler(program, _SITES, mirrored, warmup=steps, room=TIMES * steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +219,8 @@ class Found:
         marks = {"angles": bool(self.of.turned), "omega": True}
         for name in parameters(self.law):
             marks[name if name in MEANS else f"x_{name}"] = True
-        return np.moveaxis(_by_chain(self.z, self.chains)[..., _marked(marks)], 2, 0)
+        acting = marked(_SITES, marks)
+        return np.moveaxis(by_chain(self.z, self.chains)[..., acting], 2, 0)
 
     @cached_property
     def worst_rhat(self) -> float:
@@ -268,10 +231,6 @@ class Found:
     def least_ess(self) -> float:
         """Smallest effective number of draws of an unknown, in the bulk or in the tails."""
         return min(least_ess(each) for each in self._unknowns())
-
-
-def _by_chain(values: np.ndarray, chains: int) -> np.ndarray:
-    return values.reshape(chains, -1, *values.shape[1:])
 
 
 def sample(
@@ -295,20 +254,12 @@ def sample(
     there are cores.
     """
     of = seen(heart, cubes, law, angles=angles, left_out=left_out, power=power)
-    given = unknown(len(_marked({}))) if known is None else known
-    run, draws = _sampler(steps), times * steps
-
-    def one(key: jax.Array) -> Drawn:
-        return jax.block_until_ready(run(key, of, given, draws))
-
-    keys = jax.random.split(jax.random.key(seed), chains)
-    # JAX compiles once: other threads wait for the one that does.
-    with ThreadPoolExecutor(min(cores(), chains)) as pool:
-        told = list(pool.map(one, keys))
-    every = jax.tree.map(lambda *parts: np.concatenate([p[:draws] for p in parts]), *told)
+    given = unknown(len(marked(_SITES, {}))) if known is None else known
+    draws = times * steps
+    every = side_by_side(_sampler(steps), of, given, seed, chains=chains, draws=draws)
     z, density, diverging = every.chain
     if known is None and chains == EXPLORING:
-        given = joined(None, modes(_by_chain(z, chains), _by_chain(density, chains)))
+        given = joined(None, modes(by_chain(z, chains), by_chain(density, chains)))
     diverged = int(diverging.sum())
     return Found(heart, of, law, every.draws, z, diverged, chains, density, given)
 

@@ -25,15 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import logsumexp
-from numpyro.infer.hmc import HMCState, hmc
 
 EXPLORING = 4
 """Chains that seek modes, one each."""
 MODES = 2 * EXPLORING
 """That transports go between: of two searches."""
 _MOVES = 4  # of each kind a step of NUTS, which costs some thirty of them
-_PLACES = 4  # of which a chain begins at the likeliest
-_ACCEPTED, _DEPTH = 0.9, 8  # of NUTS: acceptance its step size adapts to, doublings of a trajectory
 
 
 class Modes(NamedTuple):
@@ -134,58 +131,3 @@ def moved(
 
     found: tuple[jax.Array, jax.Array] = jax.lax.scan(move, at, jax.random.split(key, _MOVES))[0]
     return found
-
-
-class Chain(NamedTuple):
-    """Draws z (d, u) of unconstrained positions, their log densities (d,), and divergences (d,)."""
-
-    z: jax.Array
-    log_density: jax.Array
-    diverging: jax.Array
-
-
-def chain(
-    potential: Callable[[jax.Array], jax.Array],
-    given: Modes,
-    mirrored: np.ndarray,
-    key: jax.Array,
-    *,
-    warmup: int,
-    draws: int,
-    room: int,
-) -> Chain:
-    """One chain of NumPyro's NUTS from somewhere, with moves after each step; under ``jit``.
-
-    Its arrays have ``room`` for draws; ``draws`` of them are made, a number that may be traced, so
-    that short chains and long ones are one program.
-
-    It is the kernel alone, since ``numpyro.infer.MCMC`` compiles a model's start anew for every
-    chain, and a process can map only so many programs.
-    """
-    begin, step = hmc(potential, algo="NUTS")
-    places, first, then = jax.random.split(key, 3)
-    somewhere = jax.random.uniform(places, (_PLACES, len(mirrored)), minval=-1.0, maxval=1.0)
-    energies = jax.lax.map(potential, somewhere)
-    start = somewhere[jnp.argmin(jnp.where(jnp.isfinite(energies), energies, jnp.inf))]
-    state = begin(
-        start,
-        warmup,
-        dense_mass=True,
-        target_accept_prob=_ACCEPTED,
-        max_tree_depth=_DEPTH,
-        rng_key=first,
-    )
-
-    def onwards(k: jax.Array, at: tuple[HMCState, Chain]) -> tuple[HMCState, Chain]:
-        state, kept = step(at[0]), at[1]
-        place = (state.z, state.potential_energy)
-        z, energy = moved(potential, given, mirrored, place, jax.random.fold_in(then, k))
-        state = state._replace(z=z, potential_energy=energy, z_grad=jax.grad(potential)(z))
-        # Steps of warm-up write where the first draw will be.
-        row = jnp.maximum(k - warmup, 0)
-        found = Chain(z, -energy, state.diverging)
-        return state, jax.tree.map(lambda all, one: all.at[row].set(one), kept, found)
-
-    kept = Chain(jnp.zeros((room, len(start))), jnp.zeros(room), jnp.zeros(room, bool))
-    every: Chain = jax.lax.fori_loop(0, warmup + draws, onwards, (state, kept))[1]
-    return every

@@ -17,16 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from numpyro.infer import MCMC, NUTS, init_to_median
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.campaign import Campaign
+from studies.sheep_myocardium.chains import by_chain, marked, sampler, side_by_side
 from studies.sheep_myocardium.inference import ANGLE_SD, Seen, log_likelihoods, means, seen
+from studies.sheep_myocardium.moves import unknown
 
 from calibrate.samplers.stopping import least_ess, r_hat
 
 NAMES = (*(p.name for p in cube.MATERIAL), "omega")
 _CENTRE = np.log([0.5, 8.0, 0.8, 8.0, 0.8, 8.0, 0.3, 8.0, 0.25])
 _WIDE, _SPREAD = 1.0, 0.5
+_CHAINS = 2
 
 
 def positions(logs: jax.Array) -> jax.Array:
@@ -39,7 +41,8 @@ def positions(logs: jax.Array) -> jax.Array:
 def program(hearts: Sequence[Seen]) -> None:
     """The NumPyro program of all hearts."""
     count = len(NAMES)
-    centre = numpyro.sample("mean", dist.Normal(_CENTRE, _WIDE).to_event(1))
+    moved = numpyro.sample("moved", dist.Normal(0.0, 1.0).expand((count,)).to_event(1))
+    centre = numpyro.deterministic("mean", _CENTRE + _WIDE * moved)
     spread = numpyro.sample("spread", dist.HalfNormal(_SPREAD * np.ones(count)).to_event(1))
     z = numpyro.sample("z", dist.Normal(0.0, 1.0).expand((len(hearts), count)).to_event(2))
     shape = (len(hearts), 3, len(cube.ANGLES))
@@ -68,20 +71,23 @@ class Sampled:
 def sampled(
     found: Sequence[Campaign], seed: int, *, draws: int = 400, warmup: int = 400
 ) -> Sampled:
-    """Draws of the population and its hearts."""
+    """Draws of the population and its hearts, from :data:`_CHAINS` chains side by side."""
     models = [seen(each.heart, each.cubes) for each in found]
-    kernel = NUTS(program, target_accept_prob=0.9, max_tree_depth=7, init_strategy=init_to_median())
-    run = MCMC(
-        kernel, num_warmup=warmup, num_samples=draws, num_chains=2, chain_method="sequential",
-        progress_bar=False,
-    )  # fmt: skip
-    run.run(jax.random.key(seed), models, extra_fields=("diverging",))
-    diverging = int(np.sum(run.get_extra_fields()["diverging"]))
-    chains = run.get_samples(group_by_chain=True)
+    count = len(NAMES)
+    sites = {
+        "moved": jnp.zeros(count),
+        "spread": jnp.zeros(count),
+        "z": jnp.zeros((len(found), count)),
+        "angles": jnp.zeros((len(found), 3, len(cube.ANGLES))),
+    }
+    mirrored = marked(sites, {"angles": True})
+    run = sampler(program, sites, mirrored, warmup=warmup, room=draws)
+    length = {"chains": _CHAINS, "draws": draws}
+    told, chain = side_by_side(run, models, unknown(len(mirrored)), seed, **length)
     each = [
-        np.asarray(chains[name])[..., k] for name in ("mean", "spread") for k in range(len(NAMES))
+        by_chain(told[name], _CHAINS)[..., k] for name in ("mean", "spread") for k in range(count)
     ]
-    told = {name: np.asarray(v) for name, v in run.get_samples().items()}
+    diverging = int(chain.diverging.sum())
     return Sampled(told, diverging, max(map(r_hat, each)), min(map(least_ess, each)))
 
 
