@@ -108,6 +108,31 @@ def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, least, 
 
 
 @pytest.mark.parametrize(
+    ("sought", "asked"), [(False, ["first"]), (True, ["first", "others", "others"])]
+)
+def test_a_mode_that_one_posterior_found_is_known_to_the_other(monkeypatch, sought, asked):
+    """Where the posterior on the mesh sought others, the one without its error is drawn again."""
+    known_to = []
+
+    def closed(fem, learned, meshes, known, plan, seed):
+        known_to.append(known)
+        return learned, SimpleNamespace(modes=known, of=SimpleNamespace(cubes=None))
+
+    def settled(heart, emulated, seed, *, known, steps):
+        known_to.append("others" if sought else known)
+        return SimpleNamespace(modes=known_to[-1])
+
+    monkeypatch.setattr(campaign, "_closed", closed)
+    monkeypatch.setattr(campaign, "settled", settled)
+    monkeypatch.setattr(campaign, "_tests", lambda *_: (np.zeros(0, int), []))
+    learned = campaign.Learned([], SimpleNamespace(emulated=None))
+    fem = SimpleNamespace(heart=None, bodies=[])
+    found = campaign._tested(fem, learned, ([], []), "first", campaign.Plan(), 0, 0.0)
+    assert known_to[::2] == asked[:1] + asked[2:]
+    assert found.on_mesh.modes == found.explored.modes == asked[-1]
+
+
+@pytest.mark.parametrize(
     ("share", "runs"), [((0.9, 0.9, 0.9), [9, 9, 9]), ((0.0, 0.0, 0.9), [0, 0, 27])]
 )
 def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):

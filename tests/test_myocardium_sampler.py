@@ -1,6 +1,7 @@
 """The study of sheep myocardium: its laws in one program, and moves between modes."""
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,15 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 from numpyro import handlers
-from studies.sheep_myocardium import chains, inference, moves
+from studies.sheep_myocardium import chains, inference, moves, population, twins
+from studies.sheep_myocardium.experiment import Curve, Heart
+
+
+class SeenLogs(NamedTuple):
+    """A heart of which logarithms of its parameters are seen."""
+
+    data: jax.Array
+    used: jax.Array
 
 
 def test_a_law_leaves_out_moduli_and_their_exponents():
@@ -28,6 +37,65 @@ def test_what_a_law_leaves_out_is_drawn_and_not_looked_at(monkeypatch, angles):
     assert acts == set(inference.parameters("fibres"))
     assert bool(np.any(sites["turned"]["value"] != 0.0)) is angles
     assert {"a_s", "x_b_s", "angles"} <= set(sites)
+
+
+def test_a_likelihood_is_taken_to_a_power():
+    heart = SimpleNamespace(curves={m: SimpleNamespace(force=np.ones(4)) for m in inference.MODES})
+    of = inference.seen(heart, None, power=0.5, left_out=("SS",))
+    np.testing.assert_array_equal(of.used, np.where(np.array(inference.MODES) == "SS", 0.0, 0.5))
+
+
+def test_twins_of_two_hearts_have_errors_of_their_own(monkeypatch):
+    """And those of one are made again as they were."""
+    made = []
+
+    def posterior(heart, *_, **__):
+        made.append(np.stack([heart.curves[mode].force for mode in inference.MODES]))
+        return SimpleNamespace(theta=lambda _: np.zeros(3), draws={"omega": np.zeros(3)})
+
+    monkeypatch.setattr(twins, "sample", posterior)
+    amounts = np.linspace(-0.3, 0.3, 4)
+    curve = Curve("FS", amounts, np.ones(4), np.ones(4))
+    for name in ("TSL1", "TSL2", "TSL1"):
+        heart = Heart(name, np.ones((3, 3)), dict.fromkeys(inference.MODES, curve))
+        found = SimpleNamespace(
+            heart=heart, by_fem=np.ones((2, 9, 4)), tests=[SimpleNamespace(x=np.zeros((1, 10)))],
+            omega=0.3, coarse=None, explored=SimpleNamespace(modes=None),
+        )  # fmt: skip
+        twins.ranks(found, 0, 10)
+    np.testing.assert_array_equal(made[0], made[2])
+    assert abs(np.corrcoef(made[0].ravel(), made[1].ravel())[0, 1]) < 0.5
+
+
+@pytest.mark.slow  # a minute
+def test_a_population_is_found_from_hearts_that_tell_their_parameters(monkeypatch):
+    """Each heart's logarithms are seen with a known error: means and spread have closed forms."""
+    rng = np.random.default_rng(6)
+    count, error = 6, 0.3
+    truth = population._CENTRE + 0.4 + 0.3 * rng.normal(size=(count, len(population.NAMES)))
+    data = truth + error * rng.normal(size=truth.shape)
+    hearts = [SimpleNamespace(heart=jnp.asarray(row), cubes=None) for row in data]
+    monkeypatch.setattr(population, "seen", lambda row, _: SeenLogs(row, jnp.ones(9)))
+    monkeypatch.setattr(population, "positions", lambda logs: logs)
+    monkeypatch.setattr(population, "means", lambda of, logs, angles: logs)
+
+    def told(of, logs, omega):
+        logs = jnp.append(logs, jnp.log(omega))
+        return -0.5 * ((logs - of.data) / error) ** 2
+
+    monkeypatch.setattr(population, "log_likelihoods", told)
+    found = population.sampled(hearts, 0, draws=300, warmup=200)
+    assert found.worst_rhat < 1.05
+    assert found.divergences < 8
+    mean = found.draws["mean"].mean(axis=0)
+    sd = found.draws["mean"].std(axis=0)
+    # Given its spread s, a mean is that of the data, pulled to the prior's centre.
+    s2 = (found.draws["spread"] ** 2 + error**2) / count
+    expected = (data.mean(axis=0) + s2.mean(axis=0) * population._CENTRE) / (1 + s2.mean(axis=0))
+    np.testing.assert_allclose(mean, expected, atol=0.06)
+    assert (np.abs(mean - data.mean(axis=0)) < sd).all()
+    spread = found.draws["spread"].mean(axis=0)
+    assert ((spread > 0.5 * data.std(axis=0)) & (spread < 2.0 * data.std(axis=0))).all()
 
 
 def test_a_transport_between_modes_is_undone_and_keeps_its_balance():

@@ -37,6 +37,7 @@ def chain(
     warmup: int,
     draws: int,
     room: int,
+    dense: bool = True,
 ) -> Chain:
     """One chain of NumPyro's NUTS from somewhere, with moves after each step; under ``jit``.
 
@@ -54,7 +55,7 @@ def chain(
     state = begin(
         start,
         warmup,
-        dense_mass=True,
+        dense_mass=dense,
         target_accept_prob=_ACCEPTED,
         max_tree_depth=_DEPTH,
         rng_key=first,
@@ -95,10 +96,12 @@ def sampler(
     *,
     warmup: int,
     room: int,
+    dense: bool = True,
 ) -> Callable[[jax.Array, Any, Modes, int], Drawn]:
     """A chain of a ``program``, given a key, the program's arrays, modes, and how many draws.
 
     sites : zeros like each of its unknowns. mirrored : (u,) positions that may change their sign.
+    dense : whether NUTS learns correlations, which takes draws beyond the number of unknowns.
     """
     unravel = ravel_pytree(sites)[1]
 
@@ -106,7 +109,7 @@ def sampler(
         def potential(z: jax.Array) -> jax.Array:
             return potential_energy(program, (of,), {}, unravel(z))
 
-        length = {"warmup": warmup, "draws": draws, "room": room}
+        length = {"warmup": warmup, "draws": draws, "room": room, "dense": dense}
         found = chain(potential, given, mirrored, key, **length)
 
         def told(z: jax.Array) -> dict[str, jax.Array]:
