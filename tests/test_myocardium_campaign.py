@@ -90,7 +90,8 @@ def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, least, 
         asked.append(known)
         return SimpleNamespace(modes=f"of {len(asked)}")
 
-    def a_round(fem, learned, found, plan, seed):
+    def a_round(fem, learned, found, plan, seed, least):
+        assert least == campaign.KNOWN
         if next(told) < campaign.KNOWN:
             return learned
         return learned._replace(doubt=(*learned.doubt, 1.0))
@@ -108,31 +109,6 @@ def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, least, 
 
 
 @pytest.mark.parametrize(
-    ("sought", "asked"), [(False, ["first"]), (True, ["first", "others", "others"])]
-)
-def test_a_mode_that_one_posterior_found_is_known_to_the_other(monkeypatch, sought, asked):
-    """Where the posterior on the mesh sought others, the one without its error is drawn again."""
-    known_to = []
-
-    def closed(fem, learned, meshes, known, plan, seed):
-        known_to.append(known)
-        return learned, SimpleNamespace(modes=known, of=SimpleNamespace(cubes=None))
-
-    def settled(heart, emulated, seed, *, known, steps):
-        known_to.append("others" if sought else known)
-        return SimpleNamespace(modes=known_to[-1])
-
-    monkeypatch.setattr(campaign, "_closed", closed)
-    monkeypatch.setattr(campaign, "settled", settled)
-    monkeypatch.setattr(campaign, "_tests", lambda *_: (np.zeros(0, int), []))
-    learned = campaign.Learned([], SimpleNamespace(emulated=None))
-    fem = SimpleNamespace(heart=None, bodies=[])
-    found = campaign._tested(fem, learned, ([], []), "first", campaign.Plan(), 0, 0.0)
-    assert known_to[::2] == asked[:1] + asked[2:]
-    assert found.on_mesh.modes == found.explored.modes == asked[-1]
-
-
-@pytest.mark.parametrize(
     ("share", "runs"), [((0.9, 0.9, 0.9), [9, 9, 9]), ((0.0, 0.0, 0.9), [0, 0, 27])]
 )
 def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):
@@ -146,12 +122,12 @@ def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):
     fem.heart, fem.bodies = SimpleNamespace(name="TSL9"), None
     monkeypatch.setattr(campaign, "fit", lambda bodies, runs, before: before)
     learned = campaign.Learned(fem("wide", [np.zeros((2, 10))] * 3), fitted)
-    made = campaign._round(fem, learned, found, plan, 0)
+    made = campaign._round(fem, learned, found, plan, 0, campaign.KNOWN)
     assert asked["round_6"] == runs
     assert made.size == 6 + 27
     assert len(made.doubt) == 1
     known = learned._replace(fitted=posterior((0.0, 0.0, 1e-4), 10)[0])
-    assert campaign._round(fem, known, found, plan, 0) is known
+    assert campaign._round(fem, known, found, plan, 0, campaign.KNOWN) is known
 
 
 def test_runs_are_chosen_from_draws_that_are_known_least_and_others():
@@ -160,24 +136,32 @@ def test_runs_are_chosen_from_draws_that_are_known_least_and_others():
     assert set(range(160, 200)) <= set(rows.tolist())
 
 
-def checked_heart(differences, spread=1.0):
+def checked_heart(differences, tilt=0.5):
     """A heart whose draws are Gaussian in logarithms, tested at 30 of them."""
     rng = np.random.default_rng(4)
     names = inference.parameters(inference.ORTHOTROPIC)
     logs = {n: rng.normal(0.0, 0.1, 1000) for n in names}
     draws = {"omega": np.exp(rng.normal(-1.0, 0.1, 1000))}
 
-    def found(moved):
-        return SimpleNamespace(
-            law=inference.ORTHOTROPIC, draws=draws, worst_rhat=1.0, least_ess=900.0, divergences=0,
-            positions=np.zeros((1000, 3, 10)), theta=lambda name: np.exp(logs[name] + moved),
-        )  # fmt: skip
-
+    explored = SimpleNamespace(
+        law=inference.ORTHOTROPIC, draws=draws, worst_rhat=1.0, least_ess=900.0, divergences=0,
+        positions=np.zeros((1000, 3, 10)), theta=lambda name: np.exp(logs[name]),
+    )  # fmt: skip
     tested = np.arange(30)
     return SimpleNamespace(
-        explored=found(0.0), on_mesh=found(0.1 * spread), tested=tested, meshes=([], []),
+        explored=explored, tested=tested, meshes=([], []),
         likelihood_differences=lambda: differences(logs, tested),
+        mesh_differences=lambda: tilt * logs["b"] / logs["b"].std(),
     )  # fmt: skip
+
+
+def test_the_mesh_moves_what_its_likelihood_prefers():
+    """A Gaussian that is tilted by s moves by s sd, and its spread stays."""
+    moved, spread = checked._mesh(checked_heart(None, 0.5))
+    assert moved["b"].value == pytest.approx(-0.3 * 0.5, abs=0.02)
+    assert 0.0 < moved["b"].error < 0.02
+    assert moved["a"].value == pytest.approx(0.0, abs=0.03)
+    assert all(abs(figure.value) < 0.04 for figure in spread.values())
 
 
 @pytest.mark.parametrize(
@@ -227,17 +211,17 @@ def test_more_tests_are_of_the_same_posterior():
 
 
 @pytest.mark.parametrize(
-    ("differences", "spread", "verdict", "word"),
+    ("differences", "tilt", "verdict", "word"),
     [
-        (lambda logs, rows: 0.05 * np.sin(rows), 1.0, "accepted", "no mean moves"),
+        (lambda logs, rows: 0.05 * np.sin(rows), 0.5, "accepted", "no mean moves"),
         # FEM's likelihood rises with a: its mean moves by a sd.
-        (lambda logs, rows: 10.0 * logs["a"][rows], 1.0, None, "mean of a"),
-        (lambda logs, rows: 3.0 * np.sin(5.0 * rows), 1.0, "not certified", "irregularly"),
-        (lambda logs, rows: np.where(rows < 3, np.nan, 0.0), 1.0, "not certified", "FEM fails"),
-        (lambda logs, rows: 0.0 * rows, 4.0, "not certified", "finer mesh"),
+        (lambda logs, rows: 10.0 * logs["a"][rows], 0.5, None, "mean of a"),
+        (lambda logs, rows: 3.0 * np.sin(5.0 * rows), 0.5, "not certified", "irregularly"),
+        (lambda logs, rows: np.where(rows < 3, np.nan, 0.0), 0.5, "not certified", "FEM fails"),
+        (lambda logs, rows: 0.0 * rows, 4.0, None, "finer mesh"),
     ],
 )
-def test_the_librarys_limits_judge_a_heart(differences, spread, verdict, word):
-    found = checked.certificate(checked_heart(differences, spread))
+def test_the_librarys_limits_judge_a_heart(differences, tilt, verdict, word):
+    found = checked.certificate(checked_heart(differences, tilt))
     assert found.verdict == verdict if verdict else found.verdict != "accepted"
     assert any(word in each for each in found.findings)

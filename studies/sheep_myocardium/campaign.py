@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import softmax
 from scipy.stats import qmc
 from studies.sheep_myocardium.cube import CELLS
 from studies.sheep_myocardium.curves import (
@@ -48,12 +47,12 @@ _ORDER = 1.2  # of the force's convergence: twice 0.595, the exponent at a glued
 class Plan:
     """Numbers of runs a cube.
 
-    wide : over the box. rounds, each : after them, so many times so many in all, of cubes that are
-    not known at draws of the posterior, where they tell most of q. power : that the likelihood is
-    taken to meanwhile, so that runs reach beyond the posterior. closer : more such rounds at most,
-    of the posterior itself, until all cubes are known. tests : at draws of it. again : times that
-    there are more of them while the verdict is open, at most. meshes : at which a finer mesh is
-    solved, too. steps : of a chain's warm-up, and of its draws.
+    wide : over the box. rounds, each : after them, so many times so many of all cubes together, at
+    draws where they tell most of q. power : that the likelihood is taken to meanwhile, but in the
+    last, so that runs reach beyond the posterior. closer : more such rounds at most, of the
+    posterior itself and of cubes that are not known, until all are. tests : at draws of it. again :
+    times that there are more of them while the verdict is open, at most. meshes : at which a finer
+    mesh is solved, too. steps : of a chain's warm-up, and of its draws.
     """
 
     wide: int = 12
@@ -91,8 +90,8 @@ class Solver:
 
     @property
     def finer(self) -> Solver:
-        """Of the finer mesh."""
-        return replace(self, bodies=[replace(body, cells=FINER) for body in self.bodies])
+        """Of the finer mesh, without slopes."""
+        return replace(self, bodies=[replace(b, cells=FINER, sloping=False) for b in self.bodies])
 
 
 class Learned(NamedTuple):
@@ -122,8 +121,8 @@ class Campaign:
     """What FEM says of a heart.
 
     bodies : its cubes. learned : what their runs say. meshes : runs at the same positions
-    on the mesh and on a finer one. cubes : emulator of the cubes without the mesh's error. on_mesh,
-    explored : the posteriors with the mesh's error and without. tests : runs that it was not fitted
+    on the mesh and on a finer one. cubes : emulator of the cubes without the mesh's error.
+    explored : the posterior by it. tests : runs that it was not fitted
     to, at the draws ``tested`` (t,) of ``explored``. seconds : it took.
     """
 
@@ -132,7 +131,6 @@ class Campaign:
     learned: Learned
     meshes: tuple[list[Runs], list[Runs]]
     cubes: Emulated
-    on_mesh: Found
     explored: Found
     tested: np.ndarray
     tests: list[Runs]
@@ -164,6 +162,13 @@ class Campaign:
         """Forces (t, 9, j) in N of the tests by the emulator."""
         x = jnp.asarray(np.stack([test.x for test in self.tests], axis=1))
         return np.asarray(_forces(self.coarse, x)).reshape(len(x), len(MODES), -1)
+
+    def mesh_differences(self) -> np.ndarray:
+        """Log likelihoods (d,) of the data at all draws, with the mesh's error less without."""
+        finer = np.asarray(self.cubes.finer).reshape(len(MODES), -1)
+        draws = self.explored.draws
+        on_mesh = of_draws(self.explored.of, draws["means"] / finer, draws["omega"])
+        return on_mesh.sum(axis=1) - self.explored.log_likelihoods.sum(axis=1)
 
     def likelihood_differences(self) -> np.ndarray:
         """Log likelihoods (t,) of the data at the tests, FEM's less the emulators'.
@@ -206,12 +211,11 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
     for number in range(plan.rounds):
         # Of a posterior with fewer terms, too: a term that is off is a corner of its own.
         law = "fibres" if number == 1 else ORTHOTROPIC
-        how = {"power": plan.power, "steps": plan.steps}
+        power = plan.power if number < plan.rounds - 1 else 1.0
+        how = {"power": power, "steps": plan.steps}
         found = sample(heart, learned.fitted.emulated, seed + number, law, **how)
         learned = _round(fem, learned, found, plan, seed)
-    share = softmax((1.0 - plan.power) * found.log_likelihoods.sum(axis=1))
-    rng = np.random.default_rng(seed)
-    rows = rng.choice(len(share), plan.meshes, replace=False, p=share)
+    rows = np.random.default_rng(seed).choice(len(found.positions), plan.meshes, replace=False)
     x = np.moveaxis(found.positions[rows], 1, 0)
     meshes = fem("mesh", x), fem.finer("mesh_finer", x)
     return _tested(fem, learned, meshes, found.modes, plan, seed, began)
@@ -235,7 +239,7 @@ def again(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign
     began = perf_counter() - found.seconds
     fem = Solver(found.heart, found.bodies, kept)
     learned = found.learned.more(fem, found.tests)
-    return _tested(fem, learned, found.meshes, found.on_mesh.modes, plan, seed, began)
+    return _tested(fem, learned, found.meshes, found.explored.modes, plan, seed, began)
 
 
 def _closed(
@@ -251,20 +255,25 @@ def _closed(
         how = {"known": known, "steps": plan.steps, "times": TIMES}
         emulated = without_mesh(learned.fitted.emulated, *meshes)
         found = settled(fem.heart, emulated, seed + learned.size, **how)
-        after = _round(fem, learned, found, plan, seed) if more else learned
+        after = _round(fem, learned, found, plan, seed, KNOWN) if more else learned
         if after is learned:
             break
         learned, known = after, found.modes
     return learned, found
 
 
-def _round(fem: Solver, learned: Learned, found: Found, plan: Plan, seed: int) -> Learned:
-    """With runs of cubes that are not known at draws of ``found``, where they tell most of q."""
+def _round(
+    fem: Solver, learned: Learned, found: Found, plan: Plan, seed: int, least: float = 0.0
+) -> Learned:
+    """With runs of cubes, where they tell most of q at draws of ``found``.
+
+    Of those whose root mean square of :func:`.doubts` is above ``least``, or none.
+    """
     every = doubts(learned.fitted, found)
     doubt = np.sqrt((every**2).mean(axis=0))
     told = ", ".join(f"{value:.2f}" for value in doubt)
     print(f"{fem.heart.name}, {learned.size} runs: log likelihood known to {told}", flush=True)
-    unknown = doubt > KNOWN
+    unknown = doubt > least
     if not unknown.any():
         return learned
     each = plan.each // int(unknown.sum())
@@ -296,19 +305,11 @@ def _tested(
     seed: int,
     began: float,
 ) -> Campaign:
-    """The posteriors, and FEM at some draws of the one without the mesh's error."""
-    for _ in range(2):
-        learned, explored = _closed(fem, learned, meshes, known, plan, seed)
-        how = {"known": explored.modes, "steps": plan.steps}
-        on_mesh = settled(fem.heart, learned.fitted.emulated, seed + learned.size + 1, **how)
-        known = on_mesh.modes
-        if known is explored.modes:
-            break
-        # Where others were sought for one, the other begins with these as well: a mode that only
-        # one of them has would look like the mesh's doing.
+    """The posterior without the mesh's error, and FEM at some of its draws."""
+    learned, explored = _closed(fem, learned, meshes, known, plan, seed)
     rows, tests = _tests(fem, learned, explored, plan, seed, 0)
     return Campaign(
-        fem.heart, fem.bodies, learned, meshes, explored.of.cubes, on_mesh, explored, rows, tests,
+        fem.heart, fem.bodies, learned, meshes, explored.of.cubes, explored, rows, tests,
         perf_counter() - began,
     )  # fmt: skip
 

@@ -111,16 +111,22 @@ def _figures(
 
 
 def _mesh(found: Campaign) -> tuple[dict[str, Figure], dict[str, Figure]]:
-    """What may be left of the mesh's error, of means and standard deviations of logarithms."""
+    """What may be left of the mesh's error, of means and standard deviations of logarithms.
+
+    Draws are weighted by the ratio of the likelihoods with that error and without.
+    """
+    differences = found.mesh_differences()
+    weights = softmax(differences) * len(differences)
+    root = np.sqrt(found.explored.least_ess / (weights**2).mean())
     moved, spread = {}, {}
-    before, after = logarithms(found.on_mesh), logarithms(found.explored)
-    for name, a in before.items():
-        b = after[name]
-        # Of two independent posteriors: errors of their means, by their effective draws.
-        error = np.sqrt(1.0 / found.on_mesh.least_ess + 1.0 / found.explored.least_ess)
-        moved[name] = Figure(_LEFT * float((b.mean() - a.mean()) / b.std()), _LEFT * error)
-        change = float(np.log(b.std() / a.std()))
-        spread[name] = Figure(_LEFT * change, _LEFT * error / np.sqrt(2.0))
+    for name, x in logarithms(found.explored).items():
+        z = (x - x.mean()) / x.std()
+        shift = (weights * z).mean()
+        change = 0.5 * np.log((weights * (z - shift) ** 2).mean())
+        error = ((weights - 1.0) * z).std() / root
+        moved[name] = Figure(-_LEFT * float(shift), _LEFT * float(error))
+        error = 0.5 * ((weights - 1.0) * z**2).std() / root
+        spread[name] = Figure(-_LEFT * float(change), _LEFT * float(error))
     return moved, spread
 
 

@@ -51,12 +51,16 @@ class Runs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Cube:
-    """One cube of a heart by FEM; its points are those of its three curves, one after the other."""
+    """One cube of a heart by FEM; its points are those of its three curves, one after the other.
+
+    cells : along an edge. sloping : whether slopes of forces are asked for.
+    """
 
     number: int
     sizes: np.ndarray
     curves: Sequence[Curve]
     cells: int = cube.CELLS
+    sloping: bool = True
 
     @cached_property
     def simulator(self) -> em.Simulator:
@@ -119,7 +123,11 @@ class Cube:
             force = SupportForce(self.body, "right", axis)
             return lambda u, theta: force(u[force.nodes], theta)
 
-        return [self.simulator.gradient_of(along(axis)) for axis in _AXES]
+        each = [along(axis) for axis in _AXES]
+        if self.sloping:
+            return [self.simulator.gradient_of(quantity) for quantity in each]
+        nothing = jnp.full(len(self.body.parameters), jnp.nan)
+        return [jax.jit(lambda u, theta, of=of: (of(u, theta), nothing)) for of in each]
 
     @property
     def amounts(self) -> np.ndarray:
