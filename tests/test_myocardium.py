@@ -1,5 +1,7 @@
 """The study of sheep myocardium: its files, its words, and its emulator through its runs."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,3 +114,14 @@ def test_no_runs_of_a_cube(tmp_path):
     some = curves.Runs(np.ones((2, 10)), np.ones((2, 30)), np.ones((2, 30, 10)))
     for joined, alone in zip(curves.joined([some, none]), some, strict=True):
         np.testing.assert_array_equal(joined, alone)
+
+
+@pytest.mark.slow  # compiles FEM of a cube twice
+def test_forces_without_slopes_are_the_same(tmp_path):
+    (heart,) = experiment.hearts(write_heart(tmp_path / "TSL9").parent)
+    (body, *_) = curves.cubes(heart, cells=1)
+    x = np.zeros((1, 10))
+    sloping, plain = body.runs(x), replace(body, sloping=False).runs(x)
+    assert np.isfinite(sloping.slopes).all()
+    assert np.isnan(plain.slopes).all()
+    np.testing.assert_allclose(plain.force, sloping.force, rtol=1e-12)
