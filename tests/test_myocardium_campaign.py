@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from studies.sheep_myocardium import campaign, checked, curves, held_out, inference
 from studies.sheep_myocardium.doubts import doubts
+from studies.sheep_myocardium.experiment import Heart
 
 
 def test_a_meshs_error_is_taken_off_by_its_order():
@@ -162,6 +163,37 @@ def test_the_mesh_moves_what_its_likelihood_prefers():
     assert 0.0 < moved["b"].error < 0.02
     assert moved["a"].value == pytest.approx(0.0, abs=0.03)
     assert all(abs(figure.value) < 0.04 for figure in spread.values())
+
+
+def test_the_mesh_narrows_what_its_likelihood_narrows():
+    """A Gaussian times exp(-c z^2 / 2) has the variance 1 / (1 + c)."""
+    heart = checked_heart(None)
+    x = np.log(heart.explored.theta("b"))
+    heart.mesh_differences = lambda: -0.25 * ((x - x.mean()) / x.std()) ** 2
+    moved, spread = checked._mesh(heart)
+    assert spread["b"].value == pytest.approx(0.3 * 0.5 * np.log(1.5), abs=0.01)
+    assert moved["b"].value == pytest.approx(0.0, abs=0.02)
+    assert spread["a"].value == pytest.approx(0.0, abs=0.02)
+
+
+def test_runs_reach_beyond_the_posterior_first(monkeypatch):
+    """Its likelihood to a power, of one with fewer terms, too; the last round is of itself."""
+    asked = []
+
+    def sample(heart, emulated, seed, law, *, power, steps):
+        asked.append((law, power))
+        return SimpleNamespace(positions=np.zeros((5, 3, 10)), modes=f"of {len(asked)}")
+
+    curve = SimpleNamespace(amount=np.linspace(-0.3, 0.3, 4))
+    heart = Heart("TSL9", np.ones((3, 3)), dict.fromkeys(inference.MODES, curve))
+    monkeypatch.setattr(campaign, "sample", sample)
+    monkeypatch.setattr(campaign, "fit", lambda *_: SimpleNamespace(emulated=None))
+    monkeypatch.setattr(campaign.Solver, "__call__", lambda self, name, x: [])
+    monkeypatch.setattr(campaign, "_round", lambda fem, learned, *_: learned)
+    monkeypatch.setattr(campaign, "_tested", lambda fem, learned, meshes, known, *_: known)
+    assert campaign.campaign(heart, campaign.Plan(), None, 0) == "of 4"
+    all_terms = inference.ORTHOTROPIC
+    assert asked == [(all_terms, 0.5), ("fibres", 0.5), (all_terms, 0.5), (all_terms, 1.0)]
 
 
 @pytest.mark.parametrize(

@@ -120,10 +120,10 @@ class Learned(NamedTuple):
 class Campaign:
     """What FEM says of a heart.
 
-    bodies : its cubes. learned : what their runs say. meshes : runs at the same positions
-    on the mesh and on a finer one. cubes : emulator of the cubes without the mesh's error.
-    explored : the posterior by it. tests : runs that it was not fitted
-    to, at the draws ``tested`` (t,) of ``explored``. seconds : it took.
+    bodies : its cubes. learned : what their runs say. meshes : runs at the same positions on the
+    mesh and on a finer one. cubes : emulator of the cubes without the mesh's error. explored : the
+    posterior by it. tests : runs that it was not fitted to, at the draws ``tested`` (t,) of
+    ``explored``. seconds : it took.
     """
 
     heart: Heart
@@ -212,8 +212,8 @@ def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign
         # Of a posterior with fewer terms, too: a term that is off is a corner of its own.
         law = "fibres" if number == 1 else ORTHOTROPIC
         power = plan.power if number < plan.rounds - 1 else 1.0
-        how = {"power": power, "steps": plan.steps}
-        found = sample(heart, learned.fitted.emulated, seed + number, law, **how)
+        emulated = learned.fitted.emulated
+        found = sample(heart, emulated, seed + number, law, power=power, steps=plan.steps)
         learned = _round(fem, learned, found, plan, seed)
     rows = np.random.default_rng(seed).choice(len(found.positions), plan.meshes, replace=False)
     x = np.moveaxis(found.positions[rows], 1, 0)

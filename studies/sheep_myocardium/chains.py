@@ -101,7 +101,7 @@ def sampler(
     """A chain of a ``program``, given a key, the program's arrays, modes, and how many draws.
 
     sites : zeros like each of its unknowns. mirrored : (u,) positions that may change their sign.
-    dense : whether NUTS learns correlations, which takes draws beyond the number of unknowns.
+    dense : whether NUTS learns correlations; warm-up must have more steps than there are unknowns.
     """
     unravel = ravel_pytree(sites)[1]
 

@@ -250,8 +250,8 @@ def sample(
     """Draws of a heart's posterior by NumPyro's NUTS, and moves between ``known`` modes.
 
     Each chain begins at a place of its own, and warms up for ``steps``; ``times`` as many, at most
-    :data:`TIMES`, are kept. Chains that know no modes find one each. As many are drawn at once as
-    there are cores.
+    :data:`TIMES`, are kept. The likelihood is taken to a ``power``. Chains that know no modes find
+    one each. As many are drawn at once as there are cores.
     """
     of = seen(heart, cubes, law, angles=angles, left_out=left_out, power=power)
     given = unknown(len(marked(_SITES, {}))) if known is None else known

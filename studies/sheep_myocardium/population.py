@@ -81,7 +81,7 @@ def sampled(
         "angles": jnp.zeros((len(found), 3, len(cube.ANGLES))),
     }
     mirrored = marked(sites, {"angles": True})
-    # More unknowns than steps of warm-up would tell correlations of: 35 effective draws, not 228.
+    # Warm-up is too short to learn the correlations of so many unknowns (docs/experiments.md).
     run = sampler(program, sites, mirrored, warmup=warmup, room=draws, dense=False)
     length = {"chains": _CHAINS, "draws": draws}
     told, chain = side_by_side(run, models, unknown(len(mirrored)), seed, **length)
