@@ -183,8 +183,8 @@ def main() -> None:
                     **one(body, make(), points, known["limit"], estimate=not arguments.quick),  # noqa: B023
                 },
             )
+    save(drawn(results.cases), arguments.out / "elements.png")
     if not arguments.quick:
-        save(drawn(results.cases), arguments.out / "elements.png")
         check(results.cases)
 
 
