@@ -40,6 +40,42 @@ def test_what_would_be_measured_is_off_as_the_data_is():
     np.testing.assert_allclose(made.mean(axis=0), mean[0], atol=0.01)
 
 
+@pytest.mark.parametrize(("doubt", "again"), [(0.3, True), (1.5, False)])
+def test_a_mode_is_not_predicted_by_forces_that_are_not_known(monkeypatch, doubt, again):
+    """Some draws have all weight: others are made without the mode, and asked what they know."""
+    rng = np.random.default_rng(9)
+    asked = []
+
+    def of(scale):
+        draws = {"means": np.ones((400, 9, 4)), "omega": np.full(400, 0.3)}
+        amounts = np.tile(np.linspace(-0.3, 0.3, 4), (9, 1))
+        seen = SimpleNamespace(cubes="cubes", data=np.ones((9, 4)), amounts=amounts)
+        likelihoods = -scale * rng.exponential(size=(400, 9))
+        return SimpleNamespace(
+            heart=SimpleNamespace(name="TSL0"), law="law", modes="modes", draws=draws,
+            of=seen, positions=np.zeros((400, 3, 10)), log_likelihoods=likelihoods,
+        )  # fmt: skip
+
+    def sample(heart, cubes, seed, law, *, left_out, known, chains):
+        asked.append((cubes, law, left_out, known, chains))
+        return of(1e-3)
+
+    monkeypatch.setattr(held_out, "sample", sample)
+    monkeypatch.setattr(held_out, "doubts", lambda fitted, _: np.full((400, 3), fitted * doubt))
+    found = of(20.0)
+    told = held_out.held_out(found, 1, fitted=1.0)
+    expected = [("cubes", "law", (mode,), "modes", 1) for mode in inference.MODES]
+    assert sorted(asked) == sorted(expected)
+    assert all((p.again, p.heavy) == (again, not again) for p in told.values())
+    densities = np.array([p.log_density for p in told.values()])
+    assert (np.abs(densities) < 0.01).all() if again else (densities < -1.0).all()
+    by_weights = held_out.held_out(found, 1)
+    assert len(asked) == 9
+    assert all(p.heavy and not p.again for p in by_weights.values())
+    if not again:
+        assert [p.log_density for p in by_weights.values()] == list(densities)
+
+
 def posterior(share, seed):
     """A posterior of 100 draws, and what cubes of 3 x 2 points say that they do not know there."""
     rng = np.random.default_rng(seed)

@@ -6,15 +6,13 @@ nearly independent, are weighted by FEM,
 .. math:: w_k \propto L_\mathrm{FEM}(\theta_k) / L_\mathrm{emulator}(\theta_k).
 
 One solve a draw. Less than 80 % of the weights in effect, a solve that fails, or R-hat above 1.01
-refuse the reference. The Pareto exponent is recorded; of weights that are all but equal it says
-nothing.
+refuse the reference.
 """
 
 import time
 from pathlib import Path
 
 import numpy as np
-from arviz_stats.base import array_stats
 from studies.common.output import Case
 from studies.inverse_benchmark import tables
 from studies.inverse_benchmark.problems import Problem, data_of, model
@@ -65,7 +63,6 @@ def make(problem: Problem, forward: ForwardMap, simulator: Simulator, draws: int
         "failed": failed,
         "log_weight_sd": float(np.std(log_w)),
         "weights_ess": float(1.0 / np.sum(weights**2) / draws),
-        "pareto_k": float(array_stats.psislw(log_w - log_w.max())[1]),
         "seconds": time.process_time() - began,
     }
     sound = case["r_hat"] < LARGEST_R_HAT and case["weights_ess"] > SMALLEST_ESS

@@ -23,7 +23,7 @@ from studies.sheep_myocardium.curves import (
     forces,
     joined,
 )
-from studies.sheep_myocardium.doubts import doubts
+from studies.sheep_myocardium.doubts import doubts, known_to
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.inference import (
     ORTHOTROPIC,
@@ -270,7 +270,7 @@ def _round(
     Of those whose root mean square of :func:`.doubts` is above ``least``, or none.
     """
     every = doubts(learned.fitted, found)
-    doubt = np.sqrt((every**2).mean(axis=0))
+    doubt = known_to(every)
     told = ", ".join(f"{value:.2f}" for value in doubt)
     print(f"{fem.heart.name}, {learned.size} runs: log likelihood known to {told}", flush=True)
     unknown = doubt > least

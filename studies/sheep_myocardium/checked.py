@@ -21,7 +21,6 @@ from studies.sheep_myocardium.campaign import FINER, Campaign, Plan, again, camp
 from studies.sheep_myocardium.experiment import Heart
 from studies.sheep_myocardium.inference import Found, parameters
 
-from calibrate.certificate.estimates import k_hat
 from calibrate.certificate.evidence import (
     Changes,
     Evidence,
@@ -33,9 +32,9 @@ from calibrate.certificate.evidence import (
 )
 from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.verdict import Certificate, judge
+from calibrate.samplers.importance import pareto_shape
 
 _LEFT = 0.3  # of the mesh's correction
-_FEWEST = 25  # weights that have a tail
 _MOST = 3  # sets of tests of one posterior
 
 
@@ -64,7 +63,7 @@ def certificate(found: Campaign) -> Certificate:
         _figures(named, value[:p] / sd, error[:p] / sd), _figures(named, value[p:], error[p:]), {}
     )
     tail = Tail(
-        k_hat(log_ratio) if len(log_ratio) >= _FEWEST else float("nan"),
+        pareto_shape(log_ratio),
         float(min(1.0 - 1.0 / np.log10(max(len(x), 10)), 0.7)),
         float(weights.sum() ** 2 / (weights**2).sum()),
         float(weights.max()),

@@ -22,6 +22,12 @@ def doubts(fitted: Fit, found: Found) -> np.ndarray:
     return np.stack(each, axis=1)
 
 
+def known_to(each: np.ndarray) -> np.ndarray:
+    """Root mean square (3,) of :func:`doubts` over draws: what log likelihoods are known to."""
+    root: np.ndarray = np.sqrt((each**2).mean(axis=0))
+    return root
+
+
 def _of_cube(number: int, fitted: Fit, found: Found) -> np.ndarray:
     share, B = fitted.unknown(number, found.positions[:, number])
     amounts = fitted.emulated.amounts[number]

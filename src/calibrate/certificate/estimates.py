@@ -8,7 +8,6 @@ from itertools import combinations
 import numpy as np
 from scipy.special import logsumexp
 
-from calibrate.arviz import array_stats
 from calibrate.certificate.correction import Correction
 from calibrate.certificate.evidence import LARGEST_MASS, Changes, Figure, Physics, Sampling, Tail
 from calibrate.certificate.moments import jackknife, moments
@@ -16,14 +15,12 @@ from calibrate.certificate.pool import Pool, effective, normalised, with_guests
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, least_likely
 from calibrate.posterior import Posterior
+from calibrate.samplers.importance import pareto_shape
 
-# Log weights closer together than this are equal to 0.1 %: their tail has no shape to fit.
-_EQUAL_WEIGHTS = 1e-3
 _LIKELY = 0.99  # mass of the region that FEM's runs are likely in
 _MISSED = 3.0  # in log likelihood: the corrected map finds a run 20 times less likely than FEM
 # A part of FEM's posterior with this mass is met by a test with this probability.
 _MASS, _MET = 0.1, 0.95
-_FEWEST = 25  # weights that have a tail of five
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +182,7 @@ def tail_of(pool: Pool, tests: Tests, missed: int, ends: int = 0) -> Tail:
     ratio = (log_fem - log_map)[both]
     spread = float(np.sqrt(share @ (ratio - share @ ratio) ** 2))
     return Tail(
-        k_hat(log_fem[np.isfinite(log_fem)]),
+        pareto_shape(log_fem[np.isfinite(log_fem)]),
         threshold,
         effective(weights),
         float(weights.max() * len(weights)),
@@ -194,16 +191,3 @@ def tail_of(pool: Pool, tests: Tests, missed: int, ends: int = 0) -> Tail:
         missed,
         ends,
     )
-
-
-def k_hat(log_weights: np.ndarray) -> float:
-    """Pareto shape of the weights' tail; NaN of too few to have one."""
-    if len(log_weights) < _FEWEST:
-        return float("nan")
-    if np.ptp(log_weights) < _EQUAL_WEIGHTS:
-        return 0.0
-    try:
-        # ArviZ takes log likelihoods and negates them (docs/experiments.md, "A sign").
-        return float(array_stats.psislw(-(log_weights - log_weights.max()))[1])
-    except ValueError:  # the tail is one point of the pool, drawn again and again
-        return float("inf")

@@ -22,16 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from calibrate.arviz import array_stats
 from calibrate.samplers.density import Density
+from calibrate.samplers.importance import FEWEST, efficiency, pareto_shape
 from calibrate.samplers.modes import Modes, find_modes, missed_mode, precision_at, slope_of
 from calibrate.samplers.options import check_counts
 from calibrate.samplers.protocol import Context, Draws
 from calibrate.statistical_model import Data
 from emulator.errors import InputError, SolverError
 
-_FEWEST = 25  # draws whose largest fifth has a tail to fit
-_EQUAL = 1e-3  # log ratios closer together than this have no tail to fit
 _AWAY = 0.05  # sd that the optimiser may stop from the mode
 
 
@@ -56,9 +54,9 @@ class LaplaceOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "draws", "chains", "starts")
-        if self.draws * self.chains < _FEWEST:
+        if self.draws * self.chains < FEWEST:
             raise InputError(
-                f"{self.label}: {self.draws} draws of {self.chains} chains; give {_FEWEST} or more "
+                f"{self.label}: {self.draws} draws of {self.chains} chains; give {FEWEST} or more "
                 "together, or its error cannot be estimated"
             )
 
@@ -115,7 +113,7 @@ class Laplace:
         statistics = {"lp": lp.reshape(shape), "log_ratio": (lp - log_q).reshape(shape)}
         attributes = {
             "approximation": "gaussian",
-            "pareto_k": pareto_k(lp - log_q),
+            "pareto_k": pareto_shape(lp - log_q),
             "importance_efficiency": efficiency(lp - log_q),
             **missed_mode(density, data, z, Modes(*gaussian.modes)),
         }
@@ -170,20 +168,6 @@ def _draw(
         )
     log_q = -0.5 * (noise**2).sum(axis=1) + np.log(np.diag(factor)).sum()
     return z[rows], lp[rows], log_q[rows] - 0.5 * size * np.log(2.0 * np.pi)
-
-
-def pareto_k(log_ratios: np.ndarray) -> float:
-    """Pareto shape of the tail of importance ratios (s,); 0 where they are equal to 0.1 %."""
-    if np.ptp(log_ratios) < _EQUAL:
-        return 0.0
-    # ArviZ takes log likelihoods and negates them (docs/experiments.md, "A sign").
-    return float(array_stats.psislw(-(log_ratios - log_ratios.max()))[1])
-
-
-def efficiency(log_ratios: np.ndarray) -> float:
-    """Effective sample size of importance ratios (s,), as a fraction: (sum w)^2 / (s sum w^2)."""
-    weights = np.exp(log_ratios - log_ratios.max())
-    return float(weights.sum() ** 2 / (len(weights) * (weights**2).sum()))
 
 
 LAPLACE = Laplace()

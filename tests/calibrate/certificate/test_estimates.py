@@ -1,4 +1,4 @@
-"""The tail of the weights of FEM's runs, and runs that the corrected map does not foresee."""
+"""Runs that the corrected map does not foresee."""
 
 import jax
 import numpy as np
@@ -6,7 +6,7 @@ from scipy.stats import chi2, norm
 
 from calibrate.certificate import estimates
 from calibrate.certificate.correction import nothing
-from calibrate.certificate.estimates import k_hat, missed_by
+from calibrate.certificate.estimates import missed_by
 from calibrate.certificate.pool import search
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs
@@ -17,20 +17,6 @@ from linear_support import Step, linear_forward
 def log_likelihoods(forward, data, points):
     at = forward.at(np.array(NODES))
     return norm.logpdf(data, np.asarray(jax.vmap(at)(points)), 0.1).sum(axis=(1, 2))
-
-
-def test_a_tail_that_is_one_point_drawn_again_has_no_shape_and_no_traceback():
-    log_weights = np.concatenate([np.linspace(-900.0, -300.0, 60), np.zeros(40)])
-    assert k_hat(log_weights) == np.inf
-
-
-def test_equal_weights_have_no_tail():
-    assert k_hat(np.zeros(50)) == 0.0
-
-
-def test_the_shape_of_pareto_weights_is_found():
-    log_weights = -0.5 * np.log(np.random.default_rng(0).uniform(size=20_000))
-    assert abs(k_hat(log_weights) - 0.5) < 0.1
 
 
 def test_runs_that_fem_finds_likely_and_the_map_does_not_are_counted(beam):

@@ -9,7 +9,6 @@ import pytest
 
 import calibrate as cal
 from calibrate.samplers import LaplaceOptions
-from calibrate.samplers.laplace import efficiency, pareto_k
 from emulator.errors import SolverError
 from linear_support import LinearForward, linear_forward, linear_problem
 
@@ -72,11 +71,6 @@ def test_a_mode_between_walls_is_refused(beam):
         cal.sample(model, truth, sampler="laplace")
 
 
-def test_the_efficiency_of_two_weights():
-    # (1 + 3)^2 / (2 (1 + 9))
-    assert efficiency(np.log([1.0, 3.0]) - 700.0) == pytest.approx(0.8)
-
-
 @dataclass(frozen=True, eq=False)
 class Even(LinearForward):
     """Only the square of mu's distance from 75 kPa is seen, ``slope`` sd higher on one side."""
@@ -104,11 +98,3 @@ def test_a_second_mode_nearly_as_high_is_told(beam, slope, told):
         lower = posterior.tree.attrs["missed_mode_nats"]
         assert lower == pytest.approx((2.0 * slope / 0.1) ** 2 / 2.0, abs=0.5)
         assert posterior.tree.attrs["missed_mode"] in ("lam 75, mu 70", "lam 75, mu 80")
-
-
-def test_pareto_k_of_known_tails():
-    rng = np.random.default_rng(0)
-    assert pareto_k(np.zeros(100)) == 0.0
-    for shape in (0.3, 0.9):
-        ratios = np.log(rng.pareto(1.0 / shape, size=20_000) + 1.0)
-        assert pareto_k(ratios) == pytest.approx(shape, abs=0.15)

@@ -1,0 +1,41 @@
+"""Weights of draws: their smoothed tail, its shape, and what fraction of the draws they leave."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibrate.arviz import array_stats
+
+FEWEST = 25  # weights whose largest fifth has a tail to fit
+_EQUAL = 1e-3  # log weights closer together than this have no tail to fit
+
+
+def smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
+    """Log weights (s,) of sum 1 with a smoothed tail, and its Pareto shape (Vehtari et al. 2024).
+
+    The shape is 0 where weights are equal to 0.1 %, NaN where there are too few to have a tail,
+    and infinite where the tail is one draw, again and again. Such weights stay as they are.
+    """
+    log_weights = log_weights - log_weights.max()
+    plain = log_weights - np.log(np.exp(log_weights).sum())
+    if len(log_weights) < FEWEST:
+        return plain, float("nan")
+    if np.ptp(log_weights) < _EQUAL:
+        return plain, 0.0
+    try:
+        # ArviZ takes log likelihoods and negates them (docs/experiments.md, "A sign").
+        told, shape = array_stats.psislw(-log_weights)
+    except ValueError:
+        return plain, float("inf")
+    return told, float(shape)
+
+
+def pareto_shape(log_weights: np.ndarray) -> float:
+    """Pareto shape of the tail of weights, as of :func:`smoothed`."""
+    return smoothed(log_weights)[1]
+
+
+def efficiency(log_weights: np.ndarray) -> float:
+    """Effective number of draws of weights (s,), as a fraction: (sum w)^2 / (s sum w^2)."""
+    weights = np.exp(log_weights - log_weights.max())
+    return float(weights.sum() ** 2 / (len(weights) * (weights**2).sum()))
