@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+
+import jax
+
+from emulator.errors import InputError
 
 
 def cores() -> int:
@@ -18,3 +23,31 @@ def memory() -> float:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
         return float("inf")
+
+
+def require_cpu(what: str) -> None:
+    """:class:`InputError` where JAX computes on an accelerator by default."""
+    platform = _platform()
+    if platform != "cpu":
+        raise InputError(
+            f"{what} runs on the CPU, and JAX's default device is '{platform}'; set "
+            "JAX_PLATFORMS=cpu, or make what needs it under "
+            "jax.default_device(jax.devices('cpu')[0])"
+        )
+
+
+def _platform() -> str:
+    """That JAX computes on in this thread by default."""
+    device = jax.config.jax_default_device
+    return jax.default_backend() if device is None else getattr(device, "platform", device)
+
+
+def inherited[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """``function`` for other threads, which compute where this one does by default."""
+    device = jax.config.jax_default_device
+
+    def there(*arguments: P.args, **named: P.kwargs) -> R:
+        with jax.default_device(device):
+            return function(*arguments, **named)
+
+    return there

@@ -30,6 +30,7 @@ from emulator.fem.options import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
 from emulator.fem.system import System
+from emulator.machine import require_cpu
 from emulator.scenes.scene import Scene
 from emulator.shown import Shown
 
@@ -48,7 +49,7 @@ class Simulator(Shown):
     Raises
     ------
     InputError
-        A factorisation that is unknown or not installed.
+        A factorisation that is unknown or not installed, or JAX's default device is no CPU.
     """
 
     scene: Scene
@@ -56,6 +57,7 @@ class Simulator(Shown):
     factorisation: str = "suitesparse"
 
     def __post_init__(self) -> None:
+        require_cpu("FEM")
         find_solver(self.factorisation)
         if self.scene.loaded_by:
             self._loaded.unloader  # noqa: B018 - what cannot be unloaded is named first

@@ -13,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from emulator.fem.linear.suitesparse import keep_factors
 from emulator.fem.simulator import Simulator
-from emulator.machine import cores, memory
+from emulator.machine import cores, inherited, memory
 
 _BYTES_A_NODE = 100_000  # of one more solve beside others; 54 000 measured at 33 605 nodes
 _SHARE = 0.5  # of the machine's memory
@@ -49,11 +49,12 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
         yield from map(function, tasks)
         return
     under_way: deque[Future[R]] = deque()
+    there = inherited(function)
     pool = ThreadPoolExecutor(workers)
     with keep_factors(workers):
         try:
             for task in tasks:
-                under_way.append(pool.submit(function, task))
+                under_way.append(pool.submit(there, task))
                 if len(under_way) > workers:
                     yield under_way.popleft().result()
             while under_way:
