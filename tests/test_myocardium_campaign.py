@@ -14,11 +14,8 @@ def test_a_meshs_error_is_taken_off_by_its_order():
     """Forces that are too large by 0.2 h^1.2, on 3 and on 5 cells."""
     right = np.full((2, 4), 2.0)
     by = {n: right * (1.0 + 0.2 * n**-1.2) for n in (3, 5)}
-    empty = np.zeros((2, 10))
-    there, fine = ([curves.Runs(empty, by[n], empty)] for n in (3, 5))
-    arrays = {name: jnp.zeros(1) for name in curves.Emulated._fields}
-    found = campaign.without_mesh(curves.Emulated(**arrays), there, fine)
-    np.testing.assert_allclose(by[3][0] * found.finer[0], right[0], rtol=1e-3)
+    found = by[3][0] * campaign.without_mesh(by[3], by[5])
+    np.testing.assert_allclose(found, right[0], rtol=1e-3)
 
 
 def test_half_of_what_a_mode_is_off_is_the_same_along_its_curve():
@@ -49,22 +46,22 @@ def test_a_mode_is_not_predicted_by_forces_that_are_not_known(monkeypatch, doubt
     def of(scale):
         draws = {"means": np.ones((400, 9, 4)), "omega": np.full(400, 0.3)}
         amounts = np.tile(np.linspace(-0.3, 0.3, 4), (9, 1))
-        seen = SimpleNamespace(cubes="cubes", data=np.ones((9, 4)), amounts=amounts)
+        seen = SimpleNamespace(cubes="cubes", data=np.ones((9, 4)), amounts=amounts, turned=0.0)
         likelihoods = -scale * rng.exponential(size=(400, 9))
         return SimpleNamespace(
             heart=SimpleNamespace(name="TSL0"), law="law", modes="modes", draws=draws,
             of=seen, positions=np.zeros((400, 3, 10)), log_likelihoods=likelihoods,
         )  # fmt: skip
 
-    def sample(heart, cubes, seed, law, *, left_out, known, chains):
-        asked.append((cubes, law, left_out, known, chains))
+    def sample(heart, cubes, seed, law, *, left_out, angles, known, **_):
+        asked.append((cubes, law, left_out, angles, known))
         return of(1e-3)
 
     monkeypatch.setattr(held_out, "sample", sample)
     monkeypatch.setattr(held_out, "doubts", lambda fitted, _: np.full((400, 3), fitted * doubt))
     found = of(20.0)
     told = held_out.held_out(found, 1, fitted=1.0)
-    expected = [("cubes", "law", (mode,), "modes", 1) for mode in inference.MODES]
+    expected = [("cubes", "law", (mode,), False, "modes") for mode in inference.MODES]
     assert sorted(asked) == sorted(expected)
     assert all((p.again, p.heavy) == (again, not again) for p in told.values())
     densities = np.array([p.log_density for p in told.values()])
@@ -135,7 +132,7 @@ def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, least, 
 
     monkeypatch.setattr(campaign, "settled", settled)
     monkeypatch.setattr(campaign, "_round", a_round)
-    monkeypatch.setattr(campaign, "without_mesh", lambda emulated, *_: emulated)
+    monkeypatch.setattr(campaign, "_of_no_mesh", lambda emulated, *_: emulated)
     learned = campaign.Learned([], SimpleNamespace(emulated=None))
     plan = campaign.Plan(closer=2)
     fem = SimpleNamespace(heart=None)

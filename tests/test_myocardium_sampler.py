@@ -42,29 +42,61 @@ def test_what_a_law_leaves_out_is_drawn_and_not_looked_at(monkeypatch, angles):
 def test_a_likelihood_is_taken_to_a_power():
     heart = SimpleNamespace(curves={m: SimpleNamespace(force=np.ones(4)) for m in inference.MODES})
     of = inference.seen(heart, None, power=0.5, left_out=("SS",))
-    np.testing.assert_array_equal(of.used, np.where(np.array(inference.MODES) == "SS", 0.0, 0.5))
+    own = np.where(np.array(inference.MODES) == "SS", 0.0, 0.5)
+    np.testing.assert_array_equal(of.used, own)
+
+
+def test_a_twin_is_seen_beside_its_heart(monkeypatch):
+    """One prior and two experiments: their log densities add."""
+    rng = np.random.default_rng(4)
+    heart, twin = (
+        SimpleNamespace(
+            curves={m: SimpleNamespace(force=rng.normal(size=4)) for m in inference.MODES}
+        )
+        for _ in range(2)
+    )
+    cubes = SimpleNamespace(amounts=jnp.tile(jnp.linspace(-0.3, 0.3, 4), (3, 3, 1)))
+    monkeypatch.setattr(inference, "means", lambda *_: jnp.ones((9, 4)))
+
+    def told(seen):
+        program = handlers.seed(inference.program, 0)
+        sites = handlers.trace(program).get_trace(seen)
+        return sum(sites[n]["fn"].log_factor for n in ("data", "twin") if n in sites)
+
+    both = told(inference.seen(heart, cubes, twin=twin))
+    alone = [told(inference.seen(each, cubes)) for each in (heart, twin)]
+    assert float(both) == pytest.approx(float(sum(alone)))
 
 
 def test_twins_of_two_hearts_have_errors_of_their_own(monkeypatch):
-    """And those of one are made again as they were."""
+    """And those of one are made again as they were; a test that FEM failed at makes none."""
     made = []
 
-    def posterior(heart, *_, **__):
-        made.append(np.stack([heart.curves[mode].force for mode in inference.MODES]))
-        return SimpleNamespace(theta=lambda _: np.zeros(3), draws={"omega": np.zeros(3)})
+    def posterior(heart, *_, twin, **__):
+        made.append(np.stack([twin.curves[mode].force for mode in inference.MODES]))
+        return SimpleNamespace(theta=lambda _: np.arange(4.0), draws={"omega": np.arange(4.0)})
 
     monkeypatch.setattr(twins, "sample", posterior)
     amounts = np.linspace(-0.3, 0.3, 4)
     curve = Curve("FS", amounts, np.ones(4), np.ones(4))
+    explored = SimpleNamespace(
+        modes=None, draws={"omega": np.array([0.1, 0.5, 2.5])},
+        theta=lambda _: np.array([0.0, 0.5, 1.5]),
+    )  # fmt: skip
+    by_fem = np.ones((2, 9, 4))
+    by_fem[0, 3, 1] = np.nan
     for name in ("TSL1", "TSL2", "TSL1"):
         heart = Heart(name, np.ones((3, 3)), dict.fromkeys(inference.MODES, curve))
         found = SimpleNamespace(
-            heart=heart, by_fem=np.ones((2, 9, 4)), tests=[SimpleNamespace(x=np.zeros((1, 10)))],
-            omega=0.3, coarse=None, explored=SimpleNamespace(modes=None),
+            heart=heart, by_fem=by_fem, tested=np.array([0, 2]), explored=explored,
+            cubes=SimpleNamespace(finer=np.full((3, 12), 0.9)),
         )  # fmt: skip
-        twins.ranks(found, 0, 10)
+        (told,) = twins.ranks(found, 0, 10)
+        assert told["a"] == 0.5
+        assert told["omega"] == 0.75
     np.testing.assert_array_equal(made[0], made[2])
     assert abs(np.corrcoef(made[0].ravel(), made[1].ravel())[0, 1]) < 0.5
+    assert np.median(np.concatenate(made)) == pytest.approx(0.9, abs=0.5)
 
 
 @pytest.mark.slow  # a minute

@@ -91,7 +91,7 @@ class Solver:
     @property
     def finer(self) -> Solver:
         """Of the finer mesh, without slopes."""
-        return replace(self, bodies=[replace(b, cells=FINER, sloping=False) for b in self.bodies])
+        return replace(self, bodies=[finer(body) for body in self.bodies])
 
 
 class Learned(NamedTuple):
@@ -142,11 +142,6 @@ class Campaign:
         return self.learned.fitted.emulated
 
     @property
-    def omega(self) -> float:
-        """Mean of its draws."""
-        return float(self.explored.draws["omega"].mean())
-
-    @property
     def runs_a_cube(self) -> int:
         """Of the cube that has most, with tests."""
         return max(len(runs.x) for runs in self.learned.runs) + len(self.tests[0].x)
@@ -183,18 +178,27 @@ class Campaign:
         return fem - cheap
 
 
-def without_mesh(coarse: Emulated, there: Sequence[Runs], fine: Sequence[Runs]) -> Emulated:
-    """The emulator of forces without the mesh's error, by runs ``there`` and ``fine`` ones.
+def finer(body: Cube) -> Cube:
+    """Of the finer mesh, without slopes."""
+    return replace(body, cells=FINER, sloping=False)
+
+
+def without_mesh(there: np.ndarray, fine: np.ndarray) -> np.ndarray:
+    """Factors (k,) that take the mesh's error off forces, by those ``there`` (r, k) and ``fine``.
 
     The displacement at the edge of a glued face goes as :math:`r^{0.595}` in an incompressible
     body (Williams 1952, a right angle), the force therefore as :math:`h^{1.19}`: a factor
     :math:`1 + c` from 3 to 5 cells is :math:`1 + c / (1 - (3/5)^{1.2})` to none.
     """
-    factors = []
-    for test, finer in zip(there, fine, strict=True):
-        change = np.nanmean(finer.force / test.force, axis=0) - 1.0
-        factors.append(1.0 + change / (1.0 - (CELLS / FINER) ** _ORDER))
-    return coarse._replace(finer=jnp.asarray(np.stack(factors)))
+    change = np.nanmean(fine / there, axis=0) - 1.0
+    factors: np.ndarray = 1.0 + change / (1.0 - (CELLS / FINER) ** _ORDER)
+    return factors
+
+
+def _of_no_mesh(coarse: Emulated, there: Sequence[Runs], fine: Sequence[Runs]) -> Emulated:
+    """The emulator of forces without the mesh's error, by runs ``there`` and ``fine`` ones."""
+    each = [without_mesh(a.force, b.force) for a, b in zip(there, fine, strict=True)]
+    return coarse._replace(finer=jnp.asarray(np.stack(each)))
 
 
 def campaign(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign:
@@ -253,7 +257,7 @@ def _closed(
     """The posterior without the mesh's error, after rounds until its draws are known."""
     for more in reversed(range(plan.closer + 1)):
         how = {"known": known, "steps": plan.steps, "times": TIMES}
-        emulated = without_mesh(learned.fitted.emulated, *meshes)
+        emulated = _of_no_mesh(learned.fitted.emulated, *meshes)
         found = settled(fem.heart, emulated, seed + learned.size, **how)
         after = _round(fem, learned, found, plan, seed, KNOWN) if more else learned
         if after is learned:

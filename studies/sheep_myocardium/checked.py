@@ -81,8 +81,9 @@ def certificate(found: Campaign) -> Certificate:
         *_mesh(found), nodes=(2 * FINER + 1) ** 3, runs=sum(len(r.x) for r in found.meshes[1])
     )
     there = np.stack(list(named.values()), axis=1)
-    means = _figures(named, there.mean(axis=0), error[:p])
-    sds = _figures(named, sd, sd * error[p:])
+    means = _figures(named, there.mean(axis=0) + value[:p], error[:p])
+    by_fem = sd * np.exp(value[p:])
+    sds = _figures(named, by_fem, by_fem * error[p:])
     return judge(Evidence(changes, changes, means, sds, sampling, physics, tail, {}, mesh))
 
 

@@ -140,9 +140,9 @@ class Cube:
         return float(self.sizes[0] * self.sizes[1])
 
 
-def cubes(heart: Heart, cells: int = cube.CELLS) -> list[Cube]:
+def cubes(heart: Heart, cells: int = cube.CELLS, *, sloping: bool = True) -> list[Cube]:
     """The three cubes of a heart."""
-    return [Cube(k, heart.sizes[k], heart.of_cube(k), cells) for k in range(3)]
+    return [Cube(k, heart.sizes[k], heart.of_cube(k), cells, sloping) for k in range(3)]
 
 
 class Emulated(NamedTuple):

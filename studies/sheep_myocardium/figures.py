@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from studies.common.output import Case, save
+from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.experiment import MODES, Heart
 
 from calibrate.figures.drawing import pyplot
@@ -57,11 +58,13 @@ def overview(cases: Sequence[Case], out: Path) -> None:
     names = [n for n in told["names"] if n != "omega"]
     for k, case in enumerate(hearts):
         alone = case["laws"]["fibres, sheets, shear"]["parameters"]
-        pooled = told["hearts"][case["name"]]["median"]
+        # Beyond the walls of the box parameters act as there.
+        walls = zip(told["hearts"][case["name"]]["median"], cube.MATERIAL, strict=False)
+        pooled = [np.clip(value, wall.low, wall.high) for value, wall in walls]
         for i, name in enumerate(names):
             x = i + 0.08 * (k - 3)
-            right.plot([x, x], [alone[name]["mean"], pooled[i]], color=COLOURS[k], lw=1)
-            right.plot(x, alone[name]["mean"], "o", mfc="none", color=COLOURS[k], ms=5)
+            right.plot([x, x], [alone[name]["median"], pooled[i]], color=COLOURS[k], lw=1)
+            right.plot(x, alone[name]["median"], "o", mfc="none", color=COLOURS[k], ms=5)
             right.plot(
                 x, pooled[i], "o", color=COLOURS[k], ms=5, label=case["name"] if not i else None
             )

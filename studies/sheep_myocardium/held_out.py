@@ -71,7 +71,8 @@ def held_out(found: Found, seed: int, fitted: Fit | None = None) -> dict[str, Pr
 
 def _without(mode: str, found: Found, fitted: Fit, seed: int) -> Found | None:
     """The posterior without a mode's data, or None where its forces are not known."""
-    how = {"left_out": (mode,), "known": found.modes, "chains": 1}
+    how = {"left_out": (mode,), "angles": bool(found.of.turned), "known": found.modes}
+    how |= {"chains": 1, "times": 2}
     anew = sample(found.heart, found.of.cubes, seed, found.law, **how)
     doubt = known_to(doubts(fitted, anew)).max()
     if doubt <= _UNKNOWN:

@@ -68,7 +68,7 @@ class Seen(NamedTuple):
     cubes : the emulator. data : (9, j) N. used : (9,) power that a mode's likelihood is taken to,
     0 for one that is left out.
     acting : (8,) whether the law has a parameter. turned : () 1 where fibre angles are unknown, 0
-    where fibres are along the cut.
+    where fibres are along the cut. twin : (9, j) N of a second experiment, or None.
     """
 
     cubes: Emulated
@@ -76,6 +76,7 @@ class Seen(NamedTuple):
     used: jax.Array
     acting: jax.Array
     turned: jax.Array
+    twin: jax.Array | None = None
 
     @property
     def amounts(self) -> jax.Array:
@@ -98,15 +99,20 @@ def seen(
     angles: bool = True,
     left_out: tuple[str, ...] = (),
     power: float = 1.0,
+    twin: Heart | None = None,
 ) -> Seen:
     """A heart's forces and data by a law, with fibre ``angles`` unknown; modes may be left out.
 
-    The likelihood is taken to a ``power``.
+    The likelihood is taken to a ``power``. A ``twin`` is of the same parameters, and seen too.
     """
-    data = np.stack([heart.curves[mode].force for mode in MODES])
+
+    def measured(each: Heart) -> jax.Array:
+        return jnp.asarray(np.stack([each.curves[mode].force for mode in MODES]))
+
     used = power * np.array([float(mode not in left_out) for mode in MODES])
     acting = np.array([name in parameters(law) for name in MATERIAL])
-    return Seen(cubes, *map(jnp.asarray, (data, used, acting, float(angles))))
+    told = map(jnp.asarray, (used, acting, float(angles)))
+    return Seen(cubes, measured(heart), *told, twin=None if twin is None else measured(twin))
 
 
 def means(of: Seen, material: jax.Array, turned: jax.Array) -> jax.Array:
@@ -160,6 +166,9 @@ def program(of: Seen) -> None:
     numpyro.deterministic("turned", turned)
     mean = numpyro.deterministic("means", means(of, material, turned))
     numpyro.factor("data", jnp.vdot(of.used, log_likelihoods(of, mean, omega)))
+    if of.twin is not None:
+        beside = log_likelihoods(of._replace(data=of.twin), mean, omega)
+        numpyro.factor("twin", beside.sum())
 
 
 _SITES = {
@@ -242,6 +251,7 @@ def sample(
     angles: bool = True,
     left_out: tuple[str, ...] = (),
     power: float = 1.0,
+    twin: Heart | None = None,
     known: Modes | None = None,
     steps: int = 300,
     times: int = 1,
@@ -250,10 +260,10 @@ def sample(
     """Draws of a heart's posterior by NumPyro's NUTS, and moves between ``known`` modes.
 
     Each chain begins at a place of its own, and warms up for ``steps``; ``times`` as many, at most
-    :data:`TIMES`, are kept. The likelihood is taken to a ``power``. Chains that know no modes find
-    one each. As many are drawn at once as there are cores.
+    :data:`TIMES`, are kept. Modes left out, ``power`` and ``twin`` are as of :func:`seen`. Chains
+    that know no modes find one each. As many are drawn at once as there are cores.
     """
-    of = seen(heart, cubes, law, angles=angles, left_out=left_out, power=power)
+    of = seen(heart, cubes, law, angles=angles, left_out=left_out, power=power, twin=twin)
     given = unknown(len(marked(_SITES, {}))) if known is None else known
     draws = times * steps
     every = side_by_side(_sampler(steps), of, given, seed, chains=chains, draws=draws)
