@@ -79,7 +79,7 @@ class Check:
     """A certificate and what it was made from.
 
     posterior : that was checked. pool : cheap points; ``pool.corrected`` are their weights under
-    the corrected map. tests : FEM runs that tested it.
+    the corrected map. tests : FEM runs that tested it. correction : what is added to the map.
     """
 
     certificate: Certificate
@@ -87,6 +87,7 @@ class Check:
     predictive: Predictive
     pool: Pool
     tests: Tests
+    correction: Correction
 
 
 def examine(
@@ -159,7 +160,7 @@ def examine(
         bar.close()
         change = mesh_change(predictive, simulator, every, pool, mesh, rng, progress=progress)
     certificate = judge(replace(evidence, mesh=change))
-    return Check(certificate, posterior, predictive, pool, tests)
+    return Check(certificate, posterior, predictive, pool, tests, correction)
 
 
 def certify(

@@ -22,7 +22,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from calibrate.certificate.correction import Correction
 from calibrate.certificate.predictive import Predictive
@@ -41,11 +40,10 @@ def misfits(
     draws = {name: jnp.asarray(values) for name, values in predictive.constrain(z).items()}
     flat = jnp.asarray(predictive.corrected_means(z, correction))
     shapes = predictive.model.observe.shapes
-    unravel = ravel_pytree({name: jnp.zeros(shape) for name, shape in shapes.items()})[1]
 
     def one(flat: jax.Array, draw: dict[str, jax.Array], key: jax.Array) -> Any:
         values = predictive.model.noise_values(draw)
-        means = unravel(flat)
+        means = predictive.by_name(flat)
         parts = predictive.model.distributions(means, values)
         key, own = jax.random.split(key)
         moved = predictive.model.fem_means(own, draw, means)

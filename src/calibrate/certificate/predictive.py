@@ -136,7 +136,7 @@ class Predictive:
         def told(z: jax.Array, means: jax.Array, slopes: jax.Array) -> tuple[jax.Array, ...]:
             def likelihood(at: jax.Array, flat: jax.Array) -> jax.Array:
                 draws = self._constrain(at)
-                return self.model.fem_log_likelihood(draws, self._unravel(flat), self.data)
+                return self.model.fem_log_likelihood(draws, self.by_name(flat), self.data)
 
             def thetas(at: jax.Array) -> jax.Array:
                 return self.model.states.thetas(self._constrain(at))
@@ -209,10 +209,10 @@ class Predictive:
         """Log likelihood of the map's data ``flat`` (m,) corrected, and the variance of that."""
         draws = self._constrain(z)
         step, variance = correct(correction, self._features(draws))
-        moved = self._unravel(flat + step)
+        moved = self.by_name(flat + step)
         return _finite(self.model.fem_log_likelihood(draws, moved, self.data)), variance
 
-    def _unravel(self, flat: jax.Array) -> dict[str, jax.Array]:
+    def by_name(self, flat: jax.Array) -> dict[str, jax.Array]:
         """Data by name from flat ones (m,)."""
         parts = self.model.observe.parts
         return ravel_pytree({name: jnp.zeros(parts[name].shape) for name in parts})[1](flat)

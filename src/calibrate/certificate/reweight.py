@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from calibrate.certificate.check import Check, examine, resampled
@@ -12,10 +13,14 @@ from calibrate.certificate.pool import effective
 from calibrate.certificate.verdict import Certificate
 from calibrate.posterior import Posterior
 from calibrate.posterior.tree import make_tree
+from calibrate.samplers.modes import MISSED_AT, MISSED_BY
 from emulator.errors import InputError
 from emulator.fem import Simulator
 
 _CHAINS = 4
+_OF_OTHER_DRAWS = (
+    "log_evidence", "log_evidence_error", "pareto_k", "importance_efficiency", MISSED_BY, MISSED_AT,
+)  # fmt: skip
 
 
 def reweight(
@@ -47,7 +52,8 @@ def reweighted(check: Check, *, seed: int = 0) -> Posterior:
     """The corrected map's posterior as 4 chains of independent draws.
 
     Resampled from the pool, 1000 draws or as many as the pool has effective points, whichever is
-    less; equal ones occur. Their number and the verdict are in the attributes ``reweighted``.
+    less; equal ones occur. Their number and the verdict are in the attributes ``reweighted``. Log
+    likelihoods and replicated data are of the corrected map's data.
 
     Raises
     ------
@@ -68,7 +74,12 @@ def reweighted(check: Check, *, seed: int = 0) -> Posterior:
     shape = (_CHAINS, length)
     draws = {name: drawn[name].reshape(shape) for name in posterior.model.names}
     statistics = {"lp": (at.prior + at.corrected)[rows].reshape(shape)}
-    tree = make_tree(posterior.model, posterior.data, draws, statistics, jax.random.key(seed))
-    tree.attrs.update(posterior.tree.attrs)
+    flat = check.predictive.corrected_means(check.pool.z[rows], check.correction)
+    by_name = jax.vmap(jax.vmap(check.predictive.by_name))(jnp.asarray(flat.reshape(*shape, -1)))
+    means = {name: np.asarray(mean) for name, mean in by_name.items()}
+    key = jax.random.key(seed)
+    tree = make_tree(posterior.model, posterior.data, draws, statistics, key, means)
+    kept = {n: a for n, a in posterior.tree.attrs.items() if n not in _OF_OTHER_DRAWS}
+    tree.attrs.update(kept)
     tree.attrs["reweighted"] = json.dumps({"verdict": verdict, "effective_points": points})
     return Posterior(tree, posterior.model, posterior.data)

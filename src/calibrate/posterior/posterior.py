@@ -237,7 +237,7 @@ def sample(
         attributes |= missed_mode(density, checked, z, modes)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
     draws = named_draws(model, found.z)
-    tree = make_tree(model, checked, draws, found.statistics, rng_key)
+    tree = make_tree(model, checked, draws, found.statistics, rng_key, found.means)
     for name, value in {**made, **attributes}.items():
         tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
     state.remove()

@@ -42,13 +42,19 @@ class Prior(NamedTuple):
     data: dict[str, np.ndarray]
 
 
-def log_likelihood(model: Model, draws: Draws, data: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def log_likelihood(
+    model: Model, draws: Draws, data: Mapping[str, Any], means: Draws | None = None
+) -> dict[str, np.ndarray]:
     """Log likelihood of each datum at each draw, (chains, draws, *shape), by observation.
 
     Where noise correlates in space, given all other data of the observation. Data of a noise that
     has no density of a single one have one number a draw instead, (chains, draws).
+
+    means : data without noise (chains, draws, *shape), where the draws are not of the model's own
+        posterior; by its forward map otherwise.
     """
-    return _unflat(_programs(model).log_likelihood(_flat(draws), data), draws)
+    told = _programs(model).log_likelihood(_flat(draws), _flat_means(means), data)
+    return _unflat(told, draws)
 
 
 def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> np.ndarray:
@@ -69,11 +75,16 @@ def _outputs(forward: ForwardMap, observe: Observation) -> Outputs:
     return Outputs(forward, {"observed": observe})
 
 
-def replicates(model: Model, draws: Draws, rng_key: jax.Array) -> dict[str, np.ndarray]:
-    """Data replicated at each draw, (chains, draws, *shape), by the observation's name."""
+def replicates(
+    model: Model, draws: Draws, rng_key: jax.Array, means: Draws | None = None
+) -> dict[str, np.ndarray]:
+    """Data replicated at each draw, (chains, draws, *shape), by the observation's name.
+
+    ``means`` as of :func:`log_likelihood`.
+    """
     flat = _flat(draws)
     keys = jax.random.split(rng_key, len(next(iter(flat.values()))))
-    return _unflat(_programs(model).replicate(flat, keys), draws)
+    return _unflat(_programs(model).replicate(flat, _flat_means(means), keys), draws)
 
 
 def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
@@ -130,26 +141,44 @@ def _prior(model: Model, rng_key: jax.Array, prediction: Prediction | None = Non
 
 
 class _Programs(NamedTuple):
-    log_likelihood: Callable[..., Any]  # (draws by name (s,), data) -> by observation (s, *shape)
-    replicate: Callable[..., Any]  # (draws by name (s,), keys (s,)) -> by observation (s, *shape)
+    # Of draws by name (s,), means by observation (s, *shape) or None, and data or keys (s,); to
+    # numbers by observation (s, *shape).
+    log_likelihood: Callable[..., Any]
+    replicate: Callable[..., Any]
     prior: Callable[..., Any]  # (keys (s,)) -> draws, data, whether valid (s,)
 
 
 @lru_cache(maxsize=4)
 def _programs(model: Model) -> _Programs:
-    def log_likelihood(draw: dict[str, jax.Array], data: Data) -> dict[str, jax.Array]:
-        trace = model.trace(draw, data)
-        return {name: _pointwise(trace[_site(name)]) for name in model.observe.parts}
+    def log_likelihood(
+        draw: dict[str, jax.Array], means: Data | None, data: Data
+    ) -> dict[str, jax.Array]:
+        if means is not None:
+            around = model.distributions(means, model.noise_values(draw))
+            return {name: _pointwise(d, data[name]) for name, d in around.items()}
+        sites = {name: model.trace(draw, data)[_site(name)] for name in model.observe.parts}
+        return {name: _pointwise(site["fn"], site["value"]) for name, site in sites.items()}
 
-    def replicate(draw: dict[str, jax.Array], rng_key: jax.Array) -> dict[str, jax.Array]:
+    def replicate(
+        draw: dict[str, jax.Array], means: Data | None, rng_key: jax.Array
+    ) -> dict[str, jax.Array]:
+        if means is not None:
+            own, *keys = jax.random.split(rng_key, len(means) + 1)
+            moved = model.fem_means(own, draw, means)
+            around = model.distributions(moved, model.noise_values(draw))
+            return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
         seeded = handlers.substitute(handlers.seed(model, rng_key), data=draw)
         trace = handlers.trace(seeded).get_trace()
         return {name: trace[_site(name)]["value"] for name in model.observe.parts}
 
     # One draw after the other: maps that solve gain nothing from being vectorised.
     return _Programs(
-        jax.jit(lambda draws, data: jax.lax.map(lambda d: log_likelihood(d, data), draws)),
-        jax.jit(lambda draws, keys: jax.lax.map(lambda pair: replicate(*pair), (draws, keys))),
+        jax.jit(
+            lambda draws, means, data: jax.lax.map(
+                lambda one: log_likelihood(one[0], one[1], data), (draws, means)
+            )
+        ),
+        jax.jit(lambda *each: jax.lax.map(lambda one: replicate(*one), each)),
         jax.jit(lambda keys: jax.lax.map(partial(_prior, model), keys)),
     )
 
@@ -158,9 +187,8 @@ def _site(name: str) -> str:
     return f"observed_{name}"
 
 
-def _pointwise(site: dict[str, Any]) -> jax.Array:
+def _pointwise(distribution: Any, value: jax.Array) -> jax.Array:
     """Log density of each datum: given all the others, where they are not independent."""
-    distribution, value = site["fn"], site["value"]
     if isinstance(distribution, SpatialNormal):
         return distribution.log_conditionals(value)
     while isinstance(distribution, dist.Independent):
@@ -171,6 +199,13 @@ def _pointwise(site: dict[str, Any]) -> jax.Array:
 
 def _flat(draws: Draws) -> dict[str, jax.Array]:
     return {name: jnp.asarray(values).reshape(-1) for name, values in draws.items()}
+
+
+def _flat_means(means: Draws | None) -> dict[str, jax.Array] | None:
+    """Chains one after the other, (s, *shape)."""
+    if means is None:
+        return None
+    return {n: jnp.asarray(m).reshape(-1, *np.shape(m)[2:]) for n, m in means.items()}
 
 
 def _unflat(values: Any, draws: Draws) -> dict[str, np.ndarray]:

@@ -15,7 +15,9 @@ def summary_of(
 ) -> dict[str, dict[str, float]]:
     """Of draws (chains, draws): mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
     found = base.dict_to_dataset(dict(draws))
-    bulk, tail = stats.ess(found, method="bulk"), stats.ess(found, method="tail")
+    # By default ArviZ takes the tails of its own interval, which a user may have set.
+    bulk = stats.ess(found, method="bulk")
+    tail = stats.ess(found, method="tail", prob=(0.05, 0.95))
     edge = 0.5 * (1.0 - probability)
     table = {}
     for name, values in draws.items():

@@ -27,11 +27,14 @@ def make_tree(
     draws: Mapping[str, np.ndarray],
     statistics: Mapping[str, np.ndarray],
     rng_key: jax.Array | None,
+    means: Mapping[str, np.ndarray] | None = None,
 ) -> xr.DataTree:
     """Draws and statistics (chains, draws) by name, with all that follows from them.
 
     Parameters
     ----------
+    means : data without noise at the draws, (chains, draws, *shape) by the observation's name,
+        where these are of FEM's posterior; by the model's forward map otherwise.
     rng_key : for replicated data; ``None`` leaves out the predictions (``log_likelihood``,
         ``posterior_predictive``, ``prior``, ``prior_predictive``).
     """
@@ -47,7 +50,7 @@ def make_tree(
     }
     rows = np.arange(0)
     if rng_key is not None:
-        rows, more = _predictions(model, data, draws, rng_key)
+        rows, more = _predictions(model, data, draws, rng_key, means)
         for group in _OF_DATA:
             more[group] |= {name: more[group][name][..., None] for name in single}
         groups.update(more)
@@ -62,15 +65,20 @@ def make_tree(
 
 
 def _predictions(
-    model: Model, data: Data, draws: Mapping[str, np.ndarray], rng_key: jax.Array
+    model: Model,
+    data: Data,
+    draws: Mapping[str, np.ndarray],
+    rng_key: jax.Array,
+    means: Mapping[str, np.ndarray] | None,
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """The groups of predictions, and which draws of each chain data was replicated at."""
     posterior_key, prior_key = jax.random.split(rng_key)
     rows, some = predictions.spread(draws)
+    there = None if means is None else {name: np.asarray(m)[:, rows] for name, m in means.items()}
     prior = predictions.prior_replicates(model, prior_key)
     groups = {
-        "log_likelihood": predictions.log_likelihood(model, draws, data),
-        "posterior_predictive": predictions.replicates(model, some, posterior_key),
+        "log_likelihood": predictions.log_likelihood(model, draws, data, means),
+        "posterior_predictive": predictions.replicates(model, some, posterior_key, there),
         "prior": {name: values[None] for name, values in prior.draws.items()},
         "prior_predictive": {name: values[None] for name, values in prior.data.items()},
     }

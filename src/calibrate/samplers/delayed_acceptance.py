@@ -74,7 +74,9 @@ class DelayedAcceptanceOptions(ChainOptions):
 
     def cheap(self) -> BlackJAXNUTSOptions:
         """Options of the cheap sampler; its pilot run is as long as its warm-up."""
-        return BlackJAXNUTSOptions(self.warmup, self.warmup, self.chains, 1, 2.0, 0.0)
+        return BlackJAXNUTSOptions(
+            self.warmup, self.warmup, self.chains, 1, 2.0, 0.0, self.start, self.target_accept
+        )
 
 
 class _Place(NamedTuple):
@@ -84,6 +86,7 @@ class _Place(NamedTuple):
     z: Any
     cheap_lp: Any
     log_w: Any
+    means: Any  # FEM's data without noise, by the observation's name
 
 
 class _State(NamedTuple):
@@ -195,7 +198,9 @@ class _Run:
             cheap.start_straightened(*jax.random.split(key))
         self.map_ = cheap.map_
         proposed, _ = self._propose(cheap.states)
-        place = proposed._replace(log_w=self._log_w(proposed.z, np.full(len(proposed.z), True)))
+        every = np.full(len(proposed.z), True)
+        log_w, means = self._by_fem(proposed.z, every, self._no_means((len(every),)))
+        place = proposed._replace(log_w=log_w, means=means)
         return _State(self.map_, place, 0, len(proposed.z), self._no_draws())
 
     def _step(self) -> Draws:
@@ -203,13 +208,14 @@ class _Run:
         proposed, cheap = self._propose(self.place.states)
         moved = (proposed.z != self.place.z).any(axis=1)
         self.solves += int(moved.sum())
-        log_w = np.where(moved, self._log_w(proposed.z, moved), self.place.log_w)
+        found, means = self._by_fem(proposed.z, moved, self.place.means)
+        log_w = np.where(moved, found, self.place.log_w)
         # Where FEM fails the weight is 0: never accepted, and left at the first chance.
         with np.errstate(invalid="ignore", over="ignore"):
             probability = np.nan_to_num(np.exp(np.minimum(log_w - self.place.log_w, 0.0)), nan=0.0)
         key = jax.random.fold_in(self.key, self.count)
         accepted = np.asarray(jax.random.uniform(key, probability.shape)) < probability
-        self.place = _choose(accepted, proposed._replace(log_w=log_w), self.place)
+        self.place = _choose(accepted, proposed._replace(log_w=log_w, means=means), self.place)
         statistics = {
             "acceptance_rate": probability,
             "accepted": accepted & moved,
@@ -219,25 +225,38 @@ class _Run:
             "n_steps": cheap["n_steps"].sum(axis=1),
             "diverging": cheap["diverging"].any(axis=1),
         }
-        return jax.tree.map(lambda array: array[:, None], Draws(self.place.z, statistics))
+        draws = Draws(self.place.z, statistics, means=self.place.means)
+        return jax.tree.map(lambda array: array[:, None], draws)
 
     def _propose(self, states: Any) -> tuple[_Place, Mapping[str, np.ndarray]]:
         """Where the cheap sampler leads, without weights; its statistics (chains, transitions)."""
         transitions = self.options.transitions
         states, draws = self.programs.advance(states, self.data, self.map_, transitions)
-        place = _Place(states, draws.z[:, -1], draws.statistics["lp"][:, -1], None)
+        place = _Place(states, draws.z[:, -1], draws.statistics["lp"][:, -1], None, None)
         return place, draws.statistics
 
-    def _log_w(self, z: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """FEM's less the tempered log likelihood (chains,), where wanted; ``-inf`` elsewhere."""
+    def _by_fem(
+        self, z: np.ndarray, wanted: np.ndarray, means: Mapping[str, np.ndarray]
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """FEM's less the tempered log likelihood (chains,), where wanted; ``-inf`` elsewhere.
+
+        And FEM's data without noise there, elsewhere and where FEM fails as in ``means``.
+        """
         assert self.fem is not None
         named = jax.tree.map(np.asarray, self.density.constrain(jnp.asarray(z)))
-        log_w = np.full(len(z), -np.inf)
+        log_w, there = np.full(len(z), -np.inf), {n: np.array(m) for n, m in means.items()}
         for k in np.flatnonzero(wanted):
             found = self.fem({name: values[k] for name, values in named.items()}, self.data)
             ratio = found.fem - self.options.power * found.cheap
             log_w[k] = ratio if np.isfinite(ratio) else -np.inf
-        return log_w
+            for name, mean in found.means.items():
+                there[name][k] = mean
+        return log_w, there
+
+    def _no_means(self, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+        assert self.fem is not None
+        shapes = self.fem.model.observe.shapes
+        return {name: np.full((*shape, *of), np.nan) for name, of in shapes.items()}
 
     def _check_start(self) -> None:
         if not np.isfinite(self.place.log_w).all():
@@ -251,7 +270,8 @@ class _Run:
         statistics: dict[str, Any] = {
             name: np.zeros((chains, 0), kind) for name, kind in _STATISTICS.items()
         }
-        return Draws(np.zeros((chains, 0, self.density.dimension)), statistics)
+        z = np.zeros((chains, 0, self.density.dimension))
+        return Draws(z, statistics, means=self._no_means((chains, 0)))
 
     def _state(self) -> _State:
         return _State(self.map_, self.place, self.count, self.solves, join(self.parts))
@@ -260,7 +280,7 @@ class _Run:
         map_ = transport.standard_identity(self.density.dimension)
         states, _ = self.programs.shapes(self.options.chains, self.data, map_)
         number = np.zeros(())
-        place = _Place(states, number, number, number)
+        place = _Place(states, number, number, number, self._no_means(()))
         count = np.zeros((), int)
         return _State(map_, place, count, count, self._no_draws())
 
@@ -275,7 +295,7 @@ def _choose(accepted: np.ndarray, proposed: _Place, current: _Place) -> _Place:
     def chosen(new: np.ndarray, old: np.ndarray) -> np.ndarray:
         return np.where(accepted.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
-    return _Place(states, *map(chosen, proposed[1:], current[1:]))
+    return _Place(states, *jax.tree.map(chosen, proposed[1:], current[1:]))
 
 
 DELAYED_ACCEPTANCE = DelayedAcceptance()

@@ -25,11 +25,14 @@ class Draws(NamedTuple):
     """Draws ``z`` (chains, draws, p) in unconstrained coordinates; statistics (chains, draws).
 
     attributes : facts of the whole run, plain JSON, e.g. ``log_evidence``.
+    means : data without noise at the draws, (chains, draws, *shape) by the observation's name, of
+        a sampler that does not draw from the model's own posterior but from FEM's.
     """
 
     z: Any
     statistics: Statistics
     attributes: Mapping[str, Any] = {}
+    means: Mapping[str, Any] | None = None
 
 
 class Context(NamedTuple):

@@ -1,10 +1,20 @@
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import calibrate as cal
-from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
+from certificate_support import (
+    NODES,
+    exact_data,
+    exact_posterior,
+    grid_of,
+    linear_model,
+    quadrature,
+)
 from emulator.errors import InputError
 from linear_support import LinearSimulator, linear_forward
 
@@ -17,6 +27,13 @@ def biased(beam):
     off = 0.2 * np.sign(fem.matrix[..., 0])
     wrong = linear_model(beam, forward=replace(fem, shift=fem.shift + off))
     return exact_posterior(wrong, data), fem, data
+
+
+def data_by(forward, posterior):
+    """Data without noise by a map, at a posterior's draws."""
+    draws = np.stack([posterior.tree["posterior"][name].values for name in ("mu", "lam")], axis=-1)
+    at = jax.vmap(jax.vmap(forward.at(np.array(NODES))))
+    return np.asarray(at(jnp.asarray(draws)))
 
 
 @pytest.mark.slow
@@ -40,13 +57,25 @@ def test_the_reweighted_posterior_is_fems_and_is_accepted(biased):
 
 
 def test_it_leaves_the_posterior_alone(biased):
-    posterior, fem, _ = biased
+    posterior, fem, data = biased
+    posterior.tree.attrs["log_evidence"] = 3.0
     before = {name: values.copy() for name, values in posterior.draws().items()}
     reweighted = cal.reweight(posterior, LinearSimulator(fem), draws=80)
     assert "reweighted" in reweighted.tree.attrs
     assert "reweighted" not in posterior.tree.attrs
     for name, values in posterior.draws().items():
         np.testing.assert_array_equal(values, before[name])
+    assert posterior.tree.attrs.pop("log_evidence") == 3.0
+    # What it says of single data, and of data that might be, is FEM's as its draws are.
+    assert "log_evidence" not in reweighted.tree.attrs
+    means = data_by(fem, reweighted)
+    for_fem = norm.logpdf(data, means, 0.1)
+    found = reweighted.tree["log_likelihood"]["displacement"].values
+    np.testing.assert_allclose(found, for_fem, atol=0.02)
+    by_map = norm.logpdf(data, data_by(posterior.model.full, reweighted), 0.1)
+    assert np.abs(by_map - for_fem).max() > 1.0
+    replicated = reweighted.tree["posterior_predictive"]["displacement"].values.mean(axis=(0, 1))
+    np.testing.assert_allclose(replicated, means.mean(axis=(0, 1)), atol=0.03)
 
 
 def test_it_is_refused_where_nothing_says_it_is_fems(biased):

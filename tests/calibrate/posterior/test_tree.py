@@ -134,10 +134,9 @@ def test_predictions_can_be_left_out(beam):
 
 def test_dependent_data_have_one_log_likelihood_a_draw():
     normal = dist.MultivariateNormal(jnp.zeros(3), jnp.eye(3))
-    site = {"fn": normal, "value": jnp.ones(3)}
-    assert predictions._pointwise(site).shape == ()
-    site = {"fn": dist.Normal(jnp.zeros(3), 1.0).to_event(1), "value": jnp.ones(3)}
-    assert predictions._pointwise(site).shape == (3,)
+    assert predictions._pointwise(normal, jnp.ones(3)).shape == ()
+    independent = dist.Normal(jnp.zeros(3), 1.0).to_event(1)
+    assert predictions._pointwise(independent, jnp.ones(3)).shape == (3,)
 
 
 @pytest.mark.slow

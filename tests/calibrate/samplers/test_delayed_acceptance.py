@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import calibrate as cal
 from calibrate.samplers import DelayedAcceptanceOptions, density_of
@@ -84,6 +86,11 @@ def test_statistics_count_fem_solves_and_acceptance(beam, biased):
     draws = posterior.tree["posterior"]["mu"].values
     moved = np.diff(draws, axis=1) != 0
     np.testing.assert_array_equal(statistics["accepted"].values[:, 1:], moved)
+    # What it says of single data is FEM's, as its draws are.
+    theta = np.stack([posterior.tree["posterior"][n].values for n in ("mu", "lam")], axis=-1)
+    means = jax.vmap(jax.vmap(exact.at(model.observe.nodes)))(jnp.asarray(theta))
+    told = posterior.tree["log_likelihood"]["displacement"].values
+    np.testing.assert_allclose(told, norm.logpdf(data, means, 0.1), atol=1e-9)
     # A cheap map that is right is never turned down.
     right = cal.sample(model, data, simulator=LinearFEM(beam, model.full), **call)
     assert float(right.tree["sample_stats"]["acceptance_rate"].min()) == pytest.approx(1.0)
@@ -126,12 +133,13 @@ def test_a_rejected_chain_stays_with_a_fresh_key(beam):
 
     def place(keys, z):
         states = tuple(State(key, x, x[0], x) for key, x in zip(keys, z, strict=True))
-        return _Place(states, z, z[:, 0], z[:, 1])
+        return _Place(states, z, z[:, 0], z[:, 1], {"displacement": z})
 
     new, old = place(keys[:2], rng.normal(size=(2, 3))), place(keys[2:], rng.normal(size=(2, 3)))
     found = _choose(np.array([True, False]), new, old)
     np.testing.assert_array_equal(found.z, np.stack([new.z[0], old.z[1]]))
     np.testing.assert_array_equal([state.nuts for state in found.states], found.z)
+    np.testing.assert_array_equal(found.means["displacement"], found.z)
     assert [state.rng_key for state in found.states] == list(keys[:2])
 
 
