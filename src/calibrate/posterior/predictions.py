@@ -156,7 +156,8 @@ def _programs(model: Model) -> _Programs:
         if means is not None:
             around = model.distributions(means, model.noise_values(draw))
             return {name: _pointwise(d, data[name]) for name, d in around.items()}
-        sites = {name: model.trace(draw, data)[_site(name)] for name in model.observe.parts}
+        trace = model.trace(draw, data)
+        sites = {name: trace[_site(name)] for name in model.observe.parts}
         return {name: _pointwise(site["fn"], site["value"]) for name, site in sites.items()}
 
     def replicate(
