@@ -13,8 +13,8 @@ from calibrate.posterior.fit import Misfit
 LARGEST_SHIFT = 0.25
 LARGEST_LOG_SD = float(np.log(1.2))
 LARGEST_CORRELATION_CHANGE = 0.2
-# Of FEM's mass below a quantile of the draws: about what the largest shift and change of sd together
-# do to a Gaussian (0.073 and 0.118). Two points may have the right mean and sd.
+# Of FEM's mass below a quantile of the draws: about what the largest shift and change of sd do
+# together to a Gaussian (0.073 and 0.118). Two points may have the right mean and sd.
 LARGEST_MASS = {0.05: 0.06, 0.5: 0.12, 0.95: 0.06}
 # Of the mesh: beyond, the posterior is about the mesh and not about the tissue.
 LARGEST_MESH_SHIFT = 0.5
