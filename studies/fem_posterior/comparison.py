@@ -7,7 +7,7 @@ import numpy as np
 from studies.fem_posterior.methods import LATE, Weighed
 
 from calibrate.certificate.moments import jackknife, moments
-from calibrate.certificate.pool import effective, normalised
+from calibrate.samplers.importance import effective, normalised
 
 MOMENTS = ("mean", "mean_error", "sd", "sd_error")
 

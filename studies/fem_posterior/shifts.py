@@ -21,7 +21,7 @@ import calibrate as cal
 from calibrate.certificate import examine
 from calibrate.certificate.check import Check
 from calibrate.certificate.moments import jackknife, moments
-from calibrate.certificate.pool import normalised
+from calibrate.samplers.importance import normalised
 from calibrate.samplers.nuts import NUTSOptions
 
 SHIFT = "shift, less FEM's change"

@@ -117,7 +117,7 @@ def _mesh(found: Campaign) -> tuple[dict[str, Figure], dict[str, Figure]]:
     """
     differences = found.mesh_differences()
     weights = softmax(differences) * len(differences)
-    # Of weights that are not smoothed these errors are 1.3 to 2 times too large (Gaussians).
+    # Of weights that are not smoothed these errors are 1.3 to 2.3 times too large (Gaussians).
     root = np.sqrt(found.explored.least_ess)
     moved, spread = {}, {}
     for name, x in logarithms(found.explored).items():

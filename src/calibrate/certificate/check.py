@@ -46,8 +46,6 @@ from calibrate.certificate.pool import (
     Pool,
     around_draws,
     corrected_again,
-    effective,
-    normalised,
     polish,
     redrawn,
     search,
@@ -58,6 +56,7 @@ from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, Solver, correction_from, joined
 from calibrate.certificate.verdict import Certificate, judge
 from calibrate.posterior import Posterior
+from calibrate.samplers.importance import effective, normalised
 from calibrate.samplers.registry import SAMPLERS
 from calibrate.statistical_model import FEMLikelihood
 from emulator.errors import InputError

@@ -11,11 +11,11 @@ from scipy.special import logsumexp
 from calibrate.certificate.correction import Correction
 from calibrate.certificate.evidence import LARGEST_MASS, Changes, Figure, Physics, Sampling, Tail
 from calibrate.certificate.moments import jackknife, moments
-from calibrate.certificate.pool import Pool, effective, normalised, with_guests
+from calibrate.certificate.pool import Pool, with_guests
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, least_likely
 from calibrate.posterior import Posterior
-from calibrate.samplers.importance import pareto_shape
+from calibrate.samplers.importance import effective, normalised, pareto_shape
 
 _LIKELY = 0.99  # mass of the region that FEM's runs are likely in
 _MISSED = 3.0  # in log likelihood: the corrected map finds a run 20 times less likely than FEM

@@ -24,11 +24,12 @@ from tqdm import tqdm
 from calibrate.certificate.correction import Correction, corrections, fit, nothing
 from calibrate.certificate.evidence import Figure, MeshChange
 from calibrate.certificate.moments import jackknife, moments
-from calibrate.certificate.pool import ENOUGH, Pool, corrected_again, effective, normalised, step
+from calibrate.certificate.pool import ENOUGH, Pool, corrected_again, step
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs
 from calibrate.observations import Observations
 from calibrate.observations.mesh_error import on_finer
+from calibrate.samplers.importance import effective, normalised
 from emulator.error.mesh_error import MeshError, MeshErrorEstimate, mesh_error
 from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator

@@ -26,6 +26,7 @@ from scipy.special import logsumexp
 from calibrate.certificate.correction import Correction
 from calibrate.certificate.predictive import Evaluated, Predictive
 from calibrate.certificate.proposals import Kernels, around
+from calibrate.samplers.importance import effective, normalised
 
 NEAR, NEAR_FREEDOM = 2048, 5.0
 WIDE, WIDE_WIDTHS, WIDE_FREEDOM = 512, (1.0, 2.0), 3.0
@@ -131,21 +132,6 @@ class Pool:
 def widths(dimension: int) -> tuple[float, ...]:
     """Widths of kernels on draws, in their sd; narrow ones are needles in many dimensions."""
     return (0.15, 0.5) if dimension <= 2 else (0.35, 0.7)
-
-
-def normalised(log_weights: np.ndarray) -> np.ndarray:
-    """Weights of sum 1; zeros where no log weight is finite."""
-    largest = np.max(log_weights)
-    if not np.isfinite(largest):
-        return np.zeros_like(log_weights)
-    weights = np.exp(log_weights - largest)
-    return weights / weights.sum()
-
-
-def effective(weights: np.ndarray) -> float:
-    """Effective number of points (Kish), 0 where all weights are."""
-    square = float(np.sum(weights**2))
-    return 1.0 / square if square > 0.0 else 0.0
 
 
 def _effective(log_weights: np.ndarray) -> float:

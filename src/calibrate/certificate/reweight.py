@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.certificate.check import Check, examine, resampled
-from calibrate.certificate.pool import effective
 from calibrate.certificate.verdict import Certificate
 from calibrate.posterior import Posterior
 from calibrate.posterior.tree import make_tree
+from calibrate.samplers.importance import effective
 from calibrate.samplers.modes import MISSED_AT, MISSED_BY
 from emulator.errors import InputError
 from emulator.fem import Simulator

@@ -10,6 +10,21 @@ FEWEST = 25  # weights whose largest fifth has a tail to fit
 _EQUAL = 1e-3  # log weights closer together than this have no tail to fit
 
 
+def normalised(log_weights: np.ndarray) -> np.ndarray:
+    """Weights of sum 1; zeros where no log weight is finite."""
+    largest = np.max(log_weights)
+    if not np.isfinite(largest):
+        return np.zeros_like(log_weights)
+    weights = np.exp(log_weights - largest)
+    return weights / weights.sum()
+
+
+def effective(weights: np.ndarray) -> float:
+    """Effective number of points (Kish), 0 where all weights are."""
+    square = float(np.sum(weights**2))
+    return 1.0 / square if square > 0.0 else 0.0
+
+
 def smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
     """Log weights (s,) of sum 1 with a smoothed tail, and its Pareto shape (Vehtari et al. 2024).
 
@@ -37,5 +52,4 @@ def pareto_shape(log_weights: np.ndarray) -> float:
 
 def efficiency(log_weights: np.ndarray) -> float:
     """Effective number of draws of weights (s,), as a fraction: (sum w)^2 / (s sum w^2)."""
-    weights = np.exp(log_weights - log_weights.max())
-    return float(weights.sum() ** 2 / (len(weights) * (weights**2).sum()))
+    return effective(normalised(log_weights)) / len(log_weights)

@@ -3,16 +3,10 @@ import numpy as np
 import pytest
 
 from calibrate.certificate.correction import nothing
-from calibrate.certificate.pool import (
-    effective,
-    normalised,
-    redrawn,
-    search,
-    tempered,
-    with_guests,
-)
+from calibrate.certificate.pool import redrawn, search, tempered, with_guests
 from calibrate.certificate.predictive import Predictive
 from calibrate.samplers import density_of
+from calibrate.samplers.importance import effective, normalised
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
 
 

@@ -143,6 +143,11 @@ def test_a_rejected_chain_stays_with_a_fresh_key(beam):
     assert [state.rng_key for state in found.states] == list(keys[:2])
 
 
+def test_the_cheap_sampler_is_given_what_a_user_asks_for():
+    cheap = DelayedAcceptanceOptions(target_accept=0.93, start="pathfinder").cheap()
+    assert (cheap.target_accept, cheap.start) == (0.93, "pathfinder")
+
+
 def test_it_needs_a_simulator_of_the_posterior_s_scene(beam, cube):
     model, data = linear_problem(beam)
     with pytest.raises(InputError, match="'delayed_acceptance' solves FEM .* give simulator="):
