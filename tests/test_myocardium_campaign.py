@@ -8,13 +8,14 @@ import pytest
 from studies.sheep_myocardium import campaign, checked, curves, held_out, inference
 from studies.sheep_myocardium.doubts import doubts
 from studies.sheep_myocardium.experiment import Heart
+from studies.sheep_myocardium.solver import without_mesh
 
 
 def test_a_meshs_error_is_taken_off_by_its_order():
     """Forces that are too large by 0.2 h^1.2, on 3 and on 5 cells."""
     right = np.full((2, 4), 2.0)
     by = {n: right * (1.0 + 0.2 * n**-1.2) for n in (3, 5)}
-    found = by[3][0] * campaign.without_mesh(by[3], by[5])
+    found = by[3][0] * without_mesh(by[3], by[5])
     np.testing.assert_allclose(found, right[0], rtol=1e-3)
 
 
@@ -113,40 +114,66 @@ def runs_at(x):
     return [curves.Runs(at, np.zeros((len(at), 1)), np.zeros((len(at), 1, 10))) for at in x]
 
 
-@pytest.mark.parametrize(
-    ("least", "rounds"), [([0.1], 0), ([9.0, 2.0, 0.1], 2), ([9.0, 2.0, 2.0, 2.0], 2)]
-)
-def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, least, rounds):
-    """Until its cubes are known at all draws, or as often as the plan says."""
-    told, asked = iter(least), []
+def closing(monkeypatch, told, limit):
+    """A campaign whose rounds say ``told`` of posteriors, and what is asked of these."""
+    asked = []
 
-    def settled(heart, emulated, seed, *, known, steps, times):
-        asked.append(known)
-        return SimpleNamespace(modes=f"of {len(asked)}")
+    def settled(heart, emulated, seed, law, *, known=None, steps, times=None):
+        asked.append((known, law, emulated))
+        return SimpleNamespace(modes=f"of {len(asked)}", law=law)
 
     def a_round(fem, learned, found, plan, seed, least):
-        assert least == campaign.KNOWN
-        if next(told) < campaign.KNOWN:
+        assert least == limit
+        if next(told) < least:
             return learned
-        return learned._replace(doubt=(*learned.doubt, 1.0))
+        return learned._replace(fitted=SimpleNamespace(emulated=f"{learned.fitted.emulated}+"))
 
     monkeypatch.setattr(campaign, "settled", settled)
     monkeypatch.setattr(campaign, "_round", a_round)
     monkeypatch.setattr(campaign, "_of_no_mesh", lambda emulated, *_: emulated)
-    learned = campaign.Learned([], SimpleNamespace(emulated=None))
-    plan = campaign.Plan(closer=2)
-    fem = SimpleNamespace(heart=None)
-    made, found = campaign._closed(fem, learned, ("coarse", "fine"), "before", plan, 0)
-    assert len(made.doubt) == rounds
-    assert asked == ["before", "of 1", "of 2"][: rounds + 1]
-    assert found.modes == f"of {rounds + 1}"
+    learned = campaign.Learned([], SimpleNamespace(emulated="runs"))
+    return learned, asked
 
 
 @pytest.mark.parametrize(
-    ("share", "runs"), [((0.9, 0.9, 0.9), [9, 9, 9]), ((0.0, 0.0, 0.9), [0, 0, 27])]
+    ("told", "rounds"), [([0.1], 0), ([9.0, 2.0, 0.1], 2), ([9.0, 2.0, 2.0, 2.0], 2)]
 )
-def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):
+def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, told, rounds):
+    """Until its cubes are known at all draws, or as often as the plan says."""
+    learned, asked = closing(monkeypatch, iter(told), campaign.KNOWN)
+    fem = SimpleNamespace(heart=None)
+    plan = campaign.Plan(closer=2)
+    found = campaign._without_error(fem, learned, ("coarse", "fine"), "before", plan, 0)
+    made, found = campaign._closed(fem, learned, ("coarse", "fine"), found, plan, 0)
+    assert made.fitted.emulated == "runs" + rounds * "+"
+    assert [known for known, *_ in asked] == ["before", "of 1", "of 2"][: rounds + 1]
+    assert found.modes == f"of {rounds + 1}"
+
+
+@pytest.mark.parametrize(("told", "rounds"), [([0.9], 0), ([4.0, 1.2, 0.5], 2)])
+def test_another_laws_posterior_is_closed_where_it_is_not_known(monkeypatch, told, rounds):
+    """By runs of its own, which the heart's campaign keeps out of its posterior."""
+    learned, asked = closing(monkeypatch, iter(told), campaign.UNKNOWN)
+    found = SimpleNamespace(heart="a heart", bodies=[], cubes="runs", learned=learned, meshes=())
+    made, fitted = campaign.of_law(found, "fibres", campaign.Plan(), None, 3)
+    assert made.modes == f"of {rounds + 1}"
+    assert fitted.emulated == "runs" + rounds * "+"
+    by = ["runs" + more * "+" for more in range(rounds + 1)]
+    assert asked == [(k, "fibres", e) for k, e in zip((None, "of 1", "of 2"), by, strict=False)]
+    assert found.learned is learned
+
+
+@pytest.mark.parametrize(
+    ("share", "runs", "law", "named"),
+    [
+        ((0.9, 0.9, 0.9), [9, 9, 9], inference.ORTHOTROPIC, "round_6"),
+        ((0.0, 0.0, 0.9), [0, 0, 27], "fibres, shear", "round_6_fibres_shear"),
+    ],
+)
+def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs, law, named):
+    """Its file is named by a law that is not the orthotropic one: laws share no runs."""
     fitted, found, _ = posterior(share, 10)
+    found.law = law
     asked, plan = {}, campaign.Plan(each=27)
 
     def fem(name, x):
@@ -157,7 +184,7 @@ def test_a_round_is_of_cubes_that_are_not_known(monkeypatch, share, runs):
     monkeypatch.setattr(campaign, "fit", lambda bodies, runs, before: before)
     learned = campaign.Learned(fem("wide", [np.zeros((2, 10))] * 3), fitted)
     made = campaign._round(fem, learned, found, plan, 0, campaign.KNOWN)
-    assert asked["round_6"] == runs
+    assert asked[named] == runs
     assert made.size == 6 + 27
     assert len(made.doubt) == 1
     known = learned._replace(fitted=posterior((0.0, 0.0, 1e-4), 10)[0])

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results, parser, run
 from studies.sheep_myocardium import cube, figures, population, twins
-from studies.sheep_myocardium.campaign import QUICK, Campaign, Plan, finer, without_mesh
+from studies.sheep_myocardium.campaign import QUICK, Campaign, Plan, of_law
 from studies.sheep_myocardium.checked import decided, told
 from studies.sheep_myocardium.curves import Fit, cubes
 from studies.sheep_myocardium.doubts import doubts, known_to
@@ -28,6 +28,7 @@ from studies.sheep_myocardium.inference import (
     parameters,
     settled,
 )
+from studies.sheep_myocardium.solver import finer, without_mesh
 
 from emulator.errors import InputError
 
@@ -73,21 +74,19 @@ def _explained(found: Found) -> dict[str, float]:
     return dict(zip(MODES, (1.0 - left / total).round(3).tolist(), strict=True))
 
 
-def of_heart(found: Campaign, plan: Plan) -> Case:
+def of_heart(found: Campaign, plan: Plan, kept: Path | None) -> Case:
     """Laws, angles known and unknown, held-out modes, FEM's check and the mesh's."""
     began = perf_counter()
-    size, fitted = {"steps": plan.steps}, found.learned.fitted
-    runs = None if plan is QUICK else fitted
+    cut = settled(found.heart, found.cubes, SEED, angles=False, steps=plan.steps)
+    fitted = found.learned.fitted
+    made = {law: of_law(found, law, plan, kept, SEED) for law in LAWS if law != ORTHOTROPIC}
+    made |= {ORTHOTROPIC: (found.explored, fitted), "angles known": (cut, fitted)}
     laws: Case = {}
-    for law in LAWS:
-        main = law == ORTHOTROPIC
-        made = found.explored if main else settled(found.heart, found.cubes, SEED, law, **size)
-        apart = held_out(made, SEED, runs)
-        laws[law] = described(made, fitted, apart)
-    # The last law is the orthotropic one.
-    bands = {mode: p.bands.round(4).tolist() for mode, p in apart.items()}
-    cut = settled(found.heart, found.cubes, SEED, angles=False, **size)
-    laws["angles known"] = described(cut, fitted, held_out(cut, SEED, runs))
+    for law, (each, by) in made.items():
+        apart = held_out(each, SEED, None if plan is QUICK else by)
+        laws[law] = described(each, by, apart)
+        if law == ORTHOTROPIC:
+            bands = {mode: p.bands.round(4).tolist() for mode, p in apart.items()}
     return {
         "laws": laws,
         "held_out_bands_N": bands,
@@ -185,7 +184,7 @@ def main() -> None:
     for each in given:
         found = decided(each, plan, words.runs, SEED)
         campaigns.append(found)
-        results.case(each.name, lambda found=found: of_heart(found, plan))
+        results.case(each.name, lambda found=found: of_heart(found, plan, words.runs))
         results.case(f"{each.name}, twins", lambda found=found: of_twins(found, plan))
     results.case("population", lambda: of_population(campaigns, words.quick))
     results.write(**_together(results.cases))

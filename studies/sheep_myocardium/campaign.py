@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
-from studies.sheep_myocardium.cube import CELLS
 from studies.sheep_myocardium.curves import (
     Cube,
     Emulated,
@@ -23,7 +22,7 @@ from studies.sheep_myocardium.curves import (
     forces,
     joined,
 )
-from studies.sheep_myocardium.doubts import doubts, known_to
+from studies.sheep_myocardium.doubts import KNOWN, UNKNOWN, doubts, known_to
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.inference import (
     ORTHOTROPIC,
@@ -35,12 +34,7 @@ from studies.sheep_myocardium.inference import (
 )
 from studies.sheep_myocardium.moves import Modes
 from studies.sheep_myocardium.process import next_runs
-
-from emulator.store import replacing
-
-FINER = 5
-"""Cells along an edge of the finer mesh: 1331 nodes."""
-_ORDER = 1.2  # of the force's convergence: twice 0.595, the exponent at a glued edge
+from studies.sheep_myocardium.solver import Solver, without_mesh
 
 
 @dataclass(frozen=True)
@@ -67,31 +61,8 @@ class Plan:
 
 
 QUICK = Plan(wide=4, rounds=1, each=6, closer=0, tests=4, again=0, meshes=1, steps=50)
-KNOWN = 0.2
-"""Root mean square of :func:`.doubts` at draws of a posterior, of a cube whose forces are known."""
 _POOL = 80  # draws that next runs are chosen from
 _forces = jax.jit(jax.vmap(forces, (None, 0)))
-
-
-@dataclass(frozen=True)
-class Solver:
-    """FEM of a heart's cubes. Runs in the folder ``kept`` are not solved again."""
-
-    heart: Heart
-    bodies: list[Cube]
-    kept: Path | None
-
-    def __call__(self, name: str, x: Sequence[np.ndarray]) -> list[Runs]:
-        """Runs named ``name`` at positions (r, p) of each cube."""
-        return [
-            _kept(self.kept, f"{self.heart.name}_{k}_{name}", body, at)
-            for k, (body, at) in enumerate(zip(self.bodies, x, strict=True))
-        ]
-
-    @property
-    def finer(self) -> Solver:
-        """Of the finer mesh, without slopes."""
-        return replace(self, bodies=[finer(body) for body in self.bodies])
 
 
 class Learned(NamedTuple):
@@ -178,23 +149,6 @@ class Campaign:
         return fem - cheap
 
 
-def finer(body: Cube) -> Cube:
-    """Of the finer mesh, without slopes."""
-    return replace(body, cells=FINER, sloping=False)
-
-
-def without_mesh(there: np.ndarray, fine: np.ndarray) -> np.ndarray:
-    """Factors (k,) that take the mesh's error off forces, by those ``there`` (r, k) and ``fine``.
-
-    The displacement at the edge of a glued face goes as :math:`r^{0.595}` in an incompressible
-    body (Williams 1952, a right angle), the force therefore as :math:`h^{1.19}`: a factor
-    :math:`1 + c` from 3 to 5 cells is :math:`1 + c / (1 - (3/5)^{1.2})` to none.
-    """
-    change = np.nanmean(fine / there, axis=0) - 1.0
-    factors: np.ndarray = 1.0 + change / (1.0 - (CELLS / FINER) ** _ORDER)
-    return factors
-
-
 def _of_no_mesh(coarse: Emulated, there: Sequence[Runs], fine: Sequence[Runs]) -> Emulated:
     """The emulator of forces without the mesh's error, by runs ``there`` and ``fine`` ones."""
     each = [without_mesh(a.force, b.force) for a, b in zip(there, fine, strict=True)]
@@ -246,24 +200,51 @@ def again(found: Campaign, plan: Plan, kept: Path | None, seed: int) -> Campaign
     return _tested(fem, learned, found.meshes, found.explored.modes, plan, seed, began)
 
 
+def of_law(
+    found: Campaign, law: str, plan: Plan, kept: Path | None, seed: int
+) -> tuple[Found, Fit]:
+    """The posterior by another law, after rounds where the orthotropic law's left it unknown.
+
+    And what its cubes are fitted to.
+    """
+    fem = Solver(found.heart, found.bodies, kept)
+    made = settled(found.heart, found.cubes, seed, law, steps=plan.steps)
+    learned, made = _closed(fem, found.learned, found.meshes, made, plan, seed, UNKNOWN)
+    return made, learned.fitted
+
+
 def _closed(
+    fem: Solver,
+    learned: Learned,
+    meshes: tuple[list[Runs], list[Runs]],
+    found: Found,
+    plan: Plan,
+    seed: int,
+    least: float = KNOWN,
+) -> tuple[Learned, Found]:
+    """A posterior without the mesh's error, after rounds until its draws are known to ``least``."""
+    for _ in range(plan.closer):
+        after = _round(fem, learned, found, plan, seed, least)
+        if after is learned:
+            break
+        learned = after
+        found = _without_error(fem, learned, meshes, found.modes, plan, seed, found.law)
+    return learned, found
+
+
+def _without_error(
     fem: Solver,
     learned: Learned,
     meshes: tuple[list[Runs], list[Runs]],
     known: Modes,
     plan: Plan,
     seed: int,
-) -> tuple[Learned, Found]:
-    """The posterior without the mesh's error, after rounds until its draws are known."""
-    for more in reversed(range(plan.closer + 1)):
-        how = {"known": known, "steps": plan.steps, "times": TIMES}
-        emulated = _of_no_mesh(learned.fitted.emulated, *meshes)
-        found = settled(fem.heart, emulated, seed + learned.size, **how)
-        after = _round(fem, learned, found, plan, seed, KNOWN) if more else learned
-        if after is learned:
-            break
-        learned, known = after, found.modes
-    return learned, found
+    law: str = ORTHOTROPIC,
+) -> Found:
+    """The posterior without the mesh's error."""
+    emulated = _of_no_mesh(learned.fitted.emulated, *meshes)
+    how = {"known": known, "steps": plan.steps, "times": TIMES}
+    return settled(fem.heart, emulated, seed + learned.size, law, **how)
 
 
 def _round(
@@ -276,7 +257,8 @@ def _round(
     every = doubts(learned.fitted, found)
     doubt = known_to(every)
     told = ", ".join(f"{value:.2f}" for value in doubt)
-    print(f"{fem.heart.name}, {learned.size} runs: log likelihood known to {told}", flush=True)
+    by = f"{fem.heart.name}, {found.law}, {learned.size} runs"
+    print(f"{by}: log likelihood known to {told}", flush=True)
     unknown = doubt > least
     if not unknown.any():
         return learned
@@ -287,7 +269,8 @@ def _round(
         x = found.positions[rows, k]
         told_most = next_runs(learned.fitted.left(k, x), len(x), each) if asked else []
         chosen.append(x[told_most])
-    made = learned.more(fem, fem(f"round_{learned.size}", chosen))
+    law = "" if found.law == ORTHOTROPIC else f"_{found.law.replace(', ', '_')}"
+    made = learned.more(fem, fem(f"round_{learned.size}{law}", chosen))
     return made._replace(doubt=(*learned.doubt, float(doubt.max())))
 
 
@@ -310,7 +293,8 @@ def _tested(
     began: float,
 ) -> Campaign:
     """The posterior without the mesh's error, and FEM at some of its draws."""
-    learned, explored = _closed(fem, learned, meshes, known, plan, seed)
+    explored = _without_error(fem, learned, meshes, known, plan, seed)
+    learned, explored = _closed(fem, learned, meshes, explored, plan, seed)
     rows, tests = _tests(fem, learned, explored, plan, seed, 0)
     return Campaign(
         fem.heart, fem.bodies, learned, meshes, explored.of.cubes, explored, rows, tests,
@@ -326,19 +310,3 @@ def _tests(
     rows = order[done : done + plan.tests]
     x = np.moveaxis(explored.positions[rows], 1, 0)
     return rows, fem(f"tests_{learned.size}_{done}", x)
-
-
-def _kept(folder: Path | None, name: str, body: Cube, x: np.ndarray) -> Runs:
-    """FEM at positions (r, p), or what a file kept of a run at these before this one."""
-    path = None if folder is None else folder / f"{name}.npz"
-    if path is not None and path.is_file():
-        with np.load(path, allow_pickle=False) as arrays:
-            known = Runs(*(arrays[field] for field in Runs._fields))
-        if known.x.shape == x.shape and np.allclose(known.x, x, atol=1e-9):
-            return known
-    found = body.runs(x)
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, **found._asdict())
-    return found

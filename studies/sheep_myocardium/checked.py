@@ -5,7 +5,7 @@ FEM's likelihood over the emulator's. What that changes of means and standard de
 of the weights and the chains are judged as :func:`calibrate.certify` judges (of correlations it
 also asks, which takes more runs than thirty). All is in logarithms of parameters.
 
-The mesh's error is taken off by its order (:func:`.campaign.without_mesh`); what may be left of it
+The mesh's error is taken off by its order (:func:`.solver.without_mesh`); what may be left of it
 is three tenths of the correction, which an order of 1 or 2 in place of 1.2 would change of it.
 """
 
@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 from scipy.special import softmax
 from studies.common.output import Case
-from studies.sheep_myocardium.campaign import FINER, Campaign, Plan, again, campaign, further
+from studies.sheep_myocardium.campaign import Campaign, Plan, again, campaign, further
 from studies.sheep_myocardium.experiment import Heart
 from studies.sheep_myocardium.inference import Found, parameters
+from studies.sheep_myocardium.solver import FINER
 
 from calibrate.certificate.evidence import (
     Changes,

@@ -15,6 +15,11 @@ import numpy as np
 from studies.sheep_myocardium.curves import Fit
 from studies.sheep_myocardium.inference import Found, covariances
 
+KNOWN = 0.2
+"""Root mean square of :func:`doubts` at draws of a posterior, of a cube whose forces are known."""
+UNKNOWN = 1.0
+"""The same of one whose forces are not known: an sd of the data."""
+
 
 def doubts(fitted: Fit, found: Found) -> np.ndarray:
     """d of each cube at draws, (d, 3)."""

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import logsumexp
 from studies.common.output import Case
 from studies.sheep_myocardium.curves import Fit
-from studies.sheep_myocardium.doubts import doubts, known_to
+from studies.sheep_myocardium.doubts import UNKNOWN, doubts, known_to
 from studies.sheep_myocardium.experiment import MODES
 from studies.sheep_myocardium.inference import Found, covariances, sample
 
@@ -24,7 +24,6 @@ from calibrate.samplers.importance import smoothed
 from emulator.machine import cores
 
 _HEAVIEST = 0.7  # Pareto shape of the weights' tail
-_UNKNOWN = 1.0  # root mean square of what is not known of a cube: an sd of the data
 _LEVELS = (0.05, 0.5, 0.95)
 
 
@@ -75,7 +74,7 @@ def _without(mode: str, found: Found, fitted: Fit, seed: int) -> Found | None:
     how |= {"chains": 1, "times": 2}
     anew = sample(found.heart, found.of.cubes, seed, found.law, **how)
     doubt = known_to(doubts(fitted, anew)).max()
-    if doubt <= _UNKNOWN:
+    if doubt <= UNKNOWN:
         return anew
     print(f"{found.heart.name} without {mode}: log likelihood known to {doubt:.2f}", flush=True)
     return None
