@@ -143,8 +143,8 @@ def test_runs_go_where_a_posterior_does_before_it_is_tested(monkeypatch, told, r
     learned, asked = closing(monkeypatch, iter(told), campaign.KNOWN)
     fem = SimpleNamespace(heart=None)
     plan = campaign.Plan(closer=2)
-    found = campaign._without_error(fem, learned, ("coarse", "fine"), "before", plan, 0)
-    made, found = campaign._closed(fem, learned, ("coarse", "fine"), found, plan, 0)
+    found = campaign._without_error(fem, learned, (), "before", plan, 0, campaign.ORTHOTROPIC)
+    made, found = campaign._closed(fem, learned, (), found, plan, 0)
     assert made.fitted.emulated == "runs" + rounds * "+"
     assert [known for known, *_ in asked] == ["before", "of 1", "of 2"][: rounds + 1]
     assert found.modes == f"of {rounds + 1}"

@@ -61,6 +61,8 @@ class Plan:
 
 
 QUICK = Plan(wide=4, rounds=1, each=6, closer=0, tests=4, again=0, meshes=1, steps=50)
+Meshes = tuple[list[Runs], list[Runs]]
+"""Runs of the cubes at the same positions on their mesh and on a finer one."""
 _POOL = 80  # draws that next runs are chosen from
 _forces = jax.jit(jax.vmap(forces, (None, 0)))
 
@@ -100,7 +102,7 @@ class Campaign:
     heart: Heart
     bodies: list[Cube]
     learned: Learned
-    meshes: tuple[list[Runs], list[Runs]]
+    meshes: Meshes
     cubes: Emulated
     explored: Found
     tested: np.ndarray
@@ -216,7 +218,7 @@ def of_law(
 def _closed(
     fem: Solver,
     learned: Learned,
-    meshes: tuple[list[Runs], list[Runs]],
+    meshes: Meshes,
     found: Found,
     plan: Plan,
     seed: int,
@@ -233,13 +235,7 @@ def _closed(
 
 
 def _without_error(
-    fem: Solver,
-    learned: Learned,
-    meshes: tuple[list[Runs], list[Runs]],
-    known: Modes,
-    plan: Plan,
-    seed: int,
-    law: str = ORTHOTROPIC,
+    fem: Solver, learned: Learned, meshes: Meshes, known: Modes, plan: Plan, seed: int, law: str
 ) -> Found:
     """The posterior without the mesh's error."""
     emulated = _of_no_mesh(learned.fitted.emulated, *meshes)
@@ -286,14 +282,14 @@ def _pool(doubt: np.ndarray, seed: int) -> np.ndarray:
 def _tested(
     fem: Solver,
     learned: Learned,
-    meshes: tuple[list[Runs], list[Runs]],
+    meshes: Meshes,
     known: Modes,
     plan: Plan,
     seed: int,
     began: float,
 ) -> Campaign:
     """The posterior without the mesh's error, and FEM at some of its draws."""
-    explored = _without_error(fem, learned, meshes, known, plan, seed)
+    explored = _without_error(fem, learned, meshes, known, plan, seed, ORTHOTROPIC)
     learned, explored = _closed(fem, learned, meshes, explored, plan, seed)
     rows, tests = _tests(fem, learned, explored, plan, seed, 0)
     return Campaign(
