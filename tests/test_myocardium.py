@@ -29,6 +29,13 @@ def write_heart(folder):
     return folder
 
 
+def in_unit(path, unit):
+    """A curve's forces in another unit."""
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table[:, 1:] *= unit
+    np.savetxt(path, table, delimiter=",", header="Strain, F", comments="")
+
+
 def test_a_heart_is_read(tmp_path):
     write_heart(tmp_path / "TSL9")
     (heart,) = experiment.hearts(tmp_path)
@@ -58,6 +65,18 @@ def test_a_heart_is_read(tmp_path):
         (
             lambda f: (f / "ForceStrain_M3.csv").write_text("Strain, F\n0.1,1\n0.0,2\n"),
             "do not rise",
+        ),
+        (
+            lambda f: (f / "WDH_Params.csv").write_text(",".join(["0.9"] * 9) + "\n"),
+            "edge lengths in mm .* 3 to 40",
+        ),
+        (
+            lambda f: in_unit(f / "ForceStrain_M3.csv", 1e3),
+            "M3.csv: forces reach 105, .* expected N",
+        ),
+        (
+            lambda f: [in_unit(f / f"ForceStrain_M{k}.csv", 1e-3) for k in range(1, 10)],
+            "forces reach 0.000435, .* expected N",
         ),
     ],
 )

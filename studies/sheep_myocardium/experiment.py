@@ -13,6 +13,8 @@ MODES = ("FS", "FN", "FF", "SF", "SN", "SS", "NF", "NS", "NN")
 """In the files' order, three a cube: normal of the glued faces, direction of motion."""
 LEVELS = 5
 """Points taken from either half of a curve, evenly over its amounts."""
+_EDGES = (3.0, 40.0)  # mm; in cm or m they would be less
+_FORCES = (0.02, 20.0)  # N, a heart's largest: 0.4 to 1 here; in mN or kN they would be outside
 _SOURCE = (
     "github.com/SoftTissueBiomechanicsLab/ML-soft-material-parameters, folder "
     "ExperimentalMyocardiumData"
@@ -63,11 +65,23 @@ def hearts(folder: Path) -> list[Heart]:
 def heart(folder: Path) -> Heart:
     """One heart."""
     sizes = _table(folder / "WDH_Params.csv", 9, skip=0)
-    if sizes.shape != (1, 9) or not (sizes > 1.0).all():
-        raise InputError(f"{folder / 'WDH_Params.csv'}: expected 9 edge lengths in mm in one row")
+    low, high = _EDGES
+    if sizes.shape != (1, 9) or not ((low < sizes) & (sizes < high)).all():
+        raise InputError(
+            f"{folder / 'WDH_Params.csv'}: expected 9 edge lengths in mm in one row, each of "
+            f"{low:g} to {high:g}"
+        )
     curves = {
         mode: curve(folder / f"ForceStrain_M{k}.csv", mode) for k, mode in enumerate(MODES, start=1)
     }
+    largest = [np.abs(each.force).max() for each in curves.values()]
+    k = int(np.argmax(largest))
+    low, high = _FORCES
+    if not low < largest[k] < high:
+        raise InputError(
+            f"{folder / f'ForceStrain_M{k + 1}.csv'}: forces reach {largest[k]:g}, the largest of "
+            f"this heart; expected N, {low:g} to {high:g} of a centimetre of muscle"
+        )
     return Heart(folder.name, sizes.reshape(3, 3), curves)
 
 
