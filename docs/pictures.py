@@ -24,7 +24,7 @@ from calibrate.explorer import Explorer, serve
 from calibrate.report import write_report
 from calibrate.workflow import infer
 from calibrate.workflow.demo import DEMOS, run_demo
-from emulator.store import write_atomically
+from emulator.core.store import write_atomically
 from emulator.surrogates import load
 
 HERE = Path(__file__).parent

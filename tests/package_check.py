@@ -24,7 +24,7 @@ for package in (emulator, calibrate):
             importlib.import_module(module.name)
         except ModuleNotFoundError as error:  # of the extra "plot"
             assert error.name in ("plotly", "matplotlib"), error
-        except emulator.errors.InputError as error:  # of another extra, which it names
+        except emulator.core.errors.InputError as error:  # of another extra, which it names
             assert "pip install 'soft-tissue-calibrate[" in str(error), error
 from emulator.surrogates.files import shipped
 for name in shipped():

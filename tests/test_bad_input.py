@@ -19,7 +19,7 @@ from calibrate.data import read_data, write_data
 from calibrate.posterior.simulation_based import sbc
 from calibrate.workflow import Run, make_data
 from cli_support import write_block
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.files import SHIPPED
 from emulator.training import recipe
 from emulator.training.budget import Budget

@@ -8,7 +8,7 @@ from studies.common.output import Results
 from studies.silicone_beam import beam, experiment
 
 import calibrate as cal
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from scene_support import rotation
 
 

@@ -10,7 +10,7 @@ from studies.common.output import run
 from studies.sheep_myocardium import cube, curves, experiment
 from studies.sheep_myocardium.__main__ import main
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 def write_heart(folder):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 _OF_THIS_MACHINE = (LOOPBACK, "localhost")

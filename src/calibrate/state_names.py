@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _AT = "@"
 

@@ -22,7 +22,7 @@ import numpy as np
 from calibrate.local_server import LOOPBACK, Handler, Server, listen
 from calibrate.observations import Observation, Observations, observations
 from calibrate.observations.outputs import Outputs
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.protocol import ForwardMap
 
 NAME = "forward"

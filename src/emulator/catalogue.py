@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.released.scenes import published_scene
 from emulator.scenes.file import read_scene
 from emulator.scenes.finer import FINER, Finer, finer

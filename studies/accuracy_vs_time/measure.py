@@ -17,10 +17,10 @@ from studies.common.output import Case
 from studies.common.timing import per_call, unseen
 
 from calibrate.observations import landmarks
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.store import replacing
 from emulator.fem import Simulator, run_campaign, sobol
 from emulator.scenes import Scene
-from emulator.store import replacing
 from emulator.surrogates.corrected import newton_step
 
 TEST_SEED = 90_210

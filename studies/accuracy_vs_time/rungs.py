@@ -20,7 +20,7 @@ from studies.common.two_meshes import on_two_meshes
 
 import emulator as em
 from calibrate.observations import landmarks, spread_landmarks
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates.additive import Emulator

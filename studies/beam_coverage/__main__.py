@@ -19,8 +19,8 @@ from calibrate.figures.drawing import pyplot
 from calibrate.observations import spread_nodes
 from calibrate.provenance import study_header
 from emulator import Simulator, load
+from emulator.core.store import write_json
 from emulator.released.scenes import published_tests
-from emulator.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 50

@@ -27,7 +27,7 @@ from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE, GREEN, ORANGE, VERMILION
 from calibrate.provenance import study_header
 from emulator import Simulator
-from emulator.store import write_json
+from emulator.core.store import write_json
 
 HERE = Path(__file__).parent
 NUTS = cal.NUTSOptions(500, 1000, chains=4)

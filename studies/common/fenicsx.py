@@ -18,7 +18,7 @@ import numpy as np
 from studies.common.output import Case
 from studies.common.timing import Clock, clocked
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import Simulator, uniform
 from emulator.fem.options import NewtonOptions
 from emulator.geometry.discretisation import quadrature_points

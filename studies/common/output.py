@@ -12,8 +12,8 @@ from typing import Any
 
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from emulator.errors import InputError, SolverError
-from emulator.store import replacing, write_json
+from emulator.core.errors import InputError, SolverError
+from emulator.core.store import replacing, write_json
 
 Case = dict[str, Any]
 

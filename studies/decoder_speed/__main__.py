@@ -15,7 +15,7 @@ from studies.decoder_speed import cubes, kinds, ventricle
 
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
-from emulator.store import write_json
+from emulator.core.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 11

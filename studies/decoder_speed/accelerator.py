@@ -22,7 +22,7 @@ from calibrate.provenance import study_header
 from calibrate.samplers.density import density_of
 from calibrate.samplers.smc import SMCOptions
 from calibrate.statistical_model import Data, Model
-from emulator.store import write_json
+from emulator.core.store import write_json
 from emulator.training.checkpoint import State
 from emulator.training.loop import Steps
 from emulator.training.plan import recipe

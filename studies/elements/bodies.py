@@ -7,7 +7,7 @@ import numpy as np
 
 import emulator as em
 from calibrate.observations.location import locate, locate_gradients
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.directions import from_nodes, of_elements, unit

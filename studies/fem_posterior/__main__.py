@@ -36,7 +36,7 @@ from studies.fem_posterior.shifts import PAIRED, SHIFT, certificates
 from studies.fem_posterior.tables import tables
 
 from calibrate.provenance import commit, study_header
-from emulator.store import write_json
+from emulator.core.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 0

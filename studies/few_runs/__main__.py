@@ -21,7 +21,7 @@ from studies.few_runs.meshes import mesh_case
 from studies.few_runs.tables import check, summary, tables
 
 from calibrate.provenance import study_header
-from emulator.store import write_json
+from emulator.core.store import write_json
 
 HERE = Path(__file__).parent
 RUNS = [1, 5, 10, 20, 30, 60, 120]

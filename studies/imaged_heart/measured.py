@@ -26,7 +26,7 @@ from studies.imaged_heart.image import fitted
 
 import calibrate as cal
 import emulator as em
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.energy import displacement_gradient
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.mesh import Mesh

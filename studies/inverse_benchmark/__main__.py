@@ -21,8 +21,8 @@ from studies.inverse_benchmark.figure import draw
 from studies.inverse_benchmark.problems import PROBLEMS, SEED, Problem, data_of, scene_of
 from studies.inverse_benchmark.score import score
 
-from emulator.errors import InputError
-from emulator.store import write_json
+from emulator.core.errors import InputError
+from emulator.core.store import write_json
 
 HERE = Path(__file__).parent
 NEEDS = {"emcee": "emcee", "pymc": "pymc"}  # packages of entries that are not ours

@@ -16,9 +16,9 @@ import numpy as np
 import calibrate as cal
 import emulator as em
 from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks, strains
+from emulator.core.store import write_json
 from emulator.fem import Simulator
 from emulator.scenes import Scene
-from emulator.store import write_json
 from emulator.surrogates.protocol import ForwardMap
 
 DATA = Path(__file__).parent / "data"

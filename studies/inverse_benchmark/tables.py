@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.errors import InputError
-from emulator.store import replacing
+from emulator.core.errors import InputError
+from emulator.core.store import replacing
 
 
 class Table(NamedTuple):

@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from studies.common.output import Case, Results
 from studies.common.processes import peak_gb, run
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.linear import mumps
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.suitesparse import SUITESPARSE, forget_factors

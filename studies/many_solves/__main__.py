@@ -18,11 +18,11 @@ from studies.common.output import save
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
+from emulator.core.store import write_json
 from emulator.fem import uniform
 from emulator.released.scenes import published_scene
 from emulator.scenes import Parameter, Scene
 from emulator.scenes.loads import CavityPressure
-from emulator.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 11

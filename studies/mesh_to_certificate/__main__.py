@@ -23,9 +23,9 @@ from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from calibrate.workflow import Run, make_data
 from emulator.catalogue import find_scene
+from emulator.core.store import write_json
 from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.io import write_mesh
-from emulator.store import write_json
 
 HERE = Path(__file__).parent
 SEED = 4

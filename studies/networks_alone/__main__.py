@@ -27,10 +27,10 @@ import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE
 from calibrate.provenance import study_header
+from emulator.core.store import write_json
 from emulator.error.comparison import case_errors, quantiles
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
-from emulator.store import write_json
 from emulator.surrogates import Architecture, Emulator, load, shipped
 from emulator.training import Plan, recipe
 from emulator.training.checkpoint import State

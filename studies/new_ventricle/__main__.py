@@ -19,12 +19,12 @@ from studies.common.processes import printed
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
+from emulator.core.store import write_json
 from emulator.error.comparison import evaluate
 from emulator.fem import run_campaign, sobol
 from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.scenes import Scene
-from emulator.store import write_json
 from emulator.training import recipe, train
 
 HERE = Path(__file__).parent

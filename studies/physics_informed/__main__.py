@@ -34,7 +34,7 @@ import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE, GREEN, ORANGE, PINK, VERMILION
 from calibrate.observations import parse_observation
-from emulator.errors import SolverError
+from emulator.core.errors import SolverError
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.scenes.loads import PublishedPressure

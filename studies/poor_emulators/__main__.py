@@ -27,10 +27,10 @@ from calibrate.observations import parse_observation
 from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import FEMLikelihood, with_error
+from emulator.core.store import write_json
 from emulator.fem import Simulator, design, run_campaign, sobol
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.scene import Scene
-from emulator.store import write_json
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.taylor import expand
 from emulator.training.discrepancy_stage import add_discrepancy

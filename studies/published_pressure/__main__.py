@@ -24,12 +24,12 @@ import calibrate as cal
 from calibrate.figures.drawing import pyplot
 from calibrate.observations import parse_observation
 from calibrate.provenance import study_header
+from emulator.core.store import write_json
 from emulator.fem import Runs, Simulator, sobol
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, Load, PublishedPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.store import write_json
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.taylor import expand
 from emulator.training.discrepancy_stage import add_discrepancy

@@ -25,9 +25,9 @@ import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.observations import parse_observation
 from calibrate.provenance import study_header
+from emulator.core.store import write_json
 from emulator.released.files import units
 from emulator.released.scenes import published_tests
-from emulator.store import write_json
 from emulator.surrogates import Emulator
 from emulator.training import recipe, train
 

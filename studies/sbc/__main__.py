@@ -21,7 +21,7 @@ from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import Model
 from calibrate.workflow import Run, by_fem, model_before_data
-from emulator.store import read_json, write_json
+from emulator.core.store import read_json, write_json
 
 HERE = Path(__file__).parent
 SEED = 11

@@ -30,7 +30,7 @@ from studies.sheep_myocardium.inference import (
 )
 from studies.sheep_myocardium.solver import finer, without_mesh
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 HERE = Path(__file__).parent
 SEED = 32

@@ -28,12 +28,12 @@ from studies.sheep_myocardium.process import Known, Process
 from threadpoolctl import threadpool_limits
 
 import emulator as em
-from emulator.errors import SolverError
+from emulator.core.errors import SolverError
+from emulator.core.machine import cores
 from emulator.fem.campaign.threads import at_once, in_order
 from emulator.fem.implicit import Quantity
 from emulator.fem.options import NewtonOptions
 from emulator.fem.support_force import SupportForce
-from emulator.machine import cores
 
 _AXES = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))  # along which each mode moves
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 MODES = ("FS", "FN", "FF", "SF", "SN", "SS", "NF", "NS", "NN")
 """In the files' order, three a cube: normal of the glued faces, direction of motion."""

@@ -21,7 +21,7 @@ from studies.sheep_myocardium.experiment import MODES
 from studies.sheep_myocardium.inference import Found, covariances, sample
 
 from calibrate.samplers.importance import smoothed
-from emulator.machine import cores
+from emulator.core.machine import cores
 
 _HEAVIEST = 0.7  # Pareto shape of the weights' tail
 _LEVELS = (0.05, 0.5, 0.95)

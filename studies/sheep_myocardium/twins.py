@@ -20,7 +20,7 @@ from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.held_out import replicated
 from studies.sheep_myocardium.inference import ORTHOTROPIC, parameters, sample
 
-from emulator.machine import cores
+from emulator.core.machine import cores
 
 _OUTER = (0.05, 0.95)
 _A_HEART = 6

@@ -19,7 +19,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.statistical_model.systematic import SystematicError
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.training.plan import recipe
 
 HERE = Path(__file__).parent

@@ -11,7 +11,7 @@ from pathlib import Path
 import c3d
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 SOURCE = "github.com/srl-ethz/diffPD_sim2real, commit 825e7b7, python/realbeam_experiments"
 LENGTH, WIDTH = 100.0, 30.0  # mm

@@ -22,7 +22,7 @@ from studies.stability.workers import study
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
 from emulator import Status
-from emulator.store import write_json
+from emulator.core.store import write_json
 
 HERE = Path(__file__).parent
 LIMIT = 120.0  # seconds for one case, compilation and judgement included

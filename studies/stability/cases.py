@@ -5,7 +5,7 @@ from typing import Any
 
 from studies.stability import emulation, solver
 
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 
 FAMILIES = (
     "nearly incompressible",

@@ -22,12 +22,12 @@ from studies.common.output import save
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
+from emulator.core.store import write_json
 from emulator.error.comparison import evaluate, field_errors, quantiles
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.geometry.cavity import Cavity
 from emulator.scenes import Scene
 from emulator.scenes.cavities import cavity_sets
-from emulator.store import write_json
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import Plan, pretrain, recipe, train
 from emulator.training.problem import Problem, prepare

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import emulator as em
+from emulator.core.store import save_arrays
 from emulator.error.comparison import case_errors, quantiles
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import design, sobol
 from emulator.scenes.left_ventricle import left_ventricle
 from emulator.scenes.nodes import all_nodes
 from emulator.scenes.scene import Scene
-from emulator.store import save_arrays
 from emulator.surrogates import Emulator, load
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.taylor import constant, expand_at

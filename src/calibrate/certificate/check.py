@@ -59,10 +59,10 @@ from calibrate.posterior import Posterior
 from calibrate.samplers.importance import effective, normalised
 from calibrate.samplers.registry import SAMPLERS
 from calibrate.statistical_model import FEMLikelihood
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.progress import counting
 from emulator.fem import Simulator
 from emulator.fem.campaign import executor
-from emulator.progress import counting
 
 _FEM_RUNS = 200
 _FEWEST = 25

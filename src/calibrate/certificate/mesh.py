@@ -30,11 +30,11 @@ from calibrate.certificate.runs import Runs
 from calibrate.observations import Observations
 from calibrate.observations.mesh_error import on_finer
 from calibrate.samplers.importance import effective, normalised
+from emulator.core.errors import InputError, SolverError
+from emulator.core.progress import counting
 from emulator.error.mesh_error import MeshError, MeshErrorEstimate, mesh_error
-from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once, in_order
-from emulator.progress import counting
 
 MOST_RUNS = 15
 _FEWEST = 4  # points

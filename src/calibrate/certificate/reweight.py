@@ -14,7 +14,7 @@ from calibrate.posterior import Posterior
 from calibrate.posterior.tree import make_tree
 from calibrate.samplers.importance import effective
 from calibrate.samplers.modes import MISSED_AT, MISSED_BY
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import Simulator
 
 _CHAINS = 4

@@ -16,7 +16,7 @@ import numpy as np
 from calibrate.certificate.evidence import Evidence, Figure, MeshChange, Physics, Sampling
 from calibrate.posterior.fit import SMALLEST_P, Misfit
 from calibrate.samplers.stopping import REFUSE_ABOVE_R_HAT, REFUSE_BELOW_ESS
-from emulator.shown import Shown
+from emulator.core.representation import TableRepr
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
 
@@ -46,7 +46,7 @@ class Finding(NamedTuple):
 
 
 @dataclass(frozen=True, repr=False)
-class Certificate(Shown):
+class Certificate(TableRepr):
     """Outcome of a check against FEM.
 
     verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use the reweighted one),
@@ -64,7 +64,7 @@ class Certificate(Shown):
         """Verdict, every finding, and what they cost."""
         return f"{self.verdict}: {'; '.join(self.findings)} ({self.evidence.physics.runs} FEM runs)"
 
-    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """Verdict, findings, and what they cost."""
         rows = [("verdict", str(self.verdict)), *(("finding", each) for each in self.findings)]
         return "Certificate", [*rows, ("FEM runs", str(self.evidence.physics.runs))]

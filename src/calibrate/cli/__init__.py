@@ -14,7 +14,7 @@ from calibrate.cli import commands
 from calibrate.cli.common import BAD_INPUT, FAILED, Parser, answer
 from calibrate.cli.compiled import VARIABLE, keep_programs
 from emulator import __version__
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 
 _NO_CACHE = "--no-cache"
 

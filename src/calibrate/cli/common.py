@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from emulator.errors import InputError
-from emulator.store import check_folder, to_json
+from emulator.core.errors import InputError
+from emulator.core.store import check_folder, to_json
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 

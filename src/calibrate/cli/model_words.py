@@ -11,7 +11,7 @@ from calibrate.cli.common import add_scene, assignments, scene_words
 from calibrate.cli.forward import add_forward, given_options
 from calibrate.cli.noise_words import discrepancy_words, noise_scale_words, noise_words
 from calibrate.places import absolute, emulator_place, prior_place, scene_place
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 if TYPE_CHECKING:
     from calibrate.workflow import Run

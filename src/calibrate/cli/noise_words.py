@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 NoiseWord = float | dict[str, Any]
 

@@ -40,7 +40,7 @@ from calibrate.observations import (
 )
 from calibrate.observations.present import check_some
 from calibrate.state_names import in_state, split
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
 Files = str | Path | Mapping[str, str]

@@ -24,8 +24,8 @@ import xarray as xr
 
 from calibrate.observations import Field
 from calibrate.state_names import in_state, split, states_of
-from emulator import store
-from emulator.errors import InputError
+from emulator.core import store
+from emulator.core.errors import InputError
 
 STATE = "state"
 """Column of a CSV file that names the load state of a row."""

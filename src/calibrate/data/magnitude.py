@@ -28,7 +28,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from calibrate.observations import Observation, Observations
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _DRAWS = 32  # predictions at draws of the prior
 PRIOR_DRAWS = 4096  # whose extremes stand for the ends of a parameter's prior

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from calibrate.observations import Observation, Observations, observations
-from emulator.errors import InputError, SolverError, check_seed
+from emulator.core.errors import InputError, SolverError, check_seed
 from emulator.fem import Simulator, Solution, Status, sobol
 from emulator.fem.energy import potential_energy
 from emulator.scenes.effects import Effect, Onto, effects_of, leave_out

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from emulator.core.errors import InputError, SolverError
 from emulator.error.comparison import Errors, case_errors
-from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign.reference import Reference, fem_reference, outside_reference
 from emulator.released.reference import published_reference

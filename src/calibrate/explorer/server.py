@@ -18,8 +18,8 @@ from plotly.offline import get_plotlyjs
 from calibrate.local_server import Handler, Server, listen
 from calibrate.observations.klotz import klotz_of
 from calibrate.observations.pressure_volume import PressureVolume, pressure_volume
+from emulator.core.errors import InputError
 from emulator.error.estimate import error_bar
-from emulator.errors import InputError
 from emulator.fem import Simulator, Status
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.facets import surface_mesh

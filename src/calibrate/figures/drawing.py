@@ -13,8 +13,8 @@ from calibrate.certificate import Certificate
 from calibrate.observations import DISPLACEMENT
 from calibrate.observations.points import DisplacementPoints
 from calibrate.posterior import Posterior
-from emulator.errors import InputError
-from emulator.store import replacing
+from emulator.core.errors import InputError
+from emulator.core.store import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

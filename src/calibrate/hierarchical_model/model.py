@@ -54,7 +54,7 @@ from calibrate.hierarchical_model.shared import (
 from calibrate.priors import log_normal, truncated, truncated_normal
 from calibrate.statistical_model import Data, Model
 from calibrate.statistical_model.prior_range import standardised
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 
 MEDIAN, SD, CHOLESKY, SCORES = "median", "sd", "correlation_cholesky", "scores"

@@ -18,9 +18,9 @@ from calibrate.posterior.diagnosis import diagnose
 from calibrate.posterior.summary import summary_of
 from calibrate.priors import Population, population_of_fits
 from calibrate.statistical_model import Model
-from emulator.errors import InputError, look_up
-from emulator.shown import Shown
-from emulator.store import write_netcdf
+from emulator.core.errors import InputError, look_up
+from emulator.core.representation import TableRepr
+from emulator.core.store import write_netcdf
 
 
 class Shrinkage(NamedTuple):
@@ -33,7 +33,7 @@ class Shrinkage(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Hierarchy(Shown):
+class Hierarchy(TableRepr):
     """Draws of a population, of its members, and of a member not seen.
 
     tree : DataTree. Group ``posterior`` has ``median`` and ``sd`` (chain, draw, parameter) of the
@@ -55,7 +55,7 @@ class Hierarchy(Shown):
         """Names of the members."""
         return tuple(map(str, np.asarray(self.tree["posterior"][MEMBER])))
 
-    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """Median and sd of the population by parameter, draws, and what is wrong with them."""
         table = self.summary()
         rows = [

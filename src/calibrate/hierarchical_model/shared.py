@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from calibrate.state_names import split
 from calibrate.statistical_model import Model
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 
 

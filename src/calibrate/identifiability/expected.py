@@ -41,7 +41,7 @@ from calibrate.identifiability.fisher import information_at
 from calibrate.statistical_model import Model
 from calibrate.statistical_model.error_modes import ErrorModes
 from calibrate.statistical_model.shared_errors import errors_of_data
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _DATA_SETS = 64
 _FROM_PRIOR, _AROUND = 3072, 512  # draws of the prior, shared, and of Student's t, a data set

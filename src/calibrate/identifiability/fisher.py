@@ -31,7 +31,7 @@ from calibrate.noise.information import information_about_means
 from calibrate.observations import Observations
 from calibrate.statistical_model import Model
 from calibrate.statistical_model.error_modes import ErrorModes
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 At = Callable[[jax.Array, ErrorModes | None, jax.Array], tuple[jax.Array, jax.Array]]
 """From x (q,), the errors that numbers share, if any, and the unknowns (m,) of these: F (q, q), and

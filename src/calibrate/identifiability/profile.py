@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from calibrate.posterior import Posterior
 from calibrate.priors import bounds
 from calibrate.samplers import density_of
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 DROP_95 = 1.92
 _BOUND = 12.0  # of the unconstrained coordinate of an interval: within 1e-5 of its ends

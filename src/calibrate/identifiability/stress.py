@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.posterior import Posterior
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 from emulator.fem.energy import point_energy
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from typing import Any
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 def describe(noise: Any) -> dict[str, Any]:

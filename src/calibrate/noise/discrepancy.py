@@ -25,7 +25,7 @@ from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise, Sites
 from calibrate.noise.scale import Scale
 from calibrate.noise.spatial_noise import SpatialNoise
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 DISCREPANCY_SD = "discrepancy_sd"
 

@@ -10,7 +10,7 @@ from calibrate.noise.discrepancy import DiscrepancyNoise
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise
 from calibrate.noise.student_t import StudentTNoise
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 
 NOISES: dict[str, type[Noise]] = {
     kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise, DiscrepancyNoise)

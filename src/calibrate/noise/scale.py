@@ -9,7 +9,7 @@ from numbers import Real
 import jax
 import numpyro.distributions as dist
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _PLAUSIBLE = 3.0  # half-normal scales, which hold 99.7 % of its mass
 

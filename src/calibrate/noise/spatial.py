@@ -42,7 +42,7 @@ from scipy.spatial.distance import cdist
 
 from calibrate.noise.protocol import Sites
 from calibrate.noise.scale import check_positive
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 
 KERNELS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "matern32": lambda s: (1.0 + np.sqrt(3.0) * s) * np.exp(-np.sqrt(3.0) * s),

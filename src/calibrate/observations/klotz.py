@@ -43,7 +43,7 @@ from jax.typing import ArrayLike
 from calibrate.noise.protocol import Noise
 from calibrate.observations.scalar import Scalar
 from calibrate.observations.volume import CavityVolume
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.cavities import inflated_cavity
 from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.scenes.scene import Scene

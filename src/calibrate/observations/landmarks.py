@@ -20,7 +20,7 @@ from calibrate.observations.points import (
     count_of,
 )
 from calibrate.observations.protocol import Field
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import shapes_at
 from emulator.scenes.scene import Scene
 

@@ -20,7 +20,7 @@ from calibrate.noise.gaussian import GaussianNoise
 from calibrate.observations.location import locate
 from calibrate.observations.protocol import LENGTH_UNITS
 from calibrate.observations.scalar import Scalar
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.nodes import check_nodes
 from emulator.scenes.scene import Scene
 

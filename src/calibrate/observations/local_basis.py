@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.directions import unit
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.fibres import circumferential, depth

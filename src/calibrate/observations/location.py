@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from skfem import MeshTet
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import shapes_at
 from emulator.geometry.mesh import Mesh
 

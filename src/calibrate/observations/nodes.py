@@ -17,7 +17,7 @@ from calibrate.observations.points import (
     count_of,
 )
 from calibrate.observations.protocol import Field
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.nodes import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrate.noise.protocol import Noise
 from calibrate.observations.scalar import Scalar
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.scenes.scene import Scene
 

@@ -10,7 +10,7 @@ import numpy as np
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Sites
 from calibrate.observations.protocol import LENGTH_UNITS, Field, Labels
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 DISPLACEMENT = "displacement"
 DISPLACEMENT_FIELD = Field(DISPLACEMENT, ("ux", "uy", "uz"))

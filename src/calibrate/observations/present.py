@@ -22,7 +22,7 @@ import numpy as np
 from calibrate.noise.protocol import Noise, Sites
 from calibrate.observations.protocol import Labels, Observation
 from calibrate.observations.several import Observations
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 ENTRIES = "present"
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.noise.protocol import Noise
 from calibrate.observations.scalar import Scalar
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.support_force import SupportForce
 from emulator.scenes.loads.force import MN_PER_N
 from emulator.scenes.scene import Scene

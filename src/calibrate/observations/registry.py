@@ -23,7 +23,7 @@ from calibrate.observations.strain import Strain
 from calibrate.observations.surface import SurfacePoints
 from calibrate.observations.volume import CavityVolume
 from calibrate.state_names import in_state, split
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 from emulator.scenes.scene import Scene
 
 # In this order they look for their columns in a file: `node` decides before `x,y,z`.

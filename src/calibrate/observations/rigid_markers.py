@@ -27,7 +27,7 @@ import numpy as np
 
 from calibrate.observations.points import DisplacementPoints, check_distinct, check_table
 from calibrate.observations.protocol import Field
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import facet_rule
 from emulator.geometry.facets import nodal_areas
 from emulator.scenes.scene import Scene

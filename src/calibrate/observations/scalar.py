@@ -10,7 +10,7 @@ import numpy as np
 
 from calibrate.noise.protocol import Sites
 from calibrate.observations.protocol import Field, Labels
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
 

@@ -21,7 +21,7 @@ from calibrate.observations.local_basis import COMPONENTS, local_directions
 from calibrate.observations.points import check_table
 from calibrate.observations.protocol import Field, Labels
 from calibrate.observations.strain_components import Samples, Strains, columns_of, components_in
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.segments import SEGMENTS, aha_segments
 from emulator.scenes.scene import Scene
 

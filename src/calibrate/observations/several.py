@@ -14,7 +14,7 @@ import numpy as np
 
 from calibrate.observations.protocol import Observation
 from calibrate.state_names import split, states_of
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from calibrate.observations.location import locate_gradients
 from calibrate.observations.points import check_distinct, check_table, count_of
 from calibrate.observations.protocol import Field, Labels
 from calibrate.observations.strain_components import Samples, Strains, columns_of, components_in
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.directions import unit
 from emulator.geometry.discretisation import from_quadrature_points
 from emulator.scenes.scene import Scene

@@ -25,7 +25,7 @@ import numpy as np
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.observations.local_basis import COMPONENTS
 from calibrate.observations.points import check_values
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _CRUSHED = -0.5  # a stretch of 0
 

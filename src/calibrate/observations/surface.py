@@ -28,7 +28,7 @@ from calibrate.noise.protocol import Sites
 from calibrate.observations.points import check_table, check_values, count_of
 from calibrate.observations.protocol import LENGTH_UNITS, Field, Labels
 from calibrate.observations.surface_location import facet_shapes, foot_on
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
 _SLACK = 1e-3  # of the body's size: how far from the surface its points may lie

@@ -36,7 +36,7 @@ import numpy as np
 import xarray as xr
 
 from calibrate.arviz import stats
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 SURE = 2.0  # standard errors of a difference that is taken for one
 FEW = 4.0  # elpd: below, normal errors of a difference are not to be relied on (Sivula et al. 2020)

@@ -22,7 +22,7 @@ import numpy as np
 from calibrate.observations.klotz import PRESSURE_SCATTER, Klotz
 from calibrate.observations.pressure_volume import pressure_volume
 from calibrate.statistical_model import Model
-from emulator.errors import InputError, check_seed
+from emulator.core.errors import InputError, check_seed
 
 DRAWS = 200
 

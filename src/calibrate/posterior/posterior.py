@@ -27,14 +27,14 @@ from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.modes import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, FEMLikelihood, Model
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.representation import TableRepr
+from emulator.core.store import write_netcdf
 from emulator.fem import Simulator
-from emulator.shown import Shown
-from emulator.store import write_netcdf
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Posterior(Shown):
+class Posterior(TableRepr):
     """Draws, with the model and the data they came from.
 
     tree : DataTree with groups posterior, sample_stats, observed_data, constant_data; with
@@ -48,7 +48,7 @@ class Posterior(Shown):
     model: Model
     data: Data
 
-    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """Mean and sd of every unknown, draws, and what is wrong with them."""
         table, sizes = self.summary(), self.tree["posterior"].sizes
         rows = [(name, f"{row['mean']:.4g} +- {row['sd']:.2g}") for name, row in table.items()]

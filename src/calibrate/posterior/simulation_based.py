@@ -31,9 +31,9 @@ from calibrate.arviz import ecdf_utils
 from calibrate.posterior import predictions
 from calibrate.posterior.posterior import sample
 from calibrate.statistical_model import Model
-from emulator.errors import InputError, check_seed
+from emulator.core.errors import InputError, check_seed
+from emulator.core.progress import counting
 from emulator.fem.campaign import executor, in_process
-from emulator.progress import counting
 from emulator.surrogates.protocol import solved_by
 
 LOG_LIKELIHOOD = "log likelihood"

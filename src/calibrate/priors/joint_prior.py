@@ -27,7 +27,7 @@ from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _EDGE = 1e-15  # mass beyond which scores end, at 7.9 sd: the ends of a range have infinite ones
 

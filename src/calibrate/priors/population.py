@@ -25,8 +25,8 @@ import numpy as np
 
 from calibrate.priors.joint_prior import Dependence, JointPrior
 from calibrate.priors.priors import log_normal, truncated
-from emulator import schema
-from emulator.errors import InputError
+from emulator.core import schema
+from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
 BOX = "box"

@@ -13,7 +13,7 @@ from numpyro.distributions import constraints
 
 from calibrate.priors.joint_prior import JointPrior, dependence_of
 from calibrate.state_names import split
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
 Prior = Mapping[str, dist.Distribution]

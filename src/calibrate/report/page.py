@@ -22,7 +22,7 @@ from calibrate.report.body import body_figure
 from calibrate.workflow import Run, holds_population, read_posterior, simulator_of
 from calibrate.workflow.cohort import read_cohort
 from calibrate.workflow.workflow import CERTIFICATE, REPORT
-from emulator.store import read_json, replacing
+from emulator.core.store import read_json, replacing
 
 _MOVED = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
 

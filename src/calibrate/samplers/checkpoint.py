@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
-from emulator.store import named_leaves, read_arrays, save_arrays
+from emulator.core.errors import InputError
+from emulator.core.store import named_leaves, read_arrays, save_arrays
 
 FORMAT = "1"  # of the states; a file of another format is refused
 _LONG = 60  # characters of a value that a message leaves out

@@ -39,8 +39,8 @@ from calibrate.samplers.protocol import Context, Draws
 from calibrate.samplers.run import Chains, compile_chains, join
 from calibrate.samplers.stopping import converged
 from calibrate.statistical_model import Data
-from emulator.errors import InputError, SolverError
-from emulator.progress import counting
+from emulator.core.errors import InputError, SolverError
+from emulator.core.progress import counting
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import potential_energy
 
 from calibrate.statistical_model import Data, Model
+from emulator.core.machine import cores
 from emulator.fem.campaign import at_once
-from emulator.machine import cores
 from emulator.surrogates.fem import FEMForward
 from emulator.surrogates.protocol import ForwardMap
 

@@ -28,7 +28,7 @@ from calibrate.samplers.modes import Modes, find_modes, missed_mode, precision_a
 from calibrate.samplers.options import check_counts
 from calibrate.samplers.protocol import Context, Draws
 from calibrate.statistical_model import Data
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 
 _AWAY = 0.05  # sd that the optimiser may stop from the mode
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from calibrate.samplers.options import ChainOptions, check_target_accept
 from calibrate.samplers.protocol import Kernel
 from calibrate.samplers.run import ChainSampler
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 # Parts of the warm-up: step size, then the metric, then the step size again.
 _STEP_SIZE, _METRIC = 0.25, 0.5

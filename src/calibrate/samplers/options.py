@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 from calibrate.samplers.stopping import ENOUGH_ESS, RUN_UNTIL_R_HAT
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 RANDOM, PATHFINDER = "random", "pathfinder"
 

@@ -13,7 +13,7 @@ from calibrate.samplers.mclmc import MCLMC
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Sampler
 from calibrate.samplers.smc import SMC
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 
 _ALL: tuple[Sampler, ...] = (
     NUTS,

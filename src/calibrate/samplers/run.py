@@ -29,8 +29,8 @@ from calibrate.samplers.options import PATHFINDER, ChainOptions
 from calibrate.samplers.pathfinder import pathfinder_start
 from calibrate.samplers.protocol import Context, Draws, Kernel
 from calibrate.samplers.stopping import converged
-from emulator.errors import SolverError
-from emulator.progress import counting
+from emulator.core.errors import SolverError
+from emulator.core.progress import counting
 
 _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere

@@ -33,8 +33,8 @@ from calibrate.samplers.density import Density
 from calibrate.samplers.options import check_counts, check_target_accept
 from calibrate.samplers.protocol import Context, Draws
 from calibrate.statistical_model import Data
-from emulator.errors import InputError, SolverError
-from emulator.progress import counting
+from emulator.core.errors import InputError, SolverError
+from emulator.core.progress import counting
 
 # Log likelihood of particles where the forward map has no answer. Finite, because its product with
 # a temperature of 0 must be 0; so low that such particles die out at the first step.

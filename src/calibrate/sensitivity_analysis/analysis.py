@@ -35,7 +35,7 @@ from SALib.sample import sobol as sobol_design
 from scipy.stats import norm, qmc
 
 from calibrate.sensitivity_analysis.factors import Factors
-from emulator.errors import InputError, check_seed
+from emulator.core.errors import InputError, check_seed
 
 METHODS = ("sobol", "morris", "derivatives")
 """Variance-based indices, screening, and what exact derivatives say."""

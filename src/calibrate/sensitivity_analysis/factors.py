@@ -13,7 +13,7 @@ import numpy as np
 import numpyro.distributions as dist
 
 from calibrate.priors import Prior, bisect, bounds, dependence_of
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _EDGE = 1e-9  # of the unit interval; beyond, a distribution without ends has infinite quantiles
 

@@ -15,7 +15,7 @@ from calibrate.priors import Prior, box_prior
 from calibrate.sensitivity_analysis.analysis import Function, analyse
 from calibrate.sensitivity_analysis.factors import Factors, check_independent, densities, quantiles
 from calibrate.statistical_model.prior_range import fit_to
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign import executor, in_process
 from emulator.surrogates.protocol import ForwardMap, solved_by
 

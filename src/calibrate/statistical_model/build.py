@@ -10,7 +10,7 @@ from calibrate.priors import Prior, dependence_of
 from calibrate.statistical_model.load_states import load_states
 from calibrate.statistical_model.model import Model, at_sites
 from calibrate.statistical_model.prior_range import check_known, fit_to
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.protocol import ForwardMap
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from calibrate.statistical_model.model import Data, Model
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Executor, Solver, in_process, solve_rows
 from emulator.fem.energy import volume_ratio

@@ -14,11 +14,11 @@ from calibrate.noise.information import information_about_means
 from calibrate.observations.mesh_error import on_finer
 from calibrate.statistical_model.approximation_error import fit
 from calibrate.statistical_model.model import Data, Model
+from emulator.core.errors import InputError, SolverError
+from emulator.core.progress import counting
 from emulator.error.mesh_error import mesh_error
-from emulator.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Solver, solve_rows
-from emulator.progress import counting
 
 FEWEST = 8
 

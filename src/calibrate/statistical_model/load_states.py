@@ -23,7 +23,7 @@ import numpyro.distributions as dist
 
 from calibrate.priors import box_prior
 from calibrate.state_names import in_state, split
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
 

@@ -34,7 +34,7 @@ from calibrate.statistical_model.error_modes import ErrorModes
 from calibrate.statistical_model.load_states import LoadStates
 from calibrate.statistical_model.prior_range import standardised
 from calibrate.whole_numpyro import mend_numpyro
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.protocol import ForwardMap, Prediction
 
 mend_numpyro()

@@ -22,7 +22,7 @@ from numpyro.distributions.transforms import AffineTransform, ComposeTransform, 
 from calibrate.priors import Prior, bisect, bounds, truncated
 from calibrate.state_names import split
 from calibrate.statistical_model.load_states import LoadStates
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap
 

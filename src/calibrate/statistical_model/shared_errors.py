@@ -29,8 +29,8 @@ from calibrate.statistical_model.systematic import (
     rigid_motion,
     systematic_error,
 )
-from emulator import schema
-from emulator.errors import InputError, look_up
+from emulator.core import schema
+from emulator.core.errors import InputError, look_up
 
 CURVE_SHARE = "curve_share"
 Vector = tuple[float, float, float]

@@ -27,7 +27,7 @@ from calibrate.noise.information import information_about_means
 from calibrate.statistical_model.error_modes import ErrorModes, Means, diagonal
 from calibrate.statistical_model.model import Model
 from calibrate.statistical_model.varying_error import VaryingError
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _AXES = "xyz"
 _VARYING = "varying_"  # before names of arrays

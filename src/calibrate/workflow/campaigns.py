@@ -12,12 +12,12 @@ import xarray as xr
 import zarr
 
 from calibrate.provenance import versions
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
+from emulator.core.progress import counting
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.campaign import Executor, Neighbours, Solver, executor, solve_rows
 from emulator.fem.campaign.designs import DESIGNS
 from emulator.fem.campaign.zarr_rows import Question, ZarrRows, make_store, writing
-from emulator.progress import counting
 from emulator.scenes.scene import Scene
 
 

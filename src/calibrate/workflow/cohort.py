@@ -44,10 +44,10 @@ from calibrate.workflow.workflow import (
     read_posterior,
     with_known,
 )
-from emulator import schema
 from emulator.catalogue import find_scene
-from emulator.errors import InputError
-from emulator.store import exclusive, read_json, write_json
+from emulator.core import schema
+from emulator.core.errors import InputError
+from emulator.core.store import exclusive, read_json, write_json
 
 SHRINKAGE = "shrinkage.png"
 NOT_CERTIFIED = "not certified"  # the verdict on a member that FEM has not checked

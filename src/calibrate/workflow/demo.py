@@ -17,7 +17,7 @@ from calibrate.figures.ventricle import ventricle_figure
 from calibrate.identifiability import identify
 from calibrate.workflow.run import Run
 from calibrate.workflow.workflow import certify_and_keep, infer, report, simulator_of
-from emulator.store import check_folder
+from emulator.core.store import check_folder
 
 # Neither a theta of the training runs nor the centre of the Taylor series.
 DEMO = Run(

@@ -54,10 +54,10 @@ from typing import Any
 from calibrate.places import absolute, emulator_place, prior_place, scene_place
 from calibrate.workflow.run import Run
 from calibrate.workflow.workflow import MEMBERS, check_names
-from emulator import schema
-from emulator.errors import InputError
-from emulator.line_index import Path as Entry
-from emulator.line_index import toml_lines
+from emulator.core import schema
+from emulator.core.errors import InputError
+from emulator.core.line_index import Path as Entry
+from emulator.core.line_index import toml_lines
 from emulator.surrogates.registry import forward_kind
 
 POPULATION = "population"

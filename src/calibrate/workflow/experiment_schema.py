@@ -18,8 +18,8 @@ from calibrate.samplers import SAMPLERS
 from calibrate.statistical_model.shared_errors import SHARED_ERRORS
 from calibrate.workflow.experiment import MEMBERS, POPULATION, Cohort, Shared
 from calibrate.workflow.run import Run
-from emulator.docstrings import documented
-from emulator.schema import OneOf, Table, json_schema, table_of
+from emulator.core.docstrings import documented
+from emulator.core.schema import OneOf, Table, json_schema, table_of
 from emulator.surrogates.registry import FORWARD_MAPS, known_options
 
 

@@ -20,8 +20,8 @@ from calibrate.posterior import Posterior
 from calibrate.statistical_model.approximation_error import ApproximationError
 from calibrate.statistical_model.error_modes import ErrorModes
 from calibrate.statistical_model.systematic import SystematicError
-from emulator.errors import InputError
-from emulator.store import read_arrays, save_arrays
+from emulator.core.errors import InputError
+from emulator.core.store import read_arrays, save_arrays
 from emulator.surrogates.protocol import ForwardMap
 
 # Paths of scene and emulator may change when a folder moves; their fingerprints may not.

@@ -11,7 +11,7 @@ from calibrate.observations import DISPLACEMENT, Observations
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
 from calibrate.statistical_model.shared_errors import shared_error
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates import registry
 
 

@@ -34,12 +34,12 @@ from calibrate.statistical_model.load_states import known_thetas, load_states
 from calibrate.statistical_model.shared_errors import with_shared_errors
 from calibrate.workflow.restore import check_forward, check_run, keep_error, restore_error
 from calibrate.workflow.run import Run
-from emulator import schema
 from emulator.catalogue import find_scene
-from emulator.errors import InputError
+from emulator.core import schema
+from emulator.core.errors import InputError
+from emulator.core.store import exclusive, read_json, write_json
 from emulator.fem import NewtonOptions, Simulator
 from emulator.scenes.scene import Scene
-from emulator.store import exclusive, read_json, write_json
 from emulator.surrogates import registry
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.kind import Ingredients

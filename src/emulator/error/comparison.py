@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import gaussian_kde
 
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.energy import displacement_gradient, potential_energy
 from emulator.geometry.cavity import Cavity
 from emulator.scenes.cavities import cavity_sets

@@ -48,6 +48,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.errors import InputError
 from emulator.error.guard import Guard, guard
 from emulator.error.step import (
     Distance,
@@ -56,7 +57,6 @@ from emulator.error.step import (
     newton_distance,
     sound_state,
 )
-from emulator.errors import InputError
 from emulator.fem.loop import cond, jit
 from emulator.fem.simulator import Simulator
 from emulator.fem.system import System

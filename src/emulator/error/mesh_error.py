@@ -28,8 +28,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.errors import InputError
 from emulator.error.step import Distance, newton_distance
-from emulator.errors import InputError
 from emulator.fem.linear.suitesparse import forget_factors
 from emulator.fem.loop import jit
 from emulator.fem.simulator import Simulator

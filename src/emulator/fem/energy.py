@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Blocks
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain, determinant

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.energy import displacement_gradient
 from emulator.fem.loaded_point import carried_back
 from emulator.fem.system import System

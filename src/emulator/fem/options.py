@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 @dataclass(frozen=True)

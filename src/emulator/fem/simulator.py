@@ -13,8 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator._precision import require_float64
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
+from emulator.core.machine import require_cpu
+from emulator.core.precision import require_float64
+from emulator.core.representation import TableRepr
 from emulator.fem.implicit import (
     Equations,
     Found,
@@ -30,13 +32,11 @@ from emulator.fem.options import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
 from emulator.fem.system import System
-from emulator.machine import require_cpu
 from emulator.scenes.scene import Scene
-from emulator.shown import Shown
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Simulator(Shown):
+class Simulator(TableRepr):
     """Finite elements for a scene; use it alone, under ``jit``, ``vmap`` or ``grad``.
 
     Parameters
@@ -62,10 +62,10 @@ class Simulator(Shown):
         if self.scene.loaded_by:
             self._loaded.unloader  # noqa: B018 - what cannot be unloaded is named first
 
-    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """What it simulates and how."""
         unknowns = int((~self.scene.held).sum())
-        _, rows = self.scene.shown()
+        _, rows = self.scene.summary_rows()
         how = [("unknowns", str(unknowns)), ("factorisation", self.factorisation)]
         return f"Simulator of '{self.scene.name}'", [*rows, *how]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from emulator.errors import SolverError
+from emulator.core.errors import SolverError
 
 
 class Status(IntEnum):
@@ -65,7 +65,7 @@ class Solution(NamedTuple):
         return self.status == Status.CONVERGED
 
     def require_converged(self, what: str = "simulation") -> Solution:
-        """The solution itself, or :class:`~emulator.errors.SolverError` naming the failure."""
+        """The solution itself, or :class:`~emulator.core.errors.SolverError` naming the failure."""
         status = np.atleast_1d(np.asarray(self.status)).ravel()
         failed = np.flatnonzero(status != Status.CONVERGED)
         if failed.size:

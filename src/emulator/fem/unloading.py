@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator._precision import require_float64
-from emulator.errors import InputError, SolverError, look_up
+from emulator.core.errors import InputError, SolverError, look_up
+from emulator.core.precision import require_float64
 from emulator.fem.balance import relative_residual
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.energy import require_rest
@@ -80,7 +80,7 @@ class Unloaded:
         return at_rest(self.loaded, self.require_converged().displacement)
 
     def require_converged(self, what: str = "unloading") -> Unloaded:
-        """Itself, or :class:`~emulator.errors.SolverError` naming the failure."""
+        """Itself, or :class:`~emulator.core.errors.SolverError` naming the failure."""
         Solution(*(getattr(self, name) for name in Solution._fields)).require_converged(what)
         return self
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import quadrature_points, shapes_at
 from emulator.geometry.mesh import Mesh, frozen_array
 

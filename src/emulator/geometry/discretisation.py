@@ -11,7 +11,7 @@ from scipy.sparse import csc_matrix
 from skfem import ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2
 from skfem.quadrature import get_quadrature
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh, frozen_array
 
 

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.linalg import spsolve
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.directions import unit
 from emulator.geometry.discretisation import Discretisation, discretise
 from emulator.geometry.mesh import Mesh

@@ -10,7 +10,7 @@ from typing import Any
 import meshio
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 # VTK's numbers of cell types, and meshio's names.
 _VTK = {1: "vertex", 3: "line", 5: "triangle", 10: "tetra", 22: "triangle6", 24: "tetra10"}

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import meshio
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import boundary_facets
 

@@ -12,7 +12,8 @@ from typing import Any
 import meshio
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.store import replacing
 from emulator.geometry.directions import across, from_elements, from_nodes
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.foreign import as_meshio
@@ -20,7 +21,6 @@ from emulator.geometry.groups import MARK, own_node_sets, read_sets
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.tetrahedra import coincident, orient
-from emulator.store import replacing
 
 # meshio's cells by the elements' order: (tetrahedron, triangle).
 _CELLS = {1: ("tetra", "triangle"), 2: ("tetra10", "triangle6")}

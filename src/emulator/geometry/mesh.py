@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 from skfem import MeshTet
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.tetrahedra import boundary_facets, folded, signed_volumes
 
 # A tetrahedron is taken for flat when its volume is below this fraction of its longest edge cubed;

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 _TRIANGLE, _TETRAHEDRON = 2, 4  # Gmsh's numbers of element types
 

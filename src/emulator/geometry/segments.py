@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.fibres import Axis
 from emulator.geometry.mesh import Mesh
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.geometry.tetrahedra import coincident
 

@@ -21,7 +21,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.facets import enclosed_volume, openings
 from emulator.geometry.io import read_cells
 

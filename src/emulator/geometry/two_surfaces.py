@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 from emulator.geometry.cavity import MM3_PER_ML, Cavity
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.flattening import Flattened

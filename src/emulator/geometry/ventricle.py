@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.cavity import MM3_PER_ML, Cavity
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.fibres import nodal_depth

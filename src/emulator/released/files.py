@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import boundary_facets, orient
 

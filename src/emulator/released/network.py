@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.released.files import folder_of, read_array, units
 
 _PICKLE = "emulationResults/trainedParameters/{model}/trainedNetworkParams.pkl"

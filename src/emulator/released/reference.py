@@ -7,7 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign import run_campaign
 from emulator.fem.campaign.reference import Reference
 from emulator.fem.simulator import Simulator

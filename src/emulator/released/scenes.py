@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 from emulator.mechanics.laws import find_law
 from emulator.released.files import (
     PRESSURE_SURFACE,

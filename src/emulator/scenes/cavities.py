@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.cavity import Cavity, encloses
 from emulator.scenes.scene import Scene
 

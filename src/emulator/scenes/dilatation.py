@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 Dilatation = Literal["pointwise", "mean", "patch"]
 """None, those of an element, or those of a patch of linear ones."""

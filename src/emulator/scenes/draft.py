@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.errors import InputError, look_up
+from emulator.core.errors import InputError, look_up
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.io import Body, read_body, write_mesh
 from emulator.geometry.mesh import Mesh

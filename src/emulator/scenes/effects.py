@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.directions import of_elements
 from emulator.geometry.quadratic import corner_parents, to_linear
 from emulator.scenes.fibre_angles import that_turn

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.directions import checked_directions
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh, frozen_array

@@ -11,7 +11,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.fibres import Axis, Depth, biventricular_depth, depth, turned
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.fibre_angles import FibreAngles, across_wall, without_parameters

@@ -163,17 +163,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.line_index import toml_lines
 from emulator.geometry.mesh import Mesh
-from emulator.line_index import toml_lines
 from emulator.mechanics.laws import Law, find_law
 from emulator.scenes.file_bodies import one_body, several_bodies
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
+    from emulator.core.schema import Source
     from emulator.scenes.file_models import Plane, SceneFile
-    from emulator.schema import Source
 
 Parts = tuple[Mesh, np.ndarray | None, np.ndarray | None, np.ndarray | None]
 
@@ -190,8 +190,8 @@ def read_scene(path: str | Path) -> Scene:
     InputError
         One line naming the file, its line and key, what was found and what would be right.
     """
+    from emulator.core.schema import Source, parse
     from emulator.scenes.file_models import SceneFile
-    from emulator.schema import Source, parse
 
     path = Path(path)
     if not path.is_file():

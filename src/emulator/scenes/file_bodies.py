@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
@@ -18,8 +18,8 @@ from emulator.mechanics.laws import Law
 from emulator.scenes.owners import directions_read
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
+    from emulator.core.schema import Source
     from emulator.scenes.file_models import SceneFile
-    from emulator.schema import Source
 
 Regions = np.ndarray | None
 

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from emulator.core.schema import OneOf, Table
 from emulator.scenes.fibre_rules import FIBRE_RULES, FibreRule
 from emulator.scenes.loads import LOADS, Load
 from emulator.scenes.supports import SUPPORTS, BoundaryCondition
-from emulator.schema import OneOf, Table
 
 
 class Plane(Table):

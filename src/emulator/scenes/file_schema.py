@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from emulator.core.schema import json_schema
 from emulator.mechanics.laws import LAWS, Law
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.file_models import SceneFile
-from emulator.schema import json_schema
 
 
 def scene_schema() -> dict[str, Any]:

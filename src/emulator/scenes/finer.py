@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.directions import across
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.fibre_angles import FibreAngles

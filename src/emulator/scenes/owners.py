@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.mechanics.laws import Law
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.fibre_angles import FibreAngles

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.mesh import frozen_array
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import Quantity, number

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 def resolved(sizes: Mapping[int, Mapping[str, Any]], order: int, **given: Any) -> dict[str, Any]:

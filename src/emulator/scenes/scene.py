@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.representation import TableRepr
 from emulator.geometry.directions import check_across, checked_directions
 from emulator.geometry.discretisation import (
     Blocks,
@@ -44,11 +45,10 @@ from emulator.scenes.regions import Tissue, checked_regions, tissue_of
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
 from emulator.scenes.supports.dirichlet import Prescribed, prescribe
 from emulator.scenes.supports.rigid import check_motions
-from emulator.shown import Shown
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Scene(Shown):
+class Scene(TableRepr):
     """Geometry, law, loads, supports and parameters of one problem.
 
     Frozen, arrays included, so that compiled functions of it never go stale.
@@ -318,7 +318,7 @@ class Scene(Shown):
         held = self.held if nodes is None else self.held[nodes]
         return jnp.where(held, level * self.held_at(theta, nodes), u)
 
-    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """Name, mesh, law, loads, supports, theta."""
         mesh = self.mesh
         order = "linear" if mesh.order == 1 else "quadratic"

@@ -26,9 +26,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.representation import TableRepr
 from emulator.scenes.nodes import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
-from emulator.shown import Shown
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network.family import FamilyNetwork
@@ -51,7 +51,7 @@ them."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Emulator(Shown):
+class Emulator(TableRepr):
     """An emulator of a scene; without any part it predicts no displacement where free.
 
     Parameters
@@ -75,9 +75,9 @@ class Emulator(Shown):
     discrepancy: Discrepancy | None = None
     record: Mapping[str, Any] = field(default_factory=dict)
 
-    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """What it emulates, what it is made of, how it was trained."""
-        _, rows = self.scene.shown()
+        _, rows = self.scene.summary_rows()
         plan = self.record.get("plan", {})
         made = [("parts", " + ".join(self.parts) or "none")]
         if plan:

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.store import inside
 from emulator.scenes.finer import Finer
 from emulator.scenes.scene import Scene
-from emulator.store import inside
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.part import CachedPart, Part, widened
 from emulator.surrogates.polynomial import Polynomial

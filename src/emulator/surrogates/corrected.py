@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.energy import volume_ratio
 from emulator.fem.simulator import Simulator
 from emulator.fem.system import System

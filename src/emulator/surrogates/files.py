@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from emulator.catalogue import scene_from_origin
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.scenes.scene import Scene
-from emulator.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.surrogates.additive import PARTS, Emulator
 from emulator.surrogates.kind import ForwardKind, Ingredients, Options
 from emulator.surrogates.protocol import ForwardMap

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import Extrapolated, ForwardMap

@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator._precision import require_float64
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.precision import require_float64
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import sobol
 from emulator.scenes.nodes import all_nodes

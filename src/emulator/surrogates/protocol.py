@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign import Executor
 from emulator.scenes.nodes import check_nodes
 from emulator.scenes.scene import Scene

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from emulator.errors import InputError, look_up
-from emulator.store import read_arrays, save_arrays
+from emulator.core.errors import InputError, look_up
+from emulator.core.store import read_arrays, save_arrays
 from emulator.surrogates.corrected import CORRECTED
 from emulator.surrogates.fem import FEM
 from emulator.surrogates.files import EMULATOR

@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.energy import potential_energy
 from emulator.geometry.mesh import frozen_array
 from emulator.released.files import units

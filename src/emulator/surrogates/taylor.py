@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.implicit import Equations
 from emulator.fem.simulator import Simulator
 from emulator.fem.unloading import Unloader

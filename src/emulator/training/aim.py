@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.training.checkpoint import State
 from emulator.training.network import NetworkTraining
 from emulator.training.plan import Plan

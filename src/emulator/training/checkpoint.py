@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
-from emulator.store import fill_tree, named_leaves, read_arrays, save_arrays
+from emulator.core.errors import InputError
+from emulator.core.store import fill_tree, named_leaves, read_arrays, save_arrays
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.plan import Plan
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.discrepancy import fit_discrepancy

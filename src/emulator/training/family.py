@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from emulator.errors import InputError
-from emulator.progress import counting
+from emulator.core.errors import InputError
+from emulator.core.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.pignn import Architecture

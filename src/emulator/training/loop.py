@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import SolverError
-from emulator.progress import counting
+from emulator.core.errors import SolverError
+from emulator.core.progress import counting
 from emulator.training.checkpoint import Session, State
 from emulator.training.network import NetworkTraining
 

@@ -48,8 +48,8 @@ import scipy.linalg
 import scipy.sparse as sp
 from flax import nnx
 
+from emulator.core.progress import counting
 from emulator.fem.campaign import Runs
-from emulator.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network.part import Network
 from emulator.surrogates.network.pignn import Architecture

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from emulator.errors import InputError, check_seed, look_up
+from emulator.core.errors import InputError, check_seed, look_up
 
 Objective = Literal["energy", "simulations", "gradients", "both", "modes"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)

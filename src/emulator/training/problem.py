@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs, StoredRuns, run_campaign
 from emulator.fem.campaign.designs import design, sobol

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.catalogue import finer_of
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.coarse import carried

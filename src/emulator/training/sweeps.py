@@ -32,14 +32,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
+from emulator.core.progress import counting
+from emulator.core.store import read_arrays, save_arrays
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
 from emulator.fem.energy import potential_energy
 from emulator.fem.loop import jit
-from emulator.progress import counting
 from emulator.scenes.scene import Scene
-from emulator.store import read_arrays, save_arrays
 from emulator.surrogates.polynomial import (
     Polynomial,
     compressed,

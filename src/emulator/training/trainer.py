@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from emulator.catalogue import finer_of
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign import StoredRuns
 from emulator.fem.energy import require_rest
 from emulator.scenes.scene import Scene

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from emulator.errors import InputError
-from emulator.progress import counting
+from emulator.core.errors import InputError
+from emulator.core.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.family import (

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign, solve_together
 from emulator.fem.balance import relative_residual
 from emulator.fem.energy import potential_energy

@@ -19,7 +19,7 @@ from certificate_support import (
     posterior_of,
     quadrature,
 )
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import LinearSimulator, Step, linear_forward
 
 

@@ -15,7 +15,7 @@ from certificate_support import (
     linear_model,
     quadrature,
 )
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import LinearSimulator, linear_forward
 
 

@@ -5,7 +5,7 @@ import xarray as xr
 import calibrate as cal
 from calibrate.data import read_data, write_data
 from calibrate.observations import observations, spread_landmarks
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 VALUES = np.array([[0.1, 0.2, -3.0], [1.0, -2.0, 1e-7]])
 

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from calibrate.data import read_data, read_known
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 CURVE = "known:lam,parameter:mu\n60,70\n62,71\n64,\n66,73\n"
 

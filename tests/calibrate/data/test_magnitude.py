@@ -13,7 +13,7 @@ from calibrate.data.magnitude import (
     predict_over_prior,
 )
 from calibrate.observations import Observations
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import linear_forward
 
 NODES = [3, 11, 20, 30]

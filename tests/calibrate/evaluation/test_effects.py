@@ -9,7 +9,7 @@ from calibrate.cli import main
 from calibrate.evaluation import effects
 from calibrate.evaluation.effects import Comparison, recommend, tolerances
 from calibrate.observations import observations, spread_landmarks
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator, sobol
 from emulator.scenes.effects import leave_out
 from emulator.scenes.loads import Gravity, Traction

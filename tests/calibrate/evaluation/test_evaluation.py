@@ -11,7 +11,7 @@ import pytest
 import emulator as em
 from calibrate.cli import main
 from calibrate.evaluation import Evaluation, run_evaluation
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign.reference import fem_reference
 from emulator.surrogates import Emulator, load, save_emulator
 from emulator.surrogates.taylor import constant

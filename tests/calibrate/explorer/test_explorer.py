@@ -16,7 +16,7 @@ import emulator as em
 from browser_support import opened
 from calibrate.cli import main
 from calibrate.explorer import Explorer, serve
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 CENTRE = {"a": "0.5", "b": "0.5", "a_f": "0.5", "b_f": "0.5", "pressure": "0.5"}
 

@@ -10,7 +10,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.samplers import NUTSOptions
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 from linear_support import linear_forward
 

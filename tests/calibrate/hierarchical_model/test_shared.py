@@ -6,7 +6,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.hierarchical_model import hierarchical_model
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import linear_forward
 
 

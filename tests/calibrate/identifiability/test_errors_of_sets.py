@@ -11,7 +11,7 @@ from calibrate.identifiability import expected_precision
 from calibrate.identifiability.combinations import prior_table
 from calibrate.statistical_model.curve import curve_covariance
 from calibrate.statistical_model.systematic import Systematic
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import linear_forward
 from scene_support import block
 

@@ -19,7 +19,7 @@ from calibrate.identifiability import (
 )
 from calibrate.identifiability.stress import stresses
 from calibrate.posterior import Posterior
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import closed_form, linear_forward
 
 NODES = np.array([3, 11, 20])

@@ -21,7 +21,7 @@ from calibrate.noise import (
     with_discrepancy,
 )
 from calibrate.noise.spatial import KERNELS
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 POINTS = np.random.default_rng(0).uniform(0.0, 30.0, (6, 3))
 MEAN = np.random.default_rng(1).normal(size=(6, 3))

@@ -11,7 +11,7 @@ from calibrate.data import read_data
 from calibrate.observations import observations_from_json, parse_observation
 from calibrate.samplers.laplace import LaplaceOptions
 from calibrate.workflow import Run
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.loads import KPA_PER_MMHG
 from klotz_support import PRIOR, lengthening, model_of
 from linear_support import linear_forward

@@ -10,7 +10,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.observations import spread_landmarks
 from calibrate.observations.location import locate
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.quadratic import to_quadratic
 from scene_support import block

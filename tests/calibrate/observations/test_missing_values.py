@@ -12,7 +12,7 @@ from calibrate.data import read_data, write_data
 from calibrate.noise import CorrelatedNoise
 from calibrate.observations import observations, observations_from_json, spread_landmarks
 from calibrate.observations.present import Present, leave_out_missing, missing_values
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import linear_forward
 
 THETA = jnp.array([70.0, 60.0])

@@ -13,7 +13,7 @@ from calibrate.data import read_data, write_data
 from calibrate.observations import OBSERVATIONS, Scalar, observations_from_json, parse_observation
 from calibrate.posterior.tree import labels_of
 from calibrate.workflow import Run, make_data
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import linear_forward
 
 

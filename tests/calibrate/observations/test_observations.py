@@ -17,7 +17,7 @@ from calibrate.observations import (
     spread_landmarks,
     spread_nodes,
 )
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 NO_THETA = jnp.zeros(0)
 

@@ -9,7 +9,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.data import read_data, write_data
 from calibrate.observations import Reaction, observations_from_json, parse_observation
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.taylor import expand
 from scene_support import between_plates
 

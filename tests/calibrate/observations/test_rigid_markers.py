@@ -9,7 +9,7 @@ from scipy.linalg import polar
 from calibrate.data import read_data, write_data
 from calibrate.observations import observations, observations_from_json, parse_observation
 from calibrate.observations.rigid_markers import rigid_markers
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.supports import Support
 from scene_support import between_plates, block, rotation
 

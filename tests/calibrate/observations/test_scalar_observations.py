@@ -15,7 +15,7 @@ from calibrate.observations import (
     parse_observation,
 )
 from calibrate.workflow import Run
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import linear_forward
 
 

@@ -21,7 +21,7 @@ from calibrate.observations import (
 )
 from calibrate.observations.local_basis import COMPONENTS, local_directions
 from calibrate.observations.location import locate, locate_gradients
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.fields import element_fields
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.segments import aha_segments

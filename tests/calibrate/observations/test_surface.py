@@ -18,7 +18,7 @@ from calibrate.observations import (
     surface_points,
 )
 from calibrate.observations.surface_location import facet_shapes, foot_on
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.ellipsoid import human_ventricle
 
 

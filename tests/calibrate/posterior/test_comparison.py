@@ -12,7 +12,7 @@ import calibrate as cal
 from calibrate.cli import main
 from calibrate.posterior.comparison import compare
 from calibrate.samplers.smc import SMCOptions
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import PRIOR_MEAN, PRIOR_SD, closed_form, linear_forward, linear_problem
 
 SD = 0.1

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from klotz_support import PRESSURE, PRIOR, VOLUME, lengthening, model_of
 
 

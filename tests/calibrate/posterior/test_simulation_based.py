@@ -14,7 +14,7 @@ from calibrate.posterior.simulation_based import (
     calibration_of,
     sbc,
 )
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import closed_form, linear_forward
 
 NODES = np.array([3, 11, 20])

@@ -16,7 +16,7 @@ from calibrate.priors.joint_prior import Conditional, Dependence, JointPrior
 from calibrate.priors.population import POPULATIONS, prior_of, read_population
 from calibrate.samplers.density import density_of
 from calibrate.workflow import Run
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.left_ventricle import left_ventricle
 from linear_support import linear_forward
 

@@ -13,7 +13,7 @@ import calibrate as cal
 from calibrate.posterior.posterior import describe_distribution
 from calibrate.priors.priors import Truncated
 from calibrate.statistical_model.prior_range import standardised
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.protocol import inside_only
 from linear_support import LinearForward, closed_form, linear_forward

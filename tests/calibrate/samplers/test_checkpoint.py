@@ -9,7 +9,7 @@ import pytest
 import calibrate as cal
 from calibrate.samplers import SAMPLERS
 from calibrate.samplers.checkpoint import Checkpoint
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import LinearFEM, linear_problem
 
 
@@ -72,7 +72,7 @@ def test_a_killed_run_goes_on_to_the_same_draws(name, problem, monkeypatch, tmp_
 
 def test_a_run_does_go_on_and_does_not_begin_again(problem, monkeypatch, tmp_path):
     """Draws spoiled in the file are found in the result."""
-    from emulator.store import read_arrays, save_arrays
+    from emulator.core.store import read_arrays, save_arrays
 
     path = tmp_path / "sampling.safetensors"
     with monkeypatch.context() as patch:

@@ -12,7 +12,7 @@ import calibrate as cal
 from calibrate.samplers import DelayedAcceptanceOptions, density_of
 from calibrate.samplers.delayed_acceptance import _choose, _Place
 from calibrate.samplers.density import tempered
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from linear_support import (
     PRIOR_MEAN,
     PRIOR_SD,

@@ -9,7 +9,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.samplers import LaplaceOptions
-from emulator.errors import SolverError
+from emulator.core.errors import SolverError
 from linear_support import LinearForward, linear_forward, linear_problem
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.samplers import transport
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates.corrected import corrected
 from emulator.surrogates.fem import fem_forward

@@ -8,7 +8,7 @@ import pytest
 import calibrate as cal
 from calibrate.samplers import find_sampler, options_from
 from calibrate.samplers.pathfinder import pathfinder_start
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import linear_problem
 
 

@@ -15,7 +15,7 @@ from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.options import ChainOptions
 from calibrate.samplers.run import Programs
 from calibrate.samplers.stopping import converged
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
 from linear_support import PRIOR_MEAN, PRIOR_SD, LinearFEM, closed_form, linear_problem
 

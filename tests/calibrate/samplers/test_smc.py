@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 import calibrate as cal
 from calibrate.samplers import SMCOptions, density_of
 from calibrate.samplers.smc import _increment, evidence
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from linear_support import PRIOR_MEAN, PRIOR_SD, LinearForward, linear_forward, linear_problem
 
 

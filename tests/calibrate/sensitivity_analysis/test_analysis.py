@@ -12,7 +12,7 @@ from scipy.stats import truncnorm
 from calibrate.priors import truncated_normal
 from calibrate.sensitivity_analysis import Factors, analyse
 from calibrate.sensitivity_analysis.factors import densities, quantiles
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 THREE = Factors(("x1", "x2", "x3"))
 

@@ -16,7 +16,7 @@ from calibrate.cli import main
 from calibrate.observations import parse_observation
 from calibrate.priors import Population
 from calibrate.sensitivity_analysis import FIELD
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.protocol import ForwardMap
 

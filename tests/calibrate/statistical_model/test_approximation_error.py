@@ -14,7 +14,7 @@ import calibrate as cal
 from calibrate.posterior import sample
 from calibrate.statistical_model import with_error
 from calibrate.statistical_model.approximation_error import ApproximationError, fit
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import LinearSimulator, closed_form, linear_forward
 
 NODES = np.array([3, 11, 20, 30])

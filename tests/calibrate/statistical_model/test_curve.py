@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrate.statistical_model.curve import check_curve, curve_covariance, curve_modes
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 AT = np.array([0.0, 0.1, 0.3, -0.2])
 VALUES = np.array([1.0, 2.0, 4.0, -1.5])

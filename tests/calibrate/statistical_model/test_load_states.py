@@ -13,7 +13,7 @@ from calibrate.data import read_data, write_data
 from calibrate.observations import observations, parse_observation, spread_landmarks
 from calibrate.statistical_model.load_states import known_thetas, load_states
 from calibrate.workflow import Run, make_data
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import LinearForward, linear_forward
 
 MATERIAL = {"a": 0.3, "b": 2.0, "a_f": 5.0, "b_f": 1.7}

@@ -18,7 +18,7 @@ from calibrate.statistical_model.shared_errors import (
     with_shared_errors,
 )
 from calibrate.statistical_model.systematic import Systematic, SystematicError
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes import Scene
 from linear_support import linear_forward
 from scene_support import block

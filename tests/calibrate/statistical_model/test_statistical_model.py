@@ -9,7 +9,7 @@ from numpyro.infer.util import log_density
 
 import calibrate as cal
 from calibrate.observations import spread_landmarks
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import LinearForward, linear_forward
 
 THETA = {"a": 0.3, "b": 2.0, "a_f": 5.0, "b_f": 1.7, "pressure": 1.1}

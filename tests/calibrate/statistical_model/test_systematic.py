@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 import calibrate as cal
 from calibrate.noise.information import information_about_means
 from calibrate.statistical_model.systematic import Systematic
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from linear_support import linear_forward
 from scene_support import block
 

@@ -17,7 +17,7 @@ import zarr
 
 import calibrate as cal
 import emulator as em
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem import sobol
 from emulator.fem.campaign.stored_runs import read_runs
 from emulator.fem.campaign.zarr_rows import ZarrRows

@@ -10,9 +10,9 @@ from calibrate.cli import main
 from calibrate.workflow import Run, read_posterior
 from calibrate.workflow.experiment import Cohort, read_experiment
 from cli_support import complaint, write_block
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.store import read_arrays, save_arrays
 from emulator.scenes import registry
-from emulator.store import read_arrays, save_arrays
 
 BEAM = "once_clamped_beam"
 NODES = "node,ux,uy,uz\n3,0.5,0.0,-9.0\n7,0.4,0.1,-5.0\n11,0.2,0.0,-2.0\n19,0.1,0.0,-7.0\n"

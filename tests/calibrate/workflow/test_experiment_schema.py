@@ -19,8 +19,8 @@ from calibrate.statistical_model.shared_errors import SHARED_ERRORS
 from calibrate.workflow import Run
 from calibrate.workflow.experiment import Shared, read_experiment
 from calibrate.workflow.experiment_schema import experiment_schema
-from emulator.errors import InputError
-from emulator.schema import read_as
+from emulator.core.errors import InputError
+from emulator.core.schema import read_as
 from emulator.surrogates.registry import FORWARD_MAPS, known_options
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -13,9 +13,9 @@ import emulator as em
 from calibrate.cli import main
 from calibrate.posterior import read_tree
 from calibrate.workflow import Run, infer, read_posterior
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.store import exclusive, read_arrays, save_arrays
 from emulator.scenes import registry
-from emulator.store import exclusive, read_arrays, save_arrays
 
 SCENE = "once_clamped_beam"
 RUN = Run(
@@ -139,7 +139,7 @@ def test_a_result_is_replaced_at_once_or_not_at_all(infer_once, folder, monkeypa
     monkeypatch.setattr("calibrate.workflow.workflow.sample", lambda *_, **__: infer_once[1])
     with monkeypatch.context() as patch:
         full = OSError(errno.ENOSPC, "No space left on device")
-        patch.setattr("emulator.store.os.fsync", Mock(side_effect=[None, full]))
+        patch.setattr("emulator.core.store.os.fsync", Mock(side_effect=[None, full]))
         with pytest.raises(OSError, match="No space left on device: '.*run.json'"):
             infer(RUN, folder, force=True)
     there = {path.name for path in folder.iterdir()}

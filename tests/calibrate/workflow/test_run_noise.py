@@ -14,8 +14,8 @@ from calibrate.data import write_data
 from calibrate.noise import DiscrepancyNoise, StudentTNoise
 from calibrate.observations import parse_observation
 from calibrate.workflow import Run, infer, make_data, read_posterior, report
-from emulator import schema
-from emulator.errors import InputError
+from emulator.core import schema
+from emulator.core.errors import InputError
 from linear_support import linear_forward
 
 TRUTH = {"mu": 70.0, "lam": 60.0}

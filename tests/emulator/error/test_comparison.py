@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.core.errors import SolverError
 from emulator.error.comparison import case_errors, evaluate, field_errors
-from emulator.errors import SolverError
 from emulator.scenes.cavities import find_cavity
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.protocol import Extrapolated

@@ -5,8 +5,8 @@ import pytest
 import sparsax
 
 import emulator as em
+from emulator.core.errors import InputError
 from emulator.error.estimate import error_bar
-from emulator.errors import InputError
 from emulator.scenes.nodes import all_nodes
 from emulator.surrogates.corrected import newton_step
 from emulator.surrogates.fem import fem_forward

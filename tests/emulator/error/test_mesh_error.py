@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.finer import finer
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.condensation import advance, consistent, linearise
 from emulator.fem.energy import pair_products, strain_energy
 from emulator.verify.consistency import block

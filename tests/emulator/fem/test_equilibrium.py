@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.continuation import find_equilibrium
 from emulator.fem.linear import Outcome
 from emulator.fem.newton import Newton

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.inverse import InverseSystem
 from emulator.fem.loaded_point import carried_back, from_rest
 from emulator.fem.moved import at_rest, moved_system

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign.designs import design
 from emulator.geometry.cavity import Cavity
 from emulator.scenes.image import image_theta

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.fem.support_force import SupportForce
 from emulator.geometry.bodies.box import box

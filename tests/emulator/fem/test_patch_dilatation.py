@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 import emulator as em
 from emulator.catalogue import find_scene
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.energy import (
     at_points,
     displacement_gradient,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.balance import relative_residual
 from emulator.geometry.bodies.box import box
 from emulator.scenes import Support

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.solution import Status
 from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.mechanics.laws.neo_hookean import bulk_modulus

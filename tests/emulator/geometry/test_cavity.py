@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.ellipsoid import LAND, EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.facets import openings
 from emulator.scenes import Support

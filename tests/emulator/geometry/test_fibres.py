@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.biventricle import biventricle
 from emulator.geometry.bodies.box import box
 from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle, land_ventricle

@@ -8,7 +8,7 @@ import pytest
 from skfem import MeshHex, MeshTet, MeshTet2
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.tetrahedra import signed_volumes
 
 

@@ -2,7 +2,7 @@ import meshio
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.box import box
 from emulator.geometry.io import read_body, read_mesh, write_mesh, write_solution
 from emulator.geometry.mesh import Mesh

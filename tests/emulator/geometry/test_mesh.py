@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.box import box, toward_ends
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.mesh import Mesh

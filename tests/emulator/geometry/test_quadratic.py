@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.box import box
 from emulator.geometry.discretisation import discretise, facet_rule
 from emulator.geometry.mesh import Mesh

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.box import box
 from emulator.geometry.quadratic import to_quadratic
 

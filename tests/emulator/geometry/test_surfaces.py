@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.disc import disc
 from emulator.geometry.flattening import Flattened
 from emulator.geometry.surfaces import (

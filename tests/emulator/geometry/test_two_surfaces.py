@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cli_support import answer, complaint
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import Simulator
 from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.discretisation import discretise

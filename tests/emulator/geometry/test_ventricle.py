@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.ellipsoid import HUMAN, truncated_ellipsoid
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.ventricle import Ventricle, ventricle

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.mechanics.barriers import Barriers
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS, find_law

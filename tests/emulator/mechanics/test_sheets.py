@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import Status
 from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import rule_based_directions

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.released.files import models_in, read_geometry, read_tests
 from emulator.released.scenes import published_scene, published_tests
 

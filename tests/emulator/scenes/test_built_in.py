@@ -7,7 +7,7 @@ import pytest
 
 import emulator as em
 from emulator.catalogue import find_scene, scene_from_origin
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import Status
 from emulator.fem.energy import volume_ratio
 from emulator.geometry.cavity import Cavity

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.energy import potential_energy
 from emulator.geometry.bodies.box import box
 from emulator.geometry.quadratic import corner_parents, to_linear, to_quadratic

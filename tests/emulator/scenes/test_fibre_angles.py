@@ -9,8 +9,8 @@ import pytest
 
 import emulator as em
 from emulator.catalogue import find_scene
+from emulator.core.errors import InputError
 from emulator.error.mesh_error import mesh_error
-from emulator.errors import InputError
 from emulator.fem.energy import potential_energy
 from emulator.fem.fields import element_fields
 from emulator.fem.inverse import InverseSystem

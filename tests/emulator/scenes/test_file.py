@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from emulator.catalogue import find_scene, scene_from_origin
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.biventricle import biventricle
 from emulator.geometry.bodies.box import box
 from emulator.geometry.bodies.ellipsoid import human_ventricle
@@ -213,7 +213,7 @@ def test_every_kind_of_pressure_takes_a_value_or_a_parameter(folder):
 
 
 def test_importing_the_package_does_not_import_pydantic():
-    code = "import sys, emulator.catalogue; print('emulator.schema' in sys.modules)"
+    code = "import sys, emulator.catalogue; print('emulator.core.schema' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

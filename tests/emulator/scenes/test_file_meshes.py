@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from emulator.catalogue import find_scene
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.box import box
 from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import rule_based_directions

@@ -10,7 +10,8 @@ import pytest
 
 import emulator.scenes.file as reader
 from cli_support import SCENE, write_block
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.schema import parse
 from emulator.mechanics.laws import LAWS
 from emulator.scenes.draft import draft
 from emulator.scenes.fibre_rules import FIBRE_RULES
@@ -18,7 +19,6 @@ from emulator.scenes.file_models import SceneFile
 from emulator.scenes.file_schema import scene_schema
 from emulator.scenes.loads import LOADS
 from emulator.scenes.supports import SUPPORTS
-from emulator.schema import parse
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.condensation import consistent, linearise
 from emulator.fem.energy import strain_energy
 from emulator.fem.fields import element_fields

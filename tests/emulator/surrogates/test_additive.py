@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.core.store import read_arrays
 from emulator.fem import design
 from emulator.fem.campaign import run_campaign
-from emulator.store import read_arrays
 from emulator.surrogates import Architecture, Emulator, augment, load, save_emulator
 from emulator.surrogates.additive import PARTS
 from emulator.surrogates.discrepancy import fit_discrepancy

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import run_campaign, sobol
 from emulator.scenes.nodes import all_nodes
 from emulator.surrogates.corrected import corrected

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import emulator as em
 from calibrate.cli import main
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import Parameter

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import sobol
 from emulator.surrogates import load, save_emulator, shipped
 from network_support import untrained

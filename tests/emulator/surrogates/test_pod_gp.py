@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.core.errors import InputError
+from emulator.core.store import save_arrays
 from emulator.error.comparison import evaluate
-from emulator.errors import InputError
 from emulator.fem import run_campaign, sobol
-from emulator.store import save_arrays
 from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.pod_gp import REDUCED, fit_reduced
 from emulator.surrogates.registry import keep_forward, restore_forward

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.kind import ForwardKind, Ingredients, Option
 from emulator.surrogates.protocol import Extrapolated, fingerprint_of
 from emulator.surrogates.registry import (

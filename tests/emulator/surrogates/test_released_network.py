@@ -11,7 +11,7 @@ from jax._src.array import _reconstruct_array
 
 import emulator as em
 from calibrate.cli import main
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.released.files import units
 from emulator.released.network import read_network
 from emulator.released.scenes import published_tests

@@ -7,7 +7,7 @@ import pytest
 import sparsax
 
 import emulator as em
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.scenes import Parameter
 from emulator.scenes.loads import FollowerPressure, Gravity
 from emulator.surrogates import taylor

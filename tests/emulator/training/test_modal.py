@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import design, sobol
 from emulator.surrogates.network.pignn import Architecture

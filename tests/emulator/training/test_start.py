@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates import load, save_emulator
 from emulator.training import Plan, pretrain, recipe, train
 from emulator.training.checkpoint import CHECKPOINT, Session

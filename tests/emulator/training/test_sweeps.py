@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem import simulator as fem_simulator
 from emulator.fem import sobol
 from emulator.surrogates import load, save_emulator

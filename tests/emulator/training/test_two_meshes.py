@@ -9,7 +9,7 @@ import pytest
 
 import emulator as em
 from emulator.catalogue import find_scene, finer_of
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import simulator as fem_simulator
 from emulator.fem import sobol
 from emulator.scenes.finer import finer

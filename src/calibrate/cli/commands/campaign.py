@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Solve what the store lacks, and count."""
     from calibrate.workflow.campaigns import fill, question
     from emulator.catalogue import find_scene
-    from emulator.errors import InputError
+    from emulator.core.errors import InputError
     from emulator.fem import NewtonOptions
     from emulator.fem.campaign.zarr_rows import WORDS, read, require_store
 

@@ -15,7 +15,7 @@ from calibrate.cli.common import (
     show_progress,
 )
 from calibrate.cli.posterior_table import summary
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 def register(commands: Any) -> None:
@@ -51,7 +51,7 @@ def register(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Check a kept posterior against FEM; a kept reweighted posterior is a success too."""
     from calibrate.workflow import certify_and_keep, read_posterior, report
-    from emulator.store import check_folder
+    from emulator.core.store import check_folder
 
     if arguments.reweight is not None:
         target = check_folder(arguments.reweight)

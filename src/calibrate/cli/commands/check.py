@@ -23,7 +23,7 @@ from calibrate.cli.common import (
 )
 from calibrate.cli.model_words import add_model, run_of
 from calibrate.cli.noise_words import noise_words
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 if TYPE_CHECKING:
     from calibrate.posterior.klotz_band import KlotzBand
@@ -86,9 +86,9 @@ def run_mesh(arguments: argparse.Namespace) -> int:
 
     from calibrate.observations.mesh_error import errors_of
     from emulator.catalogue import find_scene
+    from emulator.core.store import check_folder, write_json
     from emulator.error.mesh_error import mesh_error
     from emulator.geometry.quality import mesh_quality
-    from emulator.store import check_folder, write_json
 
     folder = None if arguments.out is None else check_folder(arguments.out)
     scene = find_scene(*scene_words(arguments))
@@ -140,7 +140,7 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     from calibrate.posterior.simulation_based import sbc
     from calibrate.samplers import NUTSOptions
     from calibrate.workflow import by_fem, model_before_data
-    from emulator.store import check_folder, write_json
+    from emulator.core.store import check_folder, write_json
 
     folder, progress = check_folder(arguments.out), show_progress(arguments)
     if arguments.scheduler is not None and not arguments.fem_data:
@@ -186,7 +186,7 @@ def run_prior(arguments: argparse.Namespace) -> int:
     from calibrate.observations.pressure_volume import in_mmhg
     from calibrate.posterior.predictions import prior_replicates
     from calibrate.workflow import model_before_data
-    from emulator.store import check_folder, save_arrays
+    from emulator.core.store import check_folder, save_arrays
 
     folder: Path = check_folder(arguments.out)
     run = run_of(arguments, seed=arguments.seed)

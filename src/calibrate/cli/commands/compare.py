@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     from calibrate.posterior import read_tree
     from calibrate.posterior.comparison import compare
     from calibrate.workflow.workflow import POSTERIOR
-    from emulator.errors import InputError
+    from emulator.core.errors import InputError
 
     if len(set(arguments.folders)) < len(arguments.folders):
         raise InputError("compare: a folder is given twice; give each model once")

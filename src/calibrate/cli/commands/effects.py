@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     from calibrate.evaluation.effects import recommend, tolerances
     from calibrate.observations import observations, parse_observation
     from emulator.catalogue import find_scene
-    from emulator.errors import check_seed
+    from emulator.core.errors import check_seed
 
     check_seed(arguments.seed, "effects")
     scene = find_scene(*scene_words(arguments))

@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.out:
         from calibrate.figures.drawing import pyplot
-        from emulator.store import check_folder
+        from emulator.core.store import check_folder
 
         check_folder(arguments.out)
         pyplot()  # a missing plotting package is reported before minutes of FEM
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
 def save(evaluated: Evaluated, folder: str | Path) -> list[Path]:
     """Write evaluation.json and the figures to ``folder``; the files written."""
     from calibrate.figures.evaluation import draw
-    from emulator.store import write_json
+    from emulator.core.store import write_json
 
     path = Path(folder) / "evaluation.json"
     write_json(path, evaluated.report)

@@ -12,7 +12,7 @@ from calibrate.cli.common import DONE, FAILED, emit, show_progress
 from calibrate.cli.model_words import add_model, plan_of
 from calibrate.cli.posterior_table import cohort_summary, summary
 from calibrate.samplers import SAMPLERS, find_sampler
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 if TYPE_CHECKING:
     from calibrate.workflow import Run
@@ -76,7 +76,7 @@ def check_warmup(sampler: str, given: int | None) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Sample and keep a posterior, or those of members of a population."""
     from calibrate.workflow import Run
-    from emulator.store import check_folder
+    from emulator.core.store import check_folder
 
     folder = check_folder(arguments.out)
     plan = plan_of(

@@ -52,9 +52,9 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the mesh, and the picture."""
+    from emulator.core.store import check_folder
     from emulator.geometry.io import write_mesh
     from emulator.geometry.two_surfaces import mesh_wall
-    from emulator.store import check_folder
 
     check_vtu(arguments.out)
     if arguments.picture is not None:

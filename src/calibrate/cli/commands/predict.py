@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import DONE, FAILED, add_theta, assignments, check_vtu, emit
 from calibrate.cli.volumes import volume_lines, volumes
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 if TYPE_CHECKING:
     import jax

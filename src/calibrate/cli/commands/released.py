@@ -25,7 +25,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, check and write the network."""
-    from emulator.store import check_folder
+    from emulator.core.store import check_folder
     from emulator.surrogates import save_emulator
     from emulator.surrogates.released_network import released_network
 

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from calibrate.cli.common import DONE, emit, needing_plotly
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 def register(commands: Any) -> None:

@@ -29,7 +29,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the schema, which is JSON with and without ``--json``."""
-    from emulator.store import to_json
+    from emulator.core.store import to_json
 
     schema = _schema(arguments.file)
     emit(schema, as_json=arguments.json, text=to_json(schema))

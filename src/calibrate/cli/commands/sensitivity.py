@@ -16,7 +16,7 @@ from calibrate.cli.common import (
     table,
 )
 from calibrate.cli.forward import add_forward, forward_options
-from emulator.errors import InputError, check_seed
+from emulator.core.errors import InputError, check_seed
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     from calibrate.sensitivity_analysis import sensitivity
     from emulator import Simulator
     from emulator.catalogue import find_scene
-    from emulator.store import check_folder
+    from emulator.core.store import check_folder
     from emulator.surrogates.kind import Ingredients
     from emulator.surrogates.registry import build_forward, check_scheduler
 
@@ -141,8 +141,8 @@ def write(found: xr.DataTree, scene: Scene, folder: Path) -> None:
 
     from calibrate.figures.sensitivity import draw
     from calibrate.sensitivity_analysis import FIELD
+    from emulator.core.store import write_netcdf
     from emulator.geometry.io import write_nodal
-    from emulator.store import write_netcdf
 
     write_netcdf(folder / "sensitivity.nc", found)
     draw(found, scene, folder)

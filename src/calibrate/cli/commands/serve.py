@@ -9,7 +9,7 @@ from typing import Any
 from calibrate.cli.common import DONE, emit
 from calibrate.cli.model_words import emulator_of
 from calibrate.local_server import LOOPBACK
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 def register(commands: Any) -> None:

@@ -15,7 +15,7 @@ from calibrate.cli.common import (
     seconds,
     show_progress,
 )
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.training.plan import OBJECTIVES, RECIPES, Plan
 
 
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
     from emulator.catalogue import find_scene
-    from emulator.store import check_folder
+    from emulator.core.store import check_folder
     from emulator.surrogates import load, save_emulator
     from emulator.training import recipe, remove_checkpoint
     from emulator.training import train as train_emulator

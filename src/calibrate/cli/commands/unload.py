@@ -47,9 +47,9 @@ def register(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Unload, load again, print both, write the files."""
     from emulator.catalogue import find_scene
+    from emulator.core.store import check_folder
     from emulator.fem import Status
     from emulator.fem.unloading import Unloader
-    from emulator.store import check_folder
 
     scene = find_scene(*scene_words(arguments))
     theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre

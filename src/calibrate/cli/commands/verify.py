@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.common import DONE, FAILED, emit, table
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 if TYPE_CHECKING:
     from emulator.verify import Benchmark

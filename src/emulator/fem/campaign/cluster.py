@@ -24,7 +24,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign.engine import Solver
 from emulator.fem.campaign.row import Row, Task
 from emulator.fem.simulator import Simulator

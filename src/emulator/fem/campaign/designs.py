@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
 _CORNER_EVERY = 5  # every fifth theta of a design is a corner of the box

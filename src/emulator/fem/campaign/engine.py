@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError, SolverError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.balance import relative_residual
 from emulator.fem.campaign.row import Row, Task
 from emulator.fem.campaign.threads import at_once, in_order

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.progress import counting
 from emulator.fem.campaign import Neighbours, Solver, run_campaign, solve_rows
 from emulator.fem.campaign.designs import sobol
 from emulator.fem.campaign.memory import MemoryRows
 from emulator.fem.simulator import Simulator
-from emulator.progress import counting
 from emulator.scenes.scene import Scene
 
 SEED = 90_210  # separate test points: training and reduced models use small seeds

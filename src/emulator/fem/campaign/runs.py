@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.progress import counting
 from emulator.fem.campaign.engine import Executor, Solver, in_process, solve_rows
 from emulator.fem.campaign.memory import MemoryRows
 from emulator.fem.campaign.starts import Neighbours, Predictor
 from emulator.fem.simulator import Simulator
-from emulator.progress import counting
 
 
 class Runs(NamedTuple):

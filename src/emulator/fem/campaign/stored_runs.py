@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign.runs import Runs, StoredRuns
 from emulator.fem.campaign.zarr_rows import MISSING, read, require_store
 from emulator.fem.solution import Status

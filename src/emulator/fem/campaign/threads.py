@@ -11,9 +11,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
+from emulator.core.machine import cores, inherited, memory
 from emulator.fem.linear.suitesparse import keep_factors
 from emulator.fem.simulator import Simulator
-from emulator.machine import cores, inherited, memory
 
 _BYTES_A_NODE = 100_000  # of one more solve beside others; 54 000 measured at 33 605 nodes
 _SHARE = 0.5  # of the machine's memory

@@ -34,13 +34,13 @@ from typing import Any
 import numpy as np
 import zarr
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.store import exclusive
 from emulator.fem.campaign.engine import Solver
 from emulator.fem.campaign.row import Row
 from emulator.fem.campaign.starts import Field
 from emulator.fem.solution import Status
 from emulator.scenes.scene import Scene
-from emulator.store import exclusive
 
 MISSING = -1
 _FORMAT = 1

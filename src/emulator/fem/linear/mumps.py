@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.linear.protocol import Structure
 
 INSTALL = "pip install dolfinx-solver-real mpich mpi4py, or petsc4py for a PETSc with MUMPS"

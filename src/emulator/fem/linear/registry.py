@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulator.errors import look_up
+from emulator.core.errors import look_up
 from emulator.fem.linear.petsc import PETSC
 from emulator.fem.linear.protocol import Direct
 from emulator.fem.linear.suitesparse import SUITESPARSE

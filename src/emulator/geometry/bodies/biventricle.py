@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.body import body
 from emulator.geometry.bodies.disc import disc
 from emulator.geometry.bodies.ellipsoid import (

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import Midpoints, to_quadratic
 from emulator.geometry.tetrahedra import boundary_facets, orient

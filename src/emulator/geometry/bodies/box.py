@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from skfem import MeshTet
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.body import body
 from emulator.geometry.mesh import Mesh
 

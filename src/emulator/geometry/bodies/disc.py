@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 def ring_counts(rings: int, around: int) -> np.ndarray:

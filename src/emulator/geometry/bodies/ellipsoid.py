@@ -13,7 +13,7 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.body import body
 from emulator.geometry.bodies.disc import disc
 from emulator.geometry.bodies.prisms import extrude, stacked

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.ball import ball, ball_midpoints
 from emulator.geometry.bodies.body import body
 from emulator.geometry.mesh import Mesh

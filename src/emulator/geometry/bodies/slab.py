@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.body import body
 from emulator.geometry.bodies.prisms import extrude, stacked
 from emulator.geometry.mesh import Mesh

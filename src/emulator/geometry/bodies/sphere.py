@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.ball import ball_midpoints, triangle_lattice, unit
 from emulator.geometry.bodies.body import body
 from emulator.geometry.bodies.prisms import extrude, stacked

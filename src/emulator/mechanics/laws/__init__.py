@@ -10,7 +10,7 @@ by differentiation. The tests in ``tests/emulator/mechanics/test_laws.py`` inclu
 import pkgutil
 from importlib import import_module
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.mechanics.laws.law import Law
 
 LAWS: dict[str, Law] = {

@@ -50,7 +50,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import parts

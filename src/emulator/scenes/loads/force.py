@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import EDGES

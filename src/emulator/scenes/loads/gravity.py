@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.mechanics.kinematics import determinant
 from emulator.mechanics.quantity import Quantity

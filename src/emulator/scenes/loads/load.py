@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.quantity import Quantity
@@ -67,7 +67,7 @@ class Load(ABC):
         return self
 
     def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
-        """Raise :class:`~emulator.errors.InputError` if the load cannot act on this body.
+        """Raise :class:`~emulator.core.errors.InputError` if the load cannot act on this body.
 
         Parameters
         ----------

@@ -19,7 +19,7 @@ from typing import ClassVar
 import jax
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.facets import cone_volume, rim
 from emulator.geometry.mesh import Mesh

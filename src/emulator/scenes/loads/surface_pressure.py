@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.mechanics.quantity import Quantity
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load

@@ -8,7 +8,7 @@ from typing import ClassVar
 import jax
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import nodal_areas
 from emulator.scenes.fibre_angles import Fibres

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.quantity import Quantity, number
 from emulator.scenes.local_terms import Values

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation, FacetRule, facet_rule
 from emulator.geometry.facets import area_vectors
 from emulator.geometry.mesh import Mesh

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import parts
 from emulator.scenes.supports.boundary_condition import BoundaryCondition

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
 from emulator.surrogates.discrepancy.kernel import Features, fit_lengths, fit_weights, fold

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator._precision import require_float64
+from emulator.core.precision import require_float64
+from emulator.core.store import inside, named_leaves
 from emulator.scenes.scene import Scene
-from emulator.store import inside, named_leaves
 from emulator.surrogates.discrepancy.kernel import Features, mean
 from emulator.surrogates.part import CachedPart, OfArrays, widened
 from emulator.surrogates.taylor import monomials, rounded

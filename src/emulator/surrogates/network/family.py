@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
+from emulator.core.store import inside, named_leaves
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.scene import Scene
-from emulator.store import inside, named_leaves
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import filled_state, standardised
 from emulator.surrogates.network.pignn import Architecture, Processor, branch, trunk

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.mesh import frozen_array
 from emulator.geometry.tetrahedra import EDGES
 from emulator.scenes.scene import Scene

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from emulator.core.store import fill_tree, inside, named_leaves
 from emulator.scenes.parameter_space import ParameterSpace
 from emulator.scenes.scene import Scene
-from emulator.store import fill_tree, inside, named_leaves
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.pignn import (
     Architecture,

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.mlp import MLP
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.ventricle import Ventricle, ventricle
 from emulator.scenes.cavities import find_cavity
 from emulator.scenes.scene import Scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import SolverError
+from emulator.core.errors import SolverError
 from emulator.fem import run_campaign, sobol
 from emulator.fem.solution import Status
 from emulator.scenes.loads import Gravity

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.balance import relative_residual
 from emulator.fem.campaign.reference import fem_reference, outside_reference, sample_outside
 from emulator.fem.solution import Status

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.linear import SOLVERS, Outcome, mumps
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.petsc import _LAST

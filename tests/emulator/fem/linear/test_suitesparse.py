@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.linear import SOLVERS, Outcome, block_pattern, find_solver, whole_blocks
 from emulator.fem.linear.foreign import INTERRUPTED, register
 from emulator.fem.linear.solve import attempt, solve

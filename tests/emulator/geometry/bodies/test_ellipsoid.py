@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.ellipsoid import (
     HUMAN,
     LAND,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.organ import organ
 from emulator.geometry.bodies.organ import volume as exact
 from emulator.geometry.quality import dihedral_angles

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.slab import cooks_membrane, slab
 from geometry_support import assert_sound, volume
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.geometry.quality import dihedral_angles
 from geometry_support import assert_sound, order_of, volume

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.energy import local_forces, potential_energy
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes.loads import CavityPressure, FollowerPressure

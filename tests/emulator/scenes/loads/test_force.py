@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.energy import dead_force
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes import Parameter

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem.energy import dead_force, potential_energy
 from emulator.scenes.loads import Gravity, GravityVector
 from emulator.scenes.parameter_space import Parameter

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.geometry.facets import enclosed_volume, rim
 from emulator.mechanics.kinematics import cofactor
 from emulator.scenes import Parameter, Support

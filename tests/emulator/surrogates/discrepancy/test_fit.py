@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.fem import run_campaign, sobol
 from emulator.scenes.loads import Gravity
 from emulator.surrogates.discrepancy import fit_discrepancy

@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 import emulator as em
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 from emulator.surrogates import Architecture, Emulator, augment
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.mlp import MLP

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
-from emulator.line_index import toml_lines
-from emulator.schema import OneOf, Table, expectation, parse, read_json_as
+from emulator.core.errors import InputError
+from emulator.core.line_index import toml_lines
+from emulator.core.schema import OneOf, Table, expectation, parse, read_json_as
 
 
 @dataclass(frozen=True)

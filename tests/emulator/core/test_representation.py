@@ -3,7 +3,7 @@
 import html
 
 import emulator as em
-from emulator.shown import Shown
+from emulator.core.representation import TableRepr
 
 
 def test_a_scene_and_what_is_made_of_it(beam, simulator):
@@ -22,8 +22,8 @@ def test_a_scene_and_what_is_made_of_it(beam, simulator):
 
 
 def test_html_is_text():
-    class Odd(Shown):
-        def shown(self):
+    class Odd(TableRepr):
+        def summary_rows(self):
             return "<b>", [("a", "1 < 2")]
 
     assert Odd()._repr_html_().count("<b>") == 1  # the row's own

@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 @contextmanager

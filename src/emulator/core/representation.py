@@ -6,21 +6,21 @@ from abc import abstractmethod
 from html import escape
 
 
-class Shown:
-    """An object that says what it is in a title and a few rows."""
+class TableRepr:
+    """An object that is represented by a title and a few named rows."""
 
     @abstractmethod
-    def shown(self) -> tuple[str, list[tuple[str, str]]]:
-        """A title, and what there is to know, by name."""
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
+        """Return the title, and the rows as pairs of a name and its text."""
 
     def __repr__(self) -> str:
-        """The title and all rows in a line."""
-        title, rows = self.shown()
+        """Return the title and all rows on one line."""
+        title, rows = self.summary_rows()
         return f"<{title}: {'; '.join(f'{name} {value}' for name, value in rows)}>"
 
     def _repr_html_(self) -> str:
-        """The same as a table, for notebooks."""
-        title, rows = self.shown()
+        """Return the title and all rows as an HTML table, which notebooks show."""
+        title, rows = self.summary_rows()
         body = "".join(
             f'<tr><td style="text-align:left"><b>{escape(name)}</b></td>'
             f'<td style="text-align:left">{escape(value)}</td></tr>'

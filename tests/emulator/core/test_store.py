@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from emulator.errors import InputError
-from emulator.store import (
+from emulator.core.errors import InputError
+from emulator.core.store import (
     fill_tree,
     inside,
     named_leaves,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import jax
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 
 def cores() -> int:

@@ -8,7 +8,7 @@ import pytest
 
 import emulator as em
 from emulator import machine
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 THREADS = """
 import jax

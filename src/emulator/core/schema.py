@@ -1,7 +1,7 @@
 """Plain data from TOML and JSON files, read into dataclasses and pydantic models.
 
-A mistake is one :class:`~emulator.errors.InputError` that names file, line and key, what was found
-and what would be right. Numbers are finite, and neither strings nor booleans.
+A mistake is one :class:`~emulator.core.errors.InputError` that names file, line and key, what was
+found and what would be right. Numbers are finite, and neither strings nor booleans.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, dataclass, field, fields
-from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path as FilePath
 from typing import (
@@ -44,10 +43,10 @@ from pydantic import Field as Entry
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
 
-from emulator.docstrings import documented, summary
-from emulator.errors import InputError
-from emulator.line_index import Path, json_lines, line_of
-from emulator.store import read_json
+from emulator.core.docstrings import documented, summary
+from emulator.core.errors import InputError, closest, look_up
+from emulator.core.line_index import Path, json_lines, line_of
+from emulator.core.store import read_json
 
 _SCALARS = {float: "number", int: "whole number", str: "string"}
 # What pydantic calls a value of the wrong type, where no field of a table says what is right.
@@ -79,7 +78,7 @@ class Table(BaseModel):
         for key in data:
             if key not in cls.model_fields:
                 known = ", ".join(sorted(cls.model_fields))
-                close = _closest(key, cls.model_fields)
+                close = closest(key, cls.model_fields)
                 raise _mistake(key=key, problem=f"unknown key '{key}'; known: {known}{close}")
         for key, info in cls.model_fields.items():
             if info.is_required() and key not in data:
@@ -243,6 +242,36 @@ def read_as[Kind](
         raise Source(where, mapping, lines or {}, toml).error(str(error), (first_word,)) from error
 
 
+def describe(value: Any) -> dict[str, Any]:
+    """Return a dataclass as plain data, which :func:`restore` reads: its ``kind`` and its fields.
+
+    Fields with ``compare=False`` are left out: the program sets them, not a file.
+    """
+    kind = {"kind": value.kind} if hasattr(value, "kind") else {}
+    return kind | {each.name: getattr(value, each.name) for each in fields(value) if each.compare}
+
+
+def restore[Kind](
+    kinds: Mapping[str, type[Kind]], description: Mapping[str, Any], noun: str
+) -> Kind:
+    """Return the dataclass that :func:`describe` described.
+
+    Parameters
+    ----------
+    kinds : the registry, from ``kind`` to dataclass.
+    description : plain data, of which ``kind`` names the class and all else are its fields.
+    noun : the word for one entry of the registry, such as ``noise``; it begins messages.
+
+    Raises
+    ------
+    InputError
+        The kind is unknown, or a field is unknown, missing or of the wrong type.
+    """
+    kind = look_up(kinds, description.get("kind"), noun)
+    options = {name: value for name, value in description.items() if name != "kind"}
+    return read_as(kind, options, f"{noun} '{description['kind']}'")
+
+
 def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:
     """The model with the fields of a dataclass, and ``key`` whose only value is ``tag``.
 
@@ -342,7 +371,7 @@ def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
         if key not in found:
             return source.error(f"key '{key}' is missing; expected {expected}", path, path)
         path, found = (*path, key), found[key]
-        expected += _closest(found, choices)
+        expected += closest(found, choices)
     if source.toml and expected == "a list":
         expected = f"tables [[{path[-1]}]]"
     value = _shortened(json.dumps(found, default=str, ensure_ascii=False))
@@ -364,11 +393,6 @@ def _found(data: Any, loc: Path) -> tuple[Path, Any]:
 
 def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
-
-
-def _closest(word: Any, known: Any) -> str:
-    close = get_close_matches(str(word), list(known), 1)
-    return f"; did you mean '{close[0]}'?" if close else ""
 
 
 def _shortened(text: str) -> str:

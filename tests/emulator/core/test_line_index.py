@@ -1,7 +1,7 @@
 import json
 import tomllib
 
-from emulator.line_index import json_lines, line_of, toml_lines
+from emulator.core.line_index import json_lines, line_of, toml_lines
 
 TOML = '''# a = 1
 law = "x"  # [not.a.table]

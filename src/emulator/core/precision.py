@@ -8,7 +8,7 @@ explicitly, so their speed is not affected.
 import jax
 import jax.numpy as jnp
 
-from emulator.errors import InputError
+from emulator.core.errors import InputError
 
 jax.config.update("jax_enable_x64", True)
 

@@ -1,0 +1,46 @@
+"""Errors meant for people: one line that names the thing, what was found, what would be right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used. The command line prints it and exits with code 2."""
+
+
+class SolverError(RuntimeError):
+    """A simulation did not converge; the message names how it failed."""
+
+
+def closest(name: object, known: Iterable[str]) -> str:
+    """Return "; did you mean 'x'?" for the known name most like ``name``, or nothing."""
+    close = get_close_matches(str(name), list(known), 1)
+    return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def look_up[T](entries: Mapping[str, T], name: object, noun: str) -> T:
+    """Return the entry called ``name``: the one wording of an unknown name.
+
+    Parameters
+    ----------
+    entries : the registry, or any other mapping from names to things of one kind.
+    name : the name that the user gave.
+    noun : the word for one entry, such as ``sampler``; it begins the message.
+
+    Raises
+    ------
+    InputError
+        No entry is called ``name``; the message lists the known names.
+    """
+    if not isinstance(name, str) or name not in entries:
+        known = ", ".join(entries) or "none"
+        raise InputError(f"{noun} '{name}' is unknown; known: {known}{closest(name, entries)}")
+    return entries[name]
+
+
+def check_seed(seed: int, what: str) -> None:
+    """Raise :class:`InputError` for a seed below 0; ``what`` begins the message."""
+    if seed < 0:
+        raise InputError(f"{what}: seed {seed} is below 0")
