@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import emulator as em
-from emulator import machine
+from emulator.core import machine
 from emulator.core.errors import InputError
 
 THREADS = """

@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from emulator import progress
+from emulator.core import progress
 
 
 @pytest.fixture
