@@ -12,7 +12,7 @@ LENIENT := $(addprefix --disable-error-code ,import-untyped import-not-found ind
 OLDEST := .venv-oldest
 OLDEST_TESTS := tests/test_package.py $(addprefix tests/emulator/,mechanics scenes fem/test_simulator.py surrogates \
 	training test_schema.py test_store.py) $(addprefix tests/calibrate/,samplers certificate cli/test_cli.py \
-	sensitivity_analysis report posterior/test_tree.py data/test_data.py workflow/test_demo.py)
+	analysis/sensitivity report posterior/test_tree.py measurements/test_data.py project/test_demo.py)
 
 .PHONY: demo test test-slow test-oldest package notebooks pictures docs lint format study clean
 

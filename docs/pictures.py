@@ -21,9 +21,9 @@ from typing import Any
 from PIL import Image
 
 from calibrate.explorer import Explorer, serve
+from calibrate.project import infer
+from calibrate.project.demo import DEMOS, run_demo
 from calibrate.report import write_report
-from calibrate.workflow import infer
-from calibrate.workflow.demo import DEMOS, run_demo
 from emulator.core.store import write_atomically
 from emulator.surrogates import load
 

@@ -26,7 +26,7 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.observations import spread_landmarks
+from calibrate.measurements import spread_landmarks
 from emulator.fem import run_campaign, sobol
 from emulator.fem.campaign.reference import fem_reference
 from emulator.surrogates.corrected import corrected

@@ -26,8 +26,8 @@ from scipy.optimize import brentq
 
 import calibrate as cal
 import emulator as em
-from calibrate.identifiability import identify, in_words
-from emulator.geometry.bodies.box import box
+from calibrate.analysis.identifiability import identify, in_words
+from emulator.geometry.generators.box import box
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS, Law, find_law
 from emulator.mechanics.laws.volumetric import quadratic

@@ -27,7 +27,7 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.observations import spread_landmarks
+from calibrate.measurements import spread_landmarks
 
 # %% [markdown]
 # ## The scene and its FEM solution

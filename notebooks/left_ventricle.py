@@ -22,8 +22,8 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.identifiability import identify, in_words, stress_band
-from calibrate.observations import spread_landmarks
+from calibrate.analysis.identifiability import identify, in_words, stress_band
+from calibrate.measurements import spread_landmarks
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "0.75"
 

@@ -28,7 +28,7 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from emulator.geometry.bodies.box import box, toward_ends
+from emulator.geometry.generators.box import box, toward_ends
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import Force, Gravity

@@ -30,9 +30,9 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.workflow import infer
-from calibrate.workflow.experiment import read_experiment
-from emulator.geometry.bodies.box import box
+from calibrate.project import infer
+from calibrate.project.experiment import read_experiment
+from emulator.geometry.generators.box import box
 
 # %% [markdown]
 # ## The scene

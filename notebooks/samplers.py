@@ -36,7 +36,7 @@ from numpyro.infer import MCMC, NUTS
 import calibrate as cal
 import emulator as em
 from calibrate.arviz import array_stats
-from calibrate.observations import spread_landmarks
+from calibrate.measurements import spread_landmarks
 from calibrate.samplers import (
     BlackJAXNUTSOptions,
     DelayedAcceptanceOptions,

@@ -33,9 +33,9 @@ import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import emulator as em
-from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.fibres import depth
+from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.tetrahedra import boundary_facets
 from emulator.scenes.draft import draft
 

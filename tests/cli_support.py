@@ -5,7 +5,7 @@ import json
 import meshio
 
 from calibrate.cli import main
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 
 SCENE = """
 law = "neo_hookean"

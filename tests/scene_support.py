@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import Gravity

@@ -5,7 +5,7 @@ from itertools import permutations, product
 import meshio
 import numpy as np
 
-from emulator.geometry.bodies.ellipsoid import HUMAN
+from emulator.geometry.generators.ellipsoid import HUMAN
 
 INSIDE = (HUMAN.short_endocardium, HUMAN.long_endocardium)
 OUTSIDE = (HUMAN.short_epicardium, HUMAN.long_epicardium)

@@ -15,9 +15,9 @@ import emulator as em
 from bad_words import COMMANDS, INFERENCES
 from calibrate.cli import main
 from calibrate.cli.common import seconds
-from calibrate.data import read_data, write_data
+from calibrate.measurements.data import read_data, write_data
 from calibrate.posterior.simulation_based import sbc
-from calibrate.workflow import Run, make_data
+from calibrate.project import Run, make_data
 from cli_support import write_block
 from emulator.core.errors import InputError
 from emulator.surrogates.files import SHIPPED
@@ -154,7 +154,7 @@ def emulators(folder):
 
 
 def posteriors(folder):
-    """Kept ones whose run.json was edited; tests/calibrate/workflow/test_restore.py has sampled ones."""
+    """Kept ones whose run.json was edited; tests/calibrate/project/test_restore.py has sampled ones."""
     scene = em.scenes.once_clamped_beam()
     truth = {"mu": 73.0, "lam": 61.0}
     run = asdict(Run(scene.name, truth=truth, noise={"displacement": 0.2}))
@@ -206,7 +206,7 @@ def test_all_commands_are_among_them():
 
 
 def test_unusual_input_is_taken(folder, monkeypatch, tmp_path):
-    """What a newcomer may do without harm; CSV's dialects: tests/calibrate/data/test_data.py."""
+    """What a newcomer may do without harm; CSV's dialects: tests/calibrate/measurements/test_data.py."""
     monkeypatch.chdir(folder)
     scene = em.scenes.once_clamped_beam()
     for name in ("tabs", "blanks"):

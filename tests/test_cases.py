@@ -9,8 +9,8 @@ import pytest
 
 from calibrate.cli import build_parser, main
 from calibrate.cli.model_words import model_of
+from calibrate.project import Run, observed
 from calibrate.statistical_model.load_states import known_thetas
-from calibrate.workflow import Run, observed
 from emulator.catalogue import find_scene
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "cases.md").read_text(encoding="utf-8")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import human_ventricle
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 
 pytestmark = pytest.mark.slow

@@ -1,8 +1,7 @@
+from .analysis.identifiability import identify
+from .analysis.sensitivity import sensitivity
 from .certificate import Certificate, certify, reweight
-from .hierarchical_model import Hierarchy, hierarchy, read_hierarchy
-from .identifiability import identify
-from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
-from .observations import (
+from .measurements import (
     CavityVolume,
     Klotz,
     KlotzVolume,
@@ -16,6 +15,8 @@ from .observations import (
     strains,
     surface_points,
 )
+from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
+from .population import Hierarchy, hierarchy, read_hierarchy
 from .posterior import Posterior, sample
 from .posterior.comparison import compare
 from .posterior.klotz_band import klotz_band
@@ -30,14 +31,13 @@ from .priors import (
     truncated,
     truncated_normal,
 )
+from .project import load
+from .project.campaigns import campaign
 from .samplers import Density, NUTSOptions, density_of
-from .sensitivity_analysis import sensitivity
 from .statistical_model import Model
 from .statistical_model.build import model
 from .statistical_model.systematic import placement, rigid_motion, with_systematic
 from .um_bridge import serve
-from .workflow import load
-from .workflow.campaigns import campaign
 
 __version__: str
 

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.local_server import LOOPBACK, Handler, Server, listen
-from calibrate.observations import Observation, Observations, observations
-from calibrate.observations.outputs import Outputs
+from calibrate.measurements import Observation, Observations, observations
+from calibrate.measurements.outputs import Outputs
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.protocol import ForwardMap
 

@@ -1,8 +1,8 @@
 from . import fem, scenes
+from .accuracy.comparison import evaluate
+from .accuracy.mesh_error import MeshError, mesh_error
 from .catalogue import find_scene
-from .error.comparison import evaluate
-from .error.mesh_error import MeshError, mesh_error
-from .errors import InputError, SolverError
+from .core.errors import InputError, SolverError
 from .fem import NewtonOptions, Simulator, Solution, Status, run_campaign
 from .fem.campaign.reference import fem_reference
 from .fem.campaign.stored_runs import read_runs

@@ -8,7 +8,7 @@ from studies.accuracy_vs_time.rungs import CLOCK, Place
 from studies.common.fenicsx import compare
 from studies.common.output import Case
 
-from calibrate.observations import landmarks
+from calibrate.measurements import landmarks
 
 STAGE = "FEniCSx"
 

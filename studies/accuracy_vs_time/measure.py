@@ -16,7 +16,7 @@ from studies.accuracy_vs_time.rungs import CLOCK, COMPILED, Place, Rung, Solve
 from studies.common.output import Case
 from studies.common.timing import per_call, unseen
 
-from calibrate.observations import landmarks
+from calibrate.measurements import landmarks
 from emulator.core.errors import InputError
 from emulator.core.store import replacing
 from emulator.fem import Simulator, run_campaign, sobol

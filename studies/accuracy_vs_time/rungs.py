@@ -19,7 +19,7 @@ from studies.common.timing import clocked
 from studies.common.two_meshes import on_two_meshes
 
 import emulator as em
-from calibrate.observations import landmarks, spread_landmarks
+from calibrate.measurements import landmarks, spread_landmarks
 from emulator.core.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign, sobol
 from emulator.scenes import Scene

@@ -16,7 +16,7 @@ import numpy as np
 
 import calibrate as cal
 from calibrate.figures.drawing import pyplot
-from calibrate.observations import spread_nodes
+from calibrate.measurements import spread_nodes
 from calibrate.provenance import study_header
 from emulator import Simulator, load
 from emulator.core.store import write_json

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import emulator as em
-from calibrate.observations import spread_nodes
+from calibrate.measurements import spread_nodes
 from emulator.fem.solution import Solution, Status
 from emulator.scenes.nodes import all_nodes
 from emulator.surrogates.protocol import Prediction, fingerprint_of

@@ -15,7 +15,7 @@ import numpy as np
 from studies.common.timing import Function, batched, clocked, loop, milliseconds, per_call, unseen
 
 import emulator as em
-from calibrate.observations import Landmarks, landmarks, spread_landmarks
+from calibrate.measurements import Landmarks, landmarks, spread_landmarks
 from emulator.surrogates import Architecture, CachedEmulator, Emulator, augment
 from emulator.surrogates.network.part import Network, fresh
 from emulator.surrogates.taylor import expand

@@ -8,7 +8,7 @@ import numpy as np
 from studies.common.timing import Function, batched, in_loop, milliseconds, per_call, unseen
 
 import emulator as em
-from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
+from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates import CachedEmulator
 from emulator.surrogates.corrected import corrected

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 
 import emulator as em
-from calibrate.observations import (
+from calibrate.measurements import (
     CavityVolume,
     Observation,
     Observations,
     landmarks,
     spread_nodes,
 )
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.geometry.quadratic import to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Scene, Support

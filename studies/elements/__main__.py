@@ -9,8 +9,8 @@ fibres an element, a node and a quadrature point. At the centre of the box and a
 corners: displacement of 40 landmarks, growth of the cavity, fibre strain, each against the limit
 of fine meshes, and seconds a solve from rest, compiled. The limit of landmarks and growth is
 Richardson's, from meshes of elements twice and four times as long, where these are given, else the
-finest mesh's. Beside each error the estimate of ``emulator.error.mesh_error``, from the mesh alone.
-Writes results.json after each case and elements.png.
+finest mesh's. Beside each error the estimate of ``emulator.accuracy.mesh_error``, from the mesh
+alone. Writes results.json after each case and elements.png.
 """
 
 import time
@@ -25,7 +25,7 @@ from studies.elements.bodies import BEAM, BODIES, Body, Measured, measured
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
-from calibrate.observations.landmarks import spread_landmarks
+from calibrate.measurements.landmarks import spread_landmarks
 from emulator.scenes.scene import Scene
 
 HERE = Path(__file__).parent

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import emulator as em
-from calibrate.observations.location import locate, locate_gradients
+from calibrate.measurements.location import locate, locate_gradients
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.directions import from_nodes, of_elements, unit
 from emulator.geometry.discretisation import from_quadrature_points, quadrature_points
 from emulator.geometry.fibres import Depth, nodal_depth, rule_based_fibres, turned
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_linear, to_quadratic
 from emulator.scenes.left_ventricle import HELIX

@@ -21,8 +21,8 @@ from studies.error_bar.tables import ESTIMATES, effectivities, polishes
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
+from emulator.accuracy.estimate import error_bar
 from emulator.core.store import write_json
-from emulator.error.estimate import error_bar
 from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates.corrected import newton_step

@@ -11,7 +11,7 @@ from studies.common.output import Case
 from studies.common.timing import clocked
 
 import emulator as em
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import DeadPressure
 from emulator.scenes.parameter_space import Parameter

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import emulator as em
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.released.scenes import published_scene
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure

@@ -16,7 +16,7 @@ from studies.common.output import Case
 from studies.common.timing import clocked
 
 import emulator as em
-from calibrate.observations import landmarks, spread_landmarks
+from calibrate.measurements import landmarks, spread_landmarks
 from emulator.fem import sobol
 from emulator.fem.balance import balance
 from emulator.scenes.scene import Scene

@@ -18,7 +18,7 @@ from studies.few_runs.methods import (
 )
 
 import emulator as em
-from emulator.error.comparison import quantiles
+from emulator.accuracy.comparison import quantiles
 from emulator.fem import Runs, sobol
 from emulator.scenes import BUILT_IN, Scene
 from emulator.scenes.cavities import find_cavity

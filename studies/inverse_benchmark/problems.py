@@ -15,7 +15,7 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks, strains
+from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks, strains
 from emulator.core.store import write_json
 from emulator.fem import Simulator
 from emulator.scenes import Scene

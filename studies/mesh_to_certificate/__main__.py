@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from studies.common.output import save
 
-from calibrate.data import write_data
 from calibrate.figures.drawing import pyplot
+from calibrate.measurements.data import write_data
+from calibrate.project import Run, make_data
 from calibrate.provenance import study_header
-from calibrate.workflow import Run, make_data
 from emulator.catalogue import find_scene
 from emulator.core.store import write_json
-from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
+from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.io import write_mesh
 
 HERE = Path(__file__).parent

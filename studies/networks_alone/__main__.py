@@ -27,8 +27,8 @@ import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE
 from calibrate.provenance import study_header
+from emulator.accuracy.comparison import case_errors, quantiles
 from emulator.core.store import write_json
-from emulator.error.comparison import case_errors, quantiles
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates import Architecture, Emulator, load, shipped

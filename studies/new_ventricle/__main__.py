@@ -19,11 +19,11 @@ from studies.common.processes import printed
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
+from emulator.accuracy.comparison import evaluate
 from emulator.core.store import write_json
-from emulator.error.comparison import evaluate
 from emulator.fem import run_campaign, sobol
-from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.fibres import rule_based_fibres
+from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.scenes import Scene
 from emulator.training import recipe, train
 

@@ -25,8 +25,8 @@ import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.evaluation import LABELS
 from calibrate.provenance import study_header
+from emulator.accuracy.comparison import Errors, case_errors, log_density, quantiles
 from emulator.core.store import write_json
-from emulator.error.comparison import Errors, case_errors, log_density, quantiles
 from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates import Architecture, load, save_emulator

@@ -33,7 +33,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE, GREEN, ORANGE, PINK, VERMILION
-from calibrate.observations import parse_observation
+from calibrate.measurements import parse_observation
 from emulator.core.errors import SolverError
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from emulator.error.comparison import case_errors, quantiles
+from emulator.accuracy.comparison import case_errors, quantiles
 from emulator.fem import Runs
 from emulator.surrogates import Emulator
 

@@ -23,7 +23,7 @@ from studies.common.output import save
 
 import calibrate as cal
 from calibrate.figures.drawing import pyplot
-from calibrate.observations import parse_observation
+from calibrate.measurements import parse_observation
 from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import FEMLikelihood, with_error

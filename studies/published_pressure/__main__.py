@@ -22,7 +22,7 @@ from studies.common.output import save
 
 import calibrate as cal
 from calibrate.figures.drawing import pyplot
-from calibrate.observations import parse_observation
+from calibrate.measurements import parse_observation
 from calibrate.provenance import study_header
 from emulator.core.store import write_json
 from emulator.fem import Runs, Simulator, sobol

@@ -23,7 +23,7 @@ from studies.common.output import save
 import calibrate as cal
 import emulator as em
 from calibrate.figures.drawing import pyplot
-from calibrate.observations import parse_observation
+from calibrate.measurements import parse_observation
 from calibrate.provenance import study_header
 from emulator.core.store import write_json
 from emulator.released.files import units

@@ -17,10 +17,10 @@ import numpyro.distributions as dist
 import calibrate as cal
 from calibrate.figures.calibration import draw
 from calibrate.posterior.simulation_based import Calibration, sbc
+from calibrate.project import Run, by_fem, model_before_data
 from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import Model
-from calibrate.workflow import Run, by_fem, model_before_data
 from emulator.core.store import read_json, write_json
 
 HERE = Path(__file__).parent

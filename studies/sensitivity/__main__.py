@@ -19,12 +19,12 @@ from studies.common.output import Case, Results, parser, save
 
 import calibrate as cal
 import emulator as em
+from calibrate.analysis.sensitivity import Factors, analyse
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE, GREEN, ORANGE
 from calibrate.figures.sensitivity import body_figure
-from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
+from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.priors import truncated_normal
-from calibrate.sensitivity_analysis import Factors, analyse
 from emulator.surrogates.fem import fem_forward
 
 HERE = Path(__file__).parent

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem.energy import point_energy
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.fibre_angles import FibreAngles, turned

@@ -18,7 +18,7 @@ import calibrate as cal
 from calibrate.statistical_model import Model
 from calibrate.statistical_model.shared_errors import turned
 from calibrate.statistical_model.systematic import Systematic, SystematicError
-from emulator.geometry.bodies.box import box, toward_ends
+from emulator.geometry.generators.box import box, toward_ends
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import Force, Gravity

@@ -22,8 +22,8 @@ from studies.common.output import save
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.provenance import study_header
+from emulator.accuracy.comparison import evaluate, field_errors, quantiles
 from emulator.core.store import write_json
-from emulator.error.comparison import evaluate, field_errors, quantiles
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.geometry.cavity import Cavity
 from emulator.scenes import Scene

@@ -10,7 +10,7 @@ from studies.common.output import Case
 from studies.unloading.bodies import farthest, imaged, some_theta
 
 import emulator as em
-from emulator.error.comparison import quantiles
+from emulator.accuracy.comparison import quantiles
 from emulator.scenes import Scene
 from emulator.scenes.cavities import find_cavity
 from emulator.scenes.loads import KPA_PER_MMHG

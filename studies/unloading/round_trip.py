@@ -17,7 +17,7 @@ import emulator as em
 from emulator.fem import NewtonOptions, Status
 from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.moved import at_rest
-from emulator.geometry.bodies.sphere import sphere_octant
+from emulator.geometry.generators.sphere import sphere_octant
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Scene
 from emulator.verify.sphere import INNER, MU, NU, OUTER, pressure_at, sphere_scene

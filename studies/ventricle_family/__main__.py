@@ -39,8 +39,8 @@ import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import BLUE, GREEN, VERMILION
 from calibrate.provenance import hardware, study_header, versions
+from emulator.accuracy.comparison import quantiles
 from emulator.core.store import read_arrays, write_json
-from emulator.error.comparison import quantiles
 from emulator.fem.campaign import run_campaign
 from emulator.fem.campaign.designs import sobol
 from emulator.scenes.left_ventricle import left_ventricle

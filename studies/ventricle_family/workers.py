@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import emulator as em
+from emulator.accuracy.comparison import case_errors, quantiles
 from emulator.core.store import save_arrays
-from emulator.error.comparison import case_errors, quantiles
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import design, sobol
 from emulator.scenes.left_ventricle import left_ventricle

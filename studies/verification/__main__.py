@@ -28,7 +28,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.figures.palette import COLOURS
-from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
+from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import Simulator, run_campaign
 from emulator.geometry.fibres import rule_based_fibres

@@ -10,7 +10,7 @@ import pytest
 import emulator as em
 from calibrate.cli import main
 from calibrate.posterior import read_tree
-from calibrate.workflow import simulator_of
+from calibrate.project import simulator_of
 from emulator.scenes import registry
 from emulator.scenes.nodes import all_nodes
 from emulator.surrogates import save_emulator

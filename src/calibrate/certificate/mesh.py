@@ -1,7 +1,7 @@
 r"""What a finer mesh would change of a posterior.
 
 FEM at a few points of the posterior, on its mesh and on the next finer one
-(:mod:`emulator.error.mesh_error`), differ in the data's space by :math:`D`, which varies little
+(:mod:`emulator.accuracy.mesh_error`), differ in the data's space by :math:`D`, which varies little
 over a posterior. A Gaussian process of theta continues it
 (:mod:`calibrate.certificate.correction`). Added to what FEM on the mesh has shown of the map, it
 gives a posterior with the finer mesh's FEM, and the pool follows that one; half of the points lie
@@ -27,12 +27,12 @@ from calibrate.certificate.moments import jackknife, moments
 from calibrate.certificate.pool import ENOUGH, Pool, corrected_again, step
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs
-from calibrate.observations import Observations
-from calibrate.observations.mesh_error import on_finer
+from calibrate.measurements import Observations
+from calibrate.measurements.mesh_error import on_finer
 from calibrate.samplers.importance import effective, normalised
+from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
 from emulator.core.errors import InputError, SolverError
 from emulator.core.progress import counting
-from emulator.error.mesh_error import MeshError, MeshErrorEstimate, mesh_error
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once, in_order
 

@@ -14,8 +14,8 @@ from calibrate.places import absolute, emulator_place, prior_place, scene_place
 from emulator.core.errors import InputError
 
 if TYPE_CHECKING:
-    from calibrate.workflow import Run
-    from calibrate.workflow.experiment import Cohort
+    from calibrate.project import Run
+    from calibrate.project.experiment import Cohort
     from emulator.surrogates.additive import Emulator
 
 
@@ -81,7 +81,7 @@ def add_model(parser: argparse.ArgumentParser) -> None:
 
 
 def model_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What :func:`add_model` read and was given, as fields of :class:`~calibrate.workflow.Run`.
+    """What :func:`add_model` read and was given, as fields of :class:`~calibrate.project.Run`.
 
     Of an experiment file, what takes the place of its entries.
     """
@@ -120,8 +120,8 @@ def plan_of(arguments: argparse.Namespace, **sampling: Any) -> Run | Cohort:
 
     ``sampling`` are further fields of a run, ``None`` where nothing was given.
     """
-    from calibrate.workflow import Run
-    from calibrate.workflow.experiment import read_experiment
+    from calibrate.project import Run
+    from calibrate.project.experiment import read_experiment
 
     given = model_of(arguments) | {n: v for n, v in sampling.items() if v is not None}
     if experiment_file(arguments.scene):
@@ -131,7 +131,7 @@ def plan_of(arguments: argparse.Namespace, **sampling: Any) -> Run | Cohort:
 
 def run_of(arguments: argparse.Namespace, **sampling: Any) -> Run:
     """:func:`plan_of` where it is of one body; :class:`InputError` where it is of several."""
-    from calibrate.workflow import Run
+    from calibrate.project import Run
 
     plan = plan_of(arguments, **sampling)
     if not isinstance(plan, Run):

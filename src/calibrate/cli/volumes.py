@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import jax
 
-    from emulator.error.estimate import ErrorEstimate
+    from emulator.accuracy.estimate import ErrorEstimate
     from emulator.scenes.scene import Scene
 
 Volumes = dict[str, dict[str, float | None]]

@@ -16,10 +16,10 @@ import numpy as np
 from plotly.offline import get_plotlyjs
 
 from calibrate.local_server import Handler, Server, listen
-from calibrate.observations.klotz import klotz_of
-from calibrate.observations.pressure_volume import PressureVolume, pressure_volume
+from calibrate.measurements.klotz import klotz_of
+from calibrate.measurements.pressure_volume import PressureVolume, pressure_volume
+from emulator.accuracy.estimate import error_bar
 from emulator.core.errors import InputError
-from emulator.error.estimate import error_bar
 from emulator.fem import Simulator, Status
 from emulator.geometry.cavity import Cavity
 from emulator.geometry.facets import surface_mesh

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from calibrate.certificate import Certificate
-from calibrate.observations import DISPLACEMENT
-from calibrate.observations.points import DisplacementPoints
+from calibrate.measurements import DISPLACEMENT
+from calibrate.measurements.points import DisplacementPoints
 from calibrate.posterior import Posterior
 from emulator.core.errors import InputError
 from emulator.core.store import replacing

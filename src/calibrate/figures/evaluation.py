@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibrate.figures.drawing import pyplot, save
-from emulator.error.comparison import UNITS, Errors, log_density, quantiles
+from emulator.accuracy.comparison import UNITS, Errors, log_density, quantiles
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import Parameter
@@ -17,7 +17,7 @@ from emulator.scenes.scene import Scene
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from calibrate.evaluation import Evaluated
+    from calibrate.analysis.evaluation import Evaluated
 
 LABELS = {
     "err_u": "error in displacement (mm)",

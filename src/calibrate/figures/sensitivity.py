@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from calibrate.analysis.sensitivity import FIELD
 from calibrate.figures.drawing import pyplot, save
 from calibrate.figures.palette import BLUE, VERMILION
-from calibrate.sensitivity_analysis import FIELD
 from emulator.geometry.facets import flat_triangles
 from emulator.scenes.scene import Scene
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from calibrate.figures.drawing import pyplot, save
 from calibrate.figures.palette import BLUE, VERMILION
-from calibrate.hierarchical_model import Hierarchy
-from calibrate.hierarchical_model.tree import ALONE
+from calibrate.population import Hierarchy
+from calibrate.population.tree import ALONE
 
 _ALONE, _TOGETHER, _POPULATION = "0.55", BLUE, VERMILION
 APART = 0.16  # of the rows' distance, between a member's two intervals

@@ -25,7 +25,7 @@ from calibrate.noise.protocol import Sites
 from calibrate.noise.scale import Scale, check_positive
 
 NOISE_SCALE = "noise_scale"
-_FAR = 5.0  # sds of a Gaussian, at which data is judged (`calibrate.data.magnitude`)
+_FAR = 5.0  # sds of a Gaussian, at which data is judged (`calibrate.measurements.magnitude`)
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.observations.klotz import PRESSURE_SCATTER, Klotz
-from calibrate.observations.pressure_volume import pressure_volume
+from calibrate.measurements.klotz import PRESSURE_SCATTER, Klotz
+from calibrate.measurements.pressure_volume import pressure_volume
 from calibrate.statistical_model import Model
 from emulator.core.errors import InputError, check_seed
 

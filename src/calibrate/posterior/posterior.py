@@ -14,8 +14,8 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
-from calibrate.observations import Observation
-from calibrate.observations.present import missing_values
+from calibrate.measurements import Observation
+from calibrate.measurements.present import missing_values
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.posterior.fit import misfits
 from calibrate.posterior.predictions import predicted

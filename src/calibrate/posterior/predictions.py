@@ -19,9 +19,9 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro import handlers
 
+from calibrate.measurements import Observation
+from calibrate.measurements.outputs import Outputs
 from calibrate.noise.spatial import SpatialNormal
-from calibrate.observations import Observation
-from calibrate.observations.outputs import Outputs
 from calibrate.statistical_model import Data, Model
 from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, evaluate_all
 

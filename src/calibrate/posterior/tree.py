@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from calibrate.arviz import base
-from calibrate.observations import Observations
+from calibrate.measurements import Observations
 from calibrate.posterior import predictions
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model

@@ -12,11 +12,11 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from scipy.stats import rankdata
 
+from calibrate.analysis.identifiability.stress import stress_band
 from calibrate.figures.palette import BLUE, COLOURS, VERMILION
-from calibrate.identifiability.stress import stress_band
-from calibrate.observations import Observation
-from calibrate.observations.klotz import klotz_of
-from calibrate.observations.pressure_volume import PressureVolume, in_mmhg, pressure_volume
+from calibrate.measurements import Observation
+from calibrate.measurements.klotz import klotz_of
+from calibrate.measurements.pressure_volume import PressureVolume, in_mmhg, pressure_volume
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
 from emulator.scenes.loads import KPA_PER_MMHG

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import numpyro.distributions as dist
 
+from calibrate.analysis.identifiability.combinations import identify, in_words
 from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
 from calibrate.certificate.verdict import shifts
-from calibrate.identifiability.combinations import identify, in_words
 from calibrate.posterior import Posterior
 from calibrate.posterior.posterior import describe_distribution
+from calibrate.project import Run, holds_population, read_posterior, simulator_of
+from calibrate.project.cohort import read_cohort
+from calibrate.project.workflow import CERTIFICATE, REPORT
 from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
-from calibrate.workflow import Run, holds_population, read_posterior, simulator_of
-from calibrate.workflow.cohort import read_cohort
-from calibrate.workflow.workflow import CERTIFICATE, REPORT
 from emulator.core.store import read_json, replacing
 
 _MOVED = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
@@ -32,8 +32,8 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, fem: bool
 
     Parameters
     ----------
-    folder : of :func:`calibrate.workflow.infer`, or of a population
-        (:func:`calibrate.workflow.cohort.infer_cohort`).
+    folder : of :func:`calibrate.project.infer`, or of a population
+        (:func:`calibrate.project.cohort.infer_cohort`).
     fem : solve once at the posterior's mean, to show the map's error on the body; nothing is solved
         for a population.
 
@@ -187,7 +187,7 @@ def _draws(posterior: Posterior) -> str:
 
 def _provenance(run: Run, posterior: Posterior) -> str:
     again = (
-        "from calibrate.workflow import infer, read_posterior\n\n"
+        "from calibrate.project import infer, read_posterior\n\n"
         'run, _ = read_posterior("THIS FOLDER")\n'
         'infer(run, "ANOTHER FOLDER")  # the same draws'
     )

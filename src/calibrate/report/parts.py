@@ -15,7 +15,7 @@ import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
 
-from calibrate.workflow import Run
+from calibrate.project import Run
 
 GOOD, UNSURE, BAD = "#00684a", "#8a5a00", "#9c2a00"
 """Colours of verdicts, from the best to the worst."""

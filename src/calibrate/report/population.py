@@ -16,16 +16,16 @@ import numpy as np
 import xarray as xr
 
 from calibrate.figures.shrinkage import label_of
-from calibrate.hierarchical_model import Hierarchy
-from calibrate.hierarchical_model.model import MEDIAN, SD
-from calibrate.hierarchical_model.tree import CORRELATION
+from calibrate.population import Hierarchy
+from calibrate.population.model import MEDIAN, SD
+from calibrate.population.tree import CORRELATION
 from calibrate.posterior import read_tree
 from calibrate.posterior.fit import misfits
+from calibrate.project.cohort import NOT_CERTIFIED, kept_verdicts
+from calibrate.project.experiment import POPULATION, Cohort, Shared
+from calibrate.project.workflow import MEMBERS, POSTERIOR, REPORT
 from calibrate.report import charts, parts
 from calibrate.report.shrinkage import shrinkage
-from calibrate.workflow.cohort import NOT_CERTIFIED, kept_verdicts
-from calibrate.workflow.experiment import POPULATION, Cohort, Shared
-from calibrate.workflow.workflow import MEMBERS, POSTERIOR, REPORT
 
 _FORM = ".4g"
 _UNTOLD = ("members", "alone")  # fingerprints, and what a cohort always says
@@ -194,7 +194,7 @@ def _provenance(cohort: Cohort, found: Hierarchy) -> str:
     usual, chosen = asdict(Shared()), asdict(cohort.population)
     shared = {k: v for k, v in chosen.items() if v != usual[k]}
     again = (
-        "from calibrate.workflow.cohort import infer_cohort, read_cohort\n\n"
+        "from calibrate.project.cohort import infer_cohort, read_cohort\n\n"
         'cohort, _ = read_cohort("THIS FOLDER")\n'
         'infer_cohort(cohort, "ANOTHER FOLDER")  # the same draws'
     )

@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 
 from calibrate.figures.palette import BLUE, VERMILION
 from calibrate.figures.shrinkage import APART, Intervals, intervals_of, label_of
-from calibrate.hierarchical_model import Hierarchy
+from calibrate.population import Hierarchy
 from calibrate.report.charts import translucent
 
 _GREY = "#8c8c8c"

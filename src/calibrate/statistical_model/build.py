@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from calibrate.measurements import Observation, Observations, observations
 from calibrate.noise import Noise
-from calibrate.observations import Observation, Observations, observations
 from calibrate.priors import Prior, dependence_of
 from calibrate.statistical_model.load_states import load_states
 from calibrate.statistical_model.model import Model, at_sites
@@ -35,7 +35,7 @@ def model(
         :class:`~calibrate.priors.JointPrior` correlates some.
     known : parameters that are not inferred, by the same names.
     check_scale : ``False`` to take data however far from every prediction
-        (:mod:`calibrate.data.magnitude`).
+        (:mod:`calibrate.measurements.magnitude`).
 
     Raises
     ------

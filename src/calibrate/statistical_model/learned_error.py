@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from calibrate.measurements.mesh_error import on_finer
 from calibrate.noise.information import information_about_means
-from calibrate.observations.mesh_error import on_finer
 from calibrate.statistical_model.approximation_error import fit
 from calibrate.statistical_model.model import Data, Model
+from emulator.accuracy.mesh_error import mesh_error
 from emulator.core.errors import InputError, SolverError
 from emulator.core.progress import counting
-from emulator.error.mesh_error import mesh_error
 from emulator.fem import Simulator
 from emulator.fem.campaign import Solver, solve_rows
 
@@ -46,8 +46,8 @@ def with_error(
     ------
     InputError
         Fewer than 8 runs, the simulator of another scene, noise that is not Gaussian or of unknown
-        sd, no finer mesh (:func:`~emulator.error.mesh_error.mesh_error`), or fewer than 8 draws at
-        which both FEM and the map have an answer.
+        sd, no finer mesh (:func:`~emulator.accuracy.mesh_error.mesh_error`), or fewer than 8 draws
+        at which both FEM and the map have an answer.
     """
     _check(model, simulator, runs)
     data = jax.jit(model.predict)

@@ -23,10 +23,10 @@ import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 
-from calibrate.data.magnitude import PRIOR_DRAWS, check_magnitudes
+from calibrate.measurements import Observations
+from calibrate.measurements.magnitude import PRIOR_DRAWS, check_magnitudes
+from calibrate.measurements.present import leave_out_missing
 from calibrate.noise import Noise
-from calibrate.observations import Observations
-from calibrate.observations.present import leave_out_missing
 from calibrate.priors import Prior
 from calibrate.priors.joint_prior import Conditional, Dependence
 from calibrate.state_names import split
@@ -253,7 +253,7 @@ class Model:
     ) -> tuple[Model, dict[str, jax.Array]]:
         """The model of the values that are not missing, and these, checked.
 
-        Missing values are NaN (:mod:`calibrate.observations.present`).
+        Missing values are NaN (:mod:`calibrate.measurements.present`).
 
         Raises
         ------

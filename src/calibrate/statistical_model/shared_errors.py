@@ -16,8 +16,8 @@ from typing import Any, Literal, Protocol
 import jax
 import numpy as np
 
-from calibrate.observations.points import DisplacementPoints
-from calibrate.observations.present import Present
+from calibrate.measurements.points import DisplacementPoints
+from calibrate.measurements.present import Present
 from calibrate.state_names import split
 from calibrate.statistical_model.curve import check_curve, curve_modes
 from calibrate.statistical_model.model import Model

@@ -46,7 +46,7 @@ def aha_segments(
     through : a point on the axis, mm.
     anterior : from the axis to the middle of the anterior wall, any length; its component along
         the axis is ignored. The default puts the septum towards positive x, as in
-        :mod:`~emulator.geometry.bodies.biventricle`.
+        :mod:`~emulator.geometry.generators.biventricle`.
 
     Raises
     ------

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from emulator.geometry.bodies.box import box, toward_ends
+from emulator.geometry.generators.box import box, toward_ends
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity, GravityVector
@@ -74,7 +74,7 @@ def once_clamped_beam(
     order : 2, quadratic elements; 1, linear ones as published, which lock: the tip of 12 x 4 x 5
         cells sinks by 38 mm instead of 59, at the centre of the box.
     grading : 1 for even cells, more for cells that are shorter at the clamp, see
-        :func:`~emulator.geometry.bodies.box.toward_ends`.
+        :func:`~emulator.geometry.generators.box.toward_ends`.
     """
     return _beam("once_clamped_beam", cells, order, grading, ("left",))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulator.geometry.bodies import biventricle as geometry
+from emulator.geometry.generators import biventricle as geometry
 from emulator.mechanics.laws import find_law
 from emulator.scenes.fibre_rules import Biventricle
 from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE
@@ -38,7 +38,7 @@ def biventricle(
     Parameters
     ----------
     rings, around, layers, grading : of the mesh, as in
-        :func:`~emulator.geometry.bodies.biventricle.biventricle`; by default what the elements'
+        :func:`~emulator.geometry.generators.biventricle.biventricle`; by default what the elements'
         order needs.
     angles : helix angle in degrees on the endocardia and on the epicardium.
     kappa : resistance to volume change, kPa.

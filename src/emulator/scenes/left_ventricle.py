@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import astuple
 
-from emulator.geometry.bodies.ellipsoid import HUMAN, EllipsoidalWall, truncated_ellipsoid
+from emulator.geometry.generators.ellipsoid import HUMAN, EllipsoidalWall, truncated_ellipsoid
 from emulator.mechanics.laws import find_law
 from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
@@ -33,7 +33,7 @@ SIZES = {
     1: {"rings": 15, "around": 30, "layers": 3, "grading": 1.0},
     2: {"rings": 8, "around": 28, "layers": 3, "grading": 1.5},
 }
-"""Mesh by default, as in :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`: 1564
+"""Mesh by default, as in :func:`~emulator.geometry.generators.ellipsoid.truncated_ellipsoid`: 1564
 linear nodes, 4627 quadratic ones."""
 
 
@@ -59,12 +59,13 @@ def left_ventricle(
     Parameters
     ----------
     rings, around, layers, grading : of the mesh, as in
-        :func:`~emulator.geometry.bodies.ellipsoid.truncated_ellipsoid`; by default what the
+        :func:`~emulator.geometry.generators.ellipsoid.truncated_ellipsoid`; by default what the
         elements' order needs.
     angles : helix angle on the endocardium and on the epicardium, in degrees, or the name of a
         parameter, which then varies within 20 degrees of ``HELIX``.
     kappa : resistance to volume change, kPa.
-    wall : the dimensions of an :class:`~emulator.geometry.bodies.ellipsoid.EllipsoidalWall`, mm.
+    wall : the dimensions of an :class:`~emulator.geometry.generators.ellipsoid.EllipsoidalWall`,
+    mm.
     thicker : by which fraction the wall is thicker at the base, and towards which angle in degrees.
     order : 2, quadratic elements with a fibre at each of their four points; 1, linear ones as
         published, whose cavity grows by a quarter too little (``studies/elements``).

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulator.geometry.bodies.ellipsoid import human_ventricle
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.mechanics.laws import find_law
 from emulator.scenes.left_ventricle import PRESSURE, SIZES
 from emulator.scenes.loads import CavityPressure

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from emulator.geometry.bodies.organ import organ
+from emulator.geometry.generators.organ import organ
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity
 from emulator.scenes.parameter_space import Parameter
@@ -16,7 +16,7 @@ SIZES: dict[int, dict[str, Any]] = {
     1: {"shells": 6, "clustering": 0.0, "ligament_shells": 6, "ligament": None},
     2: {"shells": 5, "clustering": 0.5, "ligament_shells": 5, "ligament": 2.0},
 }
-"""Mesh by default, as in :func:`~emulator.geometry.bodies.organ.organ`, and the ligament's
+"""Mesh by default, as in :func:`~emulator.geometry.generators.organ.organ`, and the ligament's
 stiffness: 923 linear nodes, 3871 quadratic ones."""
 
 
@@ -35,7 +35,8 @@ def liver(
     Parameters
     ----------
     shells, clustering, ligament_shells : of the mesh, as in
-        :func:`~emulator.geometry.bodies.organ.organ`; by default what the elements' order needs.
+        :func:`~emulator.geometry.generators.organ.organ`; by default what the elements' order
+        needs.
     order : of the elements.
     ligament : its stiffness in kPa/mm, 2 by default. Linear elements have it clamped by default, as
         published: stresses are then infinite at its edge, and no mesh for daily use is right there

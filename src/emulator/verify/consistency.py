@@ -11,8 +11,8 @@ import numpy as np
 
 from emulator.fem import Simulator
 from emulator.fem.energy import strain_energy
-from emulator.geometry.bodies.box import box
 from emulator.geometry.discretisation import discretise
+from emulator.geometry.generators.box import box
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.barriers import Barriers

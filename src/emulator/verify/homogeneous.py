@@ -22,7 +22,7 @@ from scipy.optimize import brentq
 
 from emulator.fem import Simulator
 from emulator.fem.energy import strain_energy
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.verify.benchmark import Benchmark

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem import Simulator
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import LAND, land_ventricle
 from emulator.geometry.discretisation import discretise
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import LAND, land_ventricle
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws import find_law

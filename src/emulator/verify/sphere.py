@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem import Simulator
-from emulator.geometry.bodies.sphere import sphere_octant
+from emulator.geometry.generators.sphere import sphere_octant
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Parameter, Scene, Support

@@ -10,7 +10,7 @@ import numpy as np
 from studies.stability.emulation.check import Ended, add
 
 import emulator as em
-from emulator.error.estimate import error_bar
+from emulator.accuracy.estimate import error_bar
 from emulator.fem import Simulator
 from emulator.surrogates.additive import Emulator
 

@@ -11,9 +11,9 @@ import numpy as np
 from studies.stability.solver.case import SEED
 
 from emulator import Parameter, Scene, Support
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.fibres import rule_based_fibres
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.tetrahedra import signed_volumes

@@ -9,7 +9,7 @@ from studies.stability.solver.bodies import CLAMPED, DOWN, along_x, exponents
 from studies.stability.solver.case import Case, case
 
 from emulator import Parameter, Scene, Support
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Traction
 

@@ -7,7 +7,7 @@ from studies.stability.solver.bodies import bar, moduli
 from studies.stability.solver.case import Case, case, near
 
 from emulator import Support
-from emulator.geometry.bodies.sphere import sphere_octant
+from emulator.geometry.generators.sphere import sphere_octant
 from emulator.scenes.loads import FollowerPressure
 
 

@@ -10,7 +10,7 @@ from studies.stability.solver.bodies import DOWN, bar
 from studies.stability.solver.case import CASES, Case, case
 
 from emulator import Scene, Support
-from emulator.geometry.bodies.slab import cooks_membrane
+from emulator.geometry.generators.slab import cooks_membrane
 from emulator.geometry.tetrahedra import signed_volumes
 from emulator.scenes.loads import Traction
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from studies.stability.solver.bodies import DOWN, bar, jittered, moduli, moved
 from studies.stability.solver.case import Case, case
 
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes.loads import Gravity
 

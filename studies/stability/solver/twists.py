@@ -9,7 +9,7 @@ from studies.stability.solver.bodies import bar, moduli, moved
 from studies.stability.solver.case import CASES, Case, case
 
 from emulator import Support
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.scenes.twisting_cube import twist
 
 

@@ -17,8 +17,8 @@ from studies.stability.solver.bodies import (
 from studies.stability.solver.case import SINGLE_STEP, Case, case, near, simulator_of
 
 from emulator import NewtonOptions, Scene, Support
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import land_ventricle
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import land_ventricle
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes.loads import CavityPressure, FollowerPressure
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from cli_support import SCENE, answer, complaint, write_block
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 
 
 @pytest.fixture

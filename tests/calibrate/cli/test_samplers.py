@@ -8,8 +8,8 @@ import pytest
 from calibrate.cli import main
 from calibrate.cli.commands.infer import sampler_options
 from calibrate.posterior import read_tree
+from calibrate.project.workflow import SAMPLING
 from calibrate.samplers.checkpoint import Checkpoint
-from calibrate.workflow.workflow import SAMPLING
 
 
 class Killed(Exception):

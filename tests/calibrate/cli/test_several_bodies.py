@@ -3,7 +3,7 @@
 import pytest
 
 from cli_support import answer
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.geometry.io import write_mesh
 
 TWO = """

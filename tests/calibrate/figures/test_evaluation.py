@@ -8,7 +8,7 @@ from calibrate.figures.evaluation import (
     parameter_figure,
     surface_figure,
 )
-from emulator.error.comparison import Errors
+from emulator.accuracy.comparison import Errors
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.quadratic import to_quadratic
 from scene_support import block

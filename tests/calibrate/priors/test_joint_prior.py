@@ -14,8 +14,8 @@ import calibrate as cal
 from calibrate.posterior import predictions
 from calibrate.priors.joint_prior import Conditional, Dependence, JointPrior
 from calibrate.priors.population import POPULATIONS, prior_of, read_population
+from calibrate.project import Run
 from calibrate.samplers.density import density_of
-from calibrate.workflow import Run
 from emulator.core.errors import InputError
 from emulator.scenes.left_ventricle import left_ventricle
 from linear_support import linear_forward
@@ -203,7 +203,7 @@ def test_a_run_takes_names_files_and_numbers(tmp_path, beam):
 @pytest.mark.slow
 def test_the_command_line_keeps_the_prior(tmp_path):
     from calibrate.cli import main
-    from calibrate.workflow import read_posterior
+    from calibrate.project import read_posterior
 
     path = tmp_path / "cohort.json"
     path.write_text(

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from calibrate.cli import main
+from calibrate.project import Run, infer
 from calibrate.report import charts
-from calibrate.workflow import Run, infer
 
 
 @pytest.mark.slow

@@ -9,12 +9,12 @@ import pytest
 import calibrate as cal
 import emulator as em
 from browser_support import opened
-from calibrate.observations import CavityVolume, Observations, landmarks, spread_landmarks
+from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
+from calibrate.project import Run
 from calibrate.report import charts
 from calibrate.report.body import body_figure
 from calibrate.report.page import html_of
 from calibrate.samplers.laplace import LaplaceOptions
-from calibrate.workflow import Run
 
 pytestmark = pytest.mark.slow  # compiling for a ventricle; test_command.py is quick
 

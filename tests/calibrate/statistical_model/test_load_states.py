@@ -9,10 +9,10 @@ import pytest
 from numpyro.infer.util import log_density
 
 import calibrate as cal
-from calibrate.data import read_data, write_data
-from calibrate.observations import observations, parse_observation, spread_landmarks
+from calibrate.measurements import observations, parse_observation, spread_landmarks
+from calibrate.measurements.data import read_data, write_data
+from calibrate.project import Run, make_data
 from calibrate.statistical_model.load_states import known_thetas, load_states
-from calibrate.workflow import Run, make_data
 from emulator.core.errors import InputError
 from linear_support import LinearForward, linear_forward
 
@@ -227,7 +227,7 @@ def test_observations_of_a_run_are_made_in_every_state(ventricle, monkeypatch):
     spread = parse_observation(ventricle, "volume+nodes:3@low", 0, ("low", "high"))
     assert list(spread.parts) == ["volume@low", "volume@high", "displacement@low"]
     forward = linear_forward(ventricle, size=1.0)
-    monkeypatch.setattr("calibrate.workflow.workflow.simulator_of", lambda *_: forward)
+    monkeypatch.setattr("calibrate.project.workflow.simulator_of", lambda *_: forward)
     run = Run(
         "left_ventricle",
         truth={**MATERIAL, "pressure@high": 1.1},

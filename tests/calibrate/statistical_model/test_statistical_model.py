@@ -8,7 +8,7 @@ from numpyro import handlers
 from numpyro.infer.util import log_density
 
 import calibrate as cal
-from calibrate.observations import spread_landmarks
+from calibrate.measurements import spread_landmarks
 from emulator.core.errors import InputError
 from linear_support import LinearForward, linear_forward
 

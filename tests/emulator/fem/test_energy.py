@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from emulator.fem.energy import dead_force, pair_products, potential_energy, strain_energy
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity
 from scene_support import block, rotation

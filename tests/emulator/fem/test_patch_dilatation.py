@@ -24,7 +24,7 @@ from emulator.fem.formulations import formulation_of
 from emulator.fem.formulations.mean_dilatation import MeanDilatation
 from emulator.fem.formulations.stress_iterates import applies
 from emulator.fem.system import System
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.geometry.io import write_mesh
 from emulator.geometry.patches import patches
 from emulator.geometry.quadratic import to_quadratic

@@ -8,7 +8,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.balance import relative_residual
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.scenes import Support
 from emulator.scenes.loads import FollowerPressure, Gravity
 from scene_support import block, slope

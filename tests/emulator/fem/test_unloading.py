@@ -10,7 +10,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.solution import Status
-from emulator.geometry.bodies.sphere import sphere_octant
+from emulator.geometry.generators.sphere import sphere_octant
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes.loads import KPA_PER_MMHG, Force
 from emulator.verify.sphere import INNER, MU, OUTER, pressure_at, sphere_scene

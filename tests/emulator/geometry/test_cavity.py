@@ -7,8 +7,8 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.ellipsoid import LAND, EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.facets import openings
+from emulator.geometry.generators.ellipsoid import LAND, EllipsoidalWall, truncated_ellipsoid
 from emulator.scenes import Support
 from emulator.scenes.cavities import cavity_sets, find_cavity
 from emulator.scenes.loads import CavityPressure

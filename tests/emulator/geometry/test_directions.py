@@ -4,8 +4,6 @@ import meshio
 import numpy as np
 import pytest
 
-from emulator.geometry.bodies.biventricle import biventricle
-from emulator.geometry.bodies.box import box
 from emulator.geometry.directions import across, from_elements, from_nodes, of_elements, unit
 from emulator.geometry.discretisation import (
     from_quadrature_points,
@@ -13,6 +11,8 @@ from emulator.geometry.discretisation import (
     shapes_at,
 )
 from emulator.geometry.fibres import biventricular_directions
+from emulator.geometry.generators.biventricle import biventricle
+from emulator.geometry.generators.box import box
 from emulator.geometry.io import read_body, write_mesh
 from emulator.geometry.quadratic import to_quadratic
 from geometry_support import order_of

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from emulator.geometry.bodies.box import box
 from emulator.geometry.discretisation import discretise
+from emulator.geometry.generators.box import box
 from emulator.geometry.quadratic import to_quadratic
 
 

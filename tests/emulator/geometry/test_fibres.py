@@ -4,10 +4,6 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.biventricle import biventricle
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle, land_ventricle
-from emulator.geometry.bodies.sphere import sphere_octant
 from emulator.geometry.directions import of_elements
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.fibres import (
@@ -19,6 +15,10 @@ from emulator.geometry.fibres import (
     rule_based_fibres,
     turned,
 )
+from emulator.geometry.generators.biventricle import biventricle
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle, land_ventricle
+from emulator.geometry.generators.sphere import sphere_octant
 from geometry_support import order_of
 
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.geometry.io import read_body, read_mesh, write_mesh, write_solution
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic

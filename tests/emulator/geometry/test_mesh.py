@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.box import box, toward_ends
 from emulator.geometry.discretisation import discretise
+from emulator.geometry.generators.box import box, toward_ends
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.tetrahedra import orient, parts, signed_volumes
 

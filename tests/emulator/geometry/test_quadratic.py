@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.box import box
 from emulator.geometry.discretisation import discretise, facet_rule
+from emulator.geometry.generators.box import box
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.tetrahedra import EDGES, orient, signed_volumes

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import human_ventricle
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quadratic import to_quadratic

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.fibres import rule_based_fibres
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.refinement import refined
 
 MESHES = {
@@ -42,7 +42,7 @@ def test_a_field_is_carried_as_it_is(mesh):
     H = np.einsum("mai,mqaj->mqij", carried, fine.gradients)
     points = np.einsum("qa,mai->mqi", fine.values, found.mesh.nodes[found.mesh.elements])
     values = np.einsum("qa,mai->mqi", fine.values, carried)
-    from calibrate.observations.location import locate, locate_gradients
+    from calibrate.measurements.location import locate, locate_gradients
 
     some = points.reshape(-1, 3)[::37]
     elements, shapes = locate(mesh, some)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.biventricle import biventricle
-from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle
+from emulator.geometry.generators.biventricle import biventricle
+from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.segments import aha_segments
 from emulator.geometry.tetrahedra import signed_volumes
 from scene_support import rotation

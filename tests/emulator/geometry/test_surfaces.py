@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.disc import disc
 from emulator.geometry.flattening import Flattened
+from emulator.geometry.generators.disc import disc
 from emulator.geometry.surfaces import (
     Surface,
     cut,

@@ -10,9 +10,9 @@ import pytest
 from cli_support import answer, complaint
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
-from emulator.geometry.bodies.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.facets import mean_normal
+from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.surfaces import Surface, read_surface
 from emulator.geometry.tetrahedra import signed_volumes

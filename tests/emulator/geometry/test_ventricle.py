@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.ellipsoid import HUMAN, truncated_ellipsoid
+from emulator.geometry.generators.ellipsoid import HUMAN, truncated_ellipsoid
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.ventricle import Ventricle, ventricle
 from emulator.scenes.left_ventricle import left_ventricle

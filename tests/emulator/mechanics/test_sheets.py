@@ -8,8 +8,8 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem import Status
-from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import rule_based_directions
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import CavityPressure

@@ -8,7 +8,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.balance import relative_residual
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.released import reference
 from emulator.released.reference import published_reference

@@ -3,7 +3,7 @@
 import meshio
 import pytest
 
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from scene_file_support import SCENE
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from calibrate.cli import main
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import rule_based_fibres
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.quadratic import to_quadratic
 from emulator.scenes.draft import draft

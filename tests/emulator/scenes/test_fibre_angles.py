@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.accuracy.mesh_error import mesh_error
 from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
-from emulator.error.mesh_error import mesh_error
 from emulator.fem.energy import potential_energy
 from emulator.fem.fields import element_fields
 from emulator.fem.inverse import InverseSystem
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.effects import effects_of
@@ -201,7 +201,7 @@ def test_a_law_without_fibres_has_nothing_to_turn(turning, beam):
 
 
 def test_from_a_file(tmp_path):
-    from emulator.geometry.bodies.ellipsoid import human_ventricle
+    from emulator.geometry.generators.ellipsoid import human_ventricle
     from emulator.geometry.io import write_mesh
 
     mesh = human_ventricle(4, 8, 1)

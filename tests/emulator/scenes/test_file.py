@@ -8,13 +8,13 @@ import pytest
 
 from emulator.catalogue import find_scene, scene_from_origin
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.biventricle import biventricle
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import (
     biventricular_directions,
     rule_based_fibres,
 )
+from emulator.geometry.generators.biventricle import biventricle
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.scenes import Parameter, file
 from emulator.scenes.loads import (

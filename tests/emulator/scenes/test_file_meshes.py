@@ -6,9 +6,9 @@ import pytest
 
 from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import human_ventricle
 from emulator.geometry.fibres import rule_based_directions
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.quadratic import to_quadratic
 from scene_file_support import HEART, SCENE

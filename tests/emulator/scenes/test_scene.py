@@ -7,7 +7,7 @@ import pytest
 import emulator as em
 from emulator.catalogue import find_scene, scene_from_origin
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.scenes import BUILT_IN, Parameter, Support

@@ -8,7 +8,7 @@ import pytest
 import emulator as em
 from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.geometry.io import write_mesh
 from emulator.scenes import Support
 from emulator.scenes.loads.force import Force

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.accuracy.comparison import evaluate
 from emulator.core.errors import InputError
 from emulator.core.store import save_arrays
-from emulator.error.comparison import evaluate
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.pod_gp import REDUCED, fit_reduced

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.accuracy.comparison import evaluate
 from emulator.core.errors import InputError
-from emulator.error.comparison import evaluate
 from emulator.fem import run_campaign, sobol, uniform
 from emulator.fem.campaign import StoredRuns
 from emulator.geometry.quadratic import to_quadratic

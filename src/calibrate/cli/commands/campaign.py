@@ -52,7 +52,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve what the store lacks, and count."""
-    from calibrate.workflow.campaigns import fill, question
+    from calibrate.project.campaigns import fill, question
     from emulator.catalogue import find_scene
     from emulator.core.errors import InputError
     from emulator.fem import NewtonOptions

@@ -50,7 +50,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Check a kept posterior against FEM; a kept reweighted posterior is a success too."""
-    from calibrate.workflow import certify_and_keep, read_posterior, report
+    from calibrate.project import certify_and_keep, read_posterior, report
     from emulator.core.store import check_folder
 
     if arguments.reweight is not None:

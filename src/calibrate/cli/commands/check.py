@@ -84,10 +84,10 @@ def run_mesh(arguments: argparse.Namespace) -> int:
     """The error of the mesh at one theta: displacements, observations, and a picture."""
     import numpy as np
 
-    from calibrate.observations.mesh_error import errors_of
+    from calibrate.measurements.mesh_error import errors_of
+    from emulator.accuracy.mesh_error import mesh_error
     from emulator.catalogue import find_scene
     from emulator.core.store import check_folder, write_json
-    from emulator.error.mesh_error import mesh_error
     from emulator.geometry.quality import mesh_quality
 
     folder = None if arguments.out is None else check_folder(arguments.out)
@@ -138,8 +138,8 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     """Simulation-based calibration of the model."""
     from calibrate.figures.calibration import draw
     from calibrate.posterior.simulation_based import sbc
+    from calibrate.project import by_fem, model_before_data
     from calibrate.samplers import NUTSOptions
-    from calibrate.workflow import by_fem, model_before_data
     from emulator.core.store import check_folder, write_json
 
     folder, progress = check_folder(arguments.out), show_progress(arguments)
@@ -183,9 +183,9 @@ def run_prior(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from calibrate.figures.calibration import draw_prior_predictive
-    from calibrate.observations.pressure_volume import in_mmhg
+    from calibrate.measurements.pressure_volume import in_mmhg
     from calibrate.posterior.predictions import prior_replicates
-    from calibrate.workflow import model_before_data
+    from calibrate.project import model_before_data
     from emulator.core.store import check_folder, save_arrays
 
     folder: Path = check_folder(arguments.out)
@@ -218,8 +218,8 @@ def _klotz(model: Model, seed: int) -> KlotzBand | None:
 
     Nor where the forward map solves: it would be some thousand solves.
     """
-    from calibrate.observations.klotz import klotz_of
-    from calibrate.observations.pressure_volume import pressure_volume
+    from calibrate.measurements.klotz import klotz_of
+    from calibrate.measurements.pressure_volume import pressure_volume
     from calibrate.posterior.klotz_band import klotz_band
     from emulator.surrogates.protocol import SolvingMap
 

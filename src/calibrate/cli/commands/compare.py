@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compare the posteriors in several folders."""
     from calibrate.posterior import read_tree
     from calibrate.posterior.comparison import compare
-    from calibrate.workflow.workflow import POSTERIOR
+    from calibrate.project.workflow import POSTERIOR
     from emulator.core.errors import InputError
 
     if len(set(arguments.folders)) < len(arguments.folders):

@@ -8,7 +8,7 @@ from typing import Any
 
 from calibrate.cli.common import DONE, FAILED, emit, show_progress
 from calibrate.cli.posterior_table import summary
-from calibrate.workflow.demo import DEMOS, run_demo
+from calibrate.project.demo import DEMOS, run_demo
 
 
 def register(commands: Any) -> None:
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     lines = [summary(report)]
     if "identifiability" in report:
-        from calibrate.identifiability import in_words
+        from calibrate.analysis.identifiability import in_words
 
         lines.append(in_words(report["identifiability"]))
     lines.append(f"written: {', '.join(report['files'])} ({report['seconds']:.0f} s)")

@@ -11,7 +11,7 @@ from calibrate.cli.common import DONE, emit, show_progress, table
 from calibrate.cli.forward import add_forward, forward_options
 
 if TYPE_CHECKING:
-    from calibrate.evaluation import Evaluated
+    from calibrate.analysis.evaluation import Evaluated
 
 
 def register(commands: Any) -> None:
@@ -34,7 +34,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare a forward map with stored or fresh FEM solutions."""
-    from calibrate.evaluation import Evaluation, run_evaluation
+    from calibrate.analysis.evaluation import Evaluation, run_evaluation
 
     names = ("emulator", "against", "cases", "outside", "forward")
     plan = Evaluation(

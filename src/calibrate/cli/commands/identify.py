@@ -35,9 +35,9 @@ def register(commands: Any) -> None:
 
 def run_before(arguments: argparse.Namespace) -> int:
     """What the observations would determine."""
-    from calibrate.identifiability import expected_precision
-    from calibrate.identifiability.combinations import products_in_words
-    from calibrate.workflow import model_before_data
+    from calibrate.analysis.identifiability import expected_precision
+    from calibrate.analysis.identifiability.combinations import products_in_words
+    from calibrate.project import model_before_data
 
     run = run_of(arguments, seed=arguments.seed)
     # Errors that many numbers share are made for each data set, not at one draw of the prior.
@@ -52,15 +52,15 @@ def run_before(arguments: argparse.Namespace) -> int:
 
 def run_after(arguments: argparse.Namespace) -> int:
     """What a posterior's data determined, and what would add most."""
-    from calibrate.identifiability import (
+    from calibrate.analysis.identifiability import (
         identify,
         in_words,
         next_measurement,
         profile_likelihood,
         stress_band,
     )
-    from calibrate.observations import parse_observation
-    from calibrate.workflow import read_posterior
+    from calibrate.measurements import parse_observation
+    from calibrate.project import read_posterior
 
     run, posterior = read_posterior(arguments.folder)
     found = identify(posterior)

@@ -15,8 +15,8 @@ from calibrate.samplers import SAMPLERS, find_sampler
 from emulator.core.errors import InputError
 
 if TYPE_CHECKING:
-    from calibrate.workflow import Run
-    from calibrate.workflow.experiment import Cohort
+    from calibrate.project import Run
+    from calibrate.project.experiment import Cohort
 
 
 def register(commands: Any) -> None:
@@ -75,7 +75,7 @@ def check_warmup(sampler: str, given: int | None) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Sample and keep a posterior, or those of members of a population."""
-    from calibrate.workflow import Run
+    from calibrate.project import Run
     from emulator.core.store import check_folder
 
     folder = check_folder(arguments.out)
@@ -95,8 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_one(arguments: argparse.Namespace, plan: Run, folder: Path) -> int:
-    from calibrate.workflow import certify_and_keep, report
-    from calibrate.workflow import infer as run_inference
+    from calibrate.project import certify_and_keep, report
+    from calibrate.project import infer as run_inference
 
     progress = show_progress(arguments)
     posterior = run_inference(plan, folder, force=arguments.force, progress=progress)
@@ -114,7 +114,7 @@ def _run_one(arguments: argparse.Namespace, plan: Run, folder: Path) -> int:
 
 
 def _run_cohort(arguments: argparse.Namespace, plan: Cohort, folder: Path) -> int:
-    from calibrate.workflow.cohort import cohort_report, infer_cohort
+    from calibrate.project.cohort import cohort_report, infer_cohort
 
     found, verdicts = infer_cohort(
         plan,

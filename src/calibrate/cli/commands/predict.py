@@ -13,7 +13,7 @@ from emulator.core.errors import InputError
 if TYPE_CHECKING:
     import jax
 
-    from emulator.error.estimate import ErrorEstimate
+    from emulator.accuracy.estimate import ErrorEstimate
     from emulator.scenes import Scene
 
 
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     import jax
     import numpy as np
 
-    from emulator.error.guard import guard
+    from emulator.accuracy.guard import guard
     from emulator.fem.fields import element_fields
     from emulator.geometry.io import write_solution
     from emulator.surrogates import load
@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     estimate, against = None, jax.jit(partial(guard, scene))(theta, u)
     if arguments.error_bar:
         from emulator import Simulator
-        from emulator.error.estimate import error_bar
+        from emulator.accuracy.estimate import error_bar
 
         estimate = error_bar(forward, Simulator(scene)).of_field(u, theta)
         against = estimate.guard

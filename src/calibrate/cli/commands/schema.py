@@ -41,6 +41,6 @@ def _schema(file: str) -> dict[str, Any]:
         from emulator.scenes.file_schema import scene_schema
 
         return scene_schema()
-    from calibrate.workflow.experiment_schema import experiment_schema
+    from calibrate.project.experiment_schema import experiment_schema
 
     return experiment_schema()

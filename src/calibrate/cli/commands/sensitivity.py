@@ -93,10 +93,10 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Analyse a scene's forward map."""
-    from calibrate.observations import parse_observation
+    from calibrate.analysis.sensitivity import sensitivity
+    from calibrate.measurements import parse_observation
     from calibrate.places import emulator_place, prior_place
     from calibrate.priors import prior_of
-    from calibrate.sensitivity_analysis import sensitivity
     from emulator import Simulator
     from emulator.catalogue import find_scene
     from emulator.core.store import check_folder
@@ -139,8 +139,8 @@ def write(found: xr.DataTree, scene: Scene, folder: Path) -> None:
     """The indices as netCDF, figures of them, and nodal ones as VTU."""
     import numpy as np
 
+    from calibrate.analysis.sensitivity import FIELD
     from calibrate.figures.sensitivity import draw
-    from calibrate.sensitivity_analysis import FIELD
     from emulator.core.store import write_netcdf
     from emulator.geometry.io import write_nodal
 

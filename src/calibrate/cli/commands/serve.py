@@ -41,7 +41,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until interrupted."""
-    from calibrate.observations import parse_observation
+    from calibrate.measurements import parse_observation
     from calibrate.um_bridge import NAME, serve
     from emulator.catalogue import find_scene
     from emulator.fem import Simulator

@@ -10,7 +10,7 @@ from emulator.core.errors import InputError
 from emulator.fem.balance import relative_residual
 from emulator.fem.campaign.reference import fem_reference, outside_reference, sample_outside
 from emulator.fem.solution import Status
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import Gravity

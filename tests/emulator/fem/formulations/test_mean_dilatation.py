@@ -8,8 +8,8 @@ import pytest
 import emulator as em
 from emulator.fem.condensation import Volumes, advance, carried, consistent, linearise
 from emulator.fem.energy import pair_products
-from emulator.geometry.bodies.box import box
-from emulator.geometry.bodies.ellipsoid import land_ventricle
+from emulator.geometry.generators.box import box
+from emulator.geometry.generators.ellipsoid import land_ventricle
 from emulator.geometry.quadratic import to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support

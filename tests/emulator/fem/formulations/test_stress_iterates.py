@@ -14,7 +14,7 @@ from emulator.fem.linear import Outcome
 from emulator.fem.material_point import MaterialPoint, fractions_at_stress
 from emulator.fem.options import NewtonOptions
 from emulator.fem.system import System
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Law
 from emulator.mechanics.quantity import modulus

@@ -19,7 +19,7 @@ from emulator.fem.fields import element_fields
 from emulator.fem.options import NewtonOptions
 from emulator.fem.support_force import SupportForce
 from emulator.fem.system import System
-from emulator.geometry.bodies.box import box
+from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.effects import leave_out

@@ -1,0 +1,288 @@
+"""Which effects a scene can do without: what each changes in what is observed, and what it costs.
+
+Everything is measured by FEM, the whole scene's runs against the simpler scene's at the same theta.
+Effects that alone change every observation by no more than its tolerance, and whose absence saves
+time, are left out one after the other, the one that saves most first, as long as they stay within
+the tolerance together. The choice is then judged at theta that had no part in it; where it does not
+hold there, the last effect left out comes back, and other theta judge again.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+
+from calibrate.measurements import Observation, Observations, observations
+from emulator.core.errors import InputError, SolverError, check_seed
+from emulator.fem import Simulator, Solution, Status, sobol
+from emulator.fem.energy import potential_energy
+from emulator.scenes.effects import Effect, Onto, effects_of, leave_out
+from emulator.scenes.scene import Scene
+
+_ASIDE = 1e-7
+_SAVES = 0.97  # of the time, below which leaving an effect out is worth it
+_HELD_OUT = 1_000_003  # added to the seed for theta that judge
+_WORD = re.compile(r"([0-9.+-]+(?:[eE][+-]?[0-9]+)?)\s*(\S*)")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a scene without some effects gives and takes.
+
+    changes : of each observation, the largest over theta and points; infinite where FEM failed.
+    seconds : of processor time, median of a solve from rest. ratio : median over theta of that time
+    over the whole scene's, solved just before it, so that other work on the machine hits both.
+    first_s : of the first solve, compilation included. operations : floating-point, of the energy
+    and its gradient; None for a load without a potential.
+    """
+
+    left_out: tuple[str, ...]
+    status: str
+    changes: Mapping[str, float]
+    seconds: float
+    ratio: float
+    first_s: float
+    unknowns: int
+    operations: float | None
+
+    def within(self, tolerance: Mapping[str, float]) -> bool:
+        """Whether no observation changes by more than its tolerance."""
+        return all(self.changes[name] <= limit for name, limit in tolerance.items())
+
+
+@dataclass(frozen=True, eq=False)
+class Recommendation:
+    """The effects to leave out of a scene, and what was measured.
+
+    tolerance : of each observation, in its unit. whole : of the scene as it is. alone : of each
+    effect left out alone. chosen : of all that is recommended, at theta that had no part in the
+    choice. scene : without them. effects : that the scene can do without, by name.
+    """
+
+    tolerance: Mapping[str, float]
+    units: Mapping[str, str]
+    whole: Measured
+    alone: Sequence[Measured]
+    chosen: Measured
+    scene: Scene
+    effects: Mapping[str, Effect] = field(repr=False)
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Names of the effects to leave out."""
+        return self.chosen.left_out
+
+
+def recommend(
+    scene: Scene,
+    observe: Observation | Mapping[str, Observation] | Observations,
+    tolerance: Mapping[str, float] | float,
+    *,
+    samples: int = 6,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda _: None,
+) -> Recommendation:
+    """The cheapest of the simpler scenes that keep the observations.
+
+    Parameters
+    ----------
+    tolerance : of each observation, in its unit, by name; a bare number for one observation.
+    samples : theta at which each scene is solved; as many others judge the choice.
+    say : is told what is being measured.
+
+    Raises
+    ------
+    InputError
+        No effect to leave out, a tolerance that is not above 0 or belongs to nothing observed, or
+        fewer than 2 samples.
+    SolverError
+        FEM fails on the scene as it is.
+    """
+    seen = observations(observe)
+    if seen.states != ("",):
+        raise InputError("effects: observations of several load states; take one at a time")
+    limits = seen.name(tolerance, "effects: tolerance")
+    for name, limit in limits.items():
+        if not 0.0 < limit < np.inf:
+            raise InputError(f"effects: the tolerance of {name} is {limit:g}; it must be above 0")
+    if samples < 2:
+        raise InputError(f"effects: {samples} samples; give 2 or more")
+    check_seed(seed, "effects")
+    effects = effects_of(scene)
+    if not effects:
+        raise InputError(f"scene '{scene.name}' has no effect that it can do without")
+    compared = Comparison(scene, seen, samples, seed, say)
+    alone = [compared.without((name,)) for name in effects]
+    chosen: tuple[str, ...] = ()
+    best = compared.without(())
+    for each in sorted(alone, key=lambda m: m.ratio):
+        if not each.within(limits) or each.ratio > _SAVES:
+            continue
+        trial = compared.without((*chosen, *each.left_out))
+        if trial.within(limits) and trial.ratio < _SAVES * best.ratio:
+            chosen, best = (*chosen, *each.left_out), trial
+    whole = found = compared.without(())
+    trials = 0
+    while chosen:
+        trials += 1
+        judge = Comparison(
+            scene, seen, samples, seed + trials * _HELD_OUT, say, compared.simulators
+        )
+        found = judge.without(chosen)
+        if found.within(limits):
+            break
+        chosen, found = chosen[:-1], whole
+    return Recommendation(
+        limits,
+        {name: part.unit for name, part in seen.parts.items()},
+        whole,
+        alone,
+        found,
+        leave_out(scene, chosen),
+        effects,
+    )
+
+
+def tolerances(words: Sequence[str], observe: Observations) -> dict[str, float]:
+    """Tolerance of each observation from words such as ``0.5mm``, matched by their units."""
+    by_unit: dict[str, float] = {}
+    for word in words:
+        found = _WORD.fullmatch(word.strip())
+        try:
+            value = float(found[1]) if found else float("nan")
+        except ValueError:
+            value = float("nan")
+        if found is None or not np.isfinite(value):
+            raise InputError(f"tolerance '{word}': write a number and its unit, e.g. 0.5mm")
+        unit = found[2] or "1"
+        if unit in by_unit:
+            raise InputError(f"tolerance: two are given in {unit}; give one for each unit")
+        by_unit[unit] = value
+    units = {name: part.unit for name, part in observe.parts.items()}
+    for unit in by_unit:
+        if unit not in units.values():
+            raise InputError(
+                f"tolerance in {unit}: nothing observed has that unit; observed: "
+                + ", ".join(f"{name} in {of}" for name, of in units.items())
+            )
+    for name, unit in units.items():
+        if unit not in by_unit:
+            raise InputError(f"tolerance: none for {name}; give one in {unit}, e.g. 0.5{unit}")
+    return {name: by_unit[unit] for name, unit in units.items()}
+
+
+class Comparison:
+    """Solves simpler scenes at the theta of one design and compares them with the whole one.
+
+    simulators : to take from and add to, by the effects left out.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        observe: Observations,
+        samples: int,
+        seed: int,
+        say: Callable[[str], None] = lambda _: None,
+        simulators: dict[tuple[str, ...], Simulator] | None = None,
+    ) -> None:
+        self._scene, self._observe, self._say = scene, observe, say
+        self._thetas = sobol(scene, samples, seed)
+        self.simulators = {} if simulators is None else simulators
+        self._known: dict[tuple[str, ...], Measured] = {}
+        self._values: list[dict[str, np.ndarray]] = []
+
+    def without(self, names: tuple[str, ...]) -> Measured:
+        """What the scene without these effects gives, measured once."""
+        return self.of(names, lambda: leave_out(self._scene, names))
+
+    def of(self, names: tuple[str, ...], make: Callable[[], Scene]) -> Measured:
+        """What another scene gives that takes the whole one's parameters or some of them."""
+        if names and () not in self._known:
+            self.without(())
+        if names not in self._known:
+            if names not in self.simulators:
+                self.simulators[names] = Simulator(make())
+            self._say(f"without {', '.join(names)}" if names else "the scene as it is")
+            self._known[names] = self._measure(names, self.simulators[names])
+        return self._known[names]
+
+    def _measure(self, names: tuple[str, ...], simulator: Simulator) -> Measured:
+        simpler = simulator.scene
+        onto = Onto(self._scene, simpler)
+        thetas = onto.theta(self._thetas)
+        first, _ = _clocked(simulator, simpler.centre)
+        whole = self.simulators[()]
+        values, times, ratios = [], [], []
+        for own, theta in zip(thetas, self._thetas, strict=True):
+            # Solvers keep factors of values they have seen: not the theta of the comparison again.
+            beside = _clocked(whole, theta * (1.0 + _ASIDE))[0] if names else None
+            seconds, solution = _clocked(simulator, own)
+            times.append(seconds)
+            ratios.append(1.0 if beside is None else seconds / beside)
+            status = Status(int(solution.status))
+            if status is not Status.CONVERGED:
+                if not names:
+                    raise SolverError(f"effects: FEM of scene '{simpler.name}': {status.text}")
+                never = dict.fromkeys(self._observe.parts, float("inf"))
+                return self._row(names, status.text, never, (times, ratios), first, simulator)
+            u = onto.field(solution.displacement)[self._observe.nodes]
+            seen = self._observe(u[None], theta[None])
+            values.append({name: np.asarray(value) for name, value in seen.items()})
+        if not names:
+            self._values = values
+        pairs = list(zip(values, self._values, strict=True))
+        changes = {
+            name: max(_largest(mine[name] - its[name]) for mine, its in pairs)
+            for name in self._observe.parts
+        }
+        return self._row(names, Status.CONVERGED.text, changes, (times, ratios), first, simulator)
+
+    def _row(
+        self,
+        names: tuple[str, ...],
+        status: str,
+        changes: Mapping[str, float],
+        times: tuple[list[float], list[float]],
+        first: float,
+        simulator: Simulator,
+    ) -> Measured:
+        return Measured(
+            left_out=names,
+            status=status,
+            changes=changes,
+            seconds=float(np.median(times[0])),
+            ratio=float(np.median(times[1])),
+            first_s=first,
+            unknowns=int((~simulator.scene.held).sum()),
+            operations=operations(simulator.scene),
+        )
+
+
+def _clocked(simulator: Simulator, theta: jax.Array) -> tuple[float, Solution]:
+    """Processor seconds of a solve from rest, and its solution."""
+    began = time.process_time()
+    solution = jax.block_until_ready(simulator.solve(theta))
+    return time.process_time() - began, solution
+
+
+def operations(scene: Scene) -> float | None:
+    """Floating-point operations of the potential energy and its gradient, as compiled."""
+    if not all(load.has_potential for load in scene.loads):
+        return None
+    both = jax.jit(jax.value_and_grad(potential_energy(scene)))
+    told: Any = both.lower(np.zeros(scene.held.shape), scene.centre).compile().cost_analysis()
+    return float(told["flops"])
+
+
+def _largest(change: np.ndarray) -> float:
+    """Of displacements (d, 3) the largest length, of other numbers the largest size."""
+    if change.ndim == 2 and change.shape[1] == 3:
+        return float(np.linalg.norm(change, axis=1).max())
+    return float(np.abs(change).max())

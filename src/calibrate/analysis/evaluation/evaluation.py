@@ -1,0 +1,116 @@
+"""Errors of a forward map against reference solutions, inside its box and outside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from emulator.accuracy.comparison import Errors, case_errors
+from emulator.core.errors import InputError, SolverError
+from emulator.fem import Simulator
+from emulator.fem.campaign.reference import Reference, fem_reference, outside_reference
+from emulator.released.reference import published_reference
+from emulator.surrogates import load
+from emulator.surrogates.kind import Ingredients
+from emulator.surrogates.protocol import ForwardMap
+from emulator.surrogates.registry import build_forward, full_options
+
+OUR_FEM = "fem"
+"""What to evaluate against, unless it is the folder of a released model."""
+_CASES = 50
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What to evaluate against what.
+
+    emulator : shipped name or folder; its scene is the one evaluated.
+    against : ``fem``, or the folder of a published model's data.
+    cases : FEM runs against ``fem``, inside the box and again outside; 50 by default.
+    outside : fraction of each side by which the box is widened for the cases outside; ``None``
+        for no such cases.
+    forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
+        options by name, e.g. ``{"steps": 2}``.
+    """
+
+    emulator: str
+    against: str = OUR_FEM
+    cases: int | None = None
+    outside: float | None = None
+    forward: str = "emulator"
+    forward_options: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        full_options(self.forward, self.forward_options)
+        if self.cases is not None and self.against != OUR_FEM:
+            raise InputError("cases: every released one is compared; use --against fem for others")
+        if self.outside is not None and self.against != OUR_FEM:
+            raise InputError("outside: nothing was released outside the box; use --against fem")
+        if self.outside is not None and not 0.0 < self.outside < float("inf"):
+            raise InputError(f"outside is {self.outside}; give a fraction above 0, e.g. 0.25")
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """The map, its errors inside the box and, if asked for, outside, and the report as JSON."""
+
+    forward: ForwardMap
+    inside: Errors
+    outside: Errors | None
+    report: Mapping[str, Any]
+
+
+def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
+    """Solve or read the reference solutions, and compare the forward map with them.
+
+    Raises
+    ------
+    InputError
+        The emulator is missing or damaged, or the references are for another scene.
+    SolverError
+        FEM fails inside the box.
+    """
+    emulator = load(plan.emulator)
+    scene = emulator.scene
+    cases = _CASES if plan.cases is None else plan.cases
+    simulator = Simulator(scene)  # shared by references and forward map: it compiles once
+    if plan.against == OUR_FEM:
+        reference = fem_reference(simulator, cases, progress=progress)
+    else:
+        reference = published_reference(scene, plan.against, progress=progress)
+    made_of = Ingredients(
+        scene, simulator, plan.emulator, seed=0, extrapolate=True, progress=progress
+    )
+    forward = build_forward(plan.forward, made_of, plan.forward_options)
+    inside = case_errors(forward, reference.thetas, reference.displacement)
+    report = {
+        **inside.report(),
+        "reference": reference.source,
+        "scene": scene.name,
+        "emulator": plan.emulator,
+        "forward": plan.forward,
+        "forward_options": full_options(plan.forward, plan.forward_options),
+        "label": forward.label,
+        "training": dict(emulator.record),
+    }
+    outside = None
+    if plan.outside is not None:
+        beyond = outside_reference(simulator, cases, plan.outside, reference, progress=progress)
+        outside, report["outside"] = _outside(forward, beyond, plan.outside)
+    return Evaluated(forward, inside, outside, report)
+
+
+def _outside(
+    forward: ForwardMap, beyond: Reference, fraction: float
+) -> tuple[Errors | None, dict[str, Any]]:
+    """Errors outside the box and their report; no errors where no case has a valid prediction."""
+    found: dict[str, Any] = {"fraction": fraction, "failed": beyond.failed}
+    solved = len(beyond.thetas)
+    try:
+        errors = case_errors(forward, beyond.thetas, beyond.displacement) if solved else None
+    except SolverError:  # the map has no valid prediction at any of them
+        errors = None
+    if errors is None:
+        return None, {"cases": 0, "invalid": solved, **found}
+    return errors, {**errors.report(), **found}

@@ -1,0 +1,263 @@
+r"""What data would determine, before there is any: posteriors of data that the prior expects.
+
+For each of some draws of the prior data is made, :math:`y_r \sim p(y \mid x_r)`, and the covariance
+of its posterior :math:`p(x \mid y_r)` is found by importance sampling, from draws of the prior and
+of a Student's t about a Newton step from :math:`x_r`,
+
+.. math:: w_i \propto \frac{p(x_i)\, p(y_r \mid x_i)}
+                           {\beta\, p(x_i) + (1 - \beta)\, t_5(x_i;\, \hat x, Q)},
+          \qquad Q = (F + P^{-1})^{-1},
+
+with the Fisher information F of :mod:`~calibrate.analysis.identifiability.fisher`, the prior's
+covariance P and the share :math:`\beta` of draws from the prior; :math:`\hat x` and Q are then those of the
+weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000). Where too few draws
+carry the weight the covariance is Q. Posteriors are
+averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
+the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
+:math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
+
+Errors that many numbers share are in the data and in :math:`p(y \mid x)`, which marginalises them
+(:mod:`~calibrate.analysis.identifiability.errors_of_sets`). Where the size of one is inferred, each
+data set has another quantile of its prior, and F is that of x at this size: about x and the size together
+Gaussian data has no information in common, so that not to know the size widens x in second order
+only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jax.scipy.special import gammaln
+
+from calibrate.analysis.identifiability.combinations import combinations, prior_table
+from calibrate.analysis.identifiability.errors_of_sets import Errors, log_ratio, of_each, sizes_of
+from calibrate.analysis.identifiability.fisher import information_at
+from calibrate.statistical_model import Model
+from calibrate.statistical_model.error_modes import ErrorModes
+from calibrate.statistical_model.shared_errors import errors_of_data
+from emulator.core.errors import InputError
+
+_DATA_SETS = 64
+_FROM_PRIOR, _AROUND = 3072, 512  # draws of the prior, shared, and of Student's t, a data set
+_ROUNDS = 2  # of Student's t
+_BATCH = 128
+_EFFECTIVE = 30.0  # draws; of fewer the covariance is that of the linear map and a normal prior
+_DOF = 5.0
+_WIDER = 1.3  # Student's t than the covariance it is told
+
+
+def expected_precision(
+    model: Model,
+    at: Mapping[str, float] | None = None,
+    *,
+    systematic: Mapping[str, Mapping[str, Any]] | None = None,
+    data_sets: int = _DATA_SETS,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """What ``model``'s observations would determine, before any data; plain JSON.
+
+    Parameters
+    ----------
+    at : unknowns by name where the map is taken as linear and the prior as normal; posteriors of
+        ``data_sets`` draws of the prior and its data by default.
+    systematic : errors that many numbers share, by name, as in an experiment file
+        (:mod:`~calibrate.statistical_model.shared_errors`), made for each data set. Those of
+        :func:`calibrate.with_systematic` are the model's already, the same for all data.
+
+    Returns
+    -------
+    sd : per unknown, its expected posterior sd relative to the prior's, in log theta where all
+        unknowns are positive.
+    combinations : as of :func:`~calibrate.analysis.identifiability.identify`, of the mean posterior
+        covariance, those of which something would be learned; empty where an unknown may be 0 or
+        below.
+
+    Raises
+    ------
+    InputError
+        The forward map has no answer at any of the draws, noise has no known sd, or an error that
+        does not fit.
+    """
+    if any(model.noise_sites.values()):
+        raise InputError(
+            "identifiability: give every noise a known sd, as in GaussianNoise(sd=...)"
+        )
+    errors: Errors = errors_of_data(model, systematic) if systematic else lambda _: model.error
+    names, prior = model.states.unknowns, prior_table(model)
+    log = bool((prior > 0.0).all())
+    before = np.atleast_2d(np.cov(np.log(prior) if log else prior, rowvar=False))
+    if at is None:
+        covariances = _posterior_covariances(model, errors, prior, before, data_sets, seed, log=log)
+    else:
+        information = _informations(model, errors, np.array([at[name] for name in names]), log=log)
+        covariances = np.linalg.inv(information + np.linalg.inv(before))
+    sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
+    ratio = sd / np.sqrt(np.diagonal(before))
+    many = sum(int(np.prod(part.shape)) for part in model.observe.parts.values())
+    found = combinations(names, covariances.mean(axis=0), before)[:many] if log else []
+    return {"sd": dict(zip(names, ratio.tolist(), strict=True)), "combinations": found}
+
+
+class _Around(NamedTuple):
+    """Student's t: its centre (q,) and the Cholesky factor (q, q) of its scale matrix."""
+
+    centre: jax.Array
+    root: jax.Array
+
+    def draw(self, key: jax.Array, count: int) -> jax.Array:
+        """Draws (count, q)."""
+        normal, chi2 = jax.random.split(key)
+        q = len(self.centre)
+        z = jax.random.normal(normal, (count, q))
+        g = jax.random.chisquare(chi2, _DOF, (count, 1)) / _DOF
+        return self.centre + (z / jnp.sqrt(g)) @ self.root.T
+
+    def log_density(self, x: jax.Array) -> jax.Array:
+        """Of x (s, q), shape (s,)."""
+        q = len(self.centre)
+        z = solve_triangular(self.root, (x - self.centre).T, lower=True)
+        constant = (
+            gammaln(0.5 * (_DOF + q)) - gammaln(0.5 * _DOF) - 0.5 * q * jnp.log(_DOF * jnp.pi)
+        )
+        logs = jnp.sum(jnp.log(jnp.diagonal(self.root)))
+        return constant - logs - 0.5 * (_DOF + q) * jnp.log1p(jnp.sum(z**2, axis=0) / _DOF)
+
+
+def _informations(model: Model, errors: Errors, theta: np.ndarray, *, log: bool) -> np.ndarray:
+    """F (k, q, q) at ``theta`` (q,), for each size that errors of unknown size may have."""
+    means, valid = model.predict(dict(zip(model.states.unknowns, theta, strict=True)))
+    _some(valid)
+    error = errors(means)
+    told = information_at(model, model.observe, model.noise, log=log)
+    x = jnp.asarray(np.log(theta) if log else theta)
+    found, _ = jax.jit(jax.vmap(lambda sizes: told(x, error, sizes)))(sizes_of(error))
+    return np.asarray(found)
+
+
+def _posterior_covariances(
+    model: Model,
+    errors: Errors,
+    prior: np.ndarray,
+    before: np.ndarray,
+    count: int,
+    seed: int,
+    *,
+    log: bool,
+) -> np.ndarray:
+    """Covariances (r, q, q) of the posteriors of data made at draws of the prior (s, q)."""
+    names = model.states.unknowns
+
+    def thetas(x: jax.Array) -> jax.Array:
+        return jnp.exp(x) if log else x
+
+    def values(x: jax.Array) -> dict[str, jax.Array]:
+        return dict(zip(names, thetas(x), strict=True))
+
+    def log_prior(x: jax.Array) -> jax.Array:
+        found = model.log_prior(values(x)) + (jnp.sum(x) if log else 0.0)
+        return jnp.where(jnp.isnan(found), -jnp.inf, found)
+
+    def predicted(x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        return model.predict(values(x))
+
+    def log_likelihood(
+        x: jax.Array,
+        answer: tuple[dict[str, jax.Array], jax.Array],
+        data: dict[str, jax.Array],
+        error: ErrorModes | None,
+    ) -> jax.Array:
+        means, valid = answer
+        found = model.log_density(means, model.noise_values({}), data)
+        if error is not None:
+            residual = {name: data[name] - mean for name, mean in means.items()}
+            found += log_ratio(error, thetas(x), residual, means)
+        return jnp.where(valid & jnp.isfinite(found), found, -jnp.inf)
+
+    told = information_at(model, model.observe, model.noise, log=log)
+    shared = jnp.asarray(np.log(prior[count:]) if log else prior[count:])[:_FROM_PRIOR]
+    precision = jnp.asarray(np.linalg.inv(before))
+    ask = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))
+    ahead = ask(shared)
+    p_shared = jax.vmap(log_prior)(shared)
+    share = len(shared) / (len(shared) + _AROUND)
+
+    def first(
+        x: jax.Array, sizes: jax.Array, data: dict[str, jax.Array], error: ErrorModes | None
+    ) -> _Around:
+        """A Newton step from where the data was made, in the linear map with a normal prior."""
+        Q = _inverse(told(x, error, sizes)[0] + precision)
+        score = jax.grad(lambda x: log_likelihood(x, predicted(x), data, error))(x)
+        score -= precision @ (x - shared.mean(axis=0))
+        step = jnp.where(jnp.isfinite(score), score, 0.0)
+        return _Around(x + Q @ step, _WIDER * jnp.linalg.cholesky(Q))
+
+    def covariance(
+        x: jax.Array,
+        sizes: jax.Array,
+        keys: jax.Array,
+        means: dict[str, jax.Array],
+        error: ErrorModes | None,
+    ) -> jax.Array:
+        noise, *rounds, own = keys
+        if error is not None:
+            means = error.draw(own, jnp.concatenate([thetas(x), sizes]), means)
+        parts = model.distributions(means, model.noise_values({}))
+        each = jax.random.split(noise, len(parts))
+        data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
+        likely_shared = jax.vmap(log_likelihood, in_axes=(0, 0, None, None))(
+            shared, ahead, data, error
+        )
+        around = start = first(x, sizes, data, error)
+        C = normal = start.root @ start.root.T / _WIDER**2
+        for k in rounds:
+            drawn = around.draw(k, _AROUND)
+            inside = jax.vmap(log_prior)(drawn)
+            # Where the prior is nothing the map is not asked.
+            asked = jnp.where(jnp.isfinite(inside)[:, None], drawn, x)
+            likely = jax.lax.map(
+                lambda x: log_likelihood(x, predicted(x), data, error), asked, batch_size=_BATCH
+            )
+            points = jnp.concatenate([shared, drawn])
+            p = jnp.concatenate([p_shared, inside])
+            mixture = jnp.logaddexp(
+                jnp.log(share) + p, jnp.log1p(-share) + around.log_density(points)
+            )
+            weights = jax.nn.softmax(p + jnp.concatenate([likely_shared, likely]) - mixture)
+            mean = weights @ points
+            off = points - mean
+            # A few draws that carry all weight have next to no spread, and would promise too much.
+            enough = 1.0 / jnp.sum(weights**2) >= _EFFECTIVE
+            C = jnp.where(enough, (weights[:, None] * off).T @ off, normal)
+            around = _Around(mean, _WIDER * jnp.linalg.cholesky(C))
+        return C
+
+    truths = jnp.asarray(np.log(prior[:count]) if log else prior[:count])
+    means, valid = ask(truths)
+    kept = _some(valid)
+    truths, means = truths[kept], {name: mean[kept] for name, mean in means.items()}
+    keys = jax.random.split(jax.random.key(seed), count)[kept]
+    keys = jax.vmap(lambda key: jax.random.split(key, 2 + _ROUNDS))(keys)
+    made = of_each(errors, means)
+    sets = truths, sizes_of(made, count)[kept], keys, means, made
+    found = np.asarray(jax.jit(partial(jax.lax.map, lambda each: covariance(*each)))(sets))
+    return found[_some(np.isfinite(found).all(axis=(1, 2)))]
+
+
+def _some(valid: Any) -> np.ndarray:
+    """Where it is true; :class:`InputError` where it is nowhere."""
+    if not np.any(valid):
+        raise InputError("identifiability: the forward map has no valid answer at any draw")
+    return np.flatnonzero(valid)
+
+
+def _inverse(A: jax.Array) -> jax.Array:
+    """Of a symmetric positive definite matrix."""
+    root = jnp.linalg.cholesky(A)
+    half = solve_triangular(root, jnp.eye(len(A)), lower=True)
+    return half.T @ half

@@ -1,0 +1,349 @@
+"""Data files as named arrays: CSV in its dialects, and netCDF.
+
+A CSV file has one header line, and columns separated by commas, semicolons or tabs, whichever the
+header has; with the latter two, numbers may have decimal commas. Blanks around words, empty lines
+and lines that begin with ``#`` are ignored. A measured value that is missing is an empty cell,
+``NA`` or ``nan``, and NaN in netCDF; nodes and positions may not be missing. A column ``state``
+names the load state of each row; in netCDF, variables are called ``name@state``. A column or
+variable ``known:NAME`` is a parameter's value in a state; rows of a CSV file with such columns
+and neither ``state`` nor places are a load state each.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from calibrate.measurements import Field
+from calibrate.state_names import in_state, split, states_of
+from emulator.core import store
+from emulator.core.errors import InputError
+
+STATE = "state"
+"""Column of a CSV file that names the load state of a row."""
+
+KNOWN = "known:"
+"""Before a parameter's name: a column of its value, where that is known."""
+
+_PLACES = {"node", "x", "segment"}  # columns of tables whose rows are places, not load states
+_TEXT = (".csv", ".tsv", ".txt")
+_SPREADSHEETS = (".xlsx", ".xls", ".ods")
+_MISSING = ("", "na", "n/a", "nan")
+
+
+class DataFile(ABC):
+    """Named arrays of a file.
+
+    words : names of its columns or variables.
+    what : ``column`` or ``variable``, for errors.
+    """
+
+    words: Sequence[str]
+    what: str
+
+    @abstractmethod
+    def states(self) -> Mapping[str, DataFile]:
+        """What it holds of each load state, by the state's name; one empty name if it names none.
+
+        Raises
+        ------
+        InputError
+            Some of it belongs to a state and some to none.
+        """
+
+    @abstractmethod
+    def known(self) -> dict[str, float]:
+        """Values of the parameters that are known, of one load state.
+
+        Raises
+        ------
+        InputError
+            A value that is no number, or several that differ.
+        """
+
+    @abstractmethod
+    def needs(self, field: Field) -> tuple[str, ...]:
+        """Words that hold ``field`` in a file of this kind."""
+
+    @abstractmethod
+    def arrays(
+        self, fields: Sequence[Field], others: Collection[str] = ()
+    ) -> dict[str, np.ndarray]:
+        """Arrays of numbers by variable, NaN where a measured value is missing.
+
+        ``fields`` are an observation's, and the file has every word that they need. ``others`` are
+        what other observations measured at the same places: rows with a value there are theirs.
+        """
+
+
+def open_data(path: Path) -> DataFile:
+    """The file at ``path``: CSV by its suffix, else netCDF; :class:`InputError` for others."""
+    if not path.is_file():
+        raise InputError(f"data file {path} does not exist")
+    if path.suffix.lower() in _SPREADSHEETS:
+        raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
+    return CSVFile(path) if path.suffix.lower() in _TEXT else NetCDFFile(path)
+
+
+class CSVFile(DataFile):
+    """Columns of a CSV file; rows are counted from 1 after the header."""
+
+    what = "column"
+
+    def __init__(self, path: Path) -> None:
+        lines = _lines(path)
+        delimiter = _delimiter(lines[0]) if lines else ","
+        try:
+            table = list(
+                csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
+            )
+        except csv.Error as error:
+            raise InputError(f"data file {path} is not a CSV file: {error}") from error
+        cells = [[cell.strip() for cell in row] for row in table]
+        self.path, self.decimal_comma = path, delimiter != ","
+        self.words = cells[0] if cells else []
+        if self.words and all(map(_is_number, self.words)):
+            raise InputError(
+                f"data file {path}: its first line, '{lines[0].strip()[:40]}', has no names of "
+                "columns; put them above it, e.g. node,ux,uy,uz"
+            )
+        twice = [w for w in self.words if w and self.words.count(w) > 1]
+        if twice:
+            raise InputError(f"data file {path}: column '{twice[0]}' is there twice")
+        self.rows = {
+            k: self._row(k, row) for k, row in enumerate(cells[1:], 1) if any(row) or len(row) > 1
+        }
+        if self.words and not self.rows:
+            raise InputError(f"data file {path}: names of columns, and no row below them")
+
+    def states(self) -> dict[str, CSVFile]:
+        """Rows of each state, by the word in the column ``state``; each row of a loading curve."""
+        known = any(word.startswith(KNOWN) for word in self.words)
+        curve = STATE not in self.words and known and not _PLACES & set(self.words)
+        if STATE not in self.words and not curve:
+            return {"": self}
+        found: dict[str, CSVFile] = {}
+        for number, row in self.rows.items():
+            state = str(number) if curve else row[STATE]
+            if not state or "@" in state or "/" in state:
+                raise InputError(
+                    f"data file {self.path}: row {number}, column '{STATE}' is '{state}'; "
+                    "give every row the name of its load state, without @ and /"
+                )
+            if state not in found:
+                part = found[state] = copy(self)
+                part.words, part.rows = [w for w in self.words if w != STATE], {}
+            found[state].rows[number] = row
+        # A column that is empty in a state was not measured there.
+        for part in found.values():
+            part.words = [w for w in part.words if any(row[w] for row in part.rows.values())]
+        return found
+
+    def known(self) -> dict[str, float]:
+        """Numbers of columns ``known:NAME``; empty cells say nothing."""
+        found: dict[str, float] = {}
+        for word in (w for w in self.words if w.startswith(KNOWN)):
+            name, field = word.removeprefix(KNOWN), Field(word, (word,), where=True)
+            for number, row in self.rows.items():
+                value = self._number(number, row, word, field) if row[word] else None
+                if value is not None and found.setdefault(name, value) != value:
+                    raise InputError(
+                        f"data file {self.path}: row {number}, column '{word}' is {value}, and "
+                        f"{found[name]} before it in the same load state"
+                    )
+        return found
+
+    def _row(self, number: int, cells: list[str]) -> dict[str, str]:
+        if any(cells[len(self.words) :]):
+            hint = "" if self.decimal_comma else "; decimal commas need semicolons between columns"
+            raise InputError(
+                f"data file {self.path}: row {number} has {len(cells)} values for "
+                f"{len(self.words)} columns{hint}"
+            )
+        padded = cells + [""] * (len(self.words) - len(cells))
+        return dict(zip(self.words, padded, strict=False))
+
+    def needs(self, field: Field) -> tuple[str, ...]:
+        """The field's columns."""
+        return field.columns
+
+    def arrays(
+        self, fields: Sequence[Field], others: Collection[str] = ()
+    ) -> dict[str, np.ndarray]:
+        """Rows in which any of the fields has a value, less those of other observations."""
+        measured = [word for field in fields if not field.where for word in field.columns]
+        places = [word for field in fields if field.where for word in field.columns]
+        filled = [
+            (k, row)
+            for k, row in self.rows.items()
+            if any(row[w] for w in measured)
+            or (any(row[w] for w in places) and not any(row[w] for w in others))
+        ]
+        found = {}
+        for field in fields:
+            numbers = [[self._number(k, row, w, field) for w in field.columns] for k, row in filled]
+            array = np.array(numbers, dtype=float).reshape(len(filled), len(field.columns))
+            found[field.variable] = array[:, 0] if len(field.columns) == 1 else array
+        return found
+
+    def _number(self, number: int, row: Mapping[str, str], word: str, field: Field) -> float:
+        text = row[word]
+        if not field.where and text.lower() in _MISSING:
+            return np.nan
+        if self.decimal_comma and "." not in text:
+            text = text.replace(",", ".")
+        try:
+            return float(text)
+        except ValueError as error:
+            found = f"'{row[word]}', not a number" if row[word] else "empty"
+            raise InputError(
+                f"data file {self.path}: row {number}, column '{word}' is {found}"
+            ) from error
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _lines(path: Path) -> list[str]:
+    """Lines that say something, the header first."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"data file {path} is not UTF-8 text; save it as CSV UTF-8") from error
+    if "\0" in text:
+        raise InputError(f"data file {path} is not a CSV file: it holds bytes that are no text")
+    lines = [line.strip(" \r") for line in text.split("\n")]
+    return [line for line in lines if line.strip() and not line.startswith("#")]
+
+
+def _delimiter(header: str) -> str:
+    """What separates the words of the header; what is quoted does not count."""
+    bare = re.sub(r'"[^"]*"', "", header)
+    return next((mark for mark in ";\t" if mark in bare), ",")
+
+
+class NetCDFFile(DataFile):
+    """Variables and coordinates of a netCDF file."""
+
+    what = "variable"
+
+    def __init__(self, path: Path) -> None:
+        try:
+            with xr.open_dataset(path, engine="h5netcdf") as file:
+                self.data = file.load()
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(
+                f"data file {path} is neither CSV ({', '.join(_TEXT)}) nor readable netCDF"
+            ) from error
+        self.path, self.state = path, ""
+        self.words = list(map(str, self.data.variables))
+
+    def states(self) -> dict[str, NetCDFFile]:
+        """Variables of each state, by what follows ``@`` in their names."""
+        found: dict[str, NetCDFFile] = {}
+        # Coordinates without values of their own belong to no state.
+        own = [w for w in self.words if w not in self.data.dims]
+        for state in states_of(own, f"data file {self.path}"):
+            part = found[state] = copy(self)
+            part.state = state
+            part.words = [base for base, its in map(split, own) if its == state]
+        return found
+
+    def known(self) -> dict[str, float]:
+        """Numbers of variables ``known:NAME``."""
+        words = [word for word in self.words if word.startswith(KNOWN)]
+        arrays = self.arrays([Field(word, (word,), where=True) for word in words])
+        for word, array in arrays.items():
+            if np.shape(array) != ():
+                raise InputError(f"data file {self.path}: variable '{word}' is not a number")
+        return {word.removeprefix(KNOWN): float(array) for word, array in arrays.items()}
+
+    def needs(self, field: Field) -> tuple[str, ...]:
+        """The field's variable."""
+        return (field.variable,)
+
+    def arrays(
+        self, fields: Sequence[Field], others: Collection[str] = ()
+    ) -> dict[str, np.ndarray]:
+        """The variables as numbers."""
+        found = {}
+        for name in (field.variable for field in fields):
+            try:
+                found[name] = np.asarray(self.data[in_state(name, self.state)], dtype=float)
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"data file {self.path}: variable '{name}' does not hold numbers"
+                ) from error
+        return found
+
+
+Block = Sequence[tuple[Field, np.ndarray]]
+"""The fields of one observation with their arrays."""
+
+
+def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
+    """Columns of every block side by side, load state after load state.
+
+    Blocks of one number share a row of their own, the last of their state. A block that shares a
+    column with an earlier one, such as ``x``, has rows of its own below.
+    """
+    every = [field for blocks in states.values() for block in blocks for field, _ in block]
+    header = list(dict.fromkeys(word for field in every for word in field.columns))
+    named = "" not in states
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [STATE] * named + header, lineterminator="\n")
+    writer.writeheader()
+    for state, blocks in states.items():
+        writer.writerows({**({STATE: state} if named else {}), **row} for row in _rows(blocks))
+    store.write_atomically(path, text.getvalue().encode())
+
+
+def _rows(blocks: Sequence[Block]) -> list[dict[str, str]]:
+    """Rows of one load state: cells by column."""
+    rows: list[dict[str, str]] = []
+    single: dict[str, str] = {}
+    used: set[str] = set()
+    for block in blocks:
+        words = [word for field, _ in block for word in field.columns]
+        start = len(rows) if used & set(words) else 0
+        used.update(words)
+        for field, array in block:
+            if not np.ndim(array):
+                single[field.columns[0]] = _cell(float(array))
+                continue
+            cells = np.asarray(array).reshape(-1, len(field.columns)).tolist()
+            rows += [{} for _ in range(start + len(cells) - len(rows))]
+            for row, values in zip(rows[start:], cells, strict=False):
+                row.update(zip(field.columns, map(_cell, values), strict=True))
+    return [*rows, single] if single else rows
+
+
+def _cell(value: float) -> str:
+    return "NA" if np.isnan(value) else repr(value)
+
+
+def write_netcdf(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
+    """Every array a variable; arrays of as many rows as the block's first share a dimension.
+
+    In several load states, variables are called ``name@state``.
+    """
+    variables = {}
+    every = [(state, block) for state, blocks in states.items() for block in blocks]
+    for k, (state, block) in enumerate(every):
+        for field, array in block:
+            dims = [f"point_{k}", *(f"component_{n}" for n in np.shape(array)[1:])]
+            variables[in_state(field.variable, state)] = (dims[: np.ndim(array)], np.asarray(array))
+    store.write_netcdf(path, xr.Dataset(variables))

@@ -1,0 +1,204 @@
+"""Draws of a hierarchy: each member alone, then all of them together."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+
+from calibrate.population.coordinates import Information, information_of
+from calibrate.population.density import Observed, density_of_hierarchy
+from calibrate.population.model import HierarchicalModel, hierarchical_model
+from calibrate.population.posterior import Hierarchy
+from calibrate.population.shared import to_scale
+from calibrate.population.tree import ALONE, make_tree, tree_of_alone
+from calibrate.posterior import sample
+from calibrate.posterior.posterior import describe_distribution
+from calibrate.provenance import versions
+from calibrate.samplers import NUTSOptions, check_options
+from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.samplers.nuts import NUTS
+from calibrate.samplers.protocol import Context
+from calibrate.statistical_model import Data, Model
+
+_PRIOR_DRAWS = 2000
+# The spread of few members reaches towards 0, where steps have to be short (docs/experiments.md,
+# "Members of one population").
+TARGET_ACCEPT = 0.98
+_NEW, _OF_PRIOR = 0x9E3779B9, 0x85EBCA6B  # keep these keys apart from the sampler's
+
+Alone = Mapping[str, Mapping[str, np.ndarray]]
+"""Draws (s,) of the shared unknowns, by member and name."""
+
+Members = Mapping[str, tuple[Model, Any]]
+"""Model and data of each member; data as :func:`calibrate.sample` takes it, ``None`` of none."""
+
+
+def hierarchy(
+    members: Members,
+    *,
+    shared: Sequence[str] | None = None,
+    median: Mapping[str, dist.Distribution] | None = None,
+    spread: Mapping[str, dist.Distribution | float] | None = None,
+    eta: float = 2.0,
+    options: NUTSOptions | None = None,
+    alone: str = "nuts",
+    seed: int = 0,
+    progress: bool = False,
+) -> Hierarchy:
+    """Members of one population, calibrated together (:mod:`calibrate.population.model`).
+
+    Parameters
+    ----------
+    members : name to ``(model, data)``; data ``None`` of a member that was not measured.
+    shared : unknowns that follow the population; by default all that every member has and that are
+        no parameters of its loads.
+    median : prior of the population's median, by shared name, in the parameter's unit.
+    spread : prior of the population's sd, of the logarithm where the scene's scale is logarithmic;
+        a number is the scale of a half-normal.
+    eta : of the prior of correlations; 1 is uniform, more prefers none.
+    options : of NUTS, for all members together; by default its own, with target_accept 0.98.
+    alone : sampler of each member alone, for comparison and for good coordinates; ``laplace`` is
+        cheap and as good for the latter.
+
+    Raises
+    ------
+    InputError
+        Members that do not fit each other, data that does not fit a member, an unknown sampler or
+        the options of another.
+    """
+    fitting = {
+        m: (model, None) if y is None else model.given(y) for m, (model, y) in members.items()
+    }
+    model = hierarchical_model(
+        {member: model for member, (model, _) in fitting.items()},
+        shared=shared,
+        median=median,
+        spread=spread,
+        eta=eta,
+    )
+    data = {member: dict(y) for member, (_, y) in fitting.items() if y is not None}
+    return sample_hierarchy(model, data, options=options, alone=alone, seed=seed, progress=progress)
+
+
+def sample_hierarchy(
+    model: HierarchicalModel,
+    data: Mapping[str, Data],
+    *,
+    options: NUTSOptions | None = None,
+    alone: str | Alone = "nuts",
+    seed: int = 0,
+    progress: bool = False,
+    checkpoint: str | Path | None = None,
+) -> Hierarchy:
+    """The posterior of ``model`` given ``data`` by member, checked before.
+
+    Parameters
+    ----------
+    alone : sampler of each member alone, or draws of it by member.
+    checkpoint : as of :func:`calibrate.sample`, for all members together.
+    """
+    options = check_options(NUTS, options or NUTSOptions(target_accept=TARGET_ACCEPT))
+    if isinstance(alone, str):
+        by_member, sampler = _alone(model, data, alone, seed, progress=progress), alone
+    else:
+        by_member, sampler = {m: dict(alone[m]) for m in model.members}, "given"
+    information = _information(model, by_member, data)
+    density = density_of_hierarchy(model)
+    observed = Observed(dict(data), information)
+    made = _provenance(model, options, sampler, seed)
+    state = Checkpoint(checkpoint, _identity(made, data, by_member))
+    found = NUTS.sample(density, observed, options, seed, Context(progress, state))
+    key = jax.random.fold_in(jax.random.key(seed), _NEW)
+    flat = jnp.asarray(found.z).reshape(-1, density.dimension)
+    drawn = density.constrain(flat, information)
+    tree = make_tree(model, drawn, found.z.shape[:2], found.statistics, key)
+    tree[ALONE] = tree_of_alone(by_member)
+    for name, value in made.items():
+        tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
+    state.remove()
+    return Hierarchy(tree)
+
+
+def _identity(made: Mapping[str, Any], data: Mapping[str, Data], alone: Alone) -> dict[str, str]:
+    """What a run is of: its provenance, and a hash of data and of the members' draws."""
+    digest = hashlib.sha256()
+    for member in sorted(alone):
+        for values in (data.get(member, {}), alone[member]):
+            for name in sorted(values):
+                digest.update(f"{member} {name}".encode() + np.asarray(values[name]).tobytes())
+    described = {name: json.dumps(value) for name, value in made.items()}
+    return {**described, "data": digest.hexdigest()[:16]}
+
+
+def _alone(
+    model: HierarchicalModel, data: Mapping[str, Data], sampler: str, seed: int, *, progress: bool
+) -> dict[str, dict[str, np.ndarray]]:
+    """Draws (s,) of the shared unknowns by member, each member alone; of its prior without data."""
+    found = {}
+    for i, (member, own) in enumerate(model.members.items()):
+        if member in data:
+            given = {name: np.asarray(values) for name, values in data[member].items()}
+            posterior = sample(
+                own, given, sampler=sampler, seed=seed + i, progress=progress,
+                predictions=False,
+            )  # fmt: skip
+            draws: Mapping[str, Any] = posterior.draws()
+        else:
+            draws = own.prior_draws(jax.random.key(seed + i), _PRIOR_DRAWS)
+        found[member] = {name: np.asarray(draws[name]) for name in model.shared}
+    return found
+
+
+def _information(
+    model: HierarchicalModel,
+    alone: Mapping[str, Mapping[str, np.ndarray]],
+    data: Mapping[str, Data],
+) -> Information:
+    """What each member's data says, from its posterior alone and its prior."""
+    rows, priors = [], {}
+    for member, own in model.members.items():
+        draws = _on_scales(model, alone[member])
+        if member in data and id(own) not in priors:
+            key = jax.random.fold_in(jax.random.key(0), _OF_PRIOR)
+            priors[id(own)] = _on_scales(model, own.prior_draws(key, _PRIOR_DRAWS))
+        rows.append(information_of(draws, priors[id(own)] if member in data else draws))
+    return Information(*(jnp.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _on_scales(model: HierarchicalModel, draws: Mapping[str, Any]) -> np.ndarray:
+    """Draws (s, k) of the shared unknowns on their parameters' scales."""
+    columns = [to_scale(parameter, draws[name]) for name, parameter in model.shared.items()]
+    return np.stack([np.asarray(column) for column in columns], axis=1)
+
+
+def _provenance(
+    model: HierarchicalModel, options: NUTSOptions, alone: str, seed: int
+) -> dict[str, Any]:
+    """What a hierarchy was made of; plain JSON values."""
+    return {
+        "shared": list(model.shared),
+        "prior_median": {name: describe_distribution(d) for name, d in model.median.items()},
+        "prior_spread": {name: describe_distribution(d) for name, d in model.spread.items()},
+        "eta": model.eta,
+        "members": {
+            member: {
+                "scene_fingerprint": own.forward.scene.fingerprint,
+                "forward_fingerprint": own.full.fingerprint,
+                "prior": {name: describe_distribution(d) for name, d in own.prior.items()},
+            }
+            for member, own in model.members.items()
+        },
+        "sampler_options": asdict(options),
+        "alone": alone,
+        "seed": seed,
+        "versions": versions(),
+    }

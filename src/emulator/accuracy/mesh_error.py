@@ -1,0 +1,171 @@
+r"""The error of the mesh: how far a solution is from the same body's on a finer mesh.
+
+An equilibrium :math:`u_h` on a mesh of size h, and one on the next finer mesh
+(:mod:`emulator.scenes.finer`), differ by
+
+.. math:: u_h - u_{h/2} = (u_h - u)\,(1 - 2^{-k}), \qquad |u_h - u| \sim h^k ,
+
+most of the error: seven eighths at :math:`k = 3`, as quadratic elements have on smooth solutions, a
+half at :math:`k = 1`, as at the edge of a clamp; from linear to quadratic elements nearly all of
+it. So the difference has an effectivity of one half to one.
+
+It takes no solve from rest: from the prolonged solution, moved by what another theta needed, a
+Newton step on the finer mesh is checked by a second back-substitution
+(:func:`emulator.accuracy.step.newton_distance`), and another step follows if that is not much
+shorter.
+Where steps do not contract, as for locked elements far from any theta known, FEM's iteration takes
+over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from threading import Lock
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.accuracy.step import Distance, newton_distance
+from emulator.core.errors import InputError
+from emulator.fem.linear.suitesparse import forget_factors
+from emulator.fem.loop import jit
+from emulator.fem.simulator import Simulator
+from emulator.scenes.finer import Finer, finer
+from emulator.scenes.scene import Scene
+
+LARGEST = 60_000
+"""Nodes of a finer mesh that is still looked at; beyond, a factorisation takes a minute."""
+
+_TOLERANCE = 1e-7  # of a solve on the finer mesh: far below the difference between the meshes
+_CONTRACTION = 0.1  # largest part of the last step that another one would correct
+_GOES_ON, _STEPS = 0.5, 3  # as much of a step before it, and steps at most
+
+Quantity = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+class MeshErrorEstimate(NamedTuple):
+    """The mesh's error at one theta.
+
+    theta : (p,). coarse : (n, 3) mm, the equilibrium on the mesh. fine : (f, 3) mm, on the finer
+    one, whose first n nodes are the mesh's. solved : whether FEM's iteration took over.
+    """
+
+    theta: jax.Array
+    coarse: jax.Array
+    fine: jax.Array
+    solved: bool
+
+    @property
+    def field(self) -> jax.Array:
+        """The mesh's displacement less the finer one's at the mesh's nodes, (n, 3) mm."""
+        return self.coarse - self.fine[: len(self.coarse)]
+
+    @property
+    def err_u(self) -> jax.Array:
+        """Length of :attr:`field` at each node, (n,) mm."""
+        return jnp.linalg.norm(self.field, axis=1)
+
+    def of(self, on_mesh: Quantity, on_finer: Quantity) -> jax.Array:
+        """Error of a quantity ``q(u, theta)`` that is defined on both meshes, in its unit."""
+        return on_mesh(self.coarse, self.theta) - on_finer(self.fine, self.theta)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshError:
+    """Errors of a simulator's mesh; made by :func:`mesh_error`.
+
+    Threads may share one whose simulator they may share (:func:`emulator.fem.campaign.at_once`):
+    steps on the finer mesh are taken at once, solves there, which may keep a factor, one by one.
+
+    fine : the simulator on the finer mesh.
+    """
+
+    simulator: Simulator
+    finer: Finer
+    fine: Simulator
+    _alone: Lock = field(default_factory=Lock, repr=False)
+
+    def __call__(
+        self,
+        theta: jax.Array,
+        start: jax.Array | None = None,
+        *,
+        near: MeshErrorEstimate | None = None,
+    ) -> MeshErrorEstimate:
+        """The error at ``theta`` (p,).
+
+        Parameters
+        ----------
+        start : (n, 3) mm, where the solve on the mesh begins; at rest by default.
+        near : the error at another theta, from which the finer mesh's iteration begins.
+
+        Raises
+        ------
+        SolverError
+            No equilibrium was found on one of the meshes.
+        """
+        theta = jnp.asarray(theta, dtype=float)
+        what = "the error of the mesh"
+        coarse = self.simulator.solve(theta, start).require_converged(what).displacement
+        begin = self._carried(coarse)
+        if near is not None:
+            begin = begin + near.fine - self._carried(near.coarse)
+        # Steps are those of one set of equations; a mesh that is loaded has two.
+        stepped = None if self.fine.scene.loaded_by else self._stepped(theta, begin)
+        if stepped is not None:
+            return MeshErrorEstimate(theta, coarse, stepped, solved=False)
+        with self._alone:
+            solution = self.fine.solve(theta, begin)
+            if not solution.converged:  # strains of locked elements may be too rough to begin with
+                solution = self.fine.solve(theta)
+        fine = solution.require_converged(f"{what}, on the finer one").displacement
+        return MeshErrorEstimate(theta, coarse, fine, solved=True)
+
+    def forget(self) -> None:
+        """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
+        forget_factors()
+
+    def _carried(self, u: jax.Array) -> jax.Array:
+        return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))
+
+    @cached_property
+    def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:
+        return jit(partial(newton_distance, self.fine.system))
+
+    def _stepped(self, theta: jax.Array, u: jax.Array) -> jax.Array | None:
+        """The finer mesh's displacement (f, 3) a few steps from ``u``; None if one is not sound."""
+        for _ in range(_STEPS):
+            step = self._step(u, theta)
+            if not float(step.contraction) <= _GOES_ON:
+                return None
+            u = u - step.move
+            if step.settled and float(step.contraction) <= _CONTRACTION:
+                return u
+        return None
+
+
+def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshError:
+    """Errors of the mesh of ``simulator``, or of FEM with its defaults for a scene.
+
+    Parameters
+    ----------
+    most : nodes of a finer mesh that is still looked at.
+
+    Raises
+    ------
+    InputError
+        A finer mesh of more nodes, or a load that it cannot have.
+    """
+    given = simulator if isinstance(simulator, Simulator) else Simulator(simulator)
+    found = finer(given.scene)
+    if (count := len(found.scene.mesh.nodes)) > most:
+        raise InputError(
+            f"mesh error: the mesh finer than that of '{given.scene.name}' has {count} nodes, more "
+            f"than {most}; allow more with 'most', or check a coarser mesh of the same body"
+        )
+    options = replace(given.options, tolerance=max(given.options.tolerance, _TOLERANCE))
+    return MeshError(given, found, Simulator(found.scene, options, given.factorisation))

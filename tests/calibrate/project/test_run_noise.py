@@ -1,0 +1,129 @@
+"""Noise of a run: from words and JSON to the likelihood and to synthetic data."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+import calibrate as cal
+import emulator as em
+from calibrate.cli.noise_words import discrepancy_words, noise_scale_words, noise_words
+from calibrate.cli.posterior_table import summary
+from calibrate.measurements import parse_observation
+from calibrate.measurements.data import write_data
+from calibrate.noise import DiscrepancyNoise, StudentTNoise
+from calibrate.project import Run, infer, make_data, read_posterior, report
+from emulator.core import schema
+from emulator.core.errors import InputError
+from linear_support import linear_forward
+
+TRUTH = {"mu": 70.0, "lam": 60.0}
+
+
+def run_of(**options):
+    return Run("once_clamped_beam", observe="nodes:9+length:3:14", truth=TRUTH, **options)
+
+
+def test_words_name_noise():
+    assert noise_words(["0.3"]) == 0.3
+    assert noise_words([]) == {}
+    assert noise_words(["0.3", "length:3:14=student_t:dof=4,scale=0.2", "volume=1"]) == {
+        "displacement": 0.3,
+        "length:3:14": {"kind": "student_t", "dof": 4.0, "scale": 0.2},
+        "volume": 1.0,
+    }
+    assert noise_scale_words(["volume=1"]) == {"volume": 1.0}
+    assert discrepancy_words(["displacement=0.5:20"]) == {
+        "displacement": {"scale": 0.5, "length": 20.0}
+    }
+
+
+def test_a_run_makes_its_noise_from_json(beam, tmp_path):
+    given = {"displacement": {"kind": "student_t", "dof": 4, "scale": 0.2}}
+    run = run_of(noise=given, noise_scale={"length:3:14": 2.0})
+    (tmp_path / "run.json").write_text(json.dumps(asdict(run)))
+    run = schema.read_json_as(Run, tmp_path / "run.json")
+    observe = parse_observation(beam, run.observe)
+    assert run.noises(observe) == {
+        "displacement": StudentTNoise(4, 0.2),
+        "length:3:14": cal.GaussianNoise(sd_scale=2.0),
+    }
+    assert run.synthetic_noise(observe)["length:3:14"] == cal.GaussianNoise(sd=0.5)
+    unknown = run_of(noise=given, noise_scale={"displacement": 0.4})
+    assert unknown.noises(observe)["displacement"] == StudentTNoise(4, prior_scale=0.4)
+    assert unknown.synthetic_noise(observe)["displacement"] == StudentTNoise(4, 0.2)
+
+
+def test_a_discrepancy_is_switched_on_by_name(beam):
+    run = run_of(discrepancy={"displacement": {"scale": 0.5, "length": 20.0}})
+    observe = parse_observation(beam, run.observe)
+    assert run.noises(observe)["displacement"] == DiscrepancyNoise(0.5, 20.0, sd=0.2)
+    assert run.synthetic_noise(observe)["displacement"] == cal.GaussianNoise(sd=0.2)
+    model = cal.model(linear_forward(beam), observe, run.noises(observe))
+    assert model.names == ("mu", "lam", "discrepancy_sd_displacement")
+    for options, message in (
+        ({"discrepancy": {"length:3:14": {"scale": 0.5, "length": 20.0}}}, "has no place of its"),
+        (
+            {"discrepancy": {"displacement": {"scale": 0.5}}},
+            "displacement .mm.: .*'length' is miss",
+        ),
+        ({"noise": {"displacement": {"kind": "pink"}}}, "displacement .mm.: noise kind 'pink' is"),
+    ):
+        with pytest.raises(InputError, match=message):
+            cal.model(linear_forward(beam), observe, run_of(**options).noises(observe))
+
+
+def test_synthetic_data_has_the_noise_of_the_run(beam, monkeypatch):
+    monkeypatch.setattr(
+        "calibrate.project.workflow.simulator_of", lambda scene, load_steps: linear_forward(scene)
+    )
+    word = {"kind": "correlated", "length": 500.0, "sd": 1e-9, "spatial_sd": 1.0}
+    observe, noisy = make_data(run_of(noise={"displacement": word}), beam)
+    _, exact = make_data(run_of(noise={"displacement": 1e-12}), beam)
+    noise = noisy["displacement"] - exact["displacement"]
+    # Over a length far beyond the body the noise is nearly one shift, of its own a component.
+    assert np.ptp(noise, axis=0).max() < 0.5 < np.abs(noise).max()
+    assert np.ptp(noise[0]) > 0.1
+    assert observe.parts["displacement"].shape == (9, 3)
+
+
+@pytest.mark.slow
+def test_a_posterior_with_gaps_and_a_discrepancy_is_kept_and_read(tmp_path):
+    """By files, as between `infer` and `certify`; the shipped emulator is the forward map."""
+    scene = em.scenes.once_clamped_beam()
+    observe, data = make_data(Run("once_clamped_beam", truth={"mu": 73.0, "lam": 61.0}), scene)
+    values = data["displacement"]
+    values[3] = values[5, 1] = np.nan
+    write_data(tmp_path / "d.csv", observe, data)
+    run = Run(
+        "once_clamped_beam", data=str(tmp_path / "d.csv"), warmup=50, draws=50, chains=2,
+        discrepancy={"displacement": {"scale": 0.5, "length": 20.0}},
+    )  # fmt: skip
+    posterior = infer(run, tmp_path / "out")
+    assert report(run, posterior, None)["missing"] == {"displacement": 4}
+    assert "missing values of displacement left out: 4" in summary(report(run, posterior, None))
+    again, back = read_posterior(tmp_path / "out")
+    assert again.noise == {"displacement": 0.2}
+    np.testing.assert_array_equal(back.data["displacement"], values[~np.isnan(values)])
+    draw = {name: values[7] for name, values in back.draws().items()}
+    assert "discrepancy_sd" in draw
+    thetas = back.model.states.thetas(draw)
+    u = back.model.evaluate(thetas).displacement
+    densities = [
+        float(p.model.log_density(p.model.observe(u, thetas), p.model.noise_values(draw), p.data))
+        for p in (posterior, back)
+    ]
+    assert densities[0] == pytest.approx(densities[1], rel=1e-12)
+
+
+def test_what_is_said_of_one_state_makes_its_noise_one_of_its_own(beam):
+    observe = parse_observation(beam, "nodes:4", 0, ("soft", "stiff"))
+    discrepancy = {"displacement": {"scale": 0.5, "length": 20.0}}
+    run = run_of(noise=0.3, noise_scale={"displacement@soft": 0.2}, discrepancy=discrepancy)
+    found = run.noises(observe)
+    assert {name: noise.sd for name, noise in found.items()} == {
+        "displacement@soft": None,
+        "displacement": 0.3,
+    }
+    assert all(isinstance(noise, DiscrepancyNoise) for noise in found.values())
