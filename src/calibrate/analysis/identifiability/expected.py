@@ -10,8 +10,8 @@ of a Student's t about a Newton step from :math:`x_r`,
 
 with the Fisher information F of :mod:`~calibrate.analysis.identifiability.fisher`, the prior's
 covariance P and the share :math:`\beta` of draws from the prior; :math:`\hat x` and Q are
-then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000). Where too few draws
-carry the weight the covariance is Q. Posteriors are
+then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000). Where
+too few draws carry the weight the covariance is Q. Posteriors are
 averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
 the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
 :math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
@@ -19,8 +19,8 @@ the mean posterior covariance, and a box of a prior ends where a Gaussian does n
 Errors that many numbers share are in the data and in :math:`p(y \mid x)`, which marginalises them
 (:mod:`~calibrate.analysis.identifiability.errors_of_sets`). Where the size of one is inferred, each
 data set has another quantile of its prior, and F is that of x at this size: about x and
-the size together Gaussian data has no information in common, so that not to know the size widens x in second order
-only.
+the size together Gaussian data has no information in common, so that not to know
+the size widens x in second order only.
 """
 
 from __future__ import annotations
