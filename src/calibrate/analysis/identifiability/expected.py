@@ -10,8 +10,8 @@ of a Student's t about a Newton step from :math:`x_r`,
 
 with the Fisher information F of :mod:`~calibrate.analysis.identifiability.fisher`, the prior's
 covariance P and the share :math:`\beta` of draws from the prior; :math:`\hat x` and Q are
-then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000). Where
-too few draws carry the weight the covariance is Q. Posteriors are
+then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000).
+Where too few draws carry the weight the covariance is Q. Posteriors are
 averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
 the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
 :math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
