@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator import Simulator
+from emulator.core.gaussian_process import Features, fit_lengths, fit_weights, fold
 from emulator.fem import Runs, run_campaign
 from emulator.scenes import Scene
 from emulator.surrogates.discrepancy import Discrepancy, Warp, fit, fit_discrepancy
-from emulator.surrogates.discrepancy.kernel import Features, fit_lengths, fit_weights, fold
 from emulator.surrogates.pod_gp import ReducedForward, fit_reduced
 from emulator.surrogates.taylor import Expansion, expand
 

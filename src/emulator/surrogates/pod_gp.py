@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.core.gaussian_process import squared_exponential
 from emulator.core.precision import require_float64
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import sobol
@@ -82,7 +83,9 @@ class ReducedForward:
         """
         require_float64("a reduced model")
         gap = (self.scene.to_unit(theta) - self.inputs)[None] / self.lengths[:, None]
-        coefficients = jnp.sum(self.weights * jnp.exp(-0.5 * jnp.sum(gap**2, axis=-1)), axis=-1)
+        coefficients = jnp.sum(
+            self.weights * squared_exponential(jnp.sum(gap**2, axis=-1)), axis=-1
+        )
         found = self.mean + jnp.tensordot(coefficients, self.modes, axes=1)
         return self.scene.on_supports(found, theta, self.nodes)
 

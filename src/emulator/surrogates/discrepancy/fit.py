@@ -4,7 +4,7 @@ r"""Fitting a discrepancy model: Gaussian processes of the principal modes of wh
 
 with :math:`m` a map made before the runs (none, a Taylor series, a network), the modes those of the
 remainders and their sensitivities together, and :math:`c_k` a Gaussian process conditioned on
-values *and* derivatives (:mod:`emulator.surrogates.discrepancy.kernel`). A run with its
+values *and* derivatives (:mod:`emulator.core.gaussian_process`). A run with its
 sensitivities counts as p + 1 observations for a tenth more time.
 
 A stationary kernel in theta fits badly where a body is stiff in one corner of the box and soft in
@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.core.gaussian_process import Features, fit_lengths, fit_weights, fold
 from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
-from emulator.surrogates.discrepancy.kernel import Features, fit_lengths, fit_weights, fold
 from emulator.surrogates.discrepancy.model import Discrepancy, Warp
 from emulator.surrogates.taylor import Expansion
 

@@ -3,7 +3,7 @@ r"""A fitted discrepancy model: modes with Gaussian processes as coefficients.
 .. math:: e(x) = \bar e + \sum_k c_k(x)\, \phi_k
 
 with :math:`x` theta's position in the unit box and :math:`c_k` the posterior mean of a Gaussian
-process of values and derivatives (:mod:`emulator.surrogates.discrepancy.kernel`).
+process of values and derivatives (:mod:`emulator.core.gaussian_process`).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.gaussian_process import Features, mean
 from emulator.core.precision import require_float64
 from emulator.core.store import inside, named_leaves
 from emulator.scenes.scene import Scene
-from emulator.surrogates.discrepancy.kernel import Features, mean
 from emulator.surrogates.part import CachedPart, OfArrays, widened
 from emulator.surrogates.taylor import monomials, rounded
 
@@ -53,7 +53,7 @@ class Discrepancy(OfArrays):
 
     warp : features of a position. known : (c, q) those of the runs.
     value_weights, derivative_weights : (c, r) and (c, q, r), from
-        :func:`~emulator.surrogates.discrepancy.kernel.fold`.
+        :func:`~emulator.core.gaussian_process.fold`.
     offset : (n, 3) mm. modes : (r, n, 3) mm.
     """
 

@@ -7,15 +7,16 @@ import pytest
 from scipy.optimize import check_grad
 from scipy.special import gamma, kv
 from scipy.stats import multivariate_normal
+from sklearn.gaussian_process.kernels import RBF, Matern
 
-from emulator.surrogates.discrepancy import kernel
-from emulator.surrogates.discrepancy.kernel import (
+from emulator.core import gaussian_process as kernel
+from emulator.core.gaussian_process import (
     JITTER,
     Features,
     covariance,
     fit_lengths,
     fold,
-    misfit,
+    negative_log_likelihood,
 )
 
 COUNT, PARAMETERS = 6, 2
@@ -60,19 +61,19 @@ def test_the_kernel_is_materns(features):
     distance = np.array([0.03, 0.4, 1.0, 2.7])
     z = np.sqrt(7.0) * distance
     expected = 2.0 ** (1.0 - 3.5) / gamma(3.5) * z**3.5 * kv(3.5, z)
-    np.testing.assert_allclose(kernel.radial(distance**2).value, expected, rtol=1e-12)
+    np.testing.assert_allclose(kernel.matern72(distance**2).value, expected, rtol=1e-12)
 
 
 def test_radial_derivatives_by_differences_and_at_zero():
     squared, h = jnp.array([0.02, 0.5, 3.0]), 1e-6
-    ahead, behind = kernel.radial(squared + h), kernel.radial(squared - h)
-    at = kernel.radial(squared)
+    ahead, behind = kernel.matern72(squared + h), kernel.matern72(squared - h)
+    at = kernel.matern72(squared)
     np.testing.assert_allclose(at.first, (ahead.value - behind.value) / (2 * h), rtol=1e-7)
     np.testing.assert_allclose(at.second, (ahead.first - behind.first) / (2 * h), rtol=1e-7)
-    third = jax.vmap(jax.grad(lambda s: kernel.radial(s).second))(squared)
+    third = jax.vmap(jax.grad(lambda s: kernel.matern72(s).second))(squared)
     np.testing.assert_allclose(third, (ahead.second - behind.second) / (2 * h), rtol=1e-7)
     # To all digits where two inputs meet, not only finite.
-    chain = [lambda s: kernel.radial(s).value]
+    chain = [lambda s: kernel.matern72(s).value]
     for _ in range(3):
         chain.append(jax.grad(chain[-1]))
     expected = [1.0, -0.7, 49.0 / 60.0, -343.0 / 120.0]
@@ -168,12 +169,12 @@ def test_misfit_against_scipy(features, observations):
         assert np.argmax(densities) == 1
         total -= densities[1]
     expected = total / (3 * size) - 0.5 * (1.0 + np.log(2.0 * np.pi))
-    assert misfit(features, observations) == pytest.approx(expected, rel=1e-6)
+    assert negative_log_likelihood(features, observations) == pytest.approx(expected, rel=1e-6)
 
 
 def test_lengths_are_those_of_least_misfit(features, observations):
     lengths = fit_lengths(features, observations)
-    scaled = lambda logs: misfit(features.scaled(jnp.exp(logs)), observations)
+    scaled = lambda logs: negative_log_likelihood(features.scaled(jnp.exp(logs)), observations)
     objective, slope = jax.jit(scaled), jax.jit(jax.grad(scaled))
     best = objective(np.log(lengths))
     start = np.array([0.0, 0.0, -1.0, -1.0, -1.0])
@@ -191,3 +192,13 @@ def test_two_equal_runs_change_nothing(points, observations, known):
     x = jnp.array([0.4, 0.6])
     again = predict(x, conditioned(twice, doubled))
     np.testing.assert_allclose(again, predict(x, known), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "theirs"), [("matern32", Matern(nu=1.5)), ("squared_exponential", RBF())]
+)
+def test_correlations_by_name_are_scikit_learns(name, theirs):
+    points = np.random.default_rng(0).random((5, 2))
+    squared = np.sum((points[:, None] - points) ** 2, axis=-1)
+    for distances in (squared, jnp.asarray(squared)):
+        np.testing.assert_allclose(kernel.CORRELATIONS[name](distances), theirs(points), rtol=1e-12)

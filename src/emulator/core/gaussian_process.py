@@ -1,0 +1,215 @@
+r"""Gaussian processes: correlation functions, and regression on values and their derivatives.
+
+A correlation function gives the correlation of two points at the squared distance :math:`\rho`, in
+units of the length scales:
+
+.. math::
+    \text{squared exponential:} \quad & e^{-\rho/2} \\
+    \text{Mat\'ern 3/2:} \quad & (1 + a)\, e^{-a}, \qquad a = \sqrt{3\rho} \\
+    \text{Mat\'ern 7/2:} \quad & \left(1 + a + \tfrac25 a^2 + \tfrac1{15} a^3\right) e^{-a},
+        \qquad a = \sqrt{7\rho}
+
+(Rasmussen and Williams 2006, Equations 4.9 and 4.16). The regression takes Matern 7/2, three times
+differentiable, of the distance between features :math:`\psi` of two inputs,
+
+.. math:: \rho = |\delta|^2, \qquad \delta = \Lambda\,[\psi(x) - \psi(y)],
+
+scaled by inverse lengths :math:`\Lambda`. With :math:`J = \Lambda\,\partial\psi`,
+
+.. math::
+    \partial_y \kappa = -2\kappa'\, \delta J_y, \qquad
+    \partial_x \partial_y \kappa
+        = -4 \kappa''\, (\delta J_x)(\delta J_y)^T - 2\kappa'\, J_x^T J_y, \\
+    \kappa' = -\tfrac7{10}\left(1 + a + \tfrac13 a^2\right) e^{-a}, \quad
+    \kappa'' = \tfrac{49}{60}(1 + a) e^{-a}, \quad
+    \kappa''' = -\tfrac{343}{120} e^{-a}
+
+so that a run's value and its p derivatives are p + 1 observations. None of these is singular where
+two inputs coincide (Solak et al. 2003; Rasmussen and Williams 2006, Section 9.4). JAX is given them
+as differentiation rules: differentiating the root itself would lose four digits there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve, solve_triangular
+
+from emulator.core.minimise import minimise
+
+JITTER = 1e-9  # added to the variance 1 of each observation, because FEM has no noise
+_LOG_LOW, _LOG_HIGH = (
+    -6.0,
+    3.0,
+)  # bounds of the logarithms of inverse lengths; inputs are of order 1
+
+
+def squared_exponential(squared: Any) -> Any:
+    """Return the squared exponential correlation at squared scaled distances of any shape.
+
+    Like :func:`matern32`, it computes with NumPy where the distances are NumPy's, else with JAX.
+    """
+    return _library(squared).exp(-0.5 * squared)
+
+
+def matern32(squared: Any) -> Any:
+    """Return Matern's correlation of smoothness 3/2 at squared scaled distances of any shape."""
+    xp = _library(squared)
+    a = xp.sqrt(3.0 * squared)
+    return (1.0 + a) * xp.exp(-a)
+
+
+def _library(values: Any) -> Any:
+    return np if isinstance(values, np.ndarray) else jnp
+
+
+CORRELATIONS: dict[str, Callable[[Any], Any]] = {
+    "matern32": matern32,
+    "squared_exponential": squared_exponential,
+}
+"""Correlation functions that options call by name."""
+
+
+class Matern72(NamedTuple):
+    """Matern's correlation of smoothness 7/2 and its first two derivatives in the squared distance.
+
+    The three arrays have the shape of the distances.
+    """
+
+    value: jax.Array
+    first: jax.Array
+    second: jax.Array
+
+
+def matern72(squared: jax.Array) -> Matern72:
+    """Return Matern 7/2 at squared scaled distances of any shape; smooth where they are zero."""
+    return Matern72(_value(squared), _first(squared), _second(squared))
+
+
+def _root(squared: jax.Array) -> jax.Array:
+    return jnp.sqrt(7.0 * squared + 1e-24)  # the root's own derivative is infinite at zero
+
+
+@jax.custom_jvp
+def _value(squared: jax.Array) -> jax.Array:
+    a = _root(squared)
+    return (1.0 + a + 0.4 * a**2 + a**3 / 15.0) * jnp.exp(-a)
+
+
+@jax.custom_jvp
+def _first(squared: jax.Array) -> jax.Array:
+    a = _root(squared)
+    return -0.7 * (1.0 + a + a**2 / 3.0) * jnp.exp(-a)
+
+
+@jax.custom_jvp
+def _second(squared: jax.Array) -> jax.Array:
+    a = _root(squared)
+    return 49.0 / 60.0 * (1.0 + a) * jnp.exp(-a)
+
+
+_value.defjvps(lambda change, _, squared: _first(squared) * change)
+_first.defjvps(lambda change, _, squared: _second(squared) * change)
+_second.defjvps(lambda change, _, squared: -343.0 / 120.0 * jnp.exp(-_root(squared)) * change)
+
+
+class Features(NamedTuple):
+    """Features of c inputs, (c, q), and their derivatives in the inputs, (c, q, p)."""
+
+    value: jax.Array
+    derivative: jax.Array
+
+    def scaled(self, inverse_lengths: jax.Array) -> Features:
+        """Return the features divided by the length scales, whose inverses (q,) are given."""
+        return Features(self.value * inverse_lengths, self.derivative * inverse_lengths[:, None])
+
+
+def covariance(features: Features) -> jax.Array:
+    """Return the covariance (c (1 + p), c (1 + p)) of values and derivatives at scaled features."""
+    psi, J = features
+    count, parameters = len(psi), J.shape[2]
+    gap = psi[:, None] - psi[None]
+    k = matern72(jnp.sum(gap**2, axis=-1))
+    left = jnp.einsum("ijq,iqa->ija", gap, J)  # delta J_x
+    right = jnp.einsum("ijq,jqb->ijb", gap, J)
+    crossed = -4.0 * k.second[..., None, None] * left[..., :, None] * right[..., None, :]
+    crossed += -2.0 * k.first[..., None, None] * jnp.einsum("iqa,jqb->ijab", J, J)
+    top = jnp.concatenate([k.value[..., None], -2.0 * k.first[..., None] * right], axis=-1)
+    rest = jnp.concatenate([2.0 * k.first[..., None, None] * left[..., None], crossed], axis=-1)
+    blocks = jnp.concatenate([top[:, :, None], rest], axis=2)
+    return blocks.transpose(0, 2, 1, 3).reshape([count * (1 + parameters)] * 2)
+
+
+def _factor(features: Features) -> tuple[jax.Array, jax.Array]:
+    """Return prior standard deviations (N,) and the Cholesky factor of the correlations."""
+    K = covariance(features)
+    sd = jnp.sqrt(jnp.diagonal(K))
+    correlation = K / sd[:, None] / sd + JITTER * jnp.eye(len(K))
+    return sd, jnp.linalg.cholesky(correlation)
+
+
+def negative_log_likelihood(features: Features, observations: jax.Array) -> jax.Array:
+    """Return the negative log likelihood per observed number, up to a constant.
+
+    Parameters
+    ----------
+    features : the scaled features of c inputs.
+    observations : values and derivatives of r outputs, input by input, (c (1 + p), r). The variance
+        of each output is its most likely one, the mean square of its whitened observations.
+    """
+    sd, factor = _factor(features)
+    white = solve_triangular(factor, observations / sd[:, None], lower=True)
+    variances = jnp.mean(white**2, axis=0)
+    determinant = jnp.mean(jnp.log(jnp.diagonal(factor)) + jnp.log(sd))
+    return 0.5 * jnp.mean(jnp.log(variances)) + determinant
+
+
+def fit_lengths(features: Features, observations: jax.Array) -> np.ndarray:
+    """Return the most likely inverse lengths (q,).
+
+    features : not yet scaled. observations : as in :func:`negative_log_likelihood`.
+    """
+
+    @jax.jit
+    @jax.value_and_grad
+    def objective(logs: jax.Array) -> jax.Array:
+        return negative_log_likelihood(features.scaled(jnp.exp(logs)), observations)
+
+    start = np.zeros(features.value.shape[1])
+    start[features.derivative.shape[2] :] = -1.0
+    return np.exp(minimise(objective, start, low=_LOG_LOW, high=_LOG_HIGH, iterations=80).x)
+
+
+def fit_weights(features: Features, observations: jax.Array) -> jax.Array:
+    """Return the weights (c (1 + p), r) with which the mean passes through the observations."""
+    sd, factor = _factor(features)
+    return cho_solve((factor, True), observations / sd[:, None]) / sd[:, None]
+
+
+def fold(features: Features, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Split weights into those of the values (c, r) and of the derivatives by feature (c, q, r).
+
+    A derivative in position acts through the features' derivatives, so its p weights are q here.
+    """
+    count, _, parameters = features.derivative.shape
+    each = weights.reshape(count, 1 + parameters, -1)
+    return each[:, 0], jnp.einsum("cqp,cpr->cqr", features.derivative, each[:, 1:])
+
+
+def mean(
+    at: jax.Array, known: jax.Array, value_weights: jax.Array, derivative_weights: jax.Array
+) -> jax.Array:
+    """Return the posterior mean (r,) at scaled features ``at`` (q,).
+
+    known : the scaled features of the observed inputs, (c, q).
+    value_weights, derivative_weights : the weights (c, r) and (c, q, r) from :func:`fold`.
+    """
+    gap = at - known
+    k = matern72(jnp.sum(gap**2, axis=-1))
+    count, width, outputs = derivative_weights.shape
+    along = (-2.0 * k.first[:, None] * gap).reshape(count * width)
+    return k.value @ value_weights + along @ derivative_weights.reshape(count * width, outputs)
