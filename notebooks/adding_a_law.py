@@ -30,8 +30,8 @@ from calibrate.analysis.identifiability import identify, in_words
 from emulator.geometry.generators.box import box
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS, Law, find_law
+from emulator.mechanics.laws.law import modulus, number
 from emulator.mechanics.laws.volumetric import quadratic
-from emulator.mechanics.quantity import modulus, number
 from emulator.scenes.loads import CavityPressure, Traction
 from emulator.training import recipe, train
 

@@ -33,10 +33,10 @@ import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import emulator as em
-from emulator.geometry.cavity import Cavity
+from emulator.geometry.facets import Cavity
 from emulator.geometry.fibres import depth
 from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
-from emulator.geometry.tetrahedra import boundary_facets
+from emulator.geometry.mesh import boundary_facets
 from emulator.scenes.draft import draft
 
 # %% [markdown]

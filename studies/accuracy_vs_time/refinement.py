@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import corner_parents, to_quadratic
-from emulator.geometry.tetrahedra import orient
+from emulator.geometry.mesh import Mesh, orient
+from emulator.geometry.refinement import corner_parents, to_quadratic
 from emulator.scenes import Scene
 from emulator.scenes.supports import Support
 

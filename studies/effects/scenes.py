@@ -13,7 +13,7 @@ from calibrate.measurements import (
     spread_nodes,
 )
 from emulator.geometry.generators.box import box
-from emulator.geometry.quadratic import to_linear, to_quadratic
+from emulator.geometry.refinement import to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Scene, Support
 from emulator.scenes.cavities import cavity_sets

@@ -8,13 +8,20 @@ import numpy as np
 import emulator as em
 from calibrate.measurements.location import locate, locate_gradients
 from emulator.core.errors import InputError
-from emulator.geometry.cavity import Cavity
-from emulator.geometry.directions import from_nodes, of_elements, unit
 from emulator.geometry.discretisation import from_quadrature_points, quadrature_points
-from emulator.geometry.fibres import Depth, nodal_depth, rule_based_fibres, turned
+from emulator.geometry.facets import Cavity
+from emulator.geometry.fibres import (
+    Depth,
+    from_nodes,
+    nodal_depth,
+    of_elements,
+    rule_based_fibres,
+    turned,
+    unit,
+)
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_linear, to_quadratic
+from emulator.geometry.refinement import to_linear, to_quadratic
 from emulator.scenes.left_ventricle import HELIX
 from emulator.scenes.scene import Scene
 

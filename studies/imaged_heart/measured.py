@@ -28,7 +28,7 @@ import calibrate as cal
 import emulator as em
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.energy import displacement_gradient
-from emulator.geometry.cavity import Cavity
+from emulator.geometry.facets import Cavity
 from emulator.geometry.mesh import Mesh
 from emulator.scenes import Scene
 from emulator.scenes.fibre_rules import Helix

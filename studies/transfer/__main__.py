@@ -25,7 +25,7 @@ from calibrate.provenance import study_header
 from emulator.accuracy.comparison import evaluate, field_errors, quantiles
 from emulator.core.store import write_json
 from emulator.fem import Runs, run_campaign, sobol
-from emulator.geometry.cavity import Cavity
+from emulator.geometry.facets import Cavity
 from emulator.scenes import Scene
 from emulator.scenes.cavities import cavity_sets
 from emulator.surrogates import Architecture, Emulator

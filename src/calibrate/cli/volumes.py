@@ -17,7 +17,7 @@ def volumes(scene: Scene, u: jax.Array, estimate: ErrorEstimate | None = None) -
     """Of each cavity in mL: at rest, at ``u`` (n, 3) mm, and its estimated error, if any."""
     import jax
 
-    from emulator.geometry.cavity import Cavity
+    from emulator.geometry.facets import Cavity
     from emulator.scenes.cavities import cavity_sets
 
     found: Volumes = {}

@@ -21,8 +21,7 @@ from calibrate.measurements.pressure_volume import PressureVolume, pressure_volu
 from emulator.accuracy.estimate import error_bar
 from emulator.core.errors import InputError
 from emulator.fem import Simulator, Status
-from emulator.geometry.cavity import Cavity
-from emulator.geometry.facets import surface_mesh
+from emulator.geometry.facets import Cavity, surface_mesh
 from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.surrogates.additive import Emulator

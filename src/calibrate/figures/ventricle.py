@@ -17,7 +17,7 @@ from calibrate.figures.drawing import (
     title_and_save,
 )
 from calibrate.posterior import Posterior
-from emulator.geometry.tetrahedra import boundary_facets
+from emulator.geometry.mesh import boundary_facets
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

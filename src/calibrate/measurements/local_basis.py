@@ -18,9 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.directions import unit
 from emulator.geometry.facets import mean_normal
-from emulator.geometry.fibres import circumferential, depth
+from emulator.geometry.fibres import circumferential, depth, unit
 from emulator.scenes.cavities import ENDOCARDIUM
 from emulator.scenes.scene import Scene
 

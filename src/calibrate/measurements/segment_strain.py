@@ -2,7 +2,7 @@ r"""Strains averaged over the segments of a left ventricle, as images report the
 
 .. math:: \bar E_s = \frac{1}{|V_s|} \int_{V_s} E_{ee}\, dV
 
-over the reference volume of each of the 17 segments (:mod:`emulator.geometry.segments`), by the
+over the reference volume of each of the 17 segments (:mod:`emulator.geometry.heart_wall`), by the
 mesh's quadrature.
 """
 
@@ -22,7 +22,7 @@ from calibrate.measurements.protocol import Field, Labels
 from calibrate.measurements.strain_components import Samples, Strains, columns_of, components_in
 from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
-from emulator.geometry.segments import SEGMENTS, aha_segments
+from emulator.geometry.heart_wall import SEGMENTS, aha_segments
 from emulator.scenes.scene import Scene
 
 _MEAN = "mean_"  # of column names; strains at points have none

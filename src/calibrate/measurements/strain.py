@@ -17,8 +17,8 @@ from calibrate.measurements.protocol import Field, Labels
 from calibrate.measurements.strain_components import Samples, Strains, columns_of, components_in
 from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
-from emulator.geometry.directions import unit
 from emulator.geometry.discretisation import from_quadrature_points
+from emulator.geometry.fibres import unit
 from emulator.scenes.scene import Scene
 
 

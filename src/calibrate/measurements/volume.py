@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.measurements.scalar import Scalar
 from calibrate.noise.gaussian import GaussianNoise
-from emulator.geometry.cavity import Cavity
+from emulator.geometry.facets import Cavity
 from emulator.scenes.cavities import find_cavity
 from emulator.scenes.scene import Scene
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from emulator.accuracy.step import ENDLESS
 from emulator.fem.energy import at_points, displacement_gradient
-from emulator.mechanics.barriers import Barriers
-from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.kinematics import Barriers, Strain
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
 
@@ -28,7 +27,7 @@ class Guard(NamedTuple):
     finite : whether theta and the prediction are finite numbers.
     least_J : () smallest volume ratio; not above 0 if an element is inverted.
     barrier : () whether a training barrier on J, I1 or I4f would act somewhere, so that training
-        did not see the exact energy of this state (see :mod:`emulator.mechanics.barriers`).
+        did not see the exact energy of this state (see :mod:`emulator.mechanics.kinematics`).
     indefinite : () whether the tangent at the prediction is known to be indefinite.
     unsettled : () whether no equilibrium was found near the prediction.
     """

@@ -30,8 +30,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Blocks
-from emulator.mechanics.barriers import Barriers
-from emulator.mechanics.kinematics import Strain, determinant
+from emulator.mechanics.kinematics import Barriers, Strain, determinant
 from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
 from emulator.scenes.regions import Tissue, factors
 from emulator.scenes.scene import Scene

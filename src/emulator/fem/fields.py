@@ -20,7 +20,7 @@ from emulator.fem.energy import (
     energy_of_gradient,
     point_energy,
 )
-from emulator.geometry.directions import unit
+from emulator.geometry.fibres import unit
 from emulator.mechanics.kinematics import determinant
 
 if TYPE_CHECKING:

@@ -1,22 +1,38 @@
-r"""Area vectors and volumes of surface facets, linear or quadratic.
+r"""Area vectors of surface facets, and the volume of a cavity from its wall's displacement.
 
 A facet with nodes :math:`x_a` has the area vector per reference area
 :math:`n = \partial x/\partial\xi \times \partial x/\partial\eta`, in mm2; it points out of the
 tissue. The cone from the origin over it has the volume :math:`\frac13 \int x \cdot n\, d\xi d\eta`.
 
-NumPy's arrays stay NumPy's, so that a mesh at rest is measured without a program being compiled.
+The wall of a cavity is a facet set; a flat lid, a fan of facets from the middle of the rim, closes
+each of its openings. By the divergence theorem the closed surface encloses
+
+.. math::
+    V = \frac13 \int_\Omega \nabla \cdot x \, dv = \frac13 \oint x \cdot n \, da
+      = \sum_\text{facets} \frac16\, x_1 \cdot (x_2 \times x_3),
+
+where the last sum is for linear facets; quadratic ones are integrated exactly. A closed surface has
+:math:`\oint n\, da = 0`, so the volume does not depend on the origin. The tissue may lie on either
+side of the wall, so the sign is chosen once, such that the volume at rest is positive; the volume
+stays differentiable.
+
+Functions of NumPy arrays return NumPy arrays: a mesh at rest is measured without compilation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import FacetRule, facet_rule
+from emulator.geometry.mesh import Mesh
 
 # Nodes of a quadratic facet (corners, then middles of edges 01, 12, 20) as four flat triangles.
 _QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
@@ -122,3 +138,67 @@ def _lids[A: (jax.Array, np.ndarray)](edges: A, middle: A) -> A:
         return xp.stack([end, start, middle], axis=1)
     to, back = 0.5 * (start + middle), 0.5 * (middle + end)
     return xp.stack([end, start, middle, edges[:, 2], to, back], axis=1)
+
+
+MM3_PER_ML = 1000.0
+_FLAT = 1e-9  # volumes below this fraction of the mesh's size cubed are round-off: a plane patch
+
+
+class Cavity:
+    """Volume of a cavity as a function of its wall's displacement.
+
+    Parameters
+    ----------
+    mesh : with the wall among its facet sets.
+    facet_set : the wall.
+
+    Attributes
+    ----------
+    nodes : (k,) the nodes of the wall, in the order :meth:`__call__` wants them.
+    rest : volume of the undeformed cavity, mL, above 0.
+
+    Raises
+    ------
+    InputError
+        The set is missing or encloses no volume.
+    """
+
+    def __init__(self, mesh: Mesh, facet_set: str) -> None:
+        self.facet_set = facet_set
+        facets = mesh.facet_set(facet_set)
+        self.nodes: np.ndarray = np.unique(facets)
+        X = mesh.nodes[self.nodes]
+        self._X = X - X.mean(axis=0)  # less cancellation: coordinates about the centroid
+        self._volume = enclosed_volume(np.searchsorted(self.nodes, facets))
+        signed = float(self._volume(self._X))
+        if abs(signed) <= _FLAT * mesh.size**3:
+            raise InputError(
+                f"facet set '{facet_set}' encloses no volume: it is flat, or has no inside"
+            )
+        self._factor = float(np.sign(signed)) / MM3_PER_ML
+
+    def __call__(self, displacement: jax.Array) -> jax.Array:
+        """Volume (...) in mL where the nodes of the wall move by ``displacement`` (..., k, 3) mm.
+
+        Differentiable; ``displacement[..., cavity.nodes, :]`` restricts a full field.
+        """
+
+        def one(u: jax.Array) -> jax.Array:
+            return self._factor * self._volume(self._X + u)
+
+        return jnp.vectorize(one, signature="(k,d)->()")(jnp.asarray(displacement))
+
+    @cached_property
+    def rest(self) -> float:
+        """Volume of the undeformed cavity, mL."""
+        return self._factor * float(self._volume(self._X))
+
+
+def encloses(mesh: Mesh, facet_set: str) -> bool:
+    """Whether ``facet_set`` is the wall of a cavity; a plane patch encloses nothing."""
+    mesh.facet_set(facet_set)  # a set that is not there is an error
+    try:
+        Cavity(mesh, facet_set)
+    except InputError:
+        return False
+    return True

@@ -1,16 +1,21 @@
-"""Meshes of other libraries, as meshio has them: scikit-fem's, PyVista's and meshio's own.
+"""Meshes of other libraries and files as meshio has them, with their named groups as sets.
 
-None of these libraries is asked what a mesh is: it is what has their attributes.
+scikit-fem's, PyVista's and meshio's own meshes are recognised by their attributes; none of these
+libraries is imported for it. Gmsh, Abaqus and others store names of groups differently: meshio
+returns them as ``field_data`` with tags, ``cell_sets`` or ``point_sets``. In formats without named
+sets (VTU, XDMF) a set is an array of 0 and 1 called ``set:<name>``, on triangles or on points.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import meshio
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.geometry.mesh import Mesh, boundary_facets
 
 # VTK's numbers of cell types, and meshio's names.
 _VTK = {1: "vertex", 3: "line", 5: "triangle", 10: "tetra", 22: "triangle6", 24: "tetra10"}
@@ -75,3 +80,115 @@ def _from_pyvista(source: Any) -> meshio.Mesh:
         cell_data=data,
         point_data={name: np.asarray(source.point_data[name]) for name in source.point_data.keys()},  # noqa: SIM118
     )
+
+
+MARK = "set:"
+_TAG = "gmsh:physical"
+_PLURAL = {0: "points", 1: "lines", 2: "triangles"}
+
+Sets = dict[str, np.ndarray]
+
+
+def read_sets(found: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> tuple[Sets, Sets]:
+    """Node sets and facet sets of a mesh file.
+
+    Groups of triangles become facet sets, their normals turned out of the body, and node sets of
+    the same name. Groups of points and lines become node sets. Groups of volumes are left out.
+
+    Parameters
+    ----------
+    found : the file as meshio reads it.
+    number : (n,) new number of each of its nodes, -1 for those that were dropped.
+    elements : (m, 4 or 10) tetrahedra in the new numbers, positively oriented.
+
+    Raises
+    ------
+    InputError
+        A group without a name, or a triangle of a group that is not on the surface.
+    """
+    found_groups = _groups(found)
+    facets = {name: rows for (name, dimension), rows in found_groups.items() if dimension == 2}
+    facet_sets = _on_surface({name: number[rows] for name, rows in facets.items()}, elements)
+    node_sets = {name: np.unique(rows) for name, rows in facet_sets.items()}
+    points: dict[str, list[np.ndarray]] = {}
+    for (name, dimension), rows in found_groups.items():
+        if dimension < 2:
+            points.setdefault(name, []).append(rows.ravel())
+    for name, nodes in _point_sets(found):
+        points.setdefault(name, []).append(nodes)
+    for name, parts in points.items():
+        nodes = np.unique(number[np.concatenate(parts)])
+        node_sets[name] = nodes[nodes >= 0]
+    return {name: nodes for name, nodes in node_sets.items() if nodes.size}, facet_sets
+
+
+def own_node_sets(mesh: Mesh) -> Sets:
+    """Node sets that do not follow from the facet set of the same name."""
+    implied = {name: np.unique(facets) for name, facets in mesh.facet_sets.items()}
+    return {
+        name: nodes
+        for name, nodes in mesh.node_sets.items()
+        if name not in implied or not np.array_equal(np.unique(nodes), implied[name])
+    }
+
+
+def _groups(found: meshio.Mesh) -> dict[tuple[str, int], np.ndarray]:
+    """``(name, dimension)`` -> corner nodes (k, dimension + 1) of the group's cells."""
+    parts: dict[tuple[str, int], list[np.ndarray]] = {}
+    for k, block in enumerate(found.cells):
+        if block.dim < 3:
+            for name, cells in _named_cells(found, k):
+                corners = np.asarray(block.data)[cells][:, : block.dim + 1]
+                if len(corners):
+                    parts.setdefault((name, block.dim), []).append(corners)
+    return {key: np.concatenate(rows) for key, rows in parts.items()}
+
+
+def _named_cells(found: meshio.Mesh, k: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Name and members of every group in cell block ``k``."""
+    for name, members in found.cell_sets.items():
+        if name != "gmsh:bounding_entities" and members[k] is not None:
+            yield name, np.asarray(members[k], dtype=np.int64)
+    for name, data in found.cell_data.items():
+        if name.startswith(MARK):
+            yield name.removeprefix(MARK), np.flatnonzero(data[k])
+    if _TAG in found.cell_data:
+        yield from _tagged_cells(found, k)
+
+
+def _tagged_cells(found: meshio.Mesh, k: int) -> Iterator[tuple[str, np.ndarray]]:
+    dimension, tags = found.cells[k].dim, np.asarray(found.cell_data[_TAG][k])
+    names = {tuple(map(int, entry)): name for name, entry in found.field_data.items()}
+    for tag in np.unique(tags[tags != 0]).tolist():
+        if (tag, dimension) not in names:
+            raise InputError(
+                f"physical group {tag} ({_PLURAL[dimension]}) has no name of its own; "
+                "name it in the mesh generator ($PhysicalNames)"
+            )
+        yield names[tag, dimension], np.flatnonzero(tags == tag)
+
+
+def _point_sets(found: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
+    for name, nodes in found.point_sets.items():
+        yield name, np.asarray(nodes, dtype=np.int64)
+    for name, data in found.point_data.items():
+        if name.startswith(MARK):
+            yield name.removeprefix(MARK), np.flatnonzero(data)
+
+
+def _on_surface(groups: Sets, elements: np.ndarray) -> Sets:
+    """Each triangle as ``boundary_facets`` lists it: facing out, with its mid-edge nodes."""
+    if not groups:
+        return {}
+    surface = {tuple(sorted(row[:3])): row for row in boundary_facets(elements).tolist()}
+    sets = {}
+    for name, rows in groups.items():
+        corners = np.unique(np.sort(rows, axis=1), axis=0).tolist()
+        inside = sum(tuple(row) not in surface for row in corners)
+        if inside:
+            raise InputError(
+                f"{inside} of the {len(corners)} triangles in group '{name}' are not on the "
+                "surface of the tetrahedra; a group of triangles must lie on it"
+            )
+        sets[name] = np.array([surface[tuple(row)] for row in corners])
+    return sets

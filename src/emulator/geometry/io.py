@@ -14,13 +14,11 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.store import replacing
-from emulator.geometry.directions import across, from_elements, from_nodes
 from emulator.geometry.discretisation import quadrature_points
-from emulator.geometry.foreign import as_meshio
-from emulator.geometry.groups import MARK, own_node_sets, read_sets
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
-from emulator.geometry.tetrahedra import coincident, orient
+from emulator.geometry.fibres import across, from_elements, from_nodes
+from emulator.geometry.foreign import MARK, as_meshio, own_node_sets, read_sets
+from emulator.geometry.mesh import Mesh, coincident, orient
+from emulator.geometry.refinement import to_quadratic
 
 # meshio's cells by the elements' order: (tetrahedron, triangle).
 _CELLS = {1: ("tetra", "triangle"), 2: ("tetra10", "triangle6")}
@@ -66,7 +64,7 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
     """The mesh as :func:`read_mesh` returns it, with its ``fibres`` and ``sheets``.
 
     Both are data of points, or of cells: (m, 3), or (m, 3 q) for all quadrature points. Point and
-    cell data are interpolated at the quadrature points (:mod:`emulator.geometry.directions`); cell
+    cell data are interpolated at the quadrature points (:mod:`emulator.geometry.fibres`); cell
     data of linear elements is taken as it is.
 
     Parameters

@@ -23,8 +23,7 @@ import jax
 import numpy as np
 
 from emulator.geometry.discretisation import Blocks, Discretisation
-from emulator.geometry.mesh import Mesh, frozen_array
-from emulator.geometry.tetrahedra import FACES
+from emulator.geometry.mesh import FACES, Mesh, frozen_array
 
 _SIZE = 6  # tetrahedra in a patch; the cavity of a ventricle grows as much with 8 or 12
 _LEAST = 3  # what is left between patches and smaller than this joins one of them

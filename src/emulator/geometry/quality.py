@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emulator.geometry.discretisation import discretise
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import FACES, parts
+from emulator.geometry.mesh import FACES, Mesh, parts
 
 FLAT = 3.0
 """Degrees; elements with a smaller dihedral angle are worth a word."""

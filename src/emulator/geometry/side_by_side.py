@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
-from emulator.geometry.mesh import Mesh, frozen_array
-from emulator.geometry.tetrahedra import coincident
+from emulator.geometry.mesh import Mesh, coincident, frozen_array
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 

@@ -1,7 +1,7 @@
 r"""The wall of a left ventricle, meshed between two surfaces: endocardium and epicardium.
 
 Both are cut by the base plane, laid out in the disc and meshed anew with even triangles
-(:mod:`emulator.geometry.flattening`); a flat annulus joins their rims, and Gmsh fills what they
+(:mod:`emulator.geometry.remeshing`); a flat annulus joins their rims, and Gmsh fills what they
 enclose. The long axis is the base plane's normal, from apex to base. Where it is not given it is
 the area vector of the rims, :math:`\frac12 \sum_\text{edges} x_a \times x_b`, and the plane lies
 as low as the lowest point of a rim, so that rims which are not flat, or not at one height, are cut
@@ -19,13 +19,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError, look_up
-from emulator.geometry.cavity import MM3_PER_ML, Cavity
 from emulator.geometry.discretisation import discretise
-from emulator.geometry.flattening import Flattened
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.mesher import tetrahedralise, triangulate
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.facets import MM3_PER_ML, Cavity
+from emulator.geometry.mesh import Mesh, orient
 from emulator.geometry.quality import MeshQuality, mesh_quality
+from emulator.geometry.refinement import to_quadratic
+from emulator.geometry.remeshing import Flattened, tetrahedralise, triangulate
 from emulator.geometry.surfaces import (
     UNITS,
     Surface,
@@ -36,7 +35,6 @@ from emulator.geometry.surfaces import (
     read_surface,
     smoothed,
 )
-from emulator.geometry.tetrahedra import orient
 
 _LEAST = 4.0  # mm; nobody's heart is smaller, a mouse's being 7 mm long
 _MOST_CUT = 0.2  # of the epicardium's height: rims that stand further apart are no base

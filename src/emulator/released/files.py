@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import boundary_facets, orient
+from emulator.geometry.mesh import Mesh, boundary_facets, orient
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from emulator.core.errors import InputError
-from emulator.geometry.cavity import Cavity, encloses
+from emulator.geometry.facets import Cavity, encloses
 from emulator.scenes.scene import Scene
 
 ENDOCARDIUM = "endocardium"

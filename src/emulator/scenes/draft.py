@@ -16,12 +16,11 @@ import numpy as np
 from emulator.core.errors import InputError, look_up
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.io import Body, read_body, write_mesh
-from emulator.geometry.mesh import Mesh
+from emulator.geometry.mesh import EDGES, Mesh
 from emulator.geometry.quality import mesh_quality
 from emulator.geometry.surfaces import UNITS
-from emulator.geometry.tetrahedra import EDGES
 from emulator.mechanics.laws import Law, find_law
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load
 from emulator.scenes.scene import Scene

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 
 from emulator.core.errors import InputError
-from emulator.geometry.directions import of_elements
-from emulator.geometry.quadratic import corner_parents, to_linear
+from emulator.geometry.fibres import of_elements
+from emulator.geometry.refinement import corner_parents, to_linear
 from emulator.scenes.fibre_angles import that_turn
 from emulator.scenes.owners import directions_read
 from emulator.scenes.scene import Scene

@@ -25,10 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.directions import checked_directions
 from emulator.geometry.discretisation import quadrature_points
+from emulator.geometry.fibres import checked_directions
 from emulator.geometry.mesh import Mesh, frozen_array
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.local_terms import Values
 from emulator.scenes.regions import Tissue
 

@@ -12,7 +12,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.geometry.side_by_side import Bodies, check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law
 from emulator.scenes.owners import directions_read

@@ -10,7 +10,7 @@ from typing import Any
 
 from emulator.core.schema import json_schema
 from emulator.mechanics.laws import LAWS, Law
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file_models import SceneFile
 
 

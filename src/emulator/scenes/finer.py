@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.directions import across
+from emulator.geometry.fibres import across
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.fibre_angles import FibreAngles
 from emulator.scenes.fibre_rules import FibreRule

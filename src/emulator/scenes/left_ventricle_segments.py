@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from emulator.geometry.segments import SEGMENTS, aha_segments
+from emulator.geometry.heart_wall import SEGMENTS, aha_segments
 from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE, left_ventricle
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
@@ -27,7 +27,7 @@ def left_ventricle_segments(
     """:func:`~emulator.scenes.left_ventricle.left_ventricle` with a stiffness for each segment.
 
     theta = (stiffness_1, ..., stiffness_17, pressure). Each stiffness multiplies the energy of the
-    law, except its ``kappa`` term, in one of the 17 segments of :mod:`emulator.geometry.segments`.
+    law, except its ``kappa`` term, in one of the 17 segments (:mod:`emulator.geometry.heart_wall`).
     ``a``, ``b``, ``a_f`` and ``b_f`` are constants, the geometric means of their ranges in
     ``left_ventricle``.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.mechanics.laws import Law
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_angles import FibreAngles
 from emulator.scenes.loads.load import Load
 from emulator.scenes.parameter_space import Parameter

@@ -20,8 +20,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import frozen_array
-from emulator.mechanics.laws.law import Law
-from emulator.mechanics.quantity import Quantity, number
+from emulator.mechanics.laws.law import Law, Quantity, number
 
 
 class Tissue(NamedTuple):

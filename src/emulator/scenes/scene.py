@@ -16,18 +16,17 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.representation import TableRepr
-from emulator.geometry.directions import check_across, checked_directions
 from emulator.geometry.discretisation import (
     Blocks,
     Discretisation,
     discretise,
     quadrature_points,
 )
+from emulator.geometry.fibres import check_across, checked_directions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.patches import patchwise
 from emulator.mechanics.laws import Law
-from emulator.mechanics.laws.identity import law_identity
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity, law_identity
 from emulator.scenes.dilatation import Dilatation, check_dilatation
 from emulator.scenes.fibre_angles import (
     FibreAngles,

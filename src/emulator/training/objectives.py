@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.energy import displacement_gradient, potential_energy
-from emulator.mechanics.barriers import Barriers
+from emulator.mechanics.kinematics import Barriers
 from emulator.scenes.scene import Scene
 from emulator.training.plan import Objective
 

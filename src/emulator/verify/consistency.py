@@ -14,9 +14,8 @@ from emulator.fem.energy import strain_energy
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.generators.box import box
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
-from emulator.mechanics.barriers import Barriers
-from emulator.mechanics.kinematics import Strain
+from emulator.geometry.refinement import to_quadratic
+from emulator.mechanics.kinematics import Barriers, Strain
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import FollowerPressure, Gravity

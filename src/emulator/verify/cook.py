@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem import Simulator
-from emulator.geometry.generators.box import box
-from emulator.geometry.generators.slab import cooks_membrane
+from emulator.geometry.generators.box import box, cooks_membrane
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus

@@ -14,7 +14,7 @@ from emulator.geometry.discretisation import discretise
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import LAND, land_ventricle
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import ActiveTension, CavityPressure, FollowerPressure, Load

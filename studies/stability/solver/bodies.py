@@ -14,9 +14,8 @@ from emulator import Parameter, Scene, Support
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
-from emulator.geometry.tetrahedra import signed_volumes
+from emulator.geometry.mesh import Mesh, signed_volumes
+from emulator.geometry.refinement import to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, Gravity
 

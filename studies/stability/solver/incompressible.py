@@ -10,8 +10,8 @@ from studies.stability.solver.bodies import DOWN, bar
 from studies.stability.solver.case import CASES, Case, case
 
 from emulator import Scene, Support
-from emulator.geometry.generators.slab import cooks_membrane
-from emulator.geometry.tetrahedra import signed_volumes
+from emulator.geometry.generators.box import cooks_membrane
+from emulator.geometry.mesh import signed_volumes
 from emulator.scenes.loads import Traction
 
 

@@ -6,7 +6,7 @@ from studies.stability.solver.bodies import DOWN, bar, jittered, moduli, moved
 from studies.stability.solver.case import Case, case
 
 from emulator.geometry.generators.box import box
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.loads import Gravity
 
 

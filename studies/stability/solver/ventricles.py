@@ -19,7 +19,7 @@ from studies.stability.solver.case import SINGLE_STEP, Case, case, near, simulat
 from emulator import NewtonOptions, Scene, Support
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import land_ventricle
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.loads import CavityPressure, FollowerPressure
 
 

@@ -10,7 +10,7 @@ import emulator as em
 from calibrate.cli import main
 from calibrate.cli.commands.predict import summary
 from calibrate.cli.volumes import volume_lines, volumes
-from emulator.geometry.cavity import Cavity
+from emulator.geometry.facets import Cavity
 
 CENTRE = ("mu=75", "lam=60")
 

@@ -10,7 +10,7 @@ from calibrate.figures.evaluation import (
 )
 from emulator.accuracy.comparison import Errors
 from emulator.geometry.facets import flat_triangles
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from scene_support import block
 
 

@@ -12,7 +12,7 @@ from calibrate.measurements import spread_landmarks
 from calibrate.measurements.location import locate
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import human_ventricle
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from scene_support import block
 
 NO_THETA = jnp.zeros(0)

@@ -24,7 +24,7 @@ from calibrate.measurements.location import locate, locate_gradients
 from emulator.core.errors import InputError
 from emulator.fem.fields import element_fields
 from emulator.geometry.discretisation import quadrature_points
-from emulator.geometry.segments import aha_segments
+from emulator.geometry.heart_wall import aha_segments
 from scene_support import rotation
 
 EVERY = tuple(COMPONENTS)

@@ -14,7 +14,7 @@ from calibrate.measurements.data import read_data
 from calibrate.posterior import read_tree
 from calibrate.project import demo as demos
 from calibrate.project import read_posterior, simulator_of
-from emulator.geometry.cavity import Cavity
+from emulator.geometry.facets import Cavity
 from emulator.scenes import registry
 
 # One scene for the whole module, so that its simulator is compiled once.

@@ -103,7 +103,7 @@ def test_a_scene_without_loads_computes_none():
 
 
 def test_barriers_leave_a_sound_state_untouched(beam, simulator):
-    from emulator.mechanics.barriers import Barriers
+    from emulator.mechanics.kinematics import Barriers
 
     u = simulator(beam.centre)
     exact = potential_energy(beam)(u, beam.centre)

@@ -104,7 +104,7 @@ def test_means_are_weighted_by_volume():
 def test_mean_dilatation_on_quadratic_elements():
     """Stress is symmetric, and its volume mean is the mean of what the nodal forces do."""
     from emulator.fem.energy import displacement_gradient, strain_energy
-    from emulator.geometry.quadratic import to_quadratic
+    from emulator.geometry.refinement import to_quadratic
 
     plain = block()
     mesh = to_quadratic(plain.mesh)

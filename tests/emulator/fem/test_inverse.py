@@ -14,7 +14,7 @@ from emulator.fem.loaded_point import carried_back, from_rest
 from emulator.fem.moved import at_rest, moved_system
 from emulator.fem.system import System
 from emulator.geometry.generators.ellipsoid import human_ventricle
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.loads import (

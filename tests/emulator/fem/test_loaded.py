@@ -10,7 +10,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.campaign.designs import design
-from emulator.geometry.cavity import Cavity
+from emulator.geometry.facets import Cavity
 from emulator.scenes.image import image_theta
 
 IMAGED = em.Parameter("imaged", "kPa", 0.3, 1.5)

@@ -11,9 +11,8 @@ import pytest
 import emulator as em
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.laws.law import Law
+from emulator.mechanics.laws.law import Law, modulus
 from emulator.mechanics.laws.volumetric import logarithmic, quadratic
-from emulator.mechanics.quantity import modulus
 from emulator.scenes.loads import CavityPressure, Gravity, Traction
 from scene_support import block
 

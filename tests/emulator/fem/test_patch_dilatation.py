@@ -27,7 +27,7 @@ from emulator.fem.system import System
 from emulator.geometry.generators.box import box
 from emulator.geometry.io import write_mesh
 from emulator.geometry.patches import patches
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.effects import effects_of
 from emulator.scenes.finer import finer
 from emulator.scenes.loads import Gravity

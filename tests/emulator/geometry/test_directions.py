@@ -4,17 +4,23 @@ import meshio
 import numpy as np
 import pytest
 
-from emulator.geometry.directions import across, from_elements, from_nodes, of_elements, unit
 from emulator.geometry.discretisation import (
     from_quadrature_points,
     quadrature_points,
     shapes_at,
 )
-from emulator.geometry.fibres import biventricular_directions
+from emulator.geometry.fibres import (
+    across,
+    biventricular_directions,
+    from_elements,
+    from_nodes,
+    of_elements,
+    unit,
+)
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.box import box
 from emulator.geometry.io import read_body, write_mesh
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from geometry_support import order_of
 
 MESH = box((1.0, 1.0, 1.0), (4, 4, 4))

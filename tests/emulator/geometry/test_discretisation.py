@@ -4,7 +4,7 @@ import numpy as np
 
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.generators.box import box
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 
 
 def test_the_laplacian_is_the_integral_of_squared_gradients():

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.directions import of_elements
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.fibres import (
     Depth,
     biventricular_directions,
     depth,
     nodal_depth,
+    of_elements,
     rule_based_directions,
     rule_based_fibres,
     turned,

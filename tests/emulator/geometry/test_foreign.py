@@ -9,7 +9,7 @@ from skfem import MeshHex, MeshTet, MeshTet2
 
 import emulator as em
 from emulator.core.errors import InputError
-from emulator.geometry.tetrahedra import signed_volumes
+from emulator.geometry.mesh import signed_volumes
 
 
 @pytest.fixture

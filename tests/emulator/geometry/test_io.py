@@ -10,8 +10,7 @@ from emulator.geometry.io import (
     write_mesh,
     write_solution,
 )
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import signed_volumes
+from emulator.geometry.mesh import Mesh, signed_volumes
 
 # Two tetrahedra on the base z = 0; tip, lid and far end on top. Node 5 is an arc's centre.
 NODES = """$Nodes

@@ -6,7 +6,7 @@ from emulator.core.errors import InputError
 from emulator.geometry.generators.box import box
 from emulator.geometry.io import read_body, read_mesh, write_mesh, write_solution
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 MESH = to_quadratic(box((1.0, 2.0, 3.0), (1, 2, 2)))

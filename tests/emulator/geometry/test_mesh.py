@@ -6,8 +6,7 @@ import pytest
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.generators.box import box, toward_ends
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import orient, parts, signed_volumes
+from emulator.geometry.mesh import Mesh, orient, parts, signed_volumes
 
 NODES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)
 GOOD = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])

@@ -4,9 +4,8 @@ import pytest
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import discretise, facet_rule
 from emulator.geometry.generators.box import box
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
-from emulator.geometry.tetrahedra import EDGES, orient, signed_volumes
+from emulator.geometry.mesh import EDGES, Mesh, orient, signed_volumes
+from emulator.geometry.refinement import to_quadratic
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
 from emulator.geometry.quality import FLAT, dihedral_angles, mesh_quality
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.draft import draft
 
 REGULAR = np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])

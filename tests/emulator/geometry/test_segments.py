@@ -6,8 +6,8 @@ import pytest
 from emulator.core.errors import InputError
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
-from emulator.geometry.segments import aha_segments
-from emulator.geometry.tetrahedra import signed_volumes
+from emulator.geometry.heart_wall import aha_segments
+from emulator.geometry.mesh import signed_volumes
 from scene_support import rotation
 
 

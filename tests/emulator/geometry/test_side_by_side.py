@@ -6,7 +6,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.geometry.generators.box import box
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 
 CUBE, BEAM = box((2.0, 2.0, 2.0), (1, 1, 1)), box((4.0, 1.0, 1.0), (2, 1, 1))
 

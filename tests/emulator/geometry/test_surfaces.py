@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.flattening import Flattened
-from emulator.geometry.generators.disc import disc
+from emulator.geometry.generators.ellipsoid import disc
+from emulator.geometry.remeshing import Flattened
 from emulator.geometry.surfaces import (
     Surface,
     cut,

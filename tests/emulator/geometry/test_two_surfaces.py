@@ -14,8 +14,8 @@ from emulator.geometry.discretisation import discretise
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.io import write_mesh
+from emulator.geometry.mesh import signed_volumes
 from emulator.geometry.surfaces import Surface, read_surface
-from emulator.geometry.tetrahedra import signed_volumes
 from emulator.geometry.two_surfaces import mesh_wall
 from emulator.scenes.draft import draft
 from surface_support import INSIDE, OUTSIDE, ellipsoid, write

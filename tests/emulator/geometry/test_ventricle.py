@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import HUMAN, truncated_ellipsoid
+from emulator.geometry.heart_wall import Ventricle, ventricle
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.ventricle import Ventricle, ventricle
 from emulator.scenes.left_ventricle import left_ventricle
 
 

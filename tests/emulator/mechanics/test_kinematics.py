@@ -3,8 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emulator.mechanics.barriers import Barriers
-from emulator.mechanics.kinematics import Strain, determinant
+from emulator.mechanics.kinematics import Barriers, Strain, determinant
 
 
 @pytest.mark.usefixtures("strict")

@@ -5,8 +5,7 @@ import pytest
 from scipy.optimize import brentq
 
 from emulator.core.errors import InputError
-from emulator.mechanics.barriers import Barriers
-from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.kinematics import Barriers, Strain
 from emulator.mechanics.laws import LAWS, find_law
 from emulator.mechanics.laws.holzapfel_ogden import (
     released_from_textbook,
@@ -254,5 +253,5 @@ def test_an_inverted_point_has_no_energy():
 
 
 def test_unknown_law_names_the_known_ones():
-    with pytest.raises(InputError, match="law 'hooke' is unknown; known laws: guccione, holz"):
+    with pytest.raises(InputError, match="law 'hooke' is unknown; known: guccione, holz"):
         find_law("hooke")

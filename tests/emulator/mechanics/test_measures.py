@@ -5,9 +5,8 @@ import pytest
 
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS, find_law
-from emulator.mechanics.laws.law import Law
+from emulator.mechanics.laws.law import Law, modulus
 from emulator.mechanics.measures import Measures, measures_read
-from emulator.mechanics.quantity import modulus
 from law_support import ARGUMENTS, directions
 
 H = 0.2 * np.random.default_rng(3).normal(size=(3, 3)) + 0.1 * np.eye(3)

@@ -10,8 +10,8 @@ from emulator.catalogue import find_scene, scene_from_origin
 from emulator.core.errors import InputError
 from emulator.fem import Status
 from emulator.fem.energy import volume_ratio
-from emulator.geometry.cavity import Cavity
 from emulator.geometry.discretisation import facet_rule
+from emulator.geometry.facets import Cavity
 from emulator.scenes import BUILT_IN
 from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.scenes.supports import ElasticSupport, Support

@@ -12,7 +12,7 @@ from emulator.geometry.fibres import rule_based_fibres
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.draft import draft
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity
 

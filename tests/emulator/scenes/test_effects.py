@@ -9,7 +9,7 @@ import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.energy import potential_energy
 from emulator.geometry.generators.box import box
-from emulator.geometry.quadratic import corner_parents, to_linear, to_quadratic
+from emulator.geometry.refinement import corner_parents, to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter
 from emulator.scenes.cavities import inflated_cavity

@@ -10,7 +10,7 @@ from emulator.geometry.fibres import rule_based_directions
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from scene_file_support import HEART, SCENE
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.geometry.directions import of_elements
+from emulator.geometry.fibres import of_elements
 from emulator.scenes.finer import finer
 
 

@@ -7,7 +7,7 @@ import emulator as em
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import LAWS
-from emulator.mechanics.laws.identity import law_identity, probed
+from emulator.mechanics.laws.law import law_identity, probed
 from emulator.scenes import Parameter, Support
 from emulator.scenes.identity import _as_set
 from emulator.scenes.loads import LOADS, ActiveTension, Force, Gravity, GravityVector, Traction

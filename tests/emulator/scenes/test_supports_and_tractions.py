@@ -10,7 +10,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.energy import dead_force, spring_terms, strain_energy
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.loads import Traction
 from emulator.scenes.supports import ElasticSupport
 from scene_support import block

@@ -11,7 +11,7 @@ from emulator.accuracy.comparison import evaluate
 from emulator.core.errors import InputError
 from emulator.fem import run_campaign, sobol, uniform
 from emulator.fem.campaign import StoredRuns
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import Plan, recipe, train
 from emulator.training.checkpoint import CHECKPOINT, Session

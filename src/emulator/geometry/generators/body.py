@@ -1,4 +1,4 @@
-"""Shared by the generators: oriented elements, named surfaces, straight or curved edges."""
+"""What all generators share: bodies with named surfaces, and triangulations extruded into tetrahedra."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import Midpoints, to_quadratic
-from emulator.geometry.tetrahedra import boundary_facets, orient
+from emulator.geometry.mesh import Mesh, boundary_facets, orient
+from emulator.geometry.refinement import Midpoints, to_quadratic
 
 
 def body(
@@ -37,3 +36,33 @@ def body(
     facets = {name: surface[np.isin(surface, on).all(axis=1)] for name, on in surfaces.items()}
     mesh = Mesh(nodes, elements, node_sets, facets)
     return mesh if order == 1 else to_quadratic(mesh, midpoints)
+
+
+def extrude(columns: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Three tetrahedra for each prism between two layers of a triangulation.
+
+    A prism's corners are taken in the order of their 2D numbers, so the two prisms that share a
+    side cut it along the same diagonal: from the lower number below to the higher number above.
+
+    Parameters
+    ----------
+    columns : (v, layers + 1) 3D node at each 2D vertex and layer.
+    triangles : (k, 3) 2D vertices.
+
+    Returns
+    -------
+    (3 k layers, 4) elements, not oriented.
+    """
+    lower, upper = columns[:, :-1], columns[:, 1:]
+    a, b, c = np.sort(triangles, axis=1).T
+    cut = (
+        (lower[a], lower[b], lower[c], upper[c]),
+        (lower[a], lower[b], upper[b], upper[c]),
+        (lower[a], upper[a], upper[b], upper[c]),
+    )
+    return np.stack([np.stack(corners, axis=-1) for corners in cut]).reshape(-1, 4)
+
+
+def stacked(vertices: int, layers: int) -> np.ndarray:
+    """Columns (vertices, layers + 1) of nodes numbered layer by layer."""
+    return np.arange(vertices * (layers + 1)).reshape(layers + 1, vertices).T

@@ -4,7 +4,8 @@ r"""Truncated thick-walled ellipsoid of revolution: the idealised left ventricle
           u = r\, u_{base}(t), \quad -r_l(t) \cos u_{base}(t) = z_{base}
 
 with ``r`` from 0 at the apex to 1 at the base, ``t`` from 0 on the endocardium to 1 on the
-epicardium, and both semi-axes linear in ``t``. The long axis is z, the base a plane on top.
+epicardium, and both semi-axes linear in ``t``. The long axis is z, the base a plane on top. The
+coordinates ``r`` and ``phi`` are those of a disc that is triangulated by rings around its centre.
 """
 
 from __future__ import annotations
@@ -14,11 +15,58 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.generators.body import body
-from emulator.geometry.generators.disc import disc
-from emulator.geometry.generators.prisms import extrude, stacked
+from emulator.geometry.generators.body import body, extrude, stacked
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import Midpoints
+from emulator.geometry.refinement import Midpoints
+
+
+def ring_counts(rings: int, around: int) -> np.ndarray:
+    """Points on each ring, (rings,): six more than on the one before, up to ``around``."""
+    if rings < 2 or around < 6:
+        raise InputError(f"disc: {rings} rings of {around} points; expected at least 2 and 6")
+    return np.minimum(6 * np.arange(1, rings + 1), around)
+
+
+def disc(rings: int, around: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rings of points with the centre as vertex 0.
+
+    Returns
+    -------
+    radius : (v,) from 0 at the centre to 1 on the outermost ring.
+    angle : (v,) polar angle in [0, 2 pi), zero at the centre.
+    triangles : (k, 3) vertices, anticlockwise.
+    """
+    counts = ring_counts(rings, around)
+    first = np.concatenate([[1], 1 + np.cumsum(counts)])
+    radius = np.repeat(np.arange(rings + 1) / rings, np.concatenate([[1], counts]))
+    angles = [np.arange(count) * (2.0 * np.pi / count) for count in counts]
+    fan = [(0, 1 + k, 1 + (k + 1) % counts[0]) for k in range(counts[0])]
+    between = [
+        _zip(first[k], counts[k], first[k + 1], counts[k + 1]) for k in range(len(counts) - 1)
+    ]
+    return radius, np.concatenate([[0.0], *angles]), np.concatenate([np.array(fan), *between])
+
+
+def _zip(first_inner: int, inner: int, first_outer: int, outer: int) -> np.ndarray:
+    """Triangles between two rings; whichever ring's next point has the smaller angle advances.
+
+    Between rings of equal size, where all next points tie, the inner goes first on one half of the
+    disc and the outer on the other: the triangulation is its own mirror image in the line of angle
+    zero.
+    """
+    triangles, i, j = [], 0, 0
+    while i < inner or j < outer:
+        lead = (i + 1) * outer - (j + 1) * inner
+        inner_next = lead < 0 or (lead == 0 and (inner < outer or 2 * (i + 1) <= inner))
+        a, b = first_inner + i % inner, first_outer + j % outer
+        if inner_next:
+            i += 1
+            triangles.append((a, b, first_inner + i % inner))
+        else:
+            j += 1
+            triangles.append((a, b, first_outer + j % outer))
+    return np.array(triangles)
+
 
 _MOST_UNEVEN = 0.5  # beyond, the thin side of a thick-walled ventricle is too thin to mesh
 

@@ -13,10 +13,9 @@ from __future__ import annotations
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.generators.ball import ball, ball_midpoints
 from emulator.geometry.generators.body import body
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import boundary_facets, orient
+from emulator.geometry.generators.sphere import ball, ball_midpoints
+from emulator.geometry.mesh import Mesh, boundary_facets, orient
 
 # One lobe is thick and high, the other tapers; the underside is hollow.
 _TAPER_Y, _TAPER_Z, _BEND = 0.35, 0.5, 0.3

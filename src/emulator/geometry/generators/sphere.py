@@ -1,14 +1,103 @@
-"""One eighth of a thick sphere, cut along its planes of symmetry."""
+"""Meshes of a ball and of one eighth of a thick sphere, cut along its planes of symmetry."""
 
 from __future__ import annotations
+
+from itertools import combinations, permutations, product
 
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.generators.ball import ball_midpoints, triangle_lattice, unit
-from emulator.geometry.generators.body import body
-from emulator.geometry.generators.prisms import extrude, stacked
+from emulator.geometry.generators.body import body, extrude, stacked
 from emulator.geometry.mesh import Mesh
+from emulator.geometry.refinement import Midpoints
+
+
+def triangle_lattice(divisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """A triangle cut into ``divisions**2``: barycentric coordinates (v, 3), triangles (k, 3)."""
+    n = divisions
+    corners = [(i, j) for i in range(n + 1) for j in range(n + 1 - i)]
+    number = {corner: k for k, corner in enumerate(corners)}
+    upright = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in corners if i + j < n]
+    between = [
+        (number[i + 1, j], number[i + 1, j + 1], number[i, j + 1])
+        for i, j in corners
+        if i + j < n - 1
+    ]
+    steps = np.array(corners)
+    barycentric = np.column_stack([steps, n - steps.sum(axis=1)]) / n
+    return barycentric, np.array(upright + between)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) at length one; the zero vector stays zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0.0, length, 1.0)
+
+
+def ball_midpoints(nodes: np.ndarray) -> Midpoints:
+    """Midpoints of edges between ``nodes`` (n, 3): the mean direction at the mean radius.
+
+    On an edge from the centre, which has no direction, the midpoint lies halfway along it.
+    """
+    directions = unit(nodes)
+    radii = np.linalg.norm(nodes, axis=1)
+
+    def midpoints(edges: np.ndarray) -> np.ndarray:
+        return unit(directions[edges].sum(axis=1)) * radii[edges].mean(axis=1)[:, None]
+
+    return midpoints
+
+
+def ball(shells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Unit ball of tetrahedra in ``shells`` shells, each a subdivided icosahedron.
+
+    Returns
+    -------
+    nodes : (1 + sum of 10 k^2 + 2 over the shells, 3).
+    elements : (20 shells^3, 4), not oriented.
+    """
+    corners, faces = _icosahedron()
+    steps, cells = _kuhn_lattice(shells)
+    # Barycentric steps from the centre and the three corners of a face, (v, 4).
+    weights = np.column_stack([shells - steps[:, 0], -np.diff(steps, axis=1), steps[:, 2]])
+    flat = np.einsum("va,fai->fvi", weights[:, 1:], corners[faces]).reshape(-1, 3)
+    # Neighbouring sectors share the nodes between them, equal but for round-off.
+    _, first, number = np.unique(np.round(flat, 9), axis=0, return_index=True, return_inverse=True)
+    shell = np.tile(steps[:, 0], len(faces))[first]
+    sectors = cells[None] + len(steps) * np.arange(len(faces))[:, None, None]
+    return unit(flat[first]) * (shell / shells)[:, None], number.reshape(-1)[sectors].reshape(-1, 4)
+
+
+def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
+    """Corners (12, 3) on the unit sphere and faces (20, 3)."""
+    golden = 0.5 * (1.0 + np.sqrt(5.0))
+    half = np.array([(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
+    corners = unit(np.concatenate([np.roll(half, turn, axis=1) for turn in range(3)]))
+    near = corners @ corners.T > 0.4  # neighbours' directions have cosine 1 / sqrt(5)
+    faces = [
+        (a, b, c)
+        for a, b, c in combinations(range(12), 3)
+        if near[a, b] and near[b, c] and near[a, c]
+    ]
+    return corners, np.array(faces)
+
+
+def _kuhn_lattice(divisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """The simplex ``divisions >= x >= y >= z >= 0`` in unit steps: points (v, 3), cells (c, 4).
+
+    Kuhn's six tetrahedra of each unit cube, those inside the simplex. They cut its faces into
+    regular lattices, so simplices glued face to face fit.
+    """
+    cube = np.array(list(product(range(divisions), repeat=3)))
+    paths = [
+        np.vstack([np.zeros(3, dtype=int), np.cumsum(np.eye(3, dtype=int)[list(axes)], axis=0)])
+        for axes in permutations(range(3))
+    ]
+    cells = np.concatenate([cube[:, None] + path for path in paths])  # (k, 4, 3)
+    x, y, z = np.moveaxis(cells, -1, 0)
+    inside = cells[((x >= y) & (y >= z)).all(axis=1)]
+    points, number = np.unique(inside.reshape(-1, 3), axis=0, return_inverse=True)
+    return points, number.reshape(-1, 4)
 
 
 def sphere_octant(

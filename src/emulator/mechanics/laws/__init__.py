@@ -10,7 +10,7 @@ by differentiation. The tests in ``tests/emulator/mechanics/test_laws.py`` inclu
 import pkgutil
 from importlib import import_module
 
-from emulator.core.errors import InputError
+from emulator.core.errors import look_up
 from emulator.mechanics.laws.law import Law
 
 LAWS: dict[str, Law] = {
@@ -21,10 +21,8 @@ LAWS: dict[str, Law] = {
 
 
 def find_law(name: str) -> Law:
-    """The registered law called ``name``; :class:`InputError` names the known ones."""
-    if name not in LAWS:
-        raise InputError(f"law '{name}' is unknown; known laws: {', '.join(sorted(LAWS))}")
-    return LAWS[name]
+    """Return the registered law called ``name``; :class:`InputError` names the known ones."""
+    return look_up(LAWS, name, "law")
 
 
 __all__ = ["LAWS", "Law", "find_law"]

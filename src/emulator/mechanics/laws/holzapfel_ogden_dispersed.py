@@ -26,8 +26,7 @@ from emulator.mechanics.laws.holzapfel_ogden import (
     energy_isotropic,
     energy_of_fibres,
 )
-from emulator.mechanics.laws.law import Law
-from emulator.mechanics.quantity import modulus, number
+from emulator.mechanics.laws.law import Law, modulus, number
 
 
 def energy(

@@ -18,8 +18,7 @@ import jax.numpy as jnp
 
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import holzapfel_ogden
-from emulator.mechanics.laws.law import Law
-from emulator.mechanics.quantity import modulus, number
+from emulator.mechanics.laws.law import Law, modulus, number
 
 
 def energy(

@@ -52,10 +52,9 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import parts
+from emulator.geometry.mesh import Mesh, parts
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load

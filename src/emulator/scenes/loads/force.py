@@ -16,9 +16,8 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import EDGES
-from emulator.mechanics.quantity import Quantity, number
+from emulator.geometry.mesh import EDGES, Mesh
+from emulator.mechanics.laws.law import Quantity, number
 from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load

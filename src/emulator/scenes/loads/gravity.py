@@ -17,7 +17,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.mechanics.kinematics import determinant
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.load import Load, nodal_sums
 from emulator.scenes.local_terms import LocalForce, Values

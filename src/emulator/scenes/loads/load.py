@@ -11,7 +11,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.local_terms import LocalForce, LocalTerm, Values

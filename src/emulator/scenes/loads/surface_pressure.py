@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
 from emulator.scenes.local_terms import Values

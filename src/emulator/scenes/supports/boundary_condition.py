@@ -10,7 +10,7 @@ import numpy as np
 
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.local_terms import LocalForce, LocalTerm
 
 

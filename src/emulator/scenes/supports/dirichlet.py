@@ -19,7 +19,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh, frozen_array
-from emulator.mechanics.quantity import Quantity, number
+from emulator.mechanics.laws.law import Quantity, number
 from emulator.scenes.local_terms import Values
 from emulator.scenes.supports.boundary_condition import BoundaryCondition, Held, Resisted
 

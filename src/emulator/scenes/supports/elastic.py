@@ -21,7 +21,7 @@ from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation, FacetRule, facet_rule
 from emulator.geometry.facets import area_vectors
 from emulator.geometry.mesh import Mesh
-from emulator.mechanics.quantity import Quantity
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.identity import plain_fields
 from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
 from emulator.scenes.supports.boundary_condition import BoundaryCondition, Resisted

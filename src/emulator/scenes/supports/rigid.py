@@ -8,8 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.tetrahedra import parts
+from emulator.geometry.mesh import Mesh, parts
 from emulator.scenes.supports.boundary_condition import BoundaryCondition
 
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.mesh import frozen_array
-from emulator.geometry.tetrahedra import EDGES
+from emulator.geometry.mesh import EDGES, frozen_array
 from emulator.scenes.scene import Scene
 
 

@@ -1,6 +1,6 @@
 r"""Features of a ventricle for a network that has learned a family of them.
 
-All features are products of vectors that turn with the body (:mod:`emulator.geometry.ventricle`),
+All features are products of vectors that turn with the body (:mod:`emulator.geometry.heart_wall`),
 lengths over its size L and volumes over L^3. So a ventricle moved, turned or enlarged has the same
 features, and its displacement over L, with respect to its own vectors, is the same too, as it is in
 mechanics without gravity. Features are standardised by means and deviations of the family that the
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.ventricle import Ventricle, ventricle
+from emulator.geometry.heart_wall import Ventricle, ventricle
 from emulator.scenes.cavities import find_cavity
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network.graph import hierarchy, mesh_edges

@@ -10,7 +10,7 @@ from emulator.fem.condensation import Volumes, advance, carried, consistent, lin
 from emulator.fem.energy import pair_products
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import land_ventricle
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import CavityPressure, FollowerPressure

@@ -16,8 +16,7 @@ from emulator.fem.options import NewtonOptions
 from emulator.fem.system import System
 from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.laws.law import Law
-from emulator.mechanics.quantity import modulus
+from emulator.mechanics.laws.law import Law, modulus
 from emulator.scenes import Scene, Support
 from emulator.scenes.left_ventricle import MYOCARDIUM
 from emulator.scenes.regions import Tissue

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from emulator.geometry.generators.ball import ball, ball_midpoints, triangle_lattice
-from emulator.geometry.tetrahedra import orient, signed_volumes
+from emulator.geometry.generators.sphere import ball, ball_midpoints, triangle_lattice
+from emulator.geometry.mesh import orient, signed_volumes
 
 
 @pytest.mark.parametrize("shells", [1, 2, 5])

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.generators.biventricle import biventricle
+from emulator.geometry.generators.biventricle import RightVentricle, Septum, biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN
-from emulator.geometry.generators.right_ventricle import RightVentricle, Septum
 from emulator.geometry.quality import dihedral_angles
 from geometry_support import assert_sound, order_of, volume
 

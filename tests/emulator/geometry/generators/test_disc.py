@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from emulator.geometry.generators.disc import disc, ring_counts
+from emulator.geometry.generators.ellipsoid import disc, ring_counts
 
 
 @pytest.mark.parametrize("around", [6, 13, 24])

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from emulator.geometry.generators.disc import disc
-from emulator.geometry.generators.footprint import open_sheet, spread
+from emulator.geometry.generators.biventricle import open_sheet, spread
+from emulator.geometry.generators.ellipsoid import disc
 
 
 def square(n=4):

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from emulator.geometry.generators.prisms import extrude, stacked
-from emulator.geometry.tetrahedra import orient, signed_volumes
+from emulator.geometry.generators.body import extrude, stacked
+from emulator.geometry.mesh import orient, signed_volumes
 
 
 def test_two_prisms_agree_on_the_side_they_share():

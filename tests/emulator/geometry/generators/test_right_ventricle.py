@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
+from emulator.geometry.generators.biventricle import RightVentricle, Septum
 from emulator.geometry.generators.ellipsoid import HUMAN
-from emulator.geometry.generators.right_ventricle import RightVentricle, Septum
 
 SEPTUM = Septum(HUMAN, RightVentricle(bulge=20.0, thickness=4.0))
 TOP = np.array([0.0]), np.array([1.0])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.geometry.generators.slab import cooks_membrane, slab
+from emulator.geometry.generators.box import cooks_membrane, slab
 from geometry_support import assert_sound, volume
 
 # Shoelace formula: trapezium of parallel sides 44 and 16 mm, 48 mm apart.

@@ -8,7 +8,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.energy import local_forces, potential_energy
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.loads import CavityPressure, FollowerPressure
 from scene_support import block, rotation
 

@@ -9,7 +9,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.energy import dead_force
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes import Parameter
 from emulator.scenes.loads import Force, Traction
 from emulator.scenes.loads.force import shares

@@ -5,7 +5,7 @@ import pytest
 
 import emulator as em
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quadratic import to_quadratic
+from emulator.geometry.refinement import to_quadratic
 from emulator.scenes import Scene, Support
 from emulator.surrogates.network.graph import GraphOptions, augment, mesh_edges
 
