@@ -156,7 +156,7 @@ class Refinement:
         """Unit directions (m, 3) or (m, q, 3) at the finer mesh's quadrature points.
 
         One direction an element is continued linearly first
-        (:func:`~emulator.geometry.directions.from_elements`).
+        (:func:`~emulator.geometry.fibres.from_elements`).
         """
         at_points = from_elements(self.coarse, given) if given.ndim == 2 else given
         inside = np.einsum("qa,mcab->mcqb", quadrature_points(2), self.corners)

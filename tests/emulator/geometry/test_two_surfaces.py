@@ -191,7 +191,7 @@ def test_without_gmsh_the_command_names_the_extra(rough, tmp_path, capsys, monke
     def no_library(name):
         raise OSError("libGLU.so.1: cannot open shared object file")
 
-    monkeypatch.setattr("emulator.geometry.mesher.import_module", no_library)
+    monkeypatch.setattr("emulator.geometry.remeshing.import_module", no_library)
     assert "gmsh is installed but does not load (libGLU.so.1" in complaint(capsys, *words)
 
 

@@ -1,4 +1,4 @@
-"""What all generators share: bodies with named surfaces, and triangulations extruded into tetrahedra."""
+"""Shared by the generators: named surfaces, and triangulations extruded into tetrahedra."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def describe(scene: Scene) -> Described:
     ------
     InputError
         No fibres, no cavity under pressure, or more than one; see
-        :func:`~emulator.geometry.ventricle.ventricle`.
+        :func:`~emulator.geometry.heart_wall.ventricle`.
     """
     if scene.fibres is None:
         raise InputError(f"scene '{scene.name}' has no fibres; this network was trained with them")
