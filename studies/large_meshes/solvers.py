@@ -25,9 +25,9 @@ from studies.common.output import Case, Results
 from studies.common.processes import peak_gb, run
 
 from emulator.core.errors import InputError
-from emulator.fem.linear import mumps
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.suitesparse import SUITESPARSE, forget_factors
+from emulator.fem.linear.petsc import Factor, petsc_module
+from emulator.fem.linear.suitesparse import FACTORS, SUITESPARSE
 from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 
@@ -75,13 +75,13 @@ def factorised(solver: str, matrix: Any, pattern: Pattern) -> Case:
     """With a factorisation: the first, which analyses the pattern, the second, and a solution."""
     b = np.asarray(matrix["b"])
     if solver in OPTIONS:
-        factor = mumps.Factor(pattern)
+        factor = Factor(pattern)
         first, _ = both_times(factor.factorise, matrix["first"])
         second, _ = both_times(factor.factorise, matrix["second"])
         solution, x = both_times(factor.solve, b)
         row = {"iterations": factor._ksp.getIterationNumber()}
     else:
-        forget_factors()
+        FACTORS.clear()
         solve = jax.jit(lambda values, b: SUITESPARSE.solve(pattern, values, b, definite=True)[0])
         with_solution = lambda *given: np.asarray(solve(*given))  # noqa: E731
         first, _ = both_times(with_solution, matrix["first"], b)
@@ -95,7 +95,7 @@ def factorised(solver: str, matrix: Any, pattern: Pattern) -> Case:
 
 def multigrid(matrix: Any, pattern: Pattern) -> Case:
     """Smoothed aggregation that knows the rigid motions, before conjugate gradients."""
-    PETSc = mumps.petsc()
+    PETSc = petsc_module()
     values, size = matrix["second"], pattern.size
     upper = sp.csr_matrix((values, (pattern.rows, pattern.columns)), (size, size))
     full = (upper + sp.triu(upper, 1).T).tocsr()
@@ -125,7 +125,7 @@ def one(path: Path, solver: str) -> Case:
     none = np.zeros(0, np.int32)
     pattern = Pattern(matrix["rows"], matrix["columns"], none, none, len(matrix["b"]), upper=True)
     if solver != "CHOLMOD":
-        mumps.petsc()
+        petsc_module()
     row = {"before_GB": peak_gb()}
     found = (
         factorised(solver, matrix, pattern) if solver != SOLVERS[-1] else multigrid(matrix, pattern)
@@ -136,7 +136,7 @@ def one(path: Path, solver: str) -> Case:
 def there() -> tuple[str, ...]:
     """The solvers that are installed."""
     try:
-        mumps.petsc()
+        petsc_module()
     except InputError:
         return SOLVERS[:1]
     return SOLVERS

@@ -31,7 +31,7 @@ import numpy as np
 
 from emulator.accuracy.step import Distance, newton_distance
 from emulator.core.errors import InputError
-from emulator.fem.linear.suitesparse import forget_factors
+from emulator.fem.linear.suitesparse import FACTORS
 from emulator.fem.loop import jit
 from emulator.fem.simulator import Simulator
 from emulator.scenes.finer import Finer, finer
@@ -127,7 +127,7 @@ class MeshError:
 
     def forget(self) -> None:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
-        forget_factors()
+        FACTORS.clear()
 
     def _carried(self, u: jax.Array) -> jax.Array:
         return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))

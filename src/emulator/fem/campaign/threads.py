@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from emulator.core.machine import cores, inherited, memory
-from emulator.fem.linear.suitesparse import keep_factors
+from emulator.fem.linear.suitesparse import FACTORS
 from emulator.fem.simulator import Simulator
 
 _BYTES_A_NODE = 100_000  # of one more solve beside others; 54 000 measured at 33 605 nodes
@@ -51,7 +51,7 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
     under_way: deque[Future[R]] = deque()
     there = inherited(function)
     pool = ThreadPoolExecutor(workers)
-    with keep_factors(workers):
+    with FACTORS.keep(workers):
         try:
             for task in tasks:
                 under_way.append(pool.submit(there, task))

@@ -1,4 +1,4 @@
-"""The pattern that assembled tangents share, and its products."""
+"""The sparsity pattern that all tangents of a mesh share, assembly into it, and its products."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ import numpy as np
 
 # Relative increase of the diagonal, four units of round-off: an exactly zero pivot becomes tiny.
 _RAISE = 2.0**-50
-_LEAST_ROW = 1e-290  # a row whose absolute sum is below this is empty
-_ALIKE = 1e-13  # of the largest entry: mirror images whose sums are rounded differently
+_EMPTY_ROW = 1e-290  # a row whose absolute sum is below this is empty
+_ASYMMETRY = 1e-13  # of the largest entry: mirror images whose sums are rounded differently
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Nonzeros of a matrix over the free degrees of freedom, fixed for a mesh.
+    """Nonzeros of a matrix over the free degrees of freedom, row by row, fixed for a mesh.
 
     rows, columns : (nnz,) int32 position of each nonzero.
     source : (k,) indices of the entries of the flattened element blocks that are used.
-    target : (k,) index of the nonzero that each of these entries is added to.
-    size : number of free degrees of freedom.
-    upper : whether only the upper triangle of a symmetric matrix is there.
+    target : (k,) index of the nonzero to which each of these entries is added.
+    size : the number of free degrees of freedom.
+    upper : whether only the upper triangle of a symmetric matrix is stored.
     """
 
     rows: np.ndarray
@@ -36,12 +36,12 @@ class Pattern:
     upper: bool = False
 
     def sum(self, entries: jax.Array) -> jax.Array:
-        """Values (nnz,) from the entries of all blocks, flattened one after the other."""
+        """Assemble values (nnz,) from the entries of all blocks, flattened one after the other."""
         return jax.ops.segment_sum(entries[self.source], self.target, num_segments=len(self.rows))
 
     @cached_property
     def _whole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Row, column and source of every nonzero of both triangles, row by row."""
+        """Row, column and stored index of every nonzero of both triangles, row by row."""
         above = np.flatnonzero(self.rows < self.columns)
         rows = np.concatenate([self.rows, self.columns[above]])
         columns = np.concatenate([self.columns, self.rows[above]])
@@ -50,7 +50,7 @@ class Pattern:
         return rows[order], columns[order], source[order]
 
     def both(self, values: jax.Array) -> tuple[np.ndarray, np.ndarray, jax.Array]:
-        """Rows, columns and values with both triangles."""
+        """Return rows, columns and values with both triangles."""
         if not self.upper:
             return self.rows, self.columns, values
         rows, columns, source = self._whole
@@ -58,48 +58,48 @@ class Pattern:
 
     @cached_property
     def half(self) -> Pattern:
-        """The upper triangle of a pattern with both; its ``sum`` of these values has its own."""
-        kept = np.flatnonzero(self.rows <= self.columns).astype(np.int32)
-        target = np.arange(len(kept), dtype=np.int32)
-        return Pattern(self.rows[kept], self.columns[kept], kept, target, self.size, upper=True)
+        """The upper triangle of a pattern with both; its :meth:`sum` takes the values of both."""
+        above = np.flatnonzero(self.rows <= self.columns).astype(np.int32)
+        target = np.arange(len(above), dtype=np.int32)
+        return Pattern(self.rows[above], self.columns[above], above, target, self.size, upper=True)
 
     @cached_property
     def _mirror(self) -> np.ndarray:
-        """Index of the mirror image of every nonzero; they are sorted by row, then column."""
+        """Index of every nonzero's mirror image, as nonzeros are sorted by row, then column."""
         return np.lexsort((self.rows, self.columns))
 
     def is_symmetric(self, values: jax.Array) -> jax.Array:
         """Whether ``values`` of both triangles are mirror images, shape ()."""
-        apart = jnp.max(jnp.abs(values - values[self._mirror]))
-        return apart <= _ALIKE * jnp.max(jnp.abs(values))
+        difference = jnp.max(jnp.abs(values - values[self._mirror]))
+        return difference <= _ASYMMETRY * jnp.max(jnp.abs(values))
 
     def product(self, values: jax.Array, x: jax.Array) -> jax.Array:
-        """``A x``, shape of ``x``: (size,) or (size, k)."""
+        """Return ``A x`` for ``x`` of shape (size,) or (size, k)."""
         if x.ndim == 2:
             return jax.vmap(lambda column: self.product(values, column), 1, 1)(x)
-        there = jax.ops.segment_sum(
+        stored = jax.ops.segment_sum(
             values * x[self.columns],
             self.rows,
             num_segments=self.size,
             indices_are_sorted=True,
         )
         if not self.upper:
-            return there
+            return stored
         above = jnp.where(self.rows < self.columns, values, 0.0)
-        return there.at[self.columns].add(above * x[self.rows])
+        return stored.at[self.columns].add(above * x[self.rows])
 
     def solvable(self, values: jax.Array) -> jax.Array:
         """Whether ``values`` are finite and leave no row empty, shape ()."""
         rows = jax.ops.segment_sum(jnp.abs(values), self.rows, num_segments=self.size)
         rows += jax.ops.segment_sum(jnp.abs(values), self.columns, num_segments=self.size)
-        return jnp.all(jnp.isfinite(values)) & jnp.all(rows >= _LEAST_ROW)
+        return jnp.all(jnp.isfinite(values)) & jnp.all(rows >= _EMPTY_ROW)
 
     def safe_values(self, values: jax.Array) -> jax.Array:
-        """``values`` to factorise; the identity's where they are not solvable.
+        """Return ``values`` (nnz,) to factorise: the identity's where ``values`` are not solvable.
 
-        A pivot that is exactly zero leaves no solution. A diagonal larger by round-off makes it
-        tiny, and the step so long that Newton's method rejects it. Apply
-        once to each tangent (docs/experiments.md, "A tangent that was never the same").
+        A pivot that is exactly zero leaves no solution. A diagonal larger by round-off makes the
+        pivot tiny, and the step so long that Newton's method rejects it. Apply this once to each
+        tangent (docs/experiments.md, "A tangent that was never the same").
         """
         diagonal = jnp.asarray(self.rows == self.columns, dtype=values.dtype)
         raised = values * (1.0 + _RAISE * diagonal)
@@ -107,11 +107,12 @@ class Pattern:
 
 
 class Entries(NamedTuple):
-    """Where the entries of blocks belong, in their order.
+    """Positions of the entries of dense blocks, in the order of the flattened blocks.
 
-    rows, columns : (e,) global degrees of freedom. mirrored : (e,) whether an entry of a symmetric
-    block stands for its mirror image, too, which is not there. spare : (e,) whether its mirror
-    image is there and stands for it.
+    rows, columns : (e,) global degrees of freedom.
+    mirrored : (e,) whether an entry of a symmetric block also stands for its mirror image, which
+        the block does not store.
+    spare : (e,) whether the mirror image of an entry is stored and stands for it.
     """
 
     rows: np.ndarray
@@ -121,7 +122,7 @@ class Entries(NamedTuple):
 
 
 def whole_blocks(nodes: np.ndarray) -> Entries:
-    """Of blocks (k, 3a, 3a) of the degrees of freedom of ``nodes`` (k, a)."""
+    """Return the entries of blocks (k, 3a, 3a) over the degrees of freedom of ``nodes`` (k, a)."""
     dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
     shape = (*dofs.shape, dofs.shape[1])
     rows = np.broadcast_to(dofs[:, :, None], shape).ravel()
@@ -130,9 +131,9 @@ def whole_blocks(nodes: np.ndarray) -> Entries:
 
 
 def upper_blocks(nodes: np.ndarray) -> Entries:
-    """Of symmetric blocks (k, pairs, 3, 3) of the pairs of ``nodes`` (k, a), each pair once.
+    """Return the entries of symmetric blocks (k, pairs, 3, 3) over the pairs of ``nodes`` (k, a).
 
-    Pairs are those of ``np.triu_indices``.
+    Each pair is stored once, in the order of ``np.triu_indices``.
     """
     one, other = np.triu_indices(nodes.shape[1])
     shape = (len(nodes), len(one), 3, 3)
@@ -144,13 +145,13 @@ def upper_blocks(nodes: np.ndarray) -> Entries:
 
 
 def block_pattern(groups: Sequence[Entries], free_index: np.ndarray, *, symmetric: bool) -> Pattern:
-    """Pattern of dense blocks, and where their entries go.
+    """Return the pattern into which groups of dense blocks are assembled.
 
     Parameters
     ----------
-    groups : of the entries, one after the other.
-    free_index : (n_dofs,) position among the free ones, -1 where held.
-    symmetric : keep only the upper triangle.
+    groups : the entries of each group of blocks, in the order in which they are flattened.
+    free_index : (n_dofs,) position among the free degrees of freedom, -1 where prescribed.
+    symmetric : store only the upper triangle.
     """
     size = int(free_index.max()) + 1
     rows, columns, mirrored, spare = map(np.concatenate, zip(*groups, strict=True))
@@ -160,11 +161,11 @@ def block_pattern(groups: Sequence[Entries], free_index: np.ndarray, *, symmetri
     if symmetric:
         rows, columns = np.minimum(rows, columns), np.maximum(rows, columns)
     else:
-        again = mirrored[source]
-        source = np.concatenate([source, source[again]])
+        mirror = mirrored[source]
+        source = np.concatenate([source, source[mirror]])
         rows, columns = (
-            np.concatenate([rows, columns[again]]),
-            np.concatenate([columns, rows[again]]),
+            np.concatenate([rows, columns[mirror]]),
+            np.concatenate([columns, rows[mirror]]),
         )
     keys, target = np.unique(rows * size + columns, return_inverse=True)
     return Pattern(

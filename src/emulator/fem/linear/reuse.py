@@ -1,8 +1,8 @@
 """A factor that serves other tangents: conjugate gradients preconditioned by it.
 
 On a large mesh a factorisation takes as long as many back-substitutions, and the tangents of
-Newton's method, of one theta and the next, are alike: so conjugate gradients, preconditioned by the
-Cholesky factor of one of them, replace factorisations for as long as they are faster.
+Newton's method, of one theta and the next, are alike. So conjugate gradients, preconditioned by the
+Cholesky factor of one tangent, replace factorisations for as long as they are faster.
 """
 
 from __future__ import annotations
@@ -15,23 +15,35 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.protocol import Direct, Outcome
-from emulator.fem.linear.suitesparse import keep_factors
+from emulator.fem.linear.solve import Direct, Outcome
+from emulator.fem.linear.suitesparse import FACTORS
 from emulator.fem.loop import jit, while_loop
 
-TOLERANCE = 1e-10  # of the residual, in the norm of the reference's inverse
-_PATIENCE = 6  # steps after which half the pace that the last allowed step needs is asked for
+TOLERANCE = 1e-10  # of the residual, in the norm of the inverse of the factorised tangent
+_PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
 # Unknowns from which conjugate gradients beside a factor beat a factorisation by CHOLMOD, and the
-# steps that then take as long. Times grow as n^2 and n^(4/3) (studies/large_meshes).
+# iterations that then take as long. Times grow as n^2 and n^(4/3) (studies/large_meshes).
 _LARGE = 100_000
-_STEPS_OF_LARGE = 25
+_ITERATIONS_OF_LARGE = 25
+
+
+class Gradients(NamedTuple):
+    """The result of conjugate gradients.
+
+    x : (f,) the solution. reduction : () of the residual, in the norm of the preconditioner.
+    convex : () whether every direction had positive curvature.
+    """
+
+    x: jax.Array
+    reduction: jax.Array
+    convex: jax.Array
 
 
 class _State(NamedTuple):
-    """Of conjugate gradients.
+    """State of conjugate gradients.
 
-    x, residual, direction : (f,). size : residual . preconditioned residual. convex : whether the
-    last direction had positive curvature.
+    x, residual, direction : (f,). size : () residual . preconditioned residual.
+    convex : () whether the last direction had positive curvature.
     """
 
     k: jax.Array
@@ -39,69 +51,6 @@ class _State(NamedTuple):
     residual: jax.Array
     direction: jax.Array
     size: jax.Array
-    convex: jax.Array
-
-
-class KeptFactor:
-    """Solves with definite tangents, one after the other, that keep a factor while it serves.
-
-    For numbers, on meshes where a factorisation takes as long as many back-substitutions.
-
-    pattern : upper triangle.
-    """
-
-    def __init__(self, direct: Direct, pattern: Pattern) -> None:
-        self._pattern = pattern
-        self._kept: jax.Array | None = None
-        as_long = int(_STEPS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
-        self._steps = max(_PATIENCE, as_long)
-        program = (lambda function: function) if direct.on_host else jit
-        self._product = jit(pattern.product)
-        self._factorised = program(partial(direct.solve, pattern, definite=True))
-        self._beside = program(self._conjugate_gradients)
-        self.factorisations = 0
-
-    @staticmethod
-    def pays(pattern: Pattern) -> bool:
-        """Whether the matrices are large enough."""
-        return pattern.upper and pattern.size >= _LARGE
-
-    def attempt(
-        self, tangent: jax.Array, b: jax.Array, *, near: bool = True
-    ) -> tuple[jax.Array, jax.Array]:
-        """``x`` (f,) with ``K x = b``, and the outcome.
-
-        near : whether the factor kept may serve; without, the tangent's own is made and kept.
-        """
-        if near and self._kept is not None:
-            found = self._beside(tangent, self._kept, b)
-            if bool(found.convex & (found.reduction <= TOLERANCE)):
-                return found.x, jnp.asarray(Outcome.OK, jnp.int32)
-        self._kept = None
-        with keep_factors(1):  # two of such a mesh may not fit into memory
-            x, outcome = jax.block_until_ready(self._factorised(tangent, b))
-        self.factorisations += 1
-        if int(outcome) == Outcome.OK:
-            self._kept = tangent
-        return x, outcome
-
-    def _conjugate_gradients(self, tangent: jax.Array, kept: jax.Array, b: jax.Array) -> Gradients:
-        def precondition(residual: jax.Array) -> jax.Array:
-            return self._factorised(kept, residual)[0]
-
-        product = partial(self._product, tangent)
-        return conjugate_gradients(product, precondition, b, self._steps, TOLERANCE, _PATIENCE)
-
-
-class Gradients(NamedTuple):
-    """Where conjugate gradients ended.
-
-    x : (f,). reduction : () of the residual, in the norm of the preconditioner. convex : () whether
-    every direction had positive curvature.
-    """
-
-    x: jax.Array
-    reduction: jax.Array
     convex: jax.Array
 
 
@@ -113,11 +62,14 @@ def conjugate_gradients(
     tolerance: float,
     patience: int | None = None,
 ) -> Gradients:
-    """``x`` (f,) with ``product(x) = b``, after so many ``steps`` at most.
+    """Solve ``product(x) = b`` for ``x`` (f,).
 
+    Parameters
+    ----------
+    steps : the largest number of iterations.
     tolerance : of the residual relative to ``b``, both in the norm of ``precondition``.
-    patience : steps after which they are given up where the residual falls more slowly than
-        ``steps`` allow; never by default.
+    patience : the number of iterations after which they end as soon as the residual is larger than
+        a constant rate to ``tolerance`` in ``steps`` allows; None never ends them for that.
     """
     first = precondition(b)
     begin = jnp.vdot(b, first)
@@ -134,16 +86,70 @@ def conjugate_gradients(
         length = jnp.where(convex, state.size / curvature, 0.0)
         x = state.x + length * state.direction
         residual = state.residual - length * image
-        next_ = precondition(residual)
-        size = jnp.vdot(residual, next_)
-        direction = next_ + size / state.size * state.direction
+        preconditioned = precondition(residual)
+        size = jnp.vdot(residual, preconditioned)
+        direction = preconditioned + size / state.size * state.direction
         return _State(state.k + 1, x, residual, direction, size, convex)
 
     def running(state: _State) -> jax.Array:
-        going = (state.k < steps) & (state.size > enough) & state.convex
-        return going & on_pace(state.k, state.size)
+        unfinished = (state.k < steps) & (state.size > enough) & state.convex
+        return unfinished & on_pace(state.k, state.size)
 
     start = _State(jnp.array(0), jnp.zeros_like(b), b, first, begin, jnp.array(True))
     state = while_loop(running, step, start)
-    fell = jnp.sqrt(jnp.abs(state.size) / jnp.where(begin > 0.0, begin, 1.0))
-    return Gradients(state.x, fell, state.convex & jnp.isfinite(state.size))
+    reduction = jnp.sqrt(jnp.abs(state.size) / jnp.where(begin > 0.0, begin, 1.0))
+    return Gradients(state.x, reduction, state.convex & jnp.isfinite(state.size))
+
+
+class KeptFactor:
+    """Solves with definite tangents, one after the other, that keep a factor while it serves.
+
+    Only for concrete numbers, on meshes where a factorisation takes as long as many
+    back-substitutions.
+
+    pattern : the pattern of the tangents, an upper triangle.
+    """
+
+    def __init__(self, direct: Direct, pattern: Pattern) -> None:
+        self._pattern = pattern
+        self._factorised: jax.Array | None = None  # the tangent whose factor is kept
+        affordable = int(_ITERATIONS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
+        self._iterations = max(_PATIENCE, affordable)
+        program = (lambda function: function) if direct.on_host else jit
+        self._product = jit(pattern.product)
+        self._solve = program(partial(direct.solve, pattern, definite=True))
+        self._solve_beside = program(self._conjugate_gradients)
+        self.factorisations = 0
+
+    @staticmethod
+    def pays(pattern: Pattern) -> bool:
+        """Whether the matrices are large enough for a kept factor to save time."""
+        return pattern.upper and pattern.size >= _LARGE
+
+    def attempt(
+        self, tangent: jax.Array, b: jax.Array, *, near: bool = True
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return ``x`` (f,) with ``K x = b``, and the outcome.
+
+        near : whether the kept factor may serve; otherwise ``tangent`` is factorised and kept.
+        """
+        if near and self._factorised is not None:
+            solution = self._solve_beside(tangent, self._factorised, b)
+            if bool(solution.convex & (solution.reduction <= TOLERANCE)):
+                return solution.x, jnp.asarray(Outcome.OK, jnp.int32)
+        self._factorised = None
+        with FACTORS.keep(1):  # two of such a mesh may not fit into memory
+            x, outcome = jax.block_until_ready(self._solve(tangent, b))
+        self.factorisations += 1
+        if int(outcome) == Outcome.OK:
+            self._factorised = tangent
+        return x, outcome
+
+    def _conjugate_gradients(
+        self, tangent: jax.Array, factorised: jax.Array, b: jax.Array
+    ) -> Gradients:
+        def precondition(residual: jax.Array) -> jax.Array:
+            return self._solve(factorised, residual)[0]
+
+        product = partial(self._product, tangent)
+        return conjugate_gradients(product, precondition, b, self._iterations, TOLERANCE, _PATIENCE)

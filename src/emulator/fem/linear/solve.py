@@ -1,64 +1,117 @@
-"""Solves with a tangent: definite first, any other way where that is refused."""
+"""Direct solves: what a solver provides, how a solve ends, and the order in which kinds are tried.
+
+A symmetric tangent is factorised as positive definite first. Only where that factorisation is
+refused does a general one follow, so that an unstable equilibrium has derivatives, too.
+"""
 
 from __future__ import annotations
 
+from enum import IntEnum
 from functools import partial
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.protocol import Direct, Outcome
 from emulator.fem.loop import cond, one_by_one
+
+
+class Outcome(IntEnum):
+    """How a linear solve ended, as a number that compiled programs can carry.
+
+    The solution is NaN unless the outcome is OK.
+    """
+
+    OK = 0
+    INDEFINITE = 1  # not positive definite; a general factorisation may still solve
+    SINGULAR = 2
+
+
+class Direct(Protocol):
+    """A direct solver.
+
+    name : the name in the registry.
+    on_host : whether Python calls the solver with concrete numbers, and programs under ``jax.jit``
+        reach it by a callback. Other solvers are part of the compiled program.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+
+    @property
+    def on_host(self) -> bool: ...  # noqa: D102
+
+    def check(self) -> None:
+        """Load the solver's library; :class:`InputError` where it is not installed."""
+        ...
+
+    def solve(
+        self,
+        pattern: Pattern,
+        values: jax.Array,
+        rhs: jax.Array,
+        *,
+        definite: bool,
+        transposed: bool = False,
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return ``x`` with ``A x = rhs``, (size,) or (size, k), and an :class:`Outcome`, int32 ().
+
+        definite : report INDEFINITE unless ``A``, given by its upper triangle, is positive
+            definite.
+        transposed : solve with the transpose of ``A``.
+        """
+        ...
 
 
 def attempt(
     direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """``x`` with ``A x = rhs`` and the outcome, without a second try; no derivatives.
+    """Return ``x`` with ``A x = rhs`` and the outcome, without derivatives.
 
-    A symmetric matrix has to be positive definite.
+    A matrix stored as an upper triangle must be positive definite; no other factorisation is tried.
     """
     if not pattern.upper:
-        return _both_triangles(direct, pattern, values, rhs, transposed=False)
+        return _solve_whole(direct, pattern, values, rhs, transposed=False)
     return direct.solve(pattern, values, rhs, definite=True)
 
 
 def solve(direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array) -> jax.Array:
-    """``x`` with ``A x = rhs``, (size,) or (size, k); NaN where ``A`` is singular.
+    """Return ``x`` with ``A x = rhs``, (size,) or (size, k); NaN where ``A`` is singular.
 
-    Linear in ``rhs`` and differentiable in it; ``vmap`` takes one after the other.
+    The solution is differentiable in ``values`` and ``rhs``; ``vmap`` solves one after the other.
     """
     if direct.on_host and not any(isinstance(x, jax.core.Tracer) for x in (values, rhs)):
-        return _any(direct, pattern, values, rhs, transposed=False)
+        return _solve_any(direct, pattern, values, rhs, transposed=False)
     constant = jax.lax.stop_gradient(values)
 
-    def solved(b: jax.Array, *, transposed: bool) -> jax.Array:
-        return one_by_one(partial(_any, direct, pattern, transposed=transposed))(constant, b)
+    def solution(b: jax.Array, *, transposed: bool) -> jax.Array:
+        return one_by_one(partial(_solve_any, direct, pattern, transposed=transposed))(constant, b)
 
     return jax.lax.custom_linear_solve(
         partial(pattern.product, values),
         rhs,
-        lambda _, b: solved(b, transposed=False),
-        lambda _, b: solved(b, transposed=True),
+        lambda _, b: solution(b, transposed=False),
+        lambda _, b: solution(b, transposed=True),
         symmetric=pattern.upper,
     )
 
 
-def _any(
+def _solve_any(
     direct: Direct, pattern: Pattern, values: jax.Array, b: jax.Array, *, transposed: bool
 ) -> jax.Array:
+    """Solve with any regular matrix: by a general factorisation where it is indefinite."""
     if not pattern.upper:
-        return _both_triangles(direct, pattern, values, b, transposed=transposed)[0]
+        return _solve_whole(direct, pattern, values, b, transposed=transposed)[0]
     x, outcome = attempt(direct, pattern, values, b)
     general = partial(direct.solve, pattern, values, b, definite=False)
     return cond(outcome == Outcome.INDEFINITE, lambda: general()[0], lambda: x)
 
 
-def _both_triangles(
+def _solve_whole(
     direct: Direct, pattern: Pattern, values: jax.Array, b: jax.Array, *, transposed: bool
 ) -> tuple[jax.Array, jax.Array]:
-    """``x`` and the outcome, of a matrix whose pattern has both triangles.
+    """Solve with a matrix stored with both triangles; return ``x`` and the outcome.
 
     At rest, and where unloading begins, such tangents are symmetric and definite of either sign: a
     Cholesky factor takes a sixth of the time (docs/experiments.md, "Unloading").

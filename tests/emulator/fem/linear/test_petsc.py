@@ -11,9 +11,9 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
-from emulator.fem.linear import SOLVERS, Outcome, mumps
+from emulator.fem.linear import Outcome
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.petsc import _LAST
+from emulator.fem.linear.petsc import PETSC, Factor, petsc_module
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.solve import attempt
 from emulator.fem.linear.solve import solve as solve_any
@@ -27,7 +27,7 @@ from scene_support import block
 def petsc():
     """The module petsc4py.PETSc."""
     pytest.importorskip("petsc4py", reason="petsc4py, the optional extra 'petsc', is not installed")
-    return mumps.petsc()
+    return petsc_module()
 
 
 def matrix(size=40, *, shift=4.0, symmetric=True):
@@ -43,9 +43,6 @@ def matrix(size=40, *, shift=4.0, symmetric=True):
     return A, pattern, jnp.asarray(A[rows, columns]), jnp.asarray(rng.normal(size=size))
 
 
-PETSC = SOLVERS["petsc"]
-
-
 def test_an_unknown_factorisation_is_refused():
     with pytest.raises(InputError, match="'pardiso' is unknown; known: suitesparse, petsc"):
         em.Simulator(block(), factorisation="pardiso")
@@ -54,20 +51,20 @@ def test_an_unknown_factorisation_is_refused():
 
 
 def test_without_petsc_one_line_says_what_to_install(monkeypatch):
-    mumps.petsc.cache_clear()
+    petsc_module.cache_clear()
     for module in ("petsc4py", "petsc4py.PETSc"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match="petsc4py is not installed; pip install") as refusal:
         em.Simulator(block(), factorisation="petsc")
     assert "\n" not in str(refusal.value)
-    mumps.petsc.cache_clear()
+    petsc_module.cache_clear()
 
 
 @pytest.mark.usefixtures("petsc")
 def test_inertia_tells_a_definite_matrix_from_an_indefinite_one():
     A, pattern, values, b = matrix(shift=0.0)
     assert np.linalg.eigvalsh(A)[0] < 0.0
-    factor = mumps.Factor(pattern)
+    factor = Factor(pattern)
     factor.factorise(np.asarray(values))
     assert factor.negative_eigenvalues() == (np.linalg.eigvalsh(A) < 0.0).sum()
     refused = partial(attempt, PETSC, pattern)
@@ -76,7 +73,7 @@ def test_inertia_tells_a_definite_matrix_from_an_indefinite_one():
     np.testing.assert_allclose(
         solve_any(PETSC, pattern, values, b), np.linalg.solve(A, b), rtol=1e-8
     )
-    assert _LAST.factor.factorisations == 1
+    assert PETSC.last.factor.factorisations == 1
     assert jax.jit(refused)(values, b)[1] == Outcome.INDEFINITE
     A, pattern, values, b = matrix(shift=8.0)
     assert np.linalg.eigvalsh(A)[0] > 0.0
@@ -102,7 +99,7 @@ def test_options_that_leave_no_factor_are_refused(petsc):
     petsc.Options()["pc_type"] = "jacobi"
     try:
         with pytest.raises(InputError, match="leave it at cholesky of mumps"):
-            mumps.Factor(pattern)
+            Factor(pattern)
     finally:
         petsc.Options().delValue("pc_type")
 
@@ -110,7 +107,7 @@ def test_options_that_leave_no_factor_are_refused(petsc):
 @pytest.mark.usefixtures("petsc")
 def test_a_matrix_is_factorised_once():
     _, pattern, values, b = matrix()
-    factor = mumps.Factor(pattern)
+    factor = Factor(pattern)
     for _ in range(2):
         factor.factorise(np.asarray(values))
         factor.solve(np.asarray(b))
@@ -133,7 +130,7 @@ def test_iterations_make_an_approximate_factor_exact(petsc):
     for name, value in given.items():
         options[name] = value
     try:
-        factor = mumps.Factor(system.pattern)
+        factor = Factor(system.pattern)
         factor.factorise(np.asarray(K))
         found = factor.solve(b)
     finally:
@@ -146,7 +143,7 @@ def test_iterations_make_an_approximate_factor_exact(petsc):
 def test_a_solution_is_checked_by_its_residual():
     """Here the factor is another matrix's."""
     _, pattern, values, b = matrix()
-    factor = mumps.Factor(pattern)
+    factor = Factor(pattern)
     factor.factorise(np.asarray(values))
     factor._ksp.getPC().setReusePreconditioner(True)
     factor._matrix.scale(1.001)

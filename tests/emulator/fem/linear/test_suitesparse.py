@@ -1,5 +1,6 @@
 """Solves and their outcomes, in Python, inside ``jit``, ``vmap`` and loops."""
 
+import ctypes
 import signal
 import time
 from functools import partial
@@ -11,8 +12,15 @@ import pytest
 
 from emulator.core.errors import InputError
 from emulator.fem.linear import SOLVERS, Outcome, block_pattern, find_solver, whole_blocks
-from emulator.fem.linear.foreign import INTERRUPTED, register
 from emulator.fem.linear.solve import attempt, solve
+from emulator.fem.linear.suitesparse import (
+    INTERRUPTED,
+    Api,
+    CallFrame,
+    api_version,
+    check_api,
+    register,
+)
 
 SUITESPARSE = find_solver("suitesparse")
 
@@ -141,6 +149,43 @@ def test_other_failures_still_end_the_program():
     call = jax.ffi.ffi_call("calibrate_test_strict", shapes)
     with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match="not positive definite"):
         jax.block_until_ready(call(pattern.rows, pattern.columns, values, b, mode=np.int64(0)))
+
+
+def test_the_version_of_the_headers_is_the_one_that_a_call_carries():
+    jax.devices("cpu")  # a function registered before there is a device is looked at later
+    versions = []
+
+    @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+    def handler(address):
+        api = Api.from_address(CallFrame.from_address(address).api)
+        versions.append((api.major, api.minor))
+
+    target = "calibrate_test_version"
+    # XLA first asks a handler for its own version, which this one does not answer. It is refused.
+    with pytest.raises(jax.errors.JaxRuntimeError, match="API version"):
+        jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform="cpu")
+    assert set(versions) == {api_version()}
+    check_api()
+
+
+@pytest.mark.parametrize(
+    ("header", "version"),
+    [
+        ("#define XLA_FFI_API_MAJOR 1\n#define XLA_FFI_API_MINOR 5\n", "1.5"),
+        ("#define XLA_FFI_API_MAJOR 0\n#define XLA_FFI_API_MINOR 2\n", "0.2"),
+        ("", "without a version"),
+    ],
+)
+def test_another_interface_of_xla_is_refused_in_one_line(tmp_path, monkeypatch, header, version):
+    folder = tmp_path / "xla" / "ffi" / "api"
+    folder.mkdir(parents=True)
+    (folder / "c_api.h").write_text(header)
+    monkeypatch.setattr(jax.ffi, "include_dir", lambda: str(tmp_path))
+    with pytest.raises(
+        InputError, match=f"has XLA FFI {version}; .* needs 0.3 or a later"
+    ) as refusal:
+        register("calibrate_test_other_interface", None, lambda message: None)
+    assert "\n" not in str(refusal.value)
 
 
 @pytest.fixture
