@@ -28,7 +28,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.measurements import spread_landmarks
 from emulator.fem import run_campaign, sobol
-from emulator.fem.campaign.reference import fem_reference
+from emulator.fem.campaign.designs import fem_reference
 from emulator.surrogates.corrected import corrected
 from emulator.surrogates.pod_gp import fit_reduced
 

@@ -4,8 +4,8 @@ from .accuracy.mesh_error import MeshError, mesh_error
 from .catalogue import find_scene
 from .core.errors import InputError, SolverError
 from .fem import NewtonOptions, Simulator, Solution, Status, run_campaign
-from .fem.campaign.reference import fem_reference
-from .fem.campaign.stored_runs import read_runs
+from .fem.campaign.designs import fem_reference
+from .fem.campaign.store import read_runs
 from .fem.energy import potential_energy, strain_energy
 from .fem.fields import element_fields
 from .fem.unloading import Unloaded, Unloader, unload

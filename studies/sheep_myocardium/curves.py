@@ -30,7 +30,7 @@ from threadpoolctl import threadpool_limits
 import emulator as em
 from emulator.core.errors import SolverError
 from emulator.core.machine import cores
-from emulator.fem.campaign.threads import at_once, in_order
+from emulator.fem.campaign import at_once, in_order
 from emulator.fem.implicit import Quantity
 from emulator.fem.options import NewtonOptions
 from emulator.fem.support_force import SupportForce

@@ -17,7 +17,7 @@ from emulator.core.progress import counting
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.campaign import Executor, Neighbours, Solver, executor, solve_rows
 from emulator.fem.campaign.designs import DESIGNS
-from emulator.fem.campaign.zarr_rows import Question, ZarrRows, make_store, writing
+from emulator.fem.campaign.store import Campaign, ZarrRows, make_store, writing
 from emulator.scenes.scene import Scene
 
 
@@ -51,7 +51,7 @@ def campaign(
     Returns
     -------
     Dataset over ``theta_id``, ``parameter``, ``node`` and ``xyz``, as described in
-    :mod:`emulator.fem.campaign.zarr_rows`.
+    :mod:`emulator.fem.campaign.store`.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def question(
     seed: int = 0,
     slopes: bool = False,
     options: NewtonOptions | None = None,
-) -> Question:
+) -> Campaign:
     """What :func:`campaign` asks of FEM."""
     if (samples is None) == (thetas is None):
         raise InputError("campaign: give a number of samples or thetas, one of them")
@@ -100,11 +100,11 @@ def question(
     simulator = Simulator(scene, NewtonOptions() if options is None else options)
     solver = Solver(simulator, sensitivities=slopes, energy=has_energy)
     about = {**about, "samples": len(chosen)}
-    return Question(solver, chosen, {"design": about, "versions": versions()})
+    return Campaign(solver, chosen, {"design": about, "versions": versions()})
 
 
 def fill(
-    asked: Question,
+    asked: Campaign,
     out: str | Path,
     *,
     scheduler: str | None = None,
@@ -121,7 +121,7 @@ def _solve_missing(rows: ZarrRows, solver: Solver, execute: Executor, progress: 
         solver,
         jnp.asarray(rows.thetas),
         numbers=missing,
-        starts=Neighbours(solver.simulator.scene, rows),
+        starts=Neighbours(solver.simulator.scene, rows.thetas, rows),
         execute=execute,
     )
     total = len(rows.thetas)

@@ -9,7 +9,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.campaign import run_campaign
-from emulator.fem.campaign.reference import Reference
+from emulator.fem.campaign.designs import Reference
 from emulator.fem.simulator import Simulator
 from emulator.released.scenes import published_scene, published_tests
 from emulator.scenes.scene import Scene

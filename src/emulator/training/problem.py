@@ -13,9 +13,8 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Runs, StoredRuns, run_campaign
+from emulator.fem.campaign import Predictor, Runs, StoredRuns, run_campaign
 from emulator.fem.campaign.designs import design, sobol
-from emulator.fem.campaign.starts import Predictor
 from emulator.scenes.nodes import all_nodes
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem import Simulator
-from emulator.fem.campaign.threads import at_once, in_order
+from emulator.fem.campaign import at_once, in_order
 from emulator.fem.halving import ARMIJO, falls_enough, largest_good
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients

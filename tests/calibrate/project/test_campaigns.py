@@ -19,8 +19,7 @@ import calibrate as cal
 import emulator as em
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import sobol
-from emulator.fem.campaign.stored_runs import read_runs
-from emulator.fem.campaign.zarr_rows import ZarrRows
+from emulator.fem.campaign.store import ZarrRows, read_runs
 from emulator.fem.solution import Status
 from emulator.scenes.loads import Gravity
 from scene_support import block

@@ -12,7 +12,7 @@ from emulator.core.errors import InputError
 
 THREADS = """
 import jax
-from emulator.fem.campaign.threads import in_order
+from emulator.fem.campaign import in_order
 first, second = jax.devices()
 
 def where(_):

@@ -9,7 +9,7 @@ from typing import Any
 from emulator.accuracy.comparison import Errors, case_errors
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
-from emulator.fem.campaign.reference import Reference, fem_reference, outside_reference
+from emulator.fem.campaign.designs import Reference, fem_reference, outside_reference
 from emulator.released.reference import published_reference
 from emulator.surrogates import load
 from emulator.surrogates.kind import Ingredients

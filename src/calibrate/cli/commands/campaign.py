@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections import Counter
 from typing import Any
 
 from calibrate.cli.common import (
@@ -56,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     from emulator.catalogue import find_scene
     from emulator.core.errors import InputError
     from emulator.fem import NewtonOptions
-    from emulator.fem.campaign.zarr_rows import WORDS, read, require_store
+    from emulator.fem.campaign.store import count_statuses
 
     began = time.perf_counter()
     if not arguments.out.endswith(".zarr"):
@@ -71,20 +70,20 @@ def run(arguments: argparse.Namespace) -> int:
     )
     progress = show_progress(arguments)
     solved = fill(asked, arguments.out, scheduler=arguments.scheduler, progress=progress)
-    status = read(require_store(arguments.out), "status")
-    counts = {WORDS[value]: n for value, n in Counter(status.tolist()).most_common()}
+    counts = count_statuses(arguments.out)
+    samples = sum(counts.values())
     seconds = time.perf_counter() - began
     result = {
         "out": arguments.out,
         "scene": asked.scene.name,
-        "samples": len(status),
+        "samples": samples,
         "solved_now": solved,
         "status": counts,
         "seconds": seconds,
     }
     said = ", ".join(f"{n} {word.replace('_', ' ')}" for word, n in counts.items())
     text = (
-        f"{asked.scene.name}, {len(status)} theta: {said}\n"
+        f"{asked.scene.name}, {samples} theta: {said}\n"
         f"{solved} solved now in {seconds:.0f} s, written to {arguments.out}"
     )
     emit(result, as_json=arguments.json, text=text)

@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
         _refuse_idle(plan, given, arguments.budget)
     campaign = None
     if arguments.campaign:
-        from emulator.fem.campaign.stored_runs import read_runs
+        from emulator.fem.campaign.store import read_runs
 
         campaign = read_runs(arguments.campaign, scene)
         if "simulations" not in given:

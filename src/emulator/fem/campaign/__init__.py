@@ -1,27 +1,35 @@
 """FEM at many theta: the one loop over solves, in this process or on a Dask cluster.
 
-A design of theta becomes tasks (:mod:`.row`), each with displacements to start from
-(:mod:`.starts`). An executor solves them, several at once (:mod:`.threads`, :mod:`.engine`,
-:mod:`.cluster`), and hands back rows as they are finished, which are kept in memory
-(:mod:`.memory`) or in a Zarr store (:mod:`.zarr_rows`). Zarr and Dask are imported only by who asks
-for them.
+A design of theta (:mod:`.designs`) becomes tasks, each with displacements to start from
+(:mod:`.campaign`). An executor solves them, several at once (:mod:`.workers`, :mod:`.cluster`), and
+returns rows as they are finished, which are kept in memory or in a Zarr store (:mod:`.store`). Zarr
+and Dask are imported only with the modules that need them.
 """
 
-from emulator.fem.campaign.engine import (
-    Executor,
-    Solver,
-    in_process,
+from emulator.fem.campaign.campaign import (
+    Field,
+    Neighbours,
+    Predictor,
+    Runs,
+    StoredRuns,
+    executor,
+    run_campaign,
     solve_rows,
     solve_together,
 )
-from emulator.fem.campaign.place import executor
-from emulator.fem.campaign.row import Row, Task
-from emulator.fem.campaign.runs import Runs, StoredRuns, run_campaign
-from emulator.fem.campaign.starts import Neighbours, Predictor
-from emulator.fem.campaign.threads import at_once, in_order
+from emulator.fem.campaign.workers import (
+    Executor,
+    Row,
+    Solver,
+    Task,
+    at_once,
+    in_order,
+    in_process,
+)
 
 __all__ = [
     "Executor",
+    "Field",
     "Neighbours",
     "Predictor",
     "Row",

@@ -2,8 +2,8 @@
 
 The scene goes to every worker once, also to one that starts later, and each worker keeps its
 compiled programs. It solves one theta at a time, whatever its number of threads. This process
-keeps two tasks a worker under way and does all the writing, so that a task has the start that is
-best by then, and a row whose worker was killed is solved again by another and written once.
+keeps two tasks a worker pending and does all the writing, so that a task has the best start known
+when it is taken, and a row whose worker was killed is solved again by another and written once.
 
 Dask sends Python objects between its processes as pickles: client, scheduler and workers must
 trust each other. Nothing is read from files that way.
@@ -20,13 +20,13 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from itertools import islice
 from typing import Any, cast
 
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
-from emulator.fem.campaign.engine import Solver
-from emulator.fem.campaign.row import Row, Task
+from emulator.fem.campaign.workers import Row, Solver, Task
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 
@@ -42,21 +42,21 @@ CONNECT_S = 10.0
 """Seconds in which the scheduler must answer."""
 WORKERS_S = 60.0
 """Seconds after which a campaign without any worker ends."""
-_LOOK_S = 2.0  # between two looks at whether workers are there
-_UNDER_WAY = 2  # tasks a worker: one being solved, one waiting there
+_POLL_S = 2.0  # between two checks that there are workers
+_TASKS_A_WORKER = 2  # one being solved, one waiting on the worker
 _ADDRESS = re.compile(r"(tcp|tls|ucx|ws|wss)://[^/\s]+:\d+")
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """An executor: solves on the workers of a connected client; :func:`connected` makes it."""
+    """An executor that solves on the workers of a connected client; see :func:`connected`."""
 
     client: Client
     address: str
-    _sent: dict[Solver, str] = field(default_factory=dict)
+    _names: dict[Solver, str] = field(default_factory=dict)
 
     def __call__(self, solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
-        """Rows as they come back.
+        """Yield rows in the order in which they come back.
 
         Raises
         ------
@@ -70,28 +70,29 @@ class Cluster:
             raise self._gone(error) from error
 
     def _name(self, solver: Solver) -> str:
-        """The name that workers know ``solver`` by; they are sent it once."""
-        if solver not in self._sent:
+        """Return the name by which workers know ``solver``; send it to them once."""
+        if solver not in self._names:
             name = f"campaign-{uuid.uuid4().hex}"
-            self.client.register_plugin(Bench(solver), name=name)
-            self._sent[solver] = name
-        return self._sent[solver]
+            self.client.register_plugin(SolverPlugin(solver), name=name)
+            self._names[solver] = name
+        return self._names[solver]
 
     def _rows(self, name: str, tasks: Iterator[Task]) -> Iterator[Row]:
-        under_way: dict[Future, int] = {}
+        pending: dict[Future, int] = {}
         deadly: list[int] = []
         while True:
-            for task in _some(tasks, _UNDER_WAY * self._workers() - len(under_way)):
+            room = max(0, _TASKS_A_WORKER * self._workers() - len(pending))
+            for task in islice(tasks, room):
                 future = self.client.submit(_solve, name, _as_numpy(task), pure=False)
-                under_way[future] = task.number
-            if not under_way:
+                pending[future] = task.number
+            if not pending:
                 break
-            for future in self._finished(under_way):
+            for future in self._finished(pending):
                 try:
                     row = _result(future)
-                except TimeoutError:  # it went with its worker, and is solved again
+                except TimeoutError:  # its worker was lost, and Dask solves it again
                     continue
-                number = under_way.pop(future)
+                number = pending.pop(future)
                 if row is None:
                     deadly.append(number)
                 else:
@@ -103,7 +104,7 @@ class Cluster:
             )
 
     def _workers(self) -> int:
-        """Number of workers; waits for the first."""
+        """Return the number of workers; wait for the first."""
         began = time.monotonic()
         while True:
             count = self._count()
@@ -115,15 +116,15 @@ class Cluster:
                 )
             time.sleep(0.2)
 
-    def _finished(self, under_way: dict[Future, int]) -> list[Future]:
-        """The futures that are done, at least one of them; watches over the workers meanwhile."""
+    def _finished(self, pending: dict[Future, int]) -> list[Future]:
+        """Wait until a future is done, checking that there are workers; return all that are."""
         while True:
             try:
                 with self.client.as_current():
-                    wait(list(under_way), timeout=_LOOK_S, return_when="FIRST_COMPLETED")
+                    wait(list(pending), timeout=_POLL_S, return_when="FIRST_COMPLETED")
             except TimeoutError:
                 self._workers()
-            done = [future for future in under_way if future.done()]
+            done = [future for future in pending if future.done()]
             if done:
                 return done
 
@@ -138,16 +139,16 @@ class Cluster:
         return SolverError(f"campaign: the scheduler {self.address} does not answer ({said})")
 
     def forget(self) -> None:
-        """Let the workers forget the scenes, where there still are any."""
-        for name in self._sent.values():
+        """Let the workers that are still there forget the solvers."""
+        for name in self._names.values():
             with suppress(OSError, CancelledError, RuntimeError, ValueError, KeyError):
                 self.client.unregister_worker_plugin(name)
-        self._sent.clear()
+        self._names.clear()
 
 
 @contextmanager
 def connected(address: str, *, within: float | None = None) -> Iterator[Cluster]:
-    """A cluster whose scheduler is at ``address``.
+    """Yield a cluster whose scheduler is at ``address``.
 
     Raises
     ------
@@ -171,17 +172,16 @@ def connected(address: str, *, within: float | None = None) -> Iterator[Cluster]
 
 
 def check_address(address: str) -> None:
-    """:class:`InputError` unless ``address`` looks like a scheduler's."""
+    """:class:`InputError` unless ``address`` looks like the address of a scheduler."""
     if not _ADDRESS.fullmatch(address):
         raise InputError(f"scheduler '{address}' is no address; give e.g. tcp://127.0.0.1:8786")
 
 
-class Bench(WorkerPlugin):
-    """What a worker needs to solve tasks, sent to it once."""
+class SolverPlugin(WorkerPlugin):
+    """A solver as it is sent to a worker, once: its scene and options, without cached arrays."""
 
     def __init__(self, solver: Solver) -> None:
         scene = solver.simulator.scene
-        # What a scene has cached stays behind.
         self._scene = {field.name: getattr(scene, field.name) for field in fields(Scene)}
         self._fingerprint = scene.fingerprint
         self._newton = solver.simulator.options
@@ -190,11 +190,11 @@ class Bench(WorkerPlugin):
         self._options = {name: v for name, v in options.items() if name != "simulator"}
 
     def setup(self, worker: Any) -> None:  # noqa: ARG002 - Dask's interface
-        """Called on each worker."""
+        """Prepare each worker; Dask calls this."""
         self._lock = threading.Lock()
 
     def solve(self, task: Task) -> Row:
-        """The row of ``task``, with NumPy arrays."""
+        """Return the row of ``task``, with NumPy arrays."""
         with self._lock:
             return self._solver(task).as_numpy()
 
@@ -209,15 +209,14 @@ class Bench(WorkerPlugin):
 
 
 def _solve(name: str, task: Task) -> Row:
-    """Run on a worker."""
-    bench = cast(Bench, get_worker().plugins[name])
-    return bench.solve(task)
+    """Solve a task; a worker runs this."""
+    return cast(SolverPlugin, get_worker().plugins[name]).solve(task)
 
 
 def _result(future: Future) -> Row | None:
-    """The row, or None where its theta killed workers."""
+    """Return the row, or None where its theta killed workers."""
     try:
-        return future.result(timeout=_LOOK_S)
+        return future.result(timeout=_POLL_S)
     except KilledWorker:
         return None
 
@@ -225,8 +224,3 @@ def _result(future: Future) -> Row | None:
 def _as_numpy(task: Task) -> Task:
     starts = tuple(np.asarray(start) for start in task.starts)
     return Task(task.number, np.asarray(task.theta), starts)
-
-
-def _some(tasks: Iterator[Task], count: int) -> Iterator[Task]:
-    for _, task in zip(range(count), tasks, strict=False):
-        yield task

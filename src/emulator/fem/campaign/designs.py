@@ -1,25 +1,31 @@
-"""Sets of theta in the parameter box, for training and testing."""
+"""Sets of theta: designs in the parameter box, and test points with their reference solutions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.core.progress import counting
+from emulator.fem.campaign.campaign import Field, Neighbours, run_campaign, solve_rows
+from emulator.fem.campaign.workers import Solver
+from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 
+TEST_SEED = 90_210  # separate test points: training and reduced models use small seeds
 _CORNER_EVERY = 5  # every fifth theta of a design is a corner of the box
 _MOST_CORNERED = 6  # parameters; the box of more has too many corners, and none is used
 
 
 def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
-    """``count`` theta (count, p) of a scrambled Sobol sequence over the box, on its scales."""
+    """Return ``count`` theta (count, p) of a scrambled Sobol sequence over the box's scales."""
     _check(count, seed)
-    from scipy.stats import qmc  # half a second, which a solve needs not wait for
+    from scipy.stats import qmc  # importing takes half a second, which a single solve does not need
 
     bits = max(count - 1, 1).bit_length()
     points = qmc.Sobol(len(scene.parameters), rng=seed).random_base2(bits)[:count]
@@ -27,7 +33,7 @@ def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
 
 
 def latin_hypercube(scene: Scene, count: int, seed: int) -> jax.Array:
-    """``count`` theta (count, p) of a Latin hypercube over the box, on its scales.
+    """Return ``count`` theta (count, p) of a Latin hypercube over the box, on its scales.
 
     Each parameter is spread evenly by itself; a shorter design is not part of a longer one.
     """
@@ -39,12 +45,12 @@ def latin_hypercube(scene: Scene, count: int, seed: int) -> jax.Array:
 
 
 def uniform(scene: Scene, count: int, key: jax.Array) -> jax.Array:
-    """``count`` independent theta (count, p), uniform over the box on its scales."""
+    """Return ``count`` independent theta (count, p), uniform over the box on its scales."""
     return scene.from_unit(jax.random.uniform(key, (count, len(scene.parameters))))
 
 
 def design(scene: Scene, count: int, seed: int) -> jax.Array:
-    """``count`` theta (count, p) for FEM runs: a Sobol sequence, and with it the box's corners.
+    """Return ``count`` theta (count, p) for FEM runs: a Sobol sequence and the box's corners.
 
     A surrogate is worst at the corners, which a Sobol sequence does not reach (docs/experiments.md,
     "When k-hat cries wolf"). Every fifth theta is a corner, in random order, until all are used;
@@ -52,15 +58,15 @@ def design(scene: Scene, count: int, seed: int) -> jax.Array:
     """
     whole = sobol(scene, count, seed)
     parameters = len(scene.parameters)
-    ends = np.zeros((0, parameters))
+    corners = np.zeros((0, parameters))
     if parameters <= _MOST_CORNERED:
-        ends = np.array(list(product((0.0, 1.0), repeat=parameters)))
-        ends = np.random.default_rng(seed).permutation(ends)[: count // _CORNER_EVERY]
+        corners = np.array(list(product((0.0, 1.0), repeat=parameters)))
+        corners = np.random.default_rng(seed).permutation(corners)[: count // _CORNER_EVERY]
     inside = np.asarray(scene.to_unit(whole))
-    places = _CORNER_EVERY * np.arange(1, len(ends) + 1) - 1
+    rows = _CORNER_EVERY * np.arange(1, len(corners) + 1) - 1
     positions = np.zeros((count, parameters))
-    positions[places] = ends
-    positions[np.setdiff1d(np.arange(count), places)] = inside[: count - len(ends)]
+    positions[rows] = corners
+    positions[np.setdiff1d(np.arange(count), rows)] = inside[: count - len(corners)]
     return scene.from_unit(jnp.asarray(positions))
 
 
@@ -69,7 +75,7 @@ DESIGNS: dict[str, Callable[[Scene, int, int], jax.Array]] = {
     "latin_hypercube": latin_hypercube,
     "sobol_corners": design,
 }
-"""Designs of a campaign by name; the last is the one that emulators are trained on."""
+"""Designs of a campaign by name; emulators are trained on the last."""
 
 
 def _check(count: int, seed: int) -> None:
@@ -77,3 +83,89 @@ def _check(count: int, seed: int) -> None:
         raise InputError(
             f"{count} samples with seed {seed} asked for; give 1 or more, seed 0 or more"
         )
+
+
+def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
+    """Return theta (cases, p) outside the box, but inside the box widened on both sides.
+
+    Values that law or loads do not admit are left out.
+
+    fraction : by which each side of the box is widened both ways, on its parameter's scale.
+    """
+    if not 0.0 < fraction < np.inf:
+        raise InputError(f"outside is {fraction}; give a fraction above 0, e.g. 0.25")
+    count = 2 * cases
+    for _ in range(12):
+        position = scene.to_unit(sobol(scene, count, TEST_SEED + 1))
+        thetas = scene.from_unit(position * (1.0 + 2.0 * fraction) - fraction)
+        outside = ~np.asarray(scene.space.contains(thetas))
+        admitted = outside & _admissible(scene, np.asarray(thetas))
+        if admitted.sum() >= cases:
+            return thetas[np.flatnonzero(admitted)[:cases]]
+        count *= 2
+    raise InputError(f"outside {fraction:g}: next to nothing there is a value the scene takes")
+
+
+def _admissible(scene: Scene, thetas: np.ndarray) -> np.ndarray:
+    """Whether law, loads and regions admit every entry of each theta (c, p), (c,) bool."""
+    quantities = [scene.quantities[name] for name in scene.parameter_names]
+    return np.array(
+        [
+            all(q.value_fault(float(v)) is None for q, v in zip(quantities, theta, strict=True))
+            for theta in thetas
+        ]
+    )
+
+
+class Reference(NamedTuple):
+    """Reference solutions to evaluate forward maps against.
+
+    thetas : (c, p). displacement : (c, n, 3) mm. source : where the solutions come from.
+    failed : the number of solves without a solution.
+    """
+
+    thetas: jax.Array
+    displacement: jax.Array
+    source: str
+    failed: int = 0
+
+
+def fem_reference(simulator: Simulator, cases: int, *, progress: bool = False) -> Reference:
+    """Solve at ``cases`` theta over the box; :class:`SolverError` when one fails."""
+    runs = run_campaign(simulator, sobol(simulator.scene, cases, TEST_SEED), progress=progress)
+    return Reference(runs.theta, runs.displacement, "our FEM")
+
+
+def outside_reference(
+    simulator: Simulator,
+    cases: int,
+    fraction: float,
+    inside: Reference,
+    *,
+    progress: bool = False,
+) -> Reference:
+    """Solve outside the box, each run started from the nearest solution, or else from rest.
+
+    Runs that do not converge are left out and counted.
+
+    cases, fraction : as for :func:`sample_outside`. inside : solutions to start from.
+    """
+    scene = simulator.scene
+    thetas = jnp.concatenate([inside.thetas, sample_outside(scene, cases, fraction)])
+    solutions = {number: Field(u) for number, u in enumerate(inside.displacement)}
+    results = solve_rows(
+        Solver(simulator),
+        thetas,
+        numbers=range(len(inside.thetas), len(thetas)),
+        starts=Neighbours(scene, thetas, solutions),
+    )
+    rows = []
+    for row in counting(results, "FEM outside", total=cases, disable=not progress, unit="run"):
+        if row.converged:
+            rows.append(row)
+            solutions[row.number] = Field(row.solution.displacement)
+    displacement = jnp.zeros((0, *scene.held.shape))
+    if rows:
+        displacement = jnp.stack([row.solution.displacement for row in rows])
+    numbers = np.array([row.number for row in rows], int)
+    return Reference(thetas[numbers], displacement, "our FEM", cases - len(rows))

@@ -12,7 +12,7 @@ import emulator as em
 from calibrate.analysis.evaluation import Evaluation, run_evaluation
 from calibrate.cli import main
 from emulator.core.errors import InputError
-from emulator.fem.campaign.reference import fem_reference
+from emulator.fem.campaign.designs import fem_reference
 from emulator.surrogates import Emulator, load, save_emulator
 from emulator.surrogates.taylor import constant
 from network_support import untrained

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from emulator.fem import Simulator
-from emulator.fem.campaign import at_once, in_order, run_campaign, threads
+from emulator.fem.campaign import at_once, in_order, run_campaign, workers
 from emulator.fem.campaign.designs import sobol
 
 
@@ -72,18 +72,18 @@ def test_whoever_stops_asking_stops_the_work():
 
 def test_no_more_at_once_than_cores_and_memory(simulator, monkeypatch):
     nodes = len(simulator.scene.mesh.nodes)
-    monkeypatch.setattr(threads, "cores", lambda: 8)
+    monkeypatch.setattr(workers, "cores", lambda: 8)
     assert at_once(simulator) == 8
-    monkeypatch.setattr(threads, "memory", lambda: 6.5e5 * nodes)
+    monkeypatch.setattr(workers, "memory", lambda: 6.5e5 * nodes)
     assert at_once(simulator) == 3
     assert at_once(simulator, nodes=3 * nodes) == 1
     for memory, solves in ((0.0, 1), (float("inf"), 8)):
-        monkeypatch.setattr(threads, "memory", lambda memory=memory: memory)
+        monkeypatch.setattr(workers, "memory", lambda memory=memory: memory)
         assert at_once(simulator) == solves
 
 
 def test_what_keeps_a_factor_or_is_not_fem_is_not_shared(simulator, monkeypatch):
-    monkeypatch.setattr(threads, "cores", lambda: 8)
+    monkeypatch.setattr(workers, "cores", lambda: 8)
     monkeypatch.setattr(type(simulator.system), "stepwise", True)
     assert at_once(simulator) == 1
     assert at_once(object()) == 1
@@ -94,7 +94,7 @@ def test_a_campaign_on_threads_has_the_solutions_of_one_after_the_other(beam, mo
     thetas = sobol(beam, 9, 3)
 
     def solved(cores: int) -> np.ndarray:
-        monkeypatch.setattr(threads, "cores", lambda: cores)
+        monkeypatch.setattr(workers, "cores", lambda: cores)
         return np.asarray(run_campaign(simulator, thetas).displacement)
 
     alone, three = solved(1), solved(3)

@@ -1,0 +1,234 @@
+"""The loop over FEM solves, each started from the solution at the nearest theta so far."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.core.errors import InputError
+from emulator.core.progress import counting
+from emulator.fem.campaign.workers import Executor, Row, Solver, Task, in_process
+from emulator.fem.simulator import Simulator
+from emulator.fem.solution import Solution
+from emulator.scenes.scene import Scene
+
+Starts = Callable[[int], Sequence[Any]]
+"""Maps the number of a theta to the displacements (n, 3) mm from which its solve may start."""
+
+Predictor = Callable[[jax.Array], jax.Array]
+"""Maps a position in the unit box (p,) to a starting displacement (n, 3) mm."""
+
+
+def solve_rows(
+    solver: Solver,
+    thetas: Any,
+    *,
+    numbers: Iterable[int] | None = None,
+    starts: Starts = lambda _: (),
+    execute: Executor = in_process,
+) -> Iterator[Row]:
+    """Solve at every theta (c, p), lazily: few rows are begun before they are asked for.
+
+    Every loop over FEM solves in this package is this one.
+
+    Parameters
+    ----------
+    numbers : the positions of the theta to solve at, in order; all by default.
+    starts : called when a task is taken, so that it may use the rows so far.
+    """
+    chosen = range(len(thetas)) if numbers is None else numbers
+    tasks = (Task(number, thetas[number], tuple(starts(number))) for number in chosen)
+    return execute(solver, tasks)
+
+
+def solve_together(
+    simulator: Simulator, thetas: jax.Array, starts: jax.Array | None = None
+) -> Solution:
+    """Return solutions at every theta (c, p), converged or not; fields gain a leading axis.
+
+    starts : (c, n, 3) mm, the start of each solve; from rest by default.
+    """
+    if starts is not None and len(thetas) != len(starts):
+        raise InputError(f"campaign: {len(thetas)} theta, but {len(starts)} starts")
+    solver = Solver(simulator, from_rest_again=False)
+    one = (lambda _: ()) if starts is None else (lambda number: (starts[number],))
+    solutions = [row.solution for row in solve_rows(solver, np.asarray(thetas), starts=one)]
+    return jax.tree.map(lambda *fields: jnp.stack(fields), *solutions)
+
+
+@contextmanager
+def executor(scheduler: str | None) -> Iterator[Executor]:
+    """Yield the executor of this process, or of the Dask scheduler at the address ``scheduler``.
+
+    Raises
+    ------
+    InputError
+        The address is malformed, or nobody answers there.
+    """
+    if scheduler is None:
+        yield in_process
+        return
+    from emulator.fem.campaign.cluster import connected
+
+    with connected(scheduler) as cluster:
+        yield cluster
+
+
+class Field(NamedTuple):
+    """A converged solution: displacement (n, 3) mm, and sensitivities (p, n, 3) or None."""
+
+    displacement: Any
+    sensitivities: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Proposes starts: the solution at the nearest theta so far, and two extrapolations.
+
+    thetas : (c, p) the whole design.
+    solutions : the converged solutions so far by the number of their theta; grows meanwhile.
+    predictor : proposes another start, or None.
+    """
+
+    scene: Scene
+    thetas: Any
+    solutions: Mapping[int, Field]
+    predictor: Predictor | None = None
+
+    def __call__(self, number: int) -> list[jax.Array]:
+        """Return displacements (n, 3) mm from which the solve of that number may start.
+
+        They are the nearest solution, the same extrapolated along its sensitivities, and the
+        predictor's.
+        """
+        position, starts = self._positions[number], list[jax.Array]()
+        numbers = list(self.solutions)
+        if numbers:
+            steps = position - self._positions[numbers]
+            nearest = int(np.argmin(np.sum(steps**2, axis=1)))
+            starts += self._from(numbers[nearest], steps[nearest])
+        if self.predictor is not None:
+            starts.append(self.predictor(jnp.asarray(position)))
+        return starts
+
+    def _from(self, number: int, step: np.ndarray) -> list[jax.Array]:
+        """Return a solution, and the same extrapolated by ``step`` (p,) in the unit box."""
+        u, slopes = self.solutions[number]
+        if slopes is None:
+            return [u]
+        return [u, u + jnp.tensordot(step * self._rates[number], slopes, axes=1)]
+
+    @cached_property
+    def _positions(self) -> np.ndarray:
+        return np.asarray(self.scene.to_unit(jnp.asarray(self.thetas)))
+
+    @cached_property
+    def _rates(self) -> np.ndarray:
+        return np.asarray(self.scene.space.rates(jnp.asarray(self.thetas)))
+
+
+class Runs(NamedTuple):
+    """Converged FEM solutions.
+
+    theta : (c, p). displacement : (c, n, 3) mm.
+    energy : (c,) mN mm; NaN for a scene whose mesh is the loaded shape.
+    sensitivities : (c, p, n, 3), du/dtheta in mm per unit of each parameter; None unless requested.
+    """
+
+    theta: jax.Array
+    displacement: jax.Array
+    energy: jax.Array
+    sensitivities: jax.Array | None = None
+
+    def take(self, rows: slice | np.ndarray) -> Runs:
+        """Return some of the runs."""
+        sensitivities = None if self.sensitivities is None else self.sensitivities[rows]
+        return Runs(self.theta[rows], self.displacement[rows], self.energy[rows], sensitivities)
+
+    def followed_by(self, later: Runs) -> Runs:
+        """Return these runs and ``later`` ones; with sensitivities where both have them."""
+        slopes = None
+        if self.sensitivities is not None and later.sensitivities is not None:
+            slopes = jnp.concatenate([self.sensitivities, later.sensitivities])
+        return Runs(
+            jnp.concatenate([self.theta, later.theta]),
+            jnp.concatenate([self.displacement, later.displacement]),
+            jnp.concatenate([self.energy, later.energy]),
+            slopes,
+        )
+
+
+class StoredRuns(NamedTuple):
+    """Converged rows of a campaign's store, and a short hash of which rows they are."""
+
+    runs: Runs
+    digest: str
+
+
+def run_campaign(
+    simulator: Simulator,
+    thetas: jax.Array,
+    *,
+    sensitivities: bool = False,
+    predictor: Predictor | None = None,
+    deadline: float = np.inf,
+    at_least: int = 1,
+    progress: bool = False,
+    execute: Executor = in_process,
+) -> Runs:
+    """Solve at every theta (c, p).
+
+    Each run starts from the solution at the nearest theta so far, from that solution extrapolated
+    along its sensitivities, or from ``predictor``: whichever has the smallest residual. If that
+    start fails, the run starts again from rest.
+
+    Parameters
+    ----------
+    sensitivities : compute du/dtheta too, from each run's own factor: a tenth of the run's time on
+        a ventricle with five parameters.
+    deadline : value of ``time.perf_counter`` after which only the first ``at_least`` runs begin.
+
+    Raises
+    ------
+    SolverError
+        A solve failed; the message names the run and the reason.
+    """
+    # A scene whose mesh is the loaded shape has another shape at rest, and another potential, at
+    # every theta.
+    solver = Solver(simulator, sensitivities=sensitivities, energy=not simulator.scene.loaded_by)
+    solutions: dict[int, Field] = {}
+    results = solve_rows(
+        solver,
+        thetas,
+        numbers=_until(deadline, len(thetas), at_least),
+        starts=Neighbours(simulator.scene, thetas, solutions, predictor),
+        execute=execute,
+    )
+    rows = list[Row]()
+    for row in counting(results, "FEM", total=len(thetas), disable=not progress, unit="run"):
+        row.solution.require_converged(f"FEM run {row.number}")
+        rows.append(row)
+        solutions[row.number] = Field(row.solution.displacement, row.sensitivities)
+    rows.sort(key=lambda row: row.number)
+    return Runs(
+        jnp.stack([jnp.asarray(row.theta) for row in rows]),
+        jnp.stack([row.solution.displacement for row in rows]),
+        jnp.stack([row.energy for row in rows]),
+        jnp.stack([row.sensitivities for row in rows]) if sensitivities else None,
+    )
+
+
+def _until(deadline: float, count: int, at_least: int) -> Iterator[int]:
+    """Yield numbers up to ``count``; after the deadline, up to ``at_least``."""
+    for number in range(count):
+        if number >= at_least and time.perf_counter() > deadline:
+            return
+        yield number

@@ -1,0 +1,203 @@
+"""One solve of a campaign, and the threads of this process that do many.
+
+A solve is one compiled program, which does not hold Python's lock, and CHOLMOD's factorisation uses
+one core. Two solves on two cores take 0.56 of the time of one after the other on a ventricle of
+4627 nodes, 0.61 at 33 605 (docs/experiments.md, "Two solves at once").
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.core.errors import SolverError
+from emulator.core.machine import cores, inherited, memory
+from emulator.fem.balance import relative_residual
+from emulator.fem.energy import potential_energy, volume_ratio
+from emulator.fem.linear.suitesparse import FACTORS
+from emulator.fem.simulator import Simulator
+from emulator.fem.solution import Solution, Status
+
+_BYTES_A_NODE = 100_000  # of one more solve at the same time; 54 000 measured at 33 605 nodes
+_MEMORY_SHARE = 0.5  # of the machine's memory that solves may take
+
+
+# ---- one solve -----------------------------------------------------------------------------------
+class Task(NamedTuple):
+    """One solve to do.
+
+    number : the position of theta in its design. theta : (p,).
+    starts : displacements (n, 3) mm to choose a start from; none for the start at rest.
+    """
+
+    number: int
+    theta: Any
+    starts: tuple[Any, ...] = ()
+
+
+class Row(NamedTuple):
+    """The result of one solve.
+
+    number : the position of theta in its design. theta : (p,).
+    energy : mN mm; NaN unless requested and converged.
+    sensitivities : (p, n, 3), du/dtheta in mm per unit of each parameter, NaN where not converged;
+        None unless requested.
+    seconds : wall time.
+    """
+
+    number: int
+    theta: Any
+    solution: Solution
+    energy: Any
+    sensitivities: Any
+    seconds: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solve converged."""
+        return bool(self.solution.converged)
+
+    def as_numpy(self) -> Row:
+        """Return the row with NumPy arrays, to send and to store."""
+        return jax.tree.map(np.asarray, self)._replace(number=self.number, seconds=self.seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """Solves the tasks of a campaign; compiled programs and the last factors are kept between them.
+
+    Parameters
+    ----------
+    sensitivities : compute du/dtheta too, from each solve's own factor: a tenth of its time on a
+        ventricle with five parameters.
+    energy : compute the potential energy; :class:`InputError` for a scene without one.
+    from_rest_again : solve a second time, from rest, where a start fails.
+    """
+
+    simulator: Simulator
+    sensitivities: bool = False
+    energy: bool = False
+    from_rest_again: bool = True
+
+    def __post_init__(self) -> None:
+        if self.energy:
+            self._energy  # noqa: B018 - a scene without one is refused before the first solve
+
+    def __call__(self, task: Task) -> Row:
+        """Return the row of ``task``; a solve that fails is a row with that status."""
+        began, theta = time.perf_counter(), jnp.asarray(task.theta)
+        solution = self.simulator.solve(theta, self._start(task.starts, theta))
+        if task.starts and self.from_rest_again and not solution.converged:
+            solution = self.simulator.solve(theta)
+        energy = jnp.asarray(jnp.nan)
+        if self.energy and solution.converged:
+            energy = self._energy(solution.displacement, theta)
+        solution, slopes = (
+            self._with_slopes(solution, theta) if self.sensitivities else (solution, None)
+        )
+        return Row(task.number, theta, solution, energy, slopes, time.perf_counter() - began)
+
+    def _with_slopes(self, solution: Solution, theta: jax.Array) -> tuple[Solution, jax.Array]:
+        """Return the solution and du/dtheta; a singular tangent is a failed solve."""
+        missing = jnp.full((len(theta), *solution.displacement.shape), jnp.nan)
+        if not solution.converged:
+            return solution, missing
+        try:
+            slopes = self.simulator.sensitivities(solution.displacement, theta)
+            return solution, jax.block_until_ready(slopes)
+        except SolverError:
+            return solution._replace(status=jnp.asarray(Status.SINGULAR_TANGENT)), missing
+
+    def _start(self, starts: Sequence[Any], theta: jax.Array) -> jax.Array | None:
+        """Return the start with the smallest residual; None for the start at rest.
+
+        The last start where the shape at rest, and so the residual, is not known yet.
+        """
+        if self.simulator.scene.loaded_by:
+            starts = starts[-1:]
+        if len(starts) > 1:
+            return self._best(jnp.stack([jnp.asarray(start) for start in starts]), theta)
+        return jnp.asarray(starts[0]) if starts else None
+
+    @cached_property
+    def _energy(self):  # noqa: ANN202 - a compiled program, private
+        return jax.jit(potential_energy(self.simulator.scene))
+
+    @cached_property
+    def _best(self):  # noqa: ANN202
+        """Program that picks the start with the smallest residual among several (s, n, 3)."""
+        simulator = self.simulator
+
+        @jax.jit
+        def choose(starts: jax.Array, theta: jax.Array) -> jax.Array:
+            def residual(u: jax.Array) -> jax.Array:
+                error = relative_residual(simulator.system, u, theta)
+                valid = jnp.isfinite(error) & (jnp.min(volume_ratio(simulator.scene, u)) > 0.0)
+                return jnp.where(valid, error, jnp.inf)
+
+            return starts[jnp.argmin(jax.lax.map(residual, starts))]
+
+        return choose
+
+
+# ---- many solves ---------------------------------------------------------------------------------
+Executor = Callable[[Solver, Iterator[Task]], Iterator[Row]]
+"""Solves tasks and yields rows as they are finished, taking a task when it can begin it."""
+
+
+def in_process(solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
+    """Solve in this process: as many tasks at once as it has cores and memory for."""
+    return in_order(solver, tasks, at_once(solver.simulator))
+
+
+def at_once(simulator: Simulator, nodes: int | None = None) -> int:
+    """Return the number of solves that this machine does at once, one for each core and its memory.
+
+    It is 1 on large meshes, where a factor is kept between solves or Python calls the solver, and
+    for a simulator of another class: only FEM simulators of this package are known to be
+    thread-safe.
+
+    nodes : the number of nodes of the mesh that is solved on; by default the simulator's.
+    """
+    if not isinstance(simulator, Simulator) or simulator.stepwise:
+        return 1
+    each = _BYTES_A_NODE * (nodes or len(simulator.scene.mesh.nodes))
+    return max(1, int(min(cores(), _MEMORY_SHARE * memory() / each)))
+
+
+def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Iterator[R]:
+    """Yield ``function`` of every task, in the order of the tasks, by ``workers`` threads.
+
+    The first task is done alone: the others use what it compiles. After it, a task is taken when
+    all but ``workers`` of the results before it have been yielded. So what a task is made of, such
+    as a start from earlier rows, does not depend on which thread was quicker. While the threads
+    work, as many factors are kept as there are threads.
+    """
+    for task in tasks:
+        yield function(task)
+        break
+    if workers == 1:
+        yield from map(function, tasks)
+        return
+    pending: deque[Future[R]] = deque()
+    on_thread = inherited(function)
+    pool = ThreadPoolExecutor(workers)
+    with FACTORS.keep(workers):
+        try:
+            for task in tasks:
+                pending.append(pool.submit(on_thread, task))
+                if len(pending) > workers:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
