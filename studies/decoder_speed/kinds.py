@@ -14,8 +14,8 @@ from studies.common.timing import milliseconds, per_call
 import calibrate as cal
 import emulator as em
 from calibrate.measurements import parse_observation
-from calibrate.samplers.blackjax_nuts import BlackJAXNUTSOptions
 from calibrate.samplers.density import density_of
+from calibrate.samplers.nuts import BlackJAXNUTSOptions
 from calibrate.statistical_model import Data, Model
 
 SCENE = "left_ventricle"

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from studies.fem_posterior.methods import LATE, Weighed
 
-from calibrate.certificate.moments import jackknife, moments
-from calibrate.samplers.importance import effective, normalised
+from calibrate.certificate.estimates import jackknife, moments
+from calibrate.samplers.diagnostics import effective, normalised
 
 MOMENTS = ("mean", "mean_error", "sd", "sd_error")
 

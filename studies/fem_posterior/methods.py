@@ -13,9 +13,9 @@ from studies.fem_posterior.problems import Problem
 import calibrate as cal
 from calibrate.posterior import Posterior
 from calibrate.samplers import density_of, named_draws, transport
+from calibrate.samplers.chains import compile_chains
 from calibrate.samplers.delayed_acceptance import DelayedAcceptanceOptions
 from calibrate.samplers.nuts import NUTS, NUTSOptions
-from calibrate.samplers.run import compile_chains
 from calibrate.statistical_model import FEMLikelihood
 
 AXES = {"chain_axis": 0, "draw_axis": 1}

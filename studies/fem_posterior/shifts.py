@@ -20,8 +20,8 @@ from studies.fem_posterior.problems import Problem
 import calibrate as cal
 from calibrate.certificate import examine
 from calibrate.certificate.check import Check
-from calibrate.certificate.moments import jackknife, moments
-from calibrate.samplers.importance import normalised
+from calibrate.certificate.estimates import jackknife, moments
+from calibrate.samplers.diagnostics import normalised
 from calibrate.samplers.nuts import NUTSOptions
 
 SHIFT = "shift, less FEM's change"

@@ -22,7 +22,9 @@ from studies.sheep_myocardium.experiment import Heart
 from studies.sheep_myocardium.inference import Found, parameters
 from studies.sheep_myocardium.solver import FINER
 
-from calibrate.certificate.evidence import (
+from calibrate.certificate.estimates import jackknife, moments
+from calibrate.certificate.verdict import (
+    Certificate,
     Changes,
     Evidence,
     Figure,
@@ -30,10 +32,9 @@ from calibrate.certificate.evidence import (
     Physics,
     Sampling,
     Tail,
+    judge,
 )
-from calibrate.certificate.moments import jackknife, moments
-from calibrate.certificate.verdict import Certificate, judge
-from calibrate.samplers.importance import pareto_shape
+from calibrate.samplers.diagnostics import pareto_shape
 
 _LEFT = 0.3  # of the mesh's correction
 _MOST = 3  # sets of tests of one posterior

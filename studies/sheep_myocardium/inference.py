@@ -34,7 +34,7 @@ from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.moves import EXPLORING, Modes, joined, modes, unknown
 
-from calibrate.samplers.stopping import least_ess, r_hat
+from calibrate.samplers.diagnostics import least_ess, r_hat
 from calibrate.statistical_model.curve import curve_covariance
 
 CELL = 3e-3  # N, noise of the load cell

@@ -23,7 +23,7 @@ from studies.sheep_myocardium.chains import by_chain, marked, sampler, side_by_s
 from studies.sheep_myocardium.inference import ANGLE_SD, Seen, log_likelihoods, means, seen
 from studies.sheep_myocardium.moves import unknown
 
-from calibrate.samplers.stopping import least_ess, r_hat
+from calibrate.samplers.diagnostics import least_ess, r_hat
 
 NAMES = (*(p.name for p in cube.MATERIAL), "omega")
 _CENTRE = np.log([0.5, 8.0, 0.8, 8.0, 0.8, 8.0, 0.3, 8.0, 0.25])

@@ -4,8 +4,7 @@
 rest on :func:`examine`, which solves FEM a fixed number of times.
 """
 
-from calibrate.certificate.check import Check, certify, examine
-from calibrate.certificate.reweight import reweight
+from calibrate.certificate.check import Check, certify, examine, reweight
 from calibrate.certificate.verdict import Certificate, Verdict, judge
 
 __all__ = ["Certificate", "Check", "Verdict", "certify", "examine", "judge", "reweight"]

@@ -1,62 +1,44 @@
-r"""A check against FEM with a fixed number of solves.
+r"""A check of a posterior against FEM with a fixed number of solves.
 
-1. **Train.** FEM at draws of the posterior, evenly spaced, around them, at draws of the prior, and
-   where descents of its own misfit lead from those (:mod:`calibrate.certificate.descents`).
-   What the map misses there is learned (:mod:`calibrate.certificate.correction`), and a pool of
-   cheap points follows the corrected map's posterior wherever it leads
-   (:mod:`calibrate.certificate.pool`). Further runs, in rounds, go where the correction is so
-   uncertain that FEM may find the data likely after all.
-2. **Test.** The other runs are fresh points :math:`z_j` of the pool, drawn with probabilities
+1. **Train.** FEM is solved at draws of the posterior, evenly spaced, around them, at draws of the
+   prior, and along descents of its own misfit (:mod:`calibrate.certificate.runs`). A correction of
+   the map is fitted to these runs (:mod:`calibrate.certificate.predictive`), and a pool of cheap
+   points follows the corrected map's posterior (:mod:`calibrate.certificate.pool`). Further runs,
+   in rounds, go where the correction is so uncertain that FEM may find the data likely after all.
+2. **Test.** The other runs are at fresh points :math:`z_j` of the pool, drawn with probabilities
    :math:`a_j` that mix the corrected posterior, the draws' smoothed density, where FEM may find the
-   data likely, what surrounds the draws, and the whole pool (defensive mixture; Hesterberg 1995).
-   A moment under FEM is the corrected map's over the pool, plus what FEM changes of it at these
+   data likely, the surroundings of the draws, and the whole pool (defensive mixture; Hesterberg
+   1995). A moment under FEM is the corrected map's over the pool, plus FEM's change of it at these
    points (a control variate; Owen and Zhou 2000):
 
    .. math:: \hat\theta_\text{FEM} = \hat\theta_\text{pool} +
        \hat\theta\{\pi_\text{FEM} / (q a)\} - \hat\theta\{\pi_\text{corrected} / (q a)\}
 
-Given the first half, the second is independent draws from a known density: the errors are
-honest however good or bad the correction is, and small where it is good.
+Given the training runs, the tests are independent draws from a known density: the errors are honest
+however good or bad the correction is, and small where it is good.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from itertools import pairwise
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibrate.certificate.correction import Correction
-from calibrate.certificate.descents import descend
-from calibrate.certificate.estimates import (
-    Tests,
-    figures_of,
-    missed_by,
-    physics_of,
-    sampling_of,
-    tail_of,
-)
-from calibrate.certificate.evidence import Evidence
+from calibrate.certificate.estimates import Tests, evidence_of
 from calibrate.certificate.mesh import MOST_RUNS, mesh_change
-from calibrate.certificate.misfit import DRAWS, misfits
-from calibrate.certificate.pool import (
-    MOST_TEMPERED,
-    Pool,
-    around_draws,
-    corrected_again,
-    polish,
-    redrawn,
-    search,
-    step,
-    tempered,
-)
-from calibrate.certificate.predictive import Predictive
-from calibrate.certificate.runs import Runs, Solver, correction_from, joined
+from calibrate.certificate.pool import MOST_TEMPERED, Kernels, Pool, key_from, tempered
+from calibrate.certificate.predictive import Correction, Predictive
+from calibrate.certificate.runs import Ends, Runs, Solver, correction_from, descend
 from calibrate.certificate.verdict import Certificate, judge
 from calibrate.posterior import Posterior
-from calibrate.samplers.importance import effective, normalised
+from calibrate.posterior.tree import make_tree
+from calibrate.samplers.diagnostics import effective, normalised
+from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 from calibrate.samplers.registry import SAMPLERS
 from calibrate.statistical_model import FEMLikelihood
 from emulator.core.errors import InputError
@@ -68,25 +50,41 @@ _FEM_RUNS = 200
 _FEWEST = 25
 # Shares of the runs that train the correction; the others test it.
 _AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
-_FEWEST_DESCENTS = 16  # runs; fewer end nowhere
-_ROUNDS = 5  # in which the adaptive ones are chosen
-_STABILITY = 20  # draws at which the tangent's sign is asked for
+_FEWEST_DESCENTS = 16  # runs with which descents reach an end
+_ROUNDS = 5  # rounds of adaptive runs
+_STABILITY = 20  # draws at which the sign of the tangent is examined
+_CHAINS = 4  # chains of a reweighted posterior
+_OF_OTHER_DRAWS = (
+    "log_evidence", "log_evidence_error", "pareto_k", "importance_efficiency", MISSED_BY, MISSED_AT,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
     """A certificate and what it was made from.
 
-    posterior : that was checked. pool : cheap points; ``pool.corrected`` are their weights under
-    the corrected map. tests : FEM runs that tested it. correction : what is added to the map.
+    posterior : the posterior that was checked.
+    tests : the FEM runs that tested the correction, and the pool they were drawn from.
     """
 
     certificate: Certificate
     posterior: Posterior
-    predictive: Predictive
-    pool: Pool
     tests: Tests
-    correction: Correction
+
+    @property
+    def pool(self) -> Pool:
+        """Cheap points; ``pool.corrected`` are their weights under the corrected map."""
+        return self.tests.pool
+
+    @property
+    def predictive(self) -> Predictive:
+        """Prior, likelihoods and predictions of the posterior's model."""
+        return self.pool.predictive
+
+    @property
+    def correction(self) -> Correction:
+        """What is added to the map."""
+        return self.pool.correction
 
 
 def examine(
@@ -102,16 +100,18 @@ def examine(
 ) -> Check:
     """Check ``posterior`` with ``draws`` FEM runs, 200 by default.
 
-    at_most : while these leave the verdict undecided, they are doubled, up to so many.
-    mesh : solves on the next finer mesh (:mod:`calibrate.certificate.mesh`): 0 for none, up to 15;
-        by default four more than there are unknowns.
-    scheduler : address of a Dask scheduler whose workers solve; otherwise this process does.
+    Parameters
+    ----------
+    at_most : the number of runs up to which they are doubled while the verdict is undecided.
+    mesh : the number of solves on the next finer mesh (:mod:`calibrate.certificate.mesh`): 0 for
+        none, up to 15; by default four more than there are unknowns.
+    scheduler : the address of a Dask scheduler whose workers solve; by default this process does.
 
     Raises
     ------
     InputError
-        The simulator is for another scene, too few runs are asked for, or fewer at most, FEM has
-        decided on the draws already, or a scheduler does not answer.
+        The simulator is for another scene, the number of runs is too small, or ``at_most`` is below
+        it, the sampler has solved FEM at the draws already, or the scheduler does not answer.
     """
     _refuse_fem_draws(posterior)
     count = _FEM_RUNS if draws is None else draws
@@ -123,7 +123,6 @@ def examine(
     most = count if at_most is None else at_most
     if most < count:
         raise InputError(f"certify: at most {most} FEM runs, but {count} to begin with")
-    sampling = sampling_of(posterior)
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
     # More threads than one for small matrices oversubscribe the cores: twice the time.
@@ -132,34 +131,24 @@ def examine(
         executor(scheduler) as execute,
         counting(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
     ):
-        likelihood = FEMLikelihood(posterior.model, simulator, execute)
-        solver = Solver(predictive, likelihood, bar)
-        begun = _begin(solver, z, count, rng)
-        training, spent = begun.runs, 0
+        solver = Solver(predictive, FEMLikelihood(posterior.model, simulator, execute), bar)
+        at_draws, first = _first_runs(solver, z, count, rng)
+        training, total = first.runs, count
         while True:
-            training, correction, pool = _train(solver, z, begun.ends, training, count, most, rng)
-            tests = _test(solver, pool, spent + count - len(training.z), rng)
-            every = joined([training, tests.runs])
-            spent = len(every.z)
-            figures = figures_of(posterior, predictive, pool, tests)
-            missed = missed_by(predictive, correction, pool, tests, every)
-            chosen = pool.z[resampled(pool, DRAWS, rng)]
-            evidence = Evidence(
-                *figures,
-                sampling,
-                physics_of(begun.at_draws, training, tests, pool),
-                tail_of(pool, tests, missed, len(begun.ends)),
-                misfits(predictive, correction, chosen, _key(rng)),
-            )
-            if judge(evidence).verdict != "undecided" or spent >= most:
+            training, pool = _train(solver, z, Ends(training, first.ends), count, most, rng)
+            rows, log_drawn = pool.tests(total - len(training.z), rng)
+            tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
+            runs = Runs.joined([training, tests.runs])
+            evidence = evidence_of(posterior, at_draws, training, tests, len(first.ends), rng)
+            count = _further_runs(total, most)
+            if judge(evidence).verdict != "undecided" or not count:
                 break
-            # Twice as many altogether; the earlier tests train, and fresh points test.
-            count, training = min(spent, most - spent), every
-            bar.total = spent + count
+            # The earlier tests train the next correction, and fresh points test it.
+            training, total = runs, total + count
+            bar.total = total
         bar.close()
-        change = mesh_change(predictive, simulator, every, pool, mesh, rng, progress=progress)
-    certificate = judge(replace(evidence, mesh=change))
-    return Check(certificate, posterior, predictive, pool, tests, correction)
+        change = mesh_change(pool, simulator, runs, mesh, rng, progress=progress)
+    return Check(judge(replace(evidence, mesh=change)), posterior, tests)
 
 
 def certify(
@@ -173,7 +162,7 @@ def certify(
     scheduler: str | None = None,
     progress: bool = False,
 ) -> Certificate:
-    """The certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200).
+    """Return the certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200).
 
     While they leave the verdict undecided they are doubled, up to ``at_most`` if that is given.
     ``mesh`` is the number of solves on the next finer mesh, 0 for none. ``scheduler`` is the
@@ -200,82 +189,130 @@ def _refuse_fem_draws(posterior: Posterior) -> None:
         )
 
 
-class _Begun(NamedTuple):
-    """FEM where draws, their surroundings, the prior and descents are.
+def _first_runs(
+    solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[Runs, Ends]:
+    """Return FEM at draws, and all runs that any correction needs with the ends of descents.
 
-    at_draws : runs at draws. runs : all of them. ends : points around what else FEM finds likely.
+    The numbers of runs are in proportion to ``count``.
     """
-
-    at_draws: Runs
-    runs: Runs
-    ends: tuple[np.ndarray, ...]
-
-
-def _begin(solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator) -> _Begun:
-    """The runs that any correction needs, their numbers in proportion to ``count``."""
     predictive = solver.predictive
     rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
     at_draws = solver(z[rows], stability=_STABILITY)
     # Next to the draws the map may hide a part of the posterior, by an error that draws of the
     # prior are too far apart to show.
-    wide = solver(around_draws(z, rng).sample(rng, max(round(_AROUND * count), 4)))
-    prior = predictive.prior_draws(_key(rng), max(round(_AT_PRIOR * count), 4))
+    surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
+    around = solver(surroundings)
+    prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
     at_prior = solver(prior, slopes=True)
     # Where the map hides a mode altogether, only FEM leads to it.
     most = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
-    found = descend(solver, at_prior, at_draws, z, most, rng)
-    return _Begun(at_draws, joined([at_draws, wide, at_prior, found.runs]), found.ends)
+    descents = descend(solver, at_prior, at_draws, z, most, rng)
+    runs = Runs.joined([at_draws, around, at_prior, descents.runs])
+    return at_draws, Ends(runs, descents.ends)
 
 
 def _train(
-    solver: Solver,
-    z: np.ndarray,
-    ends: tuple[np.ndarray, ...],
-    runs: Runs,
-    count: int,
-    most: int,
-    rng: np.random.Generator,
-) -> tuple[Runs, Correction, Pool]:
-    """All training runs, the correction they say, and its pool.
+    solver: Solver, z: np.ndarray, first: Ends, count: int, most: int, rng: np.random.Generator
+) -> tuple[Runs, Pool]:
+    """Return all training runs, and the pool under the correction fitted to them.
 
-    ends : points around what else FEM finds likely. runs : to begin with. most : of runs, ever.
+    Parameters
+    ----------
+    z : the draws (s, p). first : the runs to begin with, and points around further modes of FEM.
+    count : the number of runs, of which adaptive ones are a share.
+    most : the largest number of runs of the whole check.
     """
-    predictive = solver.predictive
+    predictive, runs = solver.predictive, first.runs
     correction = correction_from(runs, predictive, most)
-    pool = search(predictive, correction, z, ends, rng)
-    adaptive = max(round(_ADAPTIVE * count), 1)
-    rounds = min(_ROUNDS, adaptive)
-    for _ in range(rounds):
+    pool = Pool.search(predictive, correction, z, first.ends, rng)
+    for size in _rounds(max(round(_ADAPTIVE * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
-            size = round(adaptive / rounds)
             chosen = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
-            runs = joined([runs, solver(chosen)])
-        correction = correction_from(runs, predictive, most)
-        pool = corrected_again(pool, predictive, correction)
+            runs = Runs.joined([runs, solver(chosen)])
+        pool = pool.corrected_by(correction_from(runs, predictive, most))
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
-            pool = step(pool, predictive, correction, pool.log_explored, rng)
-    pool = polish(pool, predictive, correction, rng)
-    return runs, correction, redrawn(pool, predictive, correction, rng)
+            pool = pool.stepped(pool.log_explored, rng)
+    return runs, pool.polished(rng).redrawn(rng)
 
 
-def _test(solver: Solver, pool: Pool, count: int, rng: np.random.Generator) -> Tests:
-    """FEM at fresh points of the pool, with the log density they were drawn from."""
-    log_chances = pool.log_chances
-    chances = np.exp(log_chances)
-    rows = rng.choice(len(chances), size=count, p=chances / chances.sum())
-    return Tests(solver(pool.z[rows]), rows, (pool.log_mixture + log_chances)[rows])
+def _rounds(count: int) -> list[int]:
+    """Return the numbers of adaptive runs of each round, which add up to ``count``."""
+    rounds = min(_ROUNDS, count)
+    edges = [round(count * k / rounds) for k in range(rounds + 1)]
+    return [end - start for start, end in pairwise(edges)]
 
 
-def resampled(pool: Pool, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Rows (count,) of the pool as draws of the corrected map's posterior, in random order.
+def _further_runs(total: int, most: int) -> int:
+    """Return how many runs follow ``total``: as many again, if the limit allows, or none.
 
-    Systematic resampling: each row comes as often as its weight says, up to one.
+    A remainder that is too small for a pass of its own is added to the last pass.
     """
-    edges = np.cumsum(pool.corrected)
-    at = (np.arange(count) + rng.uniform()) / count * edges[-1]
-    return rng.permutation(np.minimum(np.searchsorted(edges, at), len(edges) - 1))
+    count = min(total, most - total)
+    if most - total - count < _FEWEST:
+        count = most - total
+    return count if count >= _FEWEST else 0
 
 
-def _key(rng: np.random.Generator) -> jax.Array:
-    return jax.random.key(int(rng.integers(2**31)))
+def reweight(
+    posterior: Posterior,
+    simulator: Simulator,
+    *,
+    draws: int | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Posterior:
+    """Return FEM's posterior in place of ``posterior``, checked with ``draws`` FEM runs.
+
+    Raises
+    ------
+    InputError
+        As :func:`calibrate.certify`; or the verdict is neither ``accepted`` nor ``reweight``, so
+        that nothing says the reweighted posterior is FEM's.
+    """
+    check = examine(posterior, simulator, draws=draws, seed=seed, progress=progress)
+    return reweighted(check, seed=seed)
+
+
+def can_reweight(certificate: Certificate) -> bool:
+    """Return whether the reweighted posterior is FEM's, as far as the check can tell."""
+    return certificate.verdict in ("accepted", "reweight")
+
+
+def reweighted(check: Check, *, seed: int = 0) -> Posterior:
+    """Return the corrected map's posterior as 4 chains of independent draws.
+
+    They are resampled from the pool, 1000 draws or as many as the pool has effective points,
+    whichever is less; equal ones occur. Their number and the verdict are in the attributes
+    ``reweighted``. Log likelihoods and replicated data are of the corrected map's data.
+
+    Raises
+    ------
+    InputError
+        The verdict is neither ``accepted`` nor ``reweight``.
+    """
+    verdict = check.certificate.verdict
+    if not can_reweight(check.certificate):
+        raise InputError(
+            f"reweight: the verdict is '{verdict}' ({check.certificate.reason}); a reweighted "
+            "posterior needs 'reweight' or 'accepted'"
+        )
+    pool, predictive, source = check.pool, check.predictive, check.posterior
+    points = effective(pool.corrected)
+    length = int(min(points, 1000.0) // _CHAINS)
+    shape = (_CHAINS, length)
+    rows = pool.resampled(_CHAINS * length, np.random.default_rng([seed, 1]))
+    by_name = predictive.constrain(pool.z[rows])
+    draws = {name: by_name[name].reshape(shape) for name in source.model.names}
+    statistics = {"lp": (pool.at.prior + pool.at.corrected)[rows].reshape(shape)}
+    flat = jnp.asarray(predictive.corrected_means(pool.z[rows], pool.correction))
+    means = jax.tree.map(
+        np.asarray, jax.vmap(jax.vmap(predictive.by_name))(flat.reshape(*shape, -1))
+    )
+    key = jax.random.key(seed)
+    tree = make_tree(source.model, source.data, draws, statistics, key, means)
+    attributes = {n: a for n, a in source.tree.attrs.items() if n not in _OF_OTHER_DRAWS}
+    tree.attrs.update(attributes)
+    tree.attrs["reweighted"] = json.dumps({"verdict": verdict, "effective_points": points})
+    return Posterior(tree, source.model, source.data)

@@ -1,63 +1,168 @@
-"""The figures of a certificate, estimated from the pool and the FEM runs that test it."""
+r"""The evidence of a certificate, estimated from the pool and the FEM runs that test it.
+
+The Monte Carlo error of any figure is the delete-a-group jackknife's,
+
+.. math:: e^2 = \frac{G - 1}{G} \sum_g (\hat\theta_{(g)} - \hat\theta)^2
+
+with every G-th point in a group (Owen 2013, Section 2.7; Wolter 2007). It ignores a tail that no
+point has reached; Pareto :math:`\hat k` watches that.
+
+Whether the data could have come from the model at all is a posterior predictive check. For draws of
+FEM's posterior and data :math:`\tilde y` simulated from each, two discrepancies between data and
+prediction (Gelman, Meng and Stern 1996),
+
+.. math:: T_1(y, \theta) = -\log p(y \mid \theta), \qquad
+    T_2(y, \theta) = \max_j |y_j - \mathrm{E} y_j| / \mathrm{sd}\, y_j
+
+have p-values :math:`P(T(\tilde y, \theta) \ge T(y, \theta))`. With Gaussian noise :math:`T_1` is
+half of chi squared. Near 0 the data lies further from every prediction than the noise allows
+(outliers, a registration error, a wrong law, a noise sd too small), and :math:`T_1` near 1 means
+closer (an sd too large). The check cannot see an error that parameters can absorb, a wrong sd of a
+single number, and a wrong sd where the sd is inferred.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
-from calibrate.certificate.correction import Correction
-from calibrate.certificate.evidence import LARGEST_MASS, Changes, Figure, Physics, Sampling, Tail
-from calibrate.certificate.moments import jackknife, moments
-from calibrate.certificate.pool import Pool, with_guests
-from calibrate.certificate.predictive import Predictive
+from calibrate.certificate.pool import Pool, key_from
+from calibrate.certificate.predictive import Correction, Predictive
 from calibrate.certificate.runs import Runs, least_likely
+from calibrate.certificate.verdict import (
+    LARGEST_MASS,
+    Changes,
+    Evidence,
+    Figure,
+    Physics,
+    Sampling,
+    Tail,
+)
 from calibrate.posterior import Posterior
-from calibrate.samplers.importance import effective, normalised, pareto_shape
+from calibrate.posterior.fit import Misfit, places_of
+from calibrate.samplers.diagnostics import effective, normalised, pareto_shape
 
-_LIKELY = 0.99  # mass of the region that FEM's runs are likely in
-_MISSED = 3.0  # in log likelihood: the corrected map finds a run 20 times less likely than FEM
+GROUPS = 25
+_DRAWS = 1000  # draws of the posterior predictive check
+_LIKELY = 0.99  # mass of the Gaussian at the best run in which FEM finds a run likely
+_MISSED = 3.0  # log likelihood: the corrected map finds a run 20 times less likely than FEM
 # A part of FEM's posterior with this mass is met by a test with this probability.
 _MASS, _MET = 0.1, 0.95
 
 
 @dataclass(frozen=True, eq=False)
 class Tests:
-    """FEM at points of the pool: ``rows`` (n,), drawn from the log density ``log_drawn`` (n,)."""
+    """FEM at points of a pool.
 
+    rows : the points' rows (n,) in the pool.
+    log_drawn : the log density (n,) that the points were drawn from.
+    """
+
+    pool: Pool
     runs: Runs
     rows: np.ndarray
     log_drawn: np.ndarray
 
-    def log_fem(self, pool: Pool) -> np.ndarray:
+    @property
+    def log_fem(self) -> np.ndarray:
         """Log weights (n,) of FEM's posterior."""
-        return pool.at.prior[self.rows] + self.runs.fem - self.log_drawn
+        return self.pool.at.prior[self.rows] + self.runs.fem - self.log_drawn
 
-    def log_corrected(self, pool: Pool) -> np.ndarray:
+    @property
+    def log_corrected(self) -> np.ndarray:
         """Log weights (n,) of the corrected map's posterior."""
-        return pool.at.prior[self.rows] + pool.at.corrected[self.rows] - self.log_drawn
+        at = self.pool.at
+        return at.prior[self.rows] + at.corrected[self.rows] - self.log_drawn
+
+
+def moments(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return means (p,), log sds (p,) and correlations (p (p - 1) / 2,) as one vector.
+
+    Points ``x`` (s, p) with ``weights`` (s,) of any sum; NaN where all weights are zero.
+    """
+    total = weights.sum()
+    if not total > 0.0:
+        p = x.shape[1]
+        return np.full(2 * p + p * (p - 1) // 2, np.nan)
+    share = weights / total
+    mean = share @ x
+    centred = x - mean
+    covariance = (share[:, None] * centred).T @ centred
+    sd = np.sqrt(np.diag(covariance))
+    upper = np.triu_indices(len(sd), 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.concatenate([mean, np.log(sd), covariance[upper] / (sd[upper[0]] * sd[upper[1]])])
+
+
+def jackknife(
+    figures: Callable[[np.ndarray], np.ndarray], count: int, groups: int = GROUPS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``figures`` of all of ``count`` points, and their errors.
+
+    figures : a function of the mask (count,) of the points to use.
+    """
+    groups = min(groups, count)
+    member = np.arange(count) % groups
+    value = figures(np.ones(count, dtype=bool))
+    left_out = np.array([figures(member != g) for g in range(groups)])
+    return value, np.sqrt((groups - 1) / groups * ((left_out - value) ** 2).sum(axis=0))
+
+
+def evidence_of(
+    posterior: Posterior,
+    at_draws: Runs,
+    training: Runs,
+    tests: Tests,
+    ends: int,
+    rng: np.random.Generator,
+) -> Evidence:
+    """Return all figures but those of a finer mesh.
+
+    Parameters
+    ----------
+    at_draws : FEM at draws of the posterior, a part of ``training``.
+    training : the runs that the correction of the pool was fitted to.
+    ends : the number of further modes of FEM that descents have found.
+    """
+    pool, figures = tests.pool, figures_of(posterior, tests)
+    missed = missed_by(tests, Runs.joined([training, tests.runs]))
+    z = pool.z[pool.resampled(_DRAWS, rng)]
+    return Evidence(
+        *figures,
+        sampling_of(posterior),
+        physics_of(at_draws, training, tests),
+        tail_of(tests, missed, ends),
+        misfits(pool.predictive, pool.correction, z, key_from(rng)),
+    )
 
 
 def figures_of(
-    posterior: Posterior, predictive: Predictive, pool: Pool, tests: Tests
+    posterior: Posterior, tests: Tests
 ) -> tuple[Changes, Changes, dict[str, Figure], dict[str, Figure]]:
-    """What FEM changes of the draws and of the corrected posterior; its means and sds."""
-    names = posterior.model.names
-    drawn = posterior.draws()
-    draws = np.stack([drawn[name] for name in names], axis=1)
-    here = predictive.constrain(pool.z)
-    x = np.stack([here[name] for name in names], axis=1)
-    corrected = pool.corrected
-    by_fem, by_map = normalised(tests.log_fem(pool)), normalised(tests.log_corrected(pool))
-    # Whether a point is below each quantile of the draws, and of the corrected posterior.
-    edges = np.hstack([_quantiles(draws, None), _quantiles(x, corrected)]).ravel()
-    below = np.repeat(x, edges.size // x.shape[1], axis=1) <= edges
+    """Return FEM's changes of the draws and of the corrected posterior, and its means and sds."""
+    pool, names = tests.pool, posterior.model.names
+    by_name = posterior.draws()
+    draws = np.stack([by_name[name] for name in names], axis=1)
+    x, corrected = pool.predictive.columns(pool.z), pool.corrected
+    by_fem, by_map = normalised(tests.log_fem), normalised(tests.log_corrected)
+    # Masses are below quantiles of the draws, and of the corrected posterior.
+    edges = np.hstack([_quantiles(draws, None), _quantiles(x, corrected)])
+
+    def below(points: np.ndarray) -> np.ndarray:
+        return np.repeat(points, edges.shape[1], axis=1) <= edges.ravel()
+
+    x_below = below(x)
 
     def figures(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
         share = weights / total if (total := weights.sum()) > 0.0 else weights * np.nan
-        return np.concatenate([moments(x[rows], weights), share @ below[rows]])
+        return np.concatenate([moments(x[rows], weights), share @ x_below[rows]])
 
     def change(used: np.ndarray) -> np.ndarray:
         return figures(tests.rows, by_fem * used) - figures(tests.rows, by_map * used)
@@ -65,45 +170,59 @@ def figures_of(
     every = np.arange(len(x))
     base, base_error = jackknife(lambda used: figures(every, corrected * used), len(x))
     step, step_error = jackknife(change, len(tests.rows))
-    found, error = base + step, np.hypot(base_error, step_error)
-    # The draws' own share: a quantile may be a draw that comes often.
-    here_too = np.repeat(draws, edges.size // x.shape[1], axis=1) <= edges
-    plain = np.concatenate([moments(draws, np.ones(len(draws))), here_too.mean(axis=0)])
-    p = len(names)
-    mean = _named(names, found[:p], error[:p])
-    sd_found = np.exp(found[p : 2 * p])
-    sd = _named(names, sd_found, sd_found * error[p : 2 * p])
-    of_draws = _changes(names, found - plain, error, np.exp(plain[p : 2 * p]), 0)
-    of_corrected = _changes(names, step, step_error, np.exp(base[p : 2 * p]), 1)
-    return of_draws, of_corrected, mean, sd
+    fem, error = base + step, np.hypot(base_error, step_error)
+    # The draws' own mass below their quantiles: a quantile may be a draw that comes often.
+    plain = np.concatenate([moments(draws, np.ones(len(draws))), below(draws).mean(axis=0)])
+    of_draws = _changes(names, fem - plain, error, plain, edges=0)
+    of_corrected = _changes(names, step, step_error, base, edges=1)
+    mean, log_sd, _, _ = _parts(fem, len(names))
+    mean_error, log_sd_error, _, _ = _parts(error, len(names))
+    sd = np.exp(log_sd)
+    return (
+        of_draws,
+        of_corrected,
+        _named(names, mean, mean_error),
+        _named(names, sd, sd * log_sd_error),
+    )
 
 
 def _quantiles(x: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
-    """Quantiles (p, 3) of points (s, p) at the levels of :data:`LARGEST_MASS`."""
+    """Return quantiles (p, levels) of points (s, p) at the levels of :data:`LARGEST_MASS`."""
     levels = np.array(list(LARGEST_MASS))
     if weights is None:
         return np.quantile(x, levels, axis=0).T
     return np.quantile(x, levels, axis=0, weights=weights, method="inverted_cdf").T
 
 
-def _changes(
-    names: tuple[str, ...], d: np.ndarray, e: np.ndarray, sd: np.ndarray, of: int
-) -> Changes:
-    """Changes ``d`` of moments and masses and their errors ``e``, with means in ``sd`` (p,).
+def _parts(figures: np.ndarray, p: int) -> list[np.ndarray]:
+    """Return means (p,), log sds (p,), correlations, and masses (p, 2, levels) of one vector.
 
-    of : quantiles of the draws, 0, or of the corrected posterior, 1.
+    Masses are below the quantiles of the draws, 0, and of the corrected posterior, 1.
+    """
+    mean, log_sd, correlation, mass = np.split(figures, [p, 2 * p, 2 * p + p * (p - 1) // 2])
+    return [mean, log_sd, correlation, mass.reshape(p, 2, len(LARGEST_MASS))]
+
+
+def _changes(
+    names: tuple[str, ...], change: np.ndarray, error: np.ndarray, before: np.ndarray, *, edges: int
+) -> Changes:
+    """Return changes with their errors, means in the sd of the figures ``before``.
+
+    edges : masses are below the quantiles of the draws, 0, or of the corrected posterior, 1.
     """
     p = len(names)
-    d_mass, e_mass = (each[-6 * p :].reshape(p, 2, 3)[:, of].T for each in (d, e))
+    mean, log_sd, correlation, mass = _parts(change, p)
+    mean_error, log_sd_error, correlation_error, mass_error = _parts(error, p)
+    sd = np.exp(_parts(before, p)[1])
     pairs = tuple(f"{a} and {b}" for a, b in combinations(names, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         return Changes(
-            _named(names, d[:p] / sd, e[:p] / sd),
-            _named(names, d[p : 2 * p], e[p : 2 * p]),
-            _named(pairs, d[2 * p : -6 * p], e[2 * p : -6 * p]),
+            _named(names, mean / sd, mean_error / sd),
+            _named(names, log_sd, log_sd_error),
+            _named(pairs, correlation, correlation_error),
             {
-                level: _named(names, values, errors)
-                for level, values, errors in zip(LARGEST_MASS, d_mass, e_mass, strict=True)
+                level: _named(names, mass[:, edges, k], mass_error[:, edges, k])
+                for k, level in enumerate(LARGEST_MASS)
             },
         )
 
@@ -113,7 +232,7 @@ def _named(names: tuple[str, ...], values: np.ndarray, errors: np.ndarray) -> di
 
 
 def sampling_of(posterior: Posterior) -> Sampling:
-    """The draws as draws; NumPy's maximum is NaN if any value is, unlike Python's."""
+    """Return the quality of the draws; NumPy's maximum is NaN if any value is, unlike Python's."""
     with np.errstate(divide="ignore", invalid="ignore"):  # of draws that do not vary
         rows = posterior.summary().values()
     sizes = posterior.tree["posterior"].sizes
@@ -127,67 +246,95 @@ def sampling_of(posterior: Posterior) -> Sampling:
     )
 
 
-def physics_of(at_draws: Runs, training: Runs, tests: Tests, pool: Pool) -> Physics:
-    """How FEM fared: failures count by the posterior mass they stand for."""
-    fails = int((~training.converged).sum() + (~tests.runs.converged).sum())
-    share = normalised(tests.log_corrected(pool)) * len(tests.rows)
-    lost = float((~at_draws.converged).sum() + share[~tests.runs.converged].sum())
-    asked = [s for s in at_draws.stable if s is not None]
+def physics_of(at_draws: Runs, training: Runs, tests: Tests) -> Physics:
+    """Return the outcome of the FEM runs; failures count by the posterior mass they stand for."""
+    failed = int((~training.converged).sum() + (~tests.runs.converged).sum())
+    share = normalised(tests.log_corrected) * len(tests.rows)
+    failed_mass = float((~at_draws.converged).sum() + share[~tests.runs.converged].sum())
+    examined = [s for s in at_draws.stable if s is not None]
     finite = at_draws.smallest_J[np.isfinite(at_draws.smallest_J)]
     return Physics(
         len(training.z) + len(tests.rows),
-        fails,
-        lost / (len(at_draws.z) + len(tests.rows)),
+        failed,
+        failed_mass / (len(at_draws.z) + len(tests.rows)),
         float(finite.min()) if finite.size else float("nan"),
-        sum(not s for s in asked),
-        len(asked),
+        sum(not s for s in examined),
+        len(examined),
     )
 
 
-def missed_by(
-    predictive: Predictive, correction: Correction, pool: Pool, tests: Tests, runs: Runs
-) -> int:
-    r"""Number of runs around which FEM's posterior may hide from the corrected map and the tests.
+def missed_by(tests: Tests, runs: Runs) -> int:
+    r"""Return the number of runs around which FEM may have a mode that no test would meet.
 
-    FEM finds such a run likely (it is within the density that bounds 99 % of a Gaussian around the
-    best run) and the corrected map, which these runs taught, does not: it errs there by a jump that
-    no smooth process follows. That does no harm where tests come anyway: with :math:`t` of them a
-    volume (:meth:`Pool.log_tested`), a mass :math:`m` of FEM's posterior :math:`\pi / Z` around the
-    run has :math:`m t Z / \pi` of them in expectation. Those runs count whose mass of 0.1 a test
-    would meet with less than 95 %.
+    Such a run is likely by FEM (within the density that bounds 99 % of a Gaussian at the best run)
+    and not by the corrected map, although the map is corrected by these runs: the map errs there by
+    a jump that no smooth process follows. That does no harm where tests come anyway: with a density
+    of tests :math:`t` (:meth:`Pool.log_tested`), a mass :math:`m` of FEM's posterior
+    :math:`\pi / Z` around the run gets :math:`m t Z / \pi` tests in expectation. Those runs count
+    at which a mass of 0.1 would be met with less than 95 % probability.
     """
-    there = with_guests(pool, predictive, correction, runs.z)
-    guests = slice(pool.drawn, None)
-    prior, corrected = there.at.prior[guests], there.at.corrected[guests]
+    pool = tests.pool.with_points(runs.z)
+    added = slice(pool.drawn, None)
+    prior, corrected = pool.at.prior[added], pool.at.corrected[added]
     fem = np.where(runs.converged, prior + runs.fem, -np.inf)
     likely = fem > least_likely(fem.max(), runs.z.shape[1], _LIKELY)
     unforeseen = likely & ~(prior + corrected > fem - _MISSED)
-    log_weights = tests.log_fem(pool)
+    log_weights = tests.log_fem
     count = len(log_weights)
     with np.errstate(invalid="ignore"):  # where no test has weight, nothing is met
         log_z = logsumexp(log_weights) - np.log(count * pool.drawn)
-        log_expected = np.log(_MASS) + there.log_tested(count)[guests] + log_z - fem
+        log_expected = np.log(_MASS) + pool.log_tested(count)[added] + log_z - fem
     return int(np.sum(unforeseen & ~(log_expected >= np.log(-np.log1p(-_MET)))))
 
 
-def tail_of(pool: Pool, tests: Tests, missed: int, ends: int = 0) -> Tail:
-    """Tail of FEM's weights, and how irregularly FEM and the corrected map differ."""
-    log_fem, log_map = tests.log_fem(pool), tests.log_corrected(pool)
+def tail_of(tests: Tests, missed: int, ends: int = 0) -> Tail:
+    """Return the tail of FEM's weights, and the spread of their log ratios to the map's."""
+    log_fem, log_map = tests.log_fem, tests.log_corrected
     threshold = float(min(1.0 - 1.0 / np.log10(len(log_fem)), 0.7))  # Vehtari et al. 2024, Eq. 13
-    weights = normalised(log_fem)
+    points = effective(tests.pool.corrected)
     both = np.isfinite(log_fem) & np.isfinite(log_map)
     if not both.any():
-        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, effective(pool.corrected), missed, ends)
+        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, points, missed, ends)
+    weights = normalised(log_fem)
     share = normalised(np.where(both, log_map, -np.inf))[both]
     ratio = (log_fem - log_map)[both]
-    spread = float(np.sqrt(share @ (ratio - share @ ratio) ** 2))
     return Tail(
         pareto_shape(log_fem[np.isfinite(log_fem)]),
         threshold,
         effective(weights),
         float(weights.max() * len(weights)),
-        spread,
-        effective(pool.corrected),
+        float(np.sqrt(share @ (ratio - share @ ratio) ** 2)),
+        points,
         missed,
         ends,
     )
+
+
+def misfits(
+    predictive: Predictive, correction: Correction, z: np.ndarray, rng_key: jax.Array
+) -> dict[str, Misfit]:
+    """Return the misfit of each observation by its name, from draws z (s, p) of FEM's posterior."""
+    model, data = predictive.model, predictive.data
+    draws = {name: jnp.asarray(values) for name, values in predictive.constrain(z).items()}
+    flat = jnp.asarray(predictive.corrected_means(z, correction))
+
+    def discrepancies(flat: jax.Array, draw: dict[str, jax.Array], key: jax.Array) -> Any:
+        means = predictive.by_name(flat)
+        parts = model.distributions(means, model.noise_values(draw))
+        key, mesh_key = jax.random.split(key)
+        errors = jax.tree.map(jnp.subtract, model.fem_means(mesh_key, draw, means), means)
+        keys = jax.random.split(key, len(parts))
+        by_name = {}
+        for (name, distribution), key in zip(parts.items(), keys, strict=True):
+            y, mean, simulated = data[name], means[name], distribution.sample(key) + errors[name]
+            unlikelier = distribution.log_prob(simulated) <= distribution.log_prob(y)
+            by_name[name] = unlikelier, jnp.abs(simulated - mean), jnp.abs(y - mean)
+        return by_name
+
+    by_name = jax.jit(jax.vmap(discrepancies))(flat, draws, jax.random.split(rng_key, len(z)))
+    misfit = {}
+    for name, (unlikelier, *distances) in by_name.items():
+        simulated, distance = (np.asarray(x).reshape(len(z), -1) for x in distances)
+        places = places_of(name, model.observe.shapes[name])
+        misfit[name] = Misfit.of(places, unlikelier, simulated, distance)
+    return misfit

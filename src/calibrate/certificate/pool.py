@@ -1,17 +1,25 @@
-r"""Many points, cheaply: draws of several proposals weighted as draws of their mixture.
+r"""Many cheap points, weighted as draws of the mixture of all proposals that they come from.
 
-With :math:`n_c` points from proposal :math:`q_c`, every point is weighted by the mixture they all
-come from (the balance heuristic; Veach and Guibas 1995, Elvira et al. 2019),
+With :math:`n_c` of :math:`M` points from proposal :math:`q_c`, every point is weighted by the
+mixture (the balance heuristic; Veach and Guibas 1995, Elvira et al. 2019),
 
 .. math:: w_i \propto \frac{\pi(z_i)}{q(z_i)}, \qquad q = \sum_c \frac{n_c}{M} q_c
 
-so that no weight is large where any proposal is at home. Proposals follow the draws of a posterior,
-look beyond them, and come from the prior. From the prior they also move to the posterior by
-themselves: each round puts kernels around points resampled with weights :math:`w^\beta`, with
-:math:`\beta` rising to 1 as fast as the weights' effective number allows (nonlinear population
+so that a weight is large only where no proposal has its mass. Proposals follow the draws of a
+posterior, surround them, and come from the prior. From the prior they also move to the posterior by
+themselves: each step puts kernels around points resampled with weights :math:`w^\beta`, with
+:math:`\beta` rising to 1 as fast as the effective number of points allows (nonlinear population
 Monte Carlo; Koblents and Miguez 2015). So a mode is found that no draw ever visited.
 
-Everything here asks the map and its correction, not FEM.
+A proposal is a mixture of Student-t kernels around points. A posterior may be a thin, bent sheet.
+Its draws are straightened by a transport map of unit Jacobian (:mod:`calibrate.samplers.transport`)
+so that one covariance :math:`\Sigma` describes them, and
+
+.. math:: q_c(\zeta) = \frac1K \sum_k t_\nu(\zeta; \zeta_k, h^2 \Sigma)
+
+is known at every point. Small widths :math:`h` follow the points, large ones surround them.
+
+A pool evaluates the map and its correction, never FEM.
 """
 
 from __future__ import annotations
@@ -21,35 +29,112 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import logsumexp
+from scipy.special import gammaln, logsumexp
 
-from calibrate.certificate.correction import Correction
-from calibrate.certificate.predictive import Evaluated, Predictive
-from calibrate.certificate.proposals import Kernels, around
-from calibrate.samplers.importance import effective, normalised
+from calibrate.certificate.predictive import Correction, Evaluated, Predictive
+from calibrate.samplers import transport
+from calibrate.samplers.diagnostics import effective, normalised
 
-NEAR, NEAR_FREEDOM = 2048, 5.0
-WIDE, WIDE_WIDTHS, WIDE_FREEDOM = 512, (1.0, 2.0), 3.0
-PRIOR = 512
-STEP, SEARCH_ROUNDS, POLISH_ROUNDS = 512, 8, 4
-_TEMPERED_ESS, MOST_TEMPERED = 0.15, 300.0  # of the points, for the next round's kernels
 ENOUGH = 800.0  # effective points at which the pool is good
-# Shares of the points that test: from the corrected posterior, from the draws' density, smoothed,
-# where FEM may find the data likely, around the draws, and from the whole pool.
-_CORRECTED, _NEAR, _EXPLORED, _WIDE, _EVEN = 0.55, 0.15, 0.1, 0.1, 0.1
+MOST_TEMPERED = 300.0  # effective points that the kernels of the next step are put on, at most
+_TEMPERED_SHARE = 0.15  # of the pool's points, likewise
+_NEAR, _FREEDOM = 2048, 5.0  # points of the proposal that follows the draws, degrees of freedom
+_WIDE, _WIDE_WIDTHS, _WIDE_FREEDOM = 512, (1.0, 2.0), 3.0
+_PRIOR = 512
+_STEP, _SEARCH_ROUNDS, _POLISH_ROUNDS = 512, 8, 4
+_CENTRES = 192  # kernels of a proposal
+_FITTED = 1024  # points that the straightening is fitted to
+# Shares of the testing points: from the corrected posterior, from the draws' smoothed density, from
+# where FEM may find the data likely, from the surroundings of the draws, and from the whole pool.
+_CORRECTED, _DRAWS, _EXPLORED, _AROUND, _EVEN = 0.55, 0.15, 0.1, 0.1, 0.1
+
+
+def key_from(rng: np.random.Generator) -> jax.Array:
+    """Return a JAX key drawn from NumPy's generator."""
+    return jax.random.key(int(rng.integers(2**31)))
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """A mixture of Student-t kernels in straightened coordinates.
+
+    map_ : the transport map from straightened coordinates to z.
+    centres : the centres (k, p), straightened.
+    root : the Cholesky factor (p, p) of the covariance.
+    widths : the factors h of the kernels' sd, all equally often.
+    freedom : the degrees of freedom.
+    """
+
+    map_: transport.TransportMap
+    centres: np.ndarray
+    root: np.ndarray
+    widths: tuple[float, ...]
+    freedom: float
+
+    @classmethod
+    def around(
+        cls, z: np.ndarray, widths: tuple[float, ...], freedom: float, rng: np.random.Generator
+    ) -> Kernels:
+        """Return kernels around some of the points z (s, p), with the covariance of all."""
+        rows = rng.permutation(len(z))
+        map_ = transport.fit(z[rows[:_FITTED]])
+        straight = transport.straighten(map_, z)
+        covariance = np.atleast_2d(np.cov(straight, rowvar=False))
+        # A coordinate that does not vary still gets a width, so that the density exists.
+        root = np.linalg.cholesky(covariance + np.diag(1e-9 * np.diag(covariance) + 1e-12))
+        return cls(map_, straight[rows[:_CENTRES]], root, widths, freedom)
+
+    @classmethod
+    def following(cls, z: np.ndarray, rng: np.random.Generator) -> Kernels:
+        """Return narrow kernels, which smooth the density of the points z (s, p)."""
+        # In many dimensions narrower kernels would be needles.
+        widths = (0.15, 0.5) if z.shape[1] <= 2 else (0.35, 0.7)
+        return cls.around(z, widths, _FREEDOM, rng)
+
+    @classmethod
+    def surrounding(cls, z: np.ndarray, rng: np.random.Generator) -> Kernels:
+        """Return kernels of one and two sd of the points z (s, p), which look beyond them."""
+        return cls.around(z, _WIDE_WIDTHS, _WIDE_FREEDOM, rng)
+
+    def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Return points z (count, p)."""
+        centres = self.centres[rng.integers(len(self.centres), size=count)]
+        width = rng.choice(self.widths, size=(count, 1))
+        scale = width * np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(count, 1)))
+        straight = centres + scale * (rng.normal(size=centres.shape) @ self.root.T)
+        return transport.bend(self.map_, straight)
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Return log densities (s,) at points z (s, p); the map has unit Jacobian."""
+        p, nu = z.shape[1], self.freedom
+        whiten = np.linalg.inv(self.root).T
+        points, centres = transport.straighten(self.map_, z) @ whiten, self.centres @ whiten
+        square = (points**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1)
+        square = np.maximum(square - 2.0 * points @ centres.T, 0.0)
+        norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * np.pi)
+        norm -= np.log(np.diag(self.root)).sum() + np.log(len(centres) * len(self.widths))
+        # Sums of powers, not of exponentials of logarithms: Student's tails do not underflow.
+        tails = [
+            (1.0 + square / (nu * h**2)) ** (-0.5 * (nu + p)) / h**p for h in self.widths
+        ]  # fmt: skip
+        return norm + np.log(sum(t.sum(axis=1) for t in tails))
 
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Points (s, p) with their log densities.
+    """Points z (s, p) with their log densities under a map and its correction.
 
-    proposals, counts : kernels and how many points each gave; the first ``priors`` points are the
-        prior's. Points beyond those ``drawn`` are guests, which change nothing of the others.
-    near : which proposal has the draws' density, smoothed; the next one surrounds them.
-    log_kernels : of each proposal at each point, (c, s).
-    at : log prior and likelihoods of the points, (s,) each.
+    The first ``priors`` points come from the prior, the next from the proposals. Points beyond
+    these are added by hand: they have log densities, but do not change those of the others.
+
+    at : log prior and log likelihoods of the points, (s,) each.
+    proposals, counts : the kernels, and the number of points from each.
+    log_kernels : log density (c, s) of each proposal at each point.
+    near : the index of the proposal that follows the draws; the next one surrounds them.
     """
 
+    predictive: Predictive
+    correction: Correction
     z: np.ndarray
     at: Evaluated
     priors: int
@@ -58,14 +143,41 @@ class Pool:
     log_kernels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     near: int = 0
 
+    @classmethod
+    def search(
+        cls,
+        predictive: Predictive,
+        correction: Correction,
+        draws: np.ndarray,
+        ends: tuple[np.ndarray, ...],
+        rng: np.random.Generator,
+    ) -> Pool:
+        """Return a pool that covers the draws (s, p) of z, and where the prior leads to.
+
+        ends : points around each further mode of FEM.
+        """
+        z = predictive.prior_draws(key_from(rng), _PRIOR)
+        at = predictive.evaluate(z, correction)
+        pool = cls(predictive, correction, z, at, _PRIOR, log_kernels=np.zeros((0, _PRIOR)))
+        for _ in range(_SEARCH_ROUNDS):
+            if _effective(pool.log_explored) >= _TEMPERED_SHARE * len(pool.z):
+                break
+            pool = pool.stepped(pool.log_explored, rng)
+        pool = replace(pool, near=len(pool.proposals))
+        pool = pool.extended(Kernels.following(draws, rng), _NEAR, rng)
+        pool = pool.extended(Kernels.surrounding(draws, rng), _WIDE, rng)
+        for points in ends:
+            pool = pool.extended(Kernels.following(points, rng), _STEP, rng)
+        return pool.polished(rng)
+
     @property
     def drawn(self) -> int:
-        """Number of points that come from the proposals."""
+        """Number of points that come from prior and proposals."""
         return self.priors + sum(self.counts)
 
     @property
     def log_mixture(self) -> np.ndarray:
-        """Log density (s,) of the mixture all points come from."""
+        """Log density (s,) of the mixture of prior and proposals."""
         shares = np.log(np.array([self.priors, *self.counts]) / self.drawn)
         components = np.vstack([self.at.prior, *self.log_kernels])
         return logsumexp(components + shares[:, None], axis=0)
@@ -76,31 +188,35 @@ class Pool:
         return self.at.prior + self.at.corrected - self.log_mixture
 
     @property
-    def log_explored(self) -> np.ndarray:
-        """Log weights (s,) of where FEM may yet find the data likely, up to a constant.
+    def corrected(self) -> np.ndarray:
+        """Weights (s,) of sum 1 of the posterior with the corrected map."""
+        return normalised(self.log_corrected)
 
-        A corrected log likelihood below the best one counts :math:`1 / (1 + v)` of its gap, with
-        the correction's variance :math:`v`: for Gaussian noise, that of a noise with the
-        correction's error added.
+    @property
+    def log_cheap(self) -> np.ndarray:
+        """Log weights (s,) of the posterior with the map alone, up to a constant."""
+        return self.at.prior + self.at.cheap - self.log_mixture
+
+    @property
+    def log_explored(self) -> np.ndarray:
+        """Log weights (s,) of where FEM may find the data likely, up to a constant.
+
+        The gap of a corrected log likelihood to the best one counts :math:`1 / (1 + v)` times, with
+        the correction's variance :math:`v`: as if the noise had the correction's error added.
         """
         gap = self.at.corrected - np.max(self.at.corrected[: self.drawn], initial=-1e300)
         return self.at.prior + gap / (1.0 + self.at.variance) - self.log_mixture
 
     @property
-    def log_cheap(self) -> np.ndarray:
-        """Log weights (s,) of the posterior with the map as it is, up to a constant."""
-        return self.at.prior + self.at.cheap - self.log_mixture
-
-    @property
     def log_chances(self) -> np.ndarray:
-        """Log of each point's chance (s,) to test: of several weights, each by its share."""
-        # Whatever a map says there: corrected or not, it may have gaps.
+        """Log probability (s,) of each point to be a test: a mixture of several weights."""
+        # Two parts ignore what the map says, because it may be wrong, corrected or not.
         near, around = self.log_kernels[self.near : self.near + 2] - self.log_mixture
         parts = (
             (_CORRECTED, self.log_corrected),
-            (_NEAR, near),
+            (_DRAWS, near),
             (_EXPLORED, self.log_explored),
-            (_WIDE, around),
+            (_AROUND, around),
             (_EVEN, np.zeros(len(self.z))),
         )
         totals = [logsumexp(log[: self.drawn]) for _, log in parts]
@@ -115,23 +231,89 @@ class Pool:
         return chances - logsumexp(chances[: self.drawn])
 
     def log_tested(self, count: int) -> np.ndarray:
-        r"""Log of how many points a volume of z ``count`` tests are at, around each point (s,).
+        r"""Return the log density (s,) of distinct tests around each point, for ``count`` tests.
 
-        In expectation, a point that is tested again counted once:
-        :math:`M q (1 - e^{-n a})` with :math:`M` points of density :math:`q` and chances :math:`a`.
+        In expectation, :math:`M q (1 - e^{-n a})` with :math:`M` points of density :math:`q` and
+        chances :math:`a`.
         """
         tested = -np.expm1(-count * np.exp(self.log_chances))
         return np.log(self.drawn) + self.log_mixture + np.log(tested)
 
-    @property
-    def corrected(self) -> np.ndarray:
-        """Weights (s,) of sum 1 of the posterior with the corrected map."""
-        return normalised(self.log_corrected)
+    def tests(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows (count,) to be tested, and the log density (count,) they are drawn from."""
+        log_chances = self.log_chances
+        chances = np.exp(log_chances)
+        rows = rng.choice(len(chances), size=count, p=chances / chances.sum())
+        return rows, (self.log_mixture + log_chances)[rows]
 
+    def resampled(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Return rows (count,) as draws of the corrected map's posterior, in random order.
 
-def widths(dimension: int) -> tuple[float, ...]:
-    """Widths of kernels on draws, in their sd; narrow ones are needles in many dimensions."""
-    return (0.15, 0.5) if dimension <= 2 else (0.35, 0.7)
+        In systematic resampling each row comes as often as its weight says, up to one.
+        """
+        edges = np.cumsum(self.corrected)
+        at = (np.arange(count) + rng.uniform()) / count * edges[-1]
+        return rng.permutation(np.minimum(np.searchsorted(edges, at), len(edges) - 1))
+
+    def polished(self, rng: np.random.Generator) -> Pool:
+        """Return a pool with :data:`ENOUGH` effective points, under the map and corrected."""
+        pool = self
+        for _ in range(_POLISH_ROUNDS):
+            poorest = min((pool.log_corrected, pool.log_cheap), key=_effective)
+            if _effective(poorest) >= ENOUGH:
+                break
+            pool = pool.stepped(poorest, rng)
+        return pool
+
+    def stepped(self, log_weights: np.ndarray, rng: np.random.Generator) -> Pool:
+        """Return the pool with points from kernels around points of large weight."""
+        chances = tempered(log_weights, min(_TEMPERED_SHARE * len(self.z), MOST_TEMPERED))
+        if not chances.any():
+            return self
+        centres = self.z[rng.choice(len(self.z), size=1024, p=chances)]
+        # A kernel centred on a point of the pool would take its weight away.
+        centres = Kernels.following(centres, rng).sample(rng, len(centres))
+        return self.extended(Kernels.following(centres, rng), _STEP, rng)
+
+    def extended(self, proposal: Kernels, count: int, rng: np.random.Generator) -> Pool:
+        """Return the pool with ``count`` points from ``proposal``."""
+        pool = self.with_points(proposal.sample(rng, count))
+        return replace(
+            pool,
+            proposals=(*pool.proposals, proposal),
+            counts=(*pool.counts, count),
+            log_kernels=np.vstack([pool.log_kernels, proposal.log_density(pool.z)[None]]),
+        )
+
+    def with_points(self, z: np.ndarray) -> Pool:
+        """Return the pool with added points z (s, p), which do not come from its proposals."""
+        new = self.predictive.evaluate(z, self.correction)
+        return replace(
+            self,
+            z=np.concatenate([self.z, z]),
+            at=Evaluated(*(np.concatenate(both) for both in zip(self.at, new, strict=True))),
+            log_kernels=np.hstack([self.log_kernels, self._log_kernels_at(z)]),
+        )
+
+    def redrawn(self, rng: np.random.Generator) -> Pool:
+        """Return a pool of fresh points, as many from each proposal.
+
+        Proposals were chosen by looking at points; only points drawn after the choice are
+        independent draws of the mixture (Marin, Pudlo and Sedki 2019).
+        """
+        prior = self.predictive.prior_draws(key_from(rng), self.priors)
+        fresh = [q.sample(rng, n) for q, n in zip(self.proposals, self.counts, strict=True)]
+        z = np.concatenate([prior, *fresh])
+        at = self.predictive.evaluate(z, self.correction)
+        return replace(self, z=z, at=at, log_kernels=self._log_kernels_at(z))
+
+    def corrected_by(self, correction: Correction) -> Pool:
+        """Return the pool under another correction."""
+        at = self.predictive.evaluate_again(self.z, self.at, correction)
+        return replace(self, correction=correction, at=at)
+
+    def _log_kernels_at(self, z: np.ndarray) -> np.ndarray:
+        return np.array([q.log_density(z) for q in self.proposals]).reshape(-1, len(z))
 
 
 def _effective(log_weights: np.ndarray) -> float:
@@ -139,133 +321,15 @@ def _effective(log_weights: np.ndarray) -> float:
 
 
 def tempered(log_weights: np.ndarray, least: float) -> np.ndarray:
-    """Weights to the largest power up to 1 that leaves ``least`` effective points, of sum 1."""
-    alive = np.isfinite(log_weights)
-    if effective(normalised(log_weights)) >= least or alive.sum() <= least:
+    """Return weights of sum 1, to the largest power up to 1 with ``least`` effective points."""
+    finite = np.isfinite(log_weights)
+    if _effective(log_weights) >= least or finite.sum() <= least:
         return normalised(log_weights)
-    log = log_weights[alive] - log_weights[alive].max()
+    log = log_weights[finite] - log_weights[finite].max()
 
-    def gap(power: float) -> float:
-        return effective(normalised(power * log)) - least
+    def surplus(power: float) -> float:
+        return _effective(power * log) - least
 
-    result = np.zeros_like(log_weights)
-    result[alive] = normalised(brentq(gap, 0.0, 1.0, xtol=1e-12) * log)
-    return result
-
-
-def search(
-    predictive: Predictive,
-    correction: Correction,
-    draws: np.ndarray,
-    ends: tuple[np.ndarray, ...],
-    rng: np.random.Generator,
-) -> Pool:
-    """A pool that knows the draws (s, p) of z, what is beyond them, and what the prior leads to.
-
-    ends : points around whatever else FEM finds likely.
-    """
-    key = jax.random.key(int(rng.integers(2**31)))
-    z = predictive.prior_draws(key, PRIOR)
-    pool = Pool(z, predictive.evaluate(z, correction), PRIOR, (), (), np.zeros((0, PRIOR)))
-    for _ in range(SEARCH_ROUNDS):
-        if _effective(pool.log_explored) >= _TEMPERED_ESS * len(pool.z):
-            break
-        pool = step(pool, predictive, correction, pool.log_explored, rng)
-    near = around(draws, widths(draws.shape[1]), NEAR_FREEDOM, rng)
-    pool = replace(pool, near=len(pool.proposals))
-    pool = extend(pool, predictive, correction, near, NEAR, rng)
-    pool = extend(pool, predictive, correction, around_draws(draws, rng), WIDE, rng)
-    for points in ends:
-        kernels = around(points, widths(draws.shape[1]), NEAR_FREEDOM, rng)
-        pool = extend(pool, predictive, correction, kernels, STEP, rng)
-    return polish(pool, predictive, correction, rng)
-
-
-def around_draws(draws: np.ndarray, rng: np.random.Generator) -> Kernels:
-    """A proposal that surrounds the draws (s, p) of z, by one and two of their sd."""
-    return around(draws, WIDE_WIDTHS, WIDE_FREEDOM, rng)
-
-
-def polish(
-    pool: Pool, predictive: Predictive, correction: Correction, rng: np.random.Generator
-) -> Pool:
-    """More points until both posteriors, corrected and not, have :data:`ENOUGH` effective ones."""
-    for _ in range(POLISH_ROUNDS):
-        poorest = min((pool.log_corrected, pool.log_cheap), key=_effective)
-        if _effective(poorest) >= ENOUGH:
-            break
-        pool = step(pool, predictive, correction, poorest, rng)
-    return pool
-
-
-def step(
-    pool: Pool,
-    predictive: Predictive,
-    correction: Correction,
-    log_weights: np.ndarray,
-    rng: np.random.Generator,
-) -> Pool:
-    """``pool`` with :data:`STEP` more points, from kernels around points of large weight.
-
-    Those are resampled with tempered weights.
-    """
-    chances = tempered(log_weights, min(_TEMPERED_ESS * len(pool.z), MOST_TEMPERED))
-    if not chances.any():
-        return pool
-    h = widths(pool.z.shape[1])
-    chosen = pool.z[rng.choice(len(pool.z), size=1024, p=chances)]
-    # Moved off the pool's points: a kernel on a point of the pool would take its weight away.
-    chosen = around(chosen, h, NEAR_FREEDOM, rng).sample(rng, len(chosen))
-    kernels = around(chosen, h, NEAR_FREEDOM, rng)
-    return extend(pool, predictive, correction, kernels, STEP, rng)
-
-
-def extend(
-    pool: Pool,
-    predictive: Predictive,
-    correction: Correction,
-    proposal: Kernels,
-    count: int,
-    rng: np.random.Generator,
-) -> Pool:
-    """``pool`` with ``count`` points from ``proposal``."""
-    pool = with_guests(pool, predictive, correction, proposal.sample(rng, count))
-    return replace(
-        pool,
-        proposals=(*pool.proposals, proposal),
-        counts=(*pool.counts, count),
-        log_kernels=np.vstack([pool.log_kernels, proposal.log_density(pool.z)[None]]),
-    )
-
-
-def with_guests(pool: Pool, predictive: Predictive, correction: Correction, z: np.ndarray) -> Pool:
-    """``pool`` with points ``z`` (s, p) that did not come from its proposals."""
-    log_kernels = np.array([q.log_density(z) for q in pool.proposals]).reshape(-1, len(z))
-    new = predictive.evaluate(z, correction)
-    at = Evaluated(*(np.concatenate(both) for both in zip(pool.at, new, strict=True)))
-    return replace(
-        pool,
-        z=np.concatenate([pool.z, z]),
-        at=at,
-        log_kernels=np.hstack([pool.log_kernels, log_kernels]),
-    )
-
-
-def redrawn(
-    pool: Pool, predictive: Predictive, correction: Correction, rng: np.random.Generator
-) -> Pool:
-    """Fresh points from the proposals of ``pool``, as many of each.
-
-    Proposals were chosen by looking at points; only points drawn after the choice are independent
-    draws of the mixture (Marin, Pudlo and Sedki 2019).
-    """
-    prior = predictive.prior_draws(jax.random.key(int(rng.integers(2**31))), pool.priors)
-    drawn = [q.sample(rng, n) for q, n in zip(pool.proposals, pool.counts, strict=True)]
-    z = np.concatenate([prior, *drawn])
-    log_kernels = np.array([q.log_density(z) for q in pool.proposals]).reshape(-1, len(z))
-    return replace(pool, z=z, at=predictive.evaluate(z, correction), log_kernels=log_kernels)
-
-
-def corrected_again(pool: Pool, predictive: Predictive, correction: Correction) -> Pool:
-    """``pool`` under another correction."""
-    return replace(pool, at=predictive.evaluate_again(pool.z, pool.at, correction))
+    weights = np.zeros_like(log_weights)
+    weights[finite] = normalised(brentq(surplus, 0.0, 1.0, xtol=1e-12) * log)
+    return weights

@@ -1,13 +1,30 @@
-r"""Densities of a posterior at any point of unconstrained coordinates, with and without correction.
+r"""The posterior density at any point, by the forward map alone and with a learned correction.
 
-A certificate asks for the posterior where no draw is. In coordinates :math:`z` (NumPyro's, see
-:mod:`calibrate.samplers.density`) the log density is the sum of
+A certificate asks for the posterior where no draw is. In unconstrained coordinates :math:`z`
+(:mod:`calibrate.samplers.density`) the log density is
 
 .. math:: \log p(z) + \log p(y \mid g(\theta(z)) + d(\theta(z)))
 
-the prior with its Jacobian and the likelihood of the forward map's data without noise, :math:`g`,
-plus a correction :math:`d` (:mod:`calibrate.certificate.correction`). The map alone has
-:math:`d = 0`.
+with the prior and its Jacobian, the map's data without noise :math:`g`, and a correction :math:`d`,
+which is zero for the map alone.
+
+The correction is a Gaussian process of theta in the space of the data. At some theta FEM was
+solved, and the map misses the data's means by :math:`D`. Between them
+
+.. math:: d(x) = k(x, X) (k(X, X) + \tau^2 I)^{-1} D, \quad
+    k(x, x') = v (1 + x \cdot x') + \exp(-|x - x'|^2 / 2 \ell^2)
+
+for all data at once, with theta standardised by its prior, :math:`x`, and a linear trend of wide
+prior :math:`v`. :math:`\ell` and :math:`\tau` minimise leave-one-out errors, which for a Gaussian
+process have a closed form (Rasmussen and Williams 2006, Eq. 5.10-5.12). The size of these errors
+also sets the scale :math:`a^2` of the process's variance, in squared noise sd,
+
+.. math:: v(x) = a^2 (k(x, x) + \tau^2 - k(x, X) (k(X, X) + \tau^2 I)^{-1} k(X, x))
+
+A wrong correction costs precision, not correctness: :math:`v` only says where to solve FEM next,
+and FEM at fresh points tests what the correction predicts (:mod:`calibrate.certificate.check`). One
+of the candidates is no correction at all, because a process that a bump far from the posterior
+spoils everywhere is worse than none.
 """
 
 from __future__ import annotations
@@ -15,31 +32,122 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from scipy.linalg import cho_factor, cho_solve
 
-from calibrate.certificate.correction import Correction, correct, corrections, nothing
 from calibrate.samplers.density import Density, density_of
 from calibrate.statistical_model import Data, Model
+from emulator.core.gaussian_process import squared_exponential
 
+_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # in sd of the prior
+_NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
+_TREND = 1e2
+_NEGLIGIBLE = 1e-3  # leave-one-out error, in noise sd, that changes no posterior
 _BLOCK = 256  # points evaluated by one call of a program, so that it is compiled for one shape
-_BATCH = 32  # of them side by side
+_BATCH = 32  # points of a block that are vectorised
 _FARTHEST = 40.0  # |z| at which a bounded parameter is its bound in double precision
-_WIDTH_DRAWS = 512  # of the prior, from which the scale of theta's features is taken
+_WIDTH_DRAWS = 512  # draws of the prior, from which the scale of theta's features is taken
+
+
+class Correction(NamedTuple):
+    r"""A fitted Gaussian process; all zeros for no correction.
+
+    at : the features (n, q) of theta where FEM was solved; rows of zeros may be padding.
+    weights : the weights of the kernel (n, m), zero in rows of padding.
+    inverse : the inverse of the kernel matrix (n, n).
+    length, nugget, scale : :math:`\\ell`, :math:`\\tau^2` and :math:`a^2` of the kernel.
+    """
+
+    at: np.ndarray
+    weights: np.ndarray
+    inverse: np.ndarray
+    length: float
+    nugget: float
+    scale: float
+
+
+def no_correction(rows: int, features: int, data: int) -> Correction:
+    """Return the correction that is zero, of the shape of one fitted to ``rows`` points."""
+    at, weights, inverse = (np.zeros((rows, width)) for width in (features, data, rows))
+    return Correction(at, weights, inverse, length=1.0, nugget=0.0, scale=0.0)
+
+
+def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the correction (m,) at features ``x`` (q,), and its variance in squared noise sd."""
+    c = correction
+    distance = jnp.sum((c.at - x) ** 2, axis=-1)
+    kernel = _TREND * (1.0 + c.at @ x) + squared_exponential(distance / c.length**2)
+    prior_variance = _TREND * (1.0 + x @ x) + 1.0 + c.nugget
+    variance = c.scale * jnp.maximum(prior_variance - kernel @ c.inverse @ kernel, c.nugget)
+    return kernel @ c.weights, variance
+
+
+@jax.jit
+def corrections(correction: Correction, x: jax.Array) -> jax.Array:
+    """Return the correction (s, m) at features ``x`` (s, q)."""
+    return jax.vmap(lambda row: correct(correction, row)[0])(x)
+
+
+def fit_correction(
+    x: np.ndarray,
+    errors: np.ndarray,
+    scales: np.ndarray,
+    rows: int,
+    likely: np.ndarray | None = None,
+) -> Correction:
+    """Fit the Gaussian process, or return no correction where that has smaller errors.
+
+    Parameters
+    ----------
+    x : the features (n, q) at which FEM was solved.
+    errors : FEM's data less the map's there, (n, m).
+    scales : the noise level (m,) of each datum, the unit of leave-one-out errors.
+    rows : the number of points to which the result is padded with zeros, so that programs are
+        compiled once.
+    likely : (n,) bool, points at which the process has to be better than no correction; all by
+        default.
+    """
+    none, fitted = (no_correction(rows, x.shape[1], errors.shape[1]) for _ in range(2))
+    fitted.at[: len(x)] = x
+    linear = _TREND * (1.0 + x @ x.T)
+    squared_errors = np.mean((errors / scales) ** 2, axis=1)
+    judged = slice(None) if likely is None or not likely.any() else likely
+    smallest_loss, loss_where_likely = np.inf, np.inf
+    distances = ((x[:, None] - x) ** 2).sum(axis=-1)
+    for length, nugget in product(_LENGTHS, _NUGGETS):
+        kernel = linear + squared_exponential(distances / length**2) + nugget * np.eye(len(x))
+        inverse = cho_solve(cho_factor(kernel), np.eye(len(x)))
+        weights = inverse @ errors
+        # Leave-one-out errors in noise sd, and their variances up to a^2.
+        square = np.mean((weights / np.diag(inverse)[:, None] / scales) ** 2, axis=1)
+        variance = 1.0 / np.diag(inverse)
+        # Geometric mean over the points, so that the prior's corners do not decide.
+        loss = np.log(square + _NEGLIGIBLE**2).mean()
+        if loss < smallest_loss:
+            smallest_loss = loss
+            loss_where_likely = np.log(square[judged] + _NEGLIGIBLE**2).mean()
+            fitted.weights[: len(x)], fitted.inverse[: len(x), : len(x)] = weights, inverse
+            scale = float(np.mean(square / variance))
+            fitted = fitted._replace(length=length, nugget=nugget, scale=scale)
+    if loss_where_likely < np.log(squared_errors[judged] + _NEGLIGIBLE**2).mean():
+        return fitted
+    return none._replace(scale=float(np.mean(squared_errors / (np.diag(linear) + 1.0))))
 
 
 class Evaluated(NamedTuple):
-    """Log densities at points (s, p): each (s,), ``-inf`` where there is none.
+    """Log densities at points (s, p), each (s,), ``-inf`` where the density is zero.
 
-    prior : of z, its Jacobian included.
-    cheap : likelihood that the draws are from: the map's, with what is allowed for its error.
-    corrected : likelihood of the map with its correction, and nothing allowed but for the mesh.
-    variance : of the correction, in squared noise sd.
-    means : the map's data without noise, flat (s, m); NaN where it has no answer.
+    prior : the prior density of z, its Jacobian included.
+    cheap : the likelihood that was sampled: the map's, widened for its error where the model is.
+    corrected : the likelihood of the map with its correction, widened for the mesh's error only.
+    variance : the variance of the correction, in squared noise sd.
+    means : the map's data without noise, flat (s, m); NaN where the map has no answer.
     """
 
     prior: Any
@@ -66,32 +174,40 @@ class Predictive:
         return self._density.dimension
 
     def constrain(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Draws by name, each (s,)."""
+        """Return draws by name, each (s,)."""
         return self._in_blocks(self._density.constrain, z)
 
+    def columns(self, z: np.ndarray) -> np.ndarray:
+        """Return draws (s, p) of the model's unknowns, in the order of their names."""
+        draws = self.constrain(z)
+        return np.stack([draws[name] for name in self.model.names], axis=1)
+
     def unconstrain(self, draws: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Z (s, p) of draws by name; a draw on a bound of its parameter is moved inside."""
+        """Return z (s, p) of draws by name; a draw on a bound of its parameter is moved inside."""
         named = {name: jnp.asarray(draws[name]) for name in self.model.names}
-        return _inside(jax.jit(jax.vmap(self._density.unconstrain))(named))
+        return _finite_coordinates(jax.jit(jax.vmap(self._density.unconstrain))(named))
 
     def prior_draws(self, rng_key: jax.Array, count: int) -> np.ndarray:
-        """Points (count, p) from the prior."""
-        return _inside(self._prior_draws(jax.random.split(rng_key, count)))
+        """Return points (count, p) drawn from the prior."""
+        return _finite_coordinates(self._prior_draws(jax.random.split(rng_key, count)))
 
     @cached_property
     def uncorrected(self) -> Correction:
         """The correction of this model's data that is zero."""
-        return nothing(1, len(self.model.states.unknowns), len(self.scales))
+        return no_correction(1, len(self.model.states.unknowns), len(self.scales))
 
     def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
-        """Log densities at points (s, p)."""
+        """Return log densities at points (s, p)."""
         prior, cheap, means = self._in_blocks(self._map_block, z)
-        nothing_yet = np.full(len(z), -np.inf)
-        at = Evaluated(prior, cheap, nothing_yet, nothing_yet, means)
+        unknown = np.full(len(z), -np.inf)
+        at = Evaluated(prior, cheap, unknown, unknown, means)
         return self.evaluate_again(z, at, correction)
 
     def evaluate_again(self, z: np.ndarray, at: Evaluated, correction: Correction) -> Evaluated:
-        """``at`` of the points (s, p) under another correction; the map is not asked again."""
+        """Return ``at``, which belongs to ``z`` (s, p), under another correction.
+
+        The map is not evaluated again.
+        """
 
         def block(points: jax.Array, means: jax.Array) -> tuple[jax.Array, jax.Array]:
             return self._correction_block(points, means, correction)
@@ -100,27 +216,32 @@ class Predictive:
         return at._replace(corrected=corrected, variance=variance)
 
     def means(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The map's data without noise, flat (s, m), and whether it has an answer (s,)."""
+        """Return the map's data without noise, flat (s, m), and whether it has an answer (s,)."""
         means = self._in_blocks(self._map_block, z)[2]
         valid = np.isfinite(means).all(axis=1)
         return np.where(valid[:, None], means, 0.0), valid
 
     def corrected_means(self, z: np.ndarray, correction: Correction) -> np.ndarray:
-        """The corrected map's data without noise, flat (s, m)."""
+        """Return the corrected map's data without noise, flat (s, m)."""
         features, means = self.features(z), self.means(z)[0]
         return means + np.asarray(corrections(correction, features))
 
     def curvature(
         self, z: np.ndarray, means: np.ndarray, slopes: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        r"""Log prior at ``z`` (p,); of FEM's log posterior, the gradient (p,), minus the curvature.
+        r"""Return the log prior, and gradient (p,) and curvature (p, p) of FEM's log posterior.
 
         .. math::
             \nabla \log\pi = J^T \nabla_m \ell + \partial_z \ell + \nabla \log p, \qquad
             H = -J^T \nabla_m^2 \ell\, J + \operatorname{diag}(s^{-2})
 
-        (Gauss-Newton), with :math:`\ell` the log likelihood of FEM's means :math:`m` (m,), their
-        derivatives in ``z``, :math:`J`, by ``slopes`` (m, S, p), and the prior's sd :math:`s`.
+        with the log likelihood :math:`\ell` of FEM's means :math:`m`, their derivatives :math:`J`
+        in z, and the prior's sd :math:`s` (Gauss-Newton).
+
+        Parameters
+        ----------
+        z : the point (p,). means : FEM's data without noise there, flat (m,).
+        slopes : derivatives (m, S, p) of ``means`` in the theta of each load state.
         """
         prior, gradient, curvature = self._curvature(z, means, slopes)
         curvature = np.asarray(curvature) + np.diag(self.prior_sd**-2)
@@ -133,13 +254,13 @@ class Predictive:
 
     @cached_property
     def _curvature(self) -> Any:
-        def told(z: jax.Array, means: jax.Array, slopes: jax.Array) -> tuple[jax.Array, ...]:
-            def likelihood(at: jax.Array, flat: jax.Array) -> jax.Array:
-                draws = self._constrain(at)
+        def curvature(z: jax.Array, means: jax.Array, slopes: jax.Array) -> tuple[jax.Array, ...]:
+            def likelihood(z: jax.Array, flat: jax.Array) -> jax.Array:
+                draws = self._constrain(z)
                 return self.model.fem_log_likelihood(draws, self.by_name(flat), self.data)
 
-            def thetas(at: jax.Array) -> jax.Array:
-                return self.model.states.thetas(self._constrain(at))
+            def thetas(z: jax.Array) -> jax.Array:
+                return self.model.states.thetas(self._constrain(z))
 
             J = jnp.tensordot(slopes, jax.jacfwd(thetas)(z), axes=2)
             in_z, in_means = jax.grad(likelihood, argnums=(0, 1))(z, means)
@@ -147,16 +268,16 @@ class Predictive:
             prior, in_prior = jax.value_and_grad(self._density.log_prior)(z)
             return prior, J.T @ in_means + in_z + in_prior, -J.T @ second @ J
 
-        return jax.jit(told)
+        return jax.jit(curvature)
 
     def features(self, z: np.ndarray) -> np.ndarray:
-        """Unknowns of theta (s, q) on their parameters' scales, standardised by the prior."""
+        """Return the unknowns (s, q) of theta on their parameters' scales, standardised."""
         draws = self.constrain(z)
         return np.asarray(self._compiled_features(draws))
 
     @cached_property
     def scales(self) -> np.ndarray:
-        """Noise level of each of the flat data, (m,), in its unit."""
+        """Noise level (m,) of each of the flat data, in its unit."""
         levels = {
             name: np.full(part.shape, self.model.noise[name].upper_sd)
             for name, part in self.model.observe.parts.items()
@@ -173,7 +294,7 @@ class Predictive:
         return x.mean(axis=0), x.std(axis=0)
 
     def _on_scales(self, draws: Mapping[str, jax.Array]) -> jax.Array:
-        """Unknowns of theta (..., q), as logarithms where their parameter's scale is ``log``."""
+        """Return unknowns (..., q) of theta, as logarithms where their parameter's scale is log."""
         columns = [
             jnp.log(draws[name]) if log else draws[name]
             for name, log in zip(self.model.states.unknowns, self.model.on_log_scale, strict=True)
@@ -192,28 +313,28 @@ class Predictive:
         return jax.tree.map(lambda values: values[0], self._density.constrain(z[None]))
 
     def _by_map(self, z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Log prior and likelihood, and the data without noise, flat (m,)."""
+        """Return log prior, log likelihood, and data without noise, flat (m,), at one point."""
         draws = self._constrain(z)
         means, valid = self.model.predict(draws)
         cheap = self.model.map_log_likelihood(draws, self.data)
         flat = jnp.where(valid, ravel_pytree(means)[0], jnp.nan)
         return (
-            _finite(self._density.log_prior(z)),
-            _finite(jnp.where(valid, cheap, -jnp.inf)),
+            _without_nan(self._density.log_prior(z)),
+            _without_nan(jnp.where(valid, cheap, -jnp.inf)),
             flat,
         )
 
     def _by_correction(
         self, z: jax.Array, flat: jax.Array, correction: Correction
     ) -> tuple[jax.Array, jax.Array]:
-        """Log likelihood of the map's data ``flat`` (m,) corrected, and the variance of that."""
+        """Return the log likelihood of the map's data ``flat`` (m,) corrected, and its variance."""
         draws = self._constrain(z)
         step, variance = correct(correction, self._features(draws))
-        moved = self.by_name(flat + step)
-        return _finite(self.model.fem_log_likelihood(draws, moved, self.data)), variance
+        means = self.by_name(flat + step)
+        return _without_nan(self.model.fem_log_likelihood(draws, means, self.data)), variance
 
     def by_name(self, flat: jax.Array) -> dict[str, jax.Array]:
-        """Data by name from flat ones (m,)."""
+        """Return flat data (m,) by the observation's name."""
         parts = self.model.observe.parts
         return ravel_pytree({name: jnp.zeros(parts[name].shape) for name in parts})[1](flat)
 
@@ -236,7 +357,7 @@ class Predictive:
         return jax.jit(jax.vmap(self._density.prior_draw))
 
     def _in_blocks(self, program: Any, *points: np.ndarray) -> Any:
-        """``program`` of arrays (s, ...), in blocks of one shape; the last one is filled up."""
+        """Return ``program`` of arrays (s, ...), called with padded blocks of one shape."""
         count = len(points[0])
         padded = [np.concatenate([x, np.repeat(x[-1:], -count % _BLOCK, axis=0)]) for x in points]
         parts = [
@@ -246,11 +367,10 @@ class Predictive:
         return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:count], *parts)
 
 
-def _finite(log_density: jax.Array) -> jax.Array:
-    """``-inf`` where it is not a number."""
+def _without_nan(log_density: jax.Array) -> jax.Array:
     return jnp.where(jnp.isfinite(log_density), log_density, -jnp.inf)
 
 
-def _inside(z: jax.Array) -> np.ndarray:
-    """Points whose coordinates are finite: a draw on a bound is at infinity."""
+def _finite_coordinates(z: jax.Array) -> np.ndarray:
+    """Return ``z`` with finite coordinates; a draw on a bound is at infinity."""
     return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)

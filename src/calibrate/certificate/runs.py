@@ -1,24 +1,46 @@
-"""FEM at points of unconstrained coordinates, remembered."""
+r"""FEM runs at points of unconstrained coordinates, and descents of FEM's own misfit.
+
+A map that is wrong only around a mode hides it: no draw is there, and the map elsewhere does not
+lead there. FEM's own derivatives do. Each descent starts at a draw of the prior and takes
+Gauss-Newton steps up FEM's log posterior,
+
+.. math:: z' = z + H^{-1} \nabla \log\pi(z)
+
+with :math:`\nabla \log\pi` and :math:`H` of :meth:`Predictive.curvature`. No step is longer than
+the prior is wide; where FEM's log posterior decreases, the step is halved. A descent that is about
+to end among the draws, where the map finds the data likely as well, gets no more runs. The runs of
+the others train the correction like any run, and the pool gets points around each end that FEM
+finds likely, from a Gaussian of covariance :math:`H^{-1}`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from scipy.linalg import eigh
 from scipy.special import chdtri
 from tqdm import tqdm
 
-from calibrate.certificate.correction import Correction, fit, nothing
-from calibrate.certificate.predictive import Predictive
+from calibrate.certificate.predictive import Correction, Predictive, fit_correction, no_correction
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood, Likelihoods
 
-_LIKELY = 0.999  # mass of the Gaussian around the likeliest run, in which a correction is judged
+ROUNDS = 4  # runs of a descent
+_LIKELY = 0.999  # mass of the Gaussian at the best run in which a point counts as likely
+_AMONG = 0.999  # mass of the Gaussian of the draws in which a point counts as among them
+_LONGEST = 1.0  # step of a descent, in sd of the prior
+_SHORTEST = 0.02  # step below which a descent has converged, likewise
+_MISSED = 3.0  # log likelihood by which the map may find a point less likely than _LIKELY
+_MOST_ENDS = 3
+_POINTS_OF_END = 256
 
 
 def least_likely(best: float, dimension: int, mass: float) -> float:
-    r"""Log density that bounds ``mass`` of a Gaussian whose largest is ``best``.
+    r"""Return the log density that bounds ``mass`` of a Gaussian with largest log density ``best``.
 
     .. math:: \log\pi > \max\log\pi - \tfrac12 \chi^2_p(\text{mass})
     """
@@ -30,7 +52,8 @@ class Runs(NamedTuple):
 
     fem : log likelihoods (s,), ``-inf`` where FEM did not converge.
     means : FEM's data without noise, flat (s, m); NaN where it did not converge.
-    smallest_J : (s,). stable : minimum of the energy, saddle, or ``None`` for not asked, (s,).
+    smallest_J : the smallest det F in the body, (s,).
+    stable : whether the equilibrium is a minimum of the energy; ``None`` if not examined, (s,).
     slopes : derivatives (m, S, p) of the means in theta of each load state, or ``None``, (s,).
     """
 
@@ -46,22 +69,36 @@ class Runs(NamedTuple):
         """Where FEM converged, (s,)."""
         return np.isfinite(self.means).all(axis=1)
 
+    def likely(self, dimension: int) -> np.ndarray:
+        """Return whether each run (s,) is within reach of the best one's Gaussian."""
+        return self.fem > least_likely(self.fem.max(), dimension, _LIKELY)
 
-def joined(parts: list[Runs]) -> Runs:
-    """Runs one after the other."""
-    return Runs(
-        np.concatenate([p.z for p in parts]),
-        np.concatenate([p.fem for p in parts]),
-        np.concatenate([p.means for p in parts]),
-        np.concatenate([p.smallest_J for p in parts]),
-        tuple(s for p in parts for s in p.stable),
-        tuple(s for p in parts for s in p.slopes),
-    )
+    def first(self, count: int) -> Runs:
+        """Return the first ``count`` runs."""
+        z, fem, means, smallest_J, stable, slopes = self
+        cut = slice(count)
+        return Runs(z[cut], fem[cut], means[cut], smallest_J[cut], stable[cut], slopes[cut])
+
+    @classmethod
+    def joined(cls, parts: Iterable[Runs]) -> Runs:
+        """Return the runs of all parts, one part after the other."""
+        z, fem, means, smallest_J, stable, slopes = zip(*parts, strict=True)
+        return cls(
+            np.concatenate(z),
+            np.concatenate(fem),
+            np.concatenate(means),
+            np.concatenate(smallest_J),
+            tuple(chain(*stable)),
+            tuple(chain(*slopes)),
+        )
 
 
 @dataclass
 class Solver:
-    """Solves FEM at points, each once; ``bar`` counts."""
+    """Solves FEM at points, each point once.
+
+    bar : the progress bar that counts the runs.
+    """
 
     predictive: Predictive
     likelihood: FEMLikelihood
@@ -71,39 +108,183 @@ class Solver:
         self._known: dict[bytes, Likelihoods] = {}
 
     def __call__(self, z: np.ndarray, *, stability: int = 0, slopes: bool = False) -> Runs:
-        """FEM at points (s, p); at the first ``stability`` of them, also whether it is stable.
+        """Return FEM at points (s, p).
 
-        slopes : whether the slopes of points that are new are wanted.
+        stability : the number of points, the first ones, at which stability is examined.
+        slopes : whether points that were not solved before get their slopes.
         """
         keys = [point.tobytes() for point in z]
         new = list(dict.fromkeys(key for key in keys if key not in self._known))
         draws, rows = self.predictive.constrain(z), [keys.index(key) for key in new]
-        each = [{name: values[s] for name, values in draws.items()} for s in rows]
-        asked = {k for k, s in enumerate(rows) if s < stability}
+        new_draws = [{name: values[s] for name, values in draws.items()} for s in rows]
+        examined = {k for k, s in enumerate(rows) if s < stability}
         self.bar.update(len(keys) - len(new))
-        for k, told in self.likelihood.many(
-            each, self.predictive.data, stability=asked, slopes=slopes
+        for k, likelihoods in self.likelihood.many(
+            new_draws, self.predictive.data, stability=examined, slopes=slopes
         ):
-            self._known[new[k]] = told
+            self._known[new[k]] = likelihoods
             self.bar.update()
-        found = [self._known[key] for key in keys]
+        runs = [self._known[key] for key in keys]
         missing = np.full(len(self.predictive.scales), np.nan)
         return Runs(
             z,
-            np.array([f.fem if np.isfinite(f.fem) else -np.inf for f in found]),
-            np.array([ravel_pytree(f.means)[0] if f.converged else missing for f in found]),
-            np.array([f.smallest_J for f in found]),
-            tuple(f.stable for f in found),
-            tuple(f.slopes for f in found),
+            np.array([f.fem if np.isfinite(f.fem) else -np.inf for f in runs]),
+            np.array([ravel_pytree(f.means)[0] if f.converged else missing for f in runs]),
+            np.array([f.smallest_J for f in runs]),
+            tuple(f.stable for f in runs),
+            tuple(f.slopes for f in runs),
         )
 
 
 def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction:
-    """The correction that FEM's ``runs`` say, with room for ``rows``."""
+    """Return the correction fitted to ``runs``, padded to ``rows`` points."""
     means, valid = predictive.means(runs.z)
     x = predictive.features(runs.z)
-    fine = valid & runs.converged
-    if fine.sum() < x.shape[1] + 2:
-        return nothing(rows, x.shape[1], means.shape[1])
-    likely = runs.fem[fine] > least_likely(runs.fem.max(), predictive.dimension, _LIKELY)
-    return fit(x[fine], (runs.means - means)[fine], predictive.scales, rows, likely)
+    usable = valid & runs.converged
+    if usable.sum() < x.shape[1] + 2:
+        return no_correction(rows, x.shape[1], means.shape[1])
+    likely = runs.likely(predictive.dimension)[usable]
+    errors = (runs.means - means)[usable]
+    return fit_correction(x[usable], errors, predictive.scales, rows, likely)
+
+
+class Ends(NamedTuple):
+    """The FEM runs of descents, and points (_, p) around each end that FEM finds likely."""
+
+    runs: Runs
+    ends: tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Descent:
+    """A descent at ``z`` (p,).
+
+    log_posterior, curvature : FEM's at z, and minus its Hessian (p, p).
+    target : the next point (p,). promise : the log posterior expected there.
+    """
+
+    z: np.ndarray
+    log_posterior: float
+    curvature: np.ndarray
+    target: np.ndarray
+    promise: float
+
+    @classmethod
+    def from_run(cls, predictive: Predictive, runs: Runs, k: int) -> _Descent | None:
+        """Return a descent at run ``k``; none where FEM did not converge or has no slopes."""
+        slopes = runs.slopes[k]
+        if slopes is None or not np.isfinite(runs.fem[k]):
+            return None
+        z = runs.z[k]
+        prior, gradient, curvature = predictive.curvature(z, runs.means[k], slopes)
+        if not (np.isfinite(gradient).all() and np.isfinite(curvature).all()):
+            return None
+        step, gain = _gauss_newton_step(gradient, curvature, predictive.prior_sd)
+        log_posterior = prior + runs.fem[k]
+        return cls(z, log_posterior, curvature, z + step, log_posterior + gain)
+
+    def advanced(self, predictive: Predictive, runs: Runs, k: int) -> _Descent:
+        """Return the descent at run ``k`` if FEM's posterior is higher there, else a half step."""
+        there = _Descent.from_run(predictive, runs, k)
+        if there is not None and there.log_posterior > self.log_posterior:
+            return there
+        return replace(self, target=0.5 * (self.z + self.target))
+
+    def converged(self, predictive: Predictive) -> bool:
+        """Return whether the next step is too short to matter."""
+        length = np.linalg.norm((self.target - self.z) / predictive.prior_sd)
+        return bool(length < _SHORTEST)
+
+
+def descend(
+    solver: Solver,
+    starts: Runs,
+    at_draws: Runs,
+    draws: np.ndarray,
+    count: int,
+    rng: np.random.Generator,
+) -> Ends:
+    """Search modes of FEM's posterior away from the draws, with at most ``count`` FEM runs.
+
+    starts : runs with slopes, at which descents begin.
+    at_draws : runs at some of the draws. draws : all draws (s, p).
+    """
+    predictive = solver.predictive
+    prior = predictive.evaluate(at_draws.z, predictive.uncorrected).prior
+    best = float(np.max(prior + at_draws.fem))
+    known = _KnownRegion(predictive, draws, best)
+    candidates = (_Descent.from_run(predictive, starts, k) for k in range(len(starts.z)))
+    descents = {k: d for k, d in enumerate(candidates) if d is not None}
+    parts: list[Runs] = []
+    remaining, width = count, max(-(-count // ROUNDS), 1)
+    while remaining:
+        targets = {k: d.target for k, d in descents.items()}
+        active = [k for k in known.outside(targets) if not descents[k].converged(predictive)]
+        chosen = sorted(active, key=lambda k: -descents[k].promise)[: min(width, remaining)]
+        if not chosen:
+            break
+        runs = solver(np.stack([targets[k] for k in chosen]), slopes=True)
+        parts.append(runs)
+        remaining -= len(chosen)
+        for row, k in enumerate(chosen):
+            descents[k] = descents[k].advanced(predictive, runs, row)
+    least = least_likely(best, draws.shape[1], _LIKELY)
+    points = {k: d.z for k, d in descents.items() if d.log_posterior > least}
+    ends = [descents[k] for k in known.outside(points)]
+    runs = Runs.joined(parts) if parts else starts.first(0)
+    return Ends(runs, _points_around(ends, predictive.prior_sd, rng))
+
+
+def _points_around(
+    ends: list[_Descent], sd: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
+    """Return points around distinct ends, the likeliest first."""
+    distinct: list[_Descent] = []
+    far = chdtri(len(sd), 1.0 - _AMONG)
+    for end in sorted(ends, key=lambda d: -d.log_posterior):
+        steps = [end.z - other.z for other in distinct]
+        if all(step @ d.curvature @ step > far for step, d in zip(steps, distinct, strict=True)):
+            distinct.append(end)
+    clouds = []
+    for end in distinct[:_MOST_ENDS]:
+        values, vectors = eigh(end.curvature * sd * sd[:, None])
+        root = sd[:, None] * vectors / np.sqrt(np.maximum(values, 1.0))
+        clouds.append(end.z + rng.normal(size=(_POINTS_OF_END, len(sd))) @ root.T)
+    return tuple(clouds)
+
+
+class _KnownRegion:
+    """The Gaussian of the draws (s, p), where it has points that the map finds likely."""
+
+    def __init__(self, predictive: Predictive, draws: np.ndarray, best: float) -> None:
+        self._predictive = predictive
+        self._mean = draws.mean(axis=0)
+        covariance = np.atleast_2d(np.cov(draws, rowvar=False))
+        values, vectors = eigh(covariance + 1e-12 * np.eye(len(covariance)))
+        self._whiten = vectors / np.sqrt(values)
+        self._far = chdtri(len(values), 1.0 - _AMONG)
+        self._least = least_likely(best, len(values), _LIKELY) - _MISSED
+
+    def outside(self, points: dict[int, np.ndarray]) -> list[int]:
+        """Return the keys of the points (p,) that are not in the region."""
+        if not points:
+            return []
+        z = np.stack(list(points.values()))
+        at = self._predictive.evaluate(z, self._predictive.uncorrected)
+        near = (((z - self._mean) @ self._whiten) ** 2).sum(axis=1) <= self._far
+        known = near & (at.prior + at.cheap > self._least)
+        return [key for key, inside in zip(points, known, strict=True) if not inside]
+
+
+def _gauss_newton_step(
+    gradient: np.ndarray, curvature: np.ndarray, sd: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the Gauss-Newton step (p,), shortened to the longest, and its expected gain."""
+    scaled = curvature * sd * sd[:, None]
+    values, vectors = eigh(scaled)
+    # The prior's curvature is 1; where the likelihood is not concave, only the prior's is left.
+    along = vectors.T @ (gradient * sd) / np.maximum(values, 1.0)
+    length = float(np.linalg.norm(along))
+    along *= min(1.0, _LONGEST / length) if length > 0.0 else 1.0
+    gain = along @ (vectors.T @ (gradient * sd)) - 0.5 * along @ (values * along)
+    return sd * (vectors @ along), float(gain)

@@ -1,25 +1,41 @@
-"""The certificate and its verdict: every figure with its error, every finding with what to do.
+"""The evidence of a certificate, the limits of each figure, and the verdict that follows.
 
-A figure counts as within its limit where its distance from it exceeds twice its Monte Carlo error,
-as beyond it likewise, and as undecided in between; so more FEM runs may decide what few leave open,
-but do not turn one verdict into the other.
+Every figure has a Monte Carlo error. A figure is within its limit if it is below by more than twice
+that error, beyond its limit if it is above by more than twice that error, and undecided in between.
+So more FEM runs may decide what few leave open, but do not turn one verdict into the other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from calibrate.certificate.evidence import Evidence, Figure, MeshChange, Physics, Sampling
 from calibrate.posterior.fit import SMALLEST_P, Misfit
-from calibrate.samplers.stopping import REFUSE_ABOVE_R_HAT, REFUSE_BELOW_ESS
+from calibrate.samplers.diagnostics import REFUSE_ABOVE_R_HAT, REFUSE_BELOW_ESS
 from emulator.core.representation import TableRepr
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
 
+# At a shift of 0.25 sd a 90 % interval still covers 88.9 %.
+LARGEST_SHIFT = 0.25
+LARGEST_LOG_SD = float(np.log(1.2))
+LARGEST_CORRELATION_CHANGE = 0.2
+# Change of the mass below a quantile, by the quantile's level: about what the largest shift and the
+# largest change of sd do together to a Gaussian (0.073 and 0.118). Mean and sd alone are not
+# enough: a posterior of two points may have the right ones.
+LARGEST_MASS = {0.05: 0.06, 0.5: 0.12, 0.95: 0.06}
+# Beyond these changes by a finer mesh the posterior is about the mesh and not about the tissue.
+LARGEST_MESH_SHIFT = 0.5
+LARGEST_MESH_LOG_SD = float(np.log(1.25))
+# For a likelihood that allows for the mesh: the finer mesh's mean is inside the 90 % interval.
+LARGEST_WIDENED_SHIFT = 1.5
+# If no weight of an FEM run exceeds this multiple of the mean weight, the tail does not matter:
+# proposals cover the prior, so that the ratios are bounded (docs/experiments.md, "When k-hat cries
+# wolf").
+NO_TAIL = 6.0
 LARGEST_DIVERGENT = 0.002
 LARGEST_FAILED = 0.02
 SMALLEST_P_WORST = 0.001
@@ -27,21 +43,216 @@ SMALLEST_P_WORST = 0.001
 # different whatever the tail; at 1.5 a tenth of the FEM runs would count.
 LARGEST_SPREAD = 1.5
 SMALLEST_POOL = 200.0  # effective points under the corrected map
+_ERRORS = 2.0  # Monte Carlo errors between a figure and its limit
+_MANY = 20.0  # factor in the number of runs above which the estimate of that factor is worthless
+
 _MORE = "more FEM runs (--until decided)"
-_MANY = 20.0  # times as many runs; beyond, it is not known how many would decide
 _WIDEN = "or allow for it in the likelihood (--mesh-error)"
 _QUADRATIC = f"make the elements quadratic (order = 2), {_WIDEN}"
 _REFINE = f"emulate the finer mesh (calibrate train finer:SCENE --recipe two_meshes), {_WIDEN}"
 
 
+@dataclass(frozen=True)
+class Figure:
+    """A number and its Monte Carlo error."""
+
+    value: float
+    error: float
+
+    def within(self, limit: float) -> bool | None:
+        """Return whether the size is below ``limit``; ``None`` if the error leaves that open."""
+        if not np.isfinite([self.value, self.error]).all():
+            return None
+        if abs(self.value) + _ERRORS * self.error <= limit:
+            return True
+        return False if abs(self.value) - _ERRORS * self.error > limit else None
+
+    def factor_to_decide(self, limit: float) -> float:
+        """Return the factor in the number of runs that decides, if the value stays as it is.
+
+        The error falls with the square root of the number of runs.
+        """
+        gap = abs(limit - abs(self.value))
+        return (_ERRORS * self.error / gap) ** 2 if gap > 0.0 else np.inf
+
+
+Comparison = tuple[str, Figure, float]
+"""A figure in words, the figure, and its limit."""
+
+
+def _all_within(comparisons: list[Comparison]) -> bool | None:
+    """Return whether all figures are within their limits; ``None`` if that is undecided."""
+    answers = [figure.within(limit) for _, figure, limit in comparisons]
+    if False in answers:
+        return False
+    return None if None in answers else True
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The changes of a posterior by FEM.
+
+    shift : the change of each mean, in posterior sd, by parameter.
+    log_sd : the change of the logarithm of each sd, by parameter.
+    correlation : the change of the correlation of each pair.
+    mass : the change of the mass below each quantile, by the quantile's level and by parameter.
+    """
+
+    shift: dict[str, Figure]
+    log_sd: dict[str, Figure]
+    correlation: dict[str, Figure]
+    mass: dict[float, dict[str, Figure]] = field(default_factory=dict)
+
+    def comparisons(self) -> list[Comparison]:
+        """Return every figure with its limit."""
+        return [
+            *((f"mean of {n} moves by {f.value:+.2f} sd", f, LARGEST_SHIFT)
+              for n, f in self.shift.items()),
+            *((f"sd of {n} changes by a factor of {np.exp(f.value):.2f}", f, LARGEST_LOG_SD)
+              for n, f in self.log_sd.items()),
+            *((f"correlation of {n} changes by {f.value:+.2f}", f, LARGEST_CORRELATION_CHANGE)
+              for n, f in self.correlation.items()),
+            *((f"below the {100 * level:.0f} % quantile of {n} FEM has "
+               f"{100 * (level + f.value):.0f} %", f, LARGEST_MASS[level])
+              for level, figures in self.mass.items() for n, f in figures.items()),
+        ]  # fmt: skip
+
+    def within(self) -> bool | None:
+        """Return whether all figures are within their limits; ``None`` if that is undecided."""
+        return _all_within(self.comparisons())
+
+
+@dataclass(frozen=True)
+class MeshChange:
+    """The changes of a posterior by a finer mesh; no figures where nothing is known.
+
+    shift : the change of each mean, in posterior sd, by parameter.
+    log_sd : the change of the logarithm of each sd, by parameter.
+    nodes : the number of nodes of the finer mesh.
+    runs, failed : the numbers of solves on the finer mesh, and of those that did not converge.
+    linear : whether the coarser mesh has linear elements.
+    widened : whether the likelihood allows for the error of the mesh.
+    why : the reason for which no finer mesh was solved; empty if one was.
+    """
+
+    shift: dict[str, Figure] = field(default_factory=dict)
+    log_sd: dict[str, Figure] = field(default_factory=dict)
+    nodes: int = 0
+    runs: int = 0
+    failed: int = 0
+    linear: bool = False
+    widened: bool = False
+    why: str = ""
+
+    def comparisons(self) -> list[Comparison]:
+        """Return every figure with its limit."""
+        largest = LARGEST_WIDENED_SHIFT if self.widened else LARGEST_MESH_SHIFT
+        return [
+            *((f"mean of {n} would move by {f.value:+.2f} sd", f, largest)
+              for n, f in self.shift.items()),
+            *((f"sd of {n} would change by a factor of {np.exp(f.value):.2f}", f,
+               LARGEST_MESH_LOG_SD) for n, f in self.log_sd.items()),
+        ]  # fmt: skip
+
+    def within(self) -> bool | None:
+        """Return whether all figures are within their limits; ``None`` if that is undecided."""
+        return _all_within(self.comparisons()) if self.shift else None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The quality of the draws: largest R-hat, smallest effective sample sizes, divergences.
+
+    transitions : the number of draws.
+    vary : whether the draws of every parameter vary.
+    """
+
+    r_hat: float
+    ess_bulk: float
+    ess_tail: float
+    divergences: int
+    transitions: int
+    vary: bool = True
+
+
+@dataclass(frozen=True)
+class Physics:
+    """The outcome of the FEM runs.
+
+    runs, failed : the numbers of runs, and of those that did not converge.
+    failed_mass : the posterior mass on which FEM does not converge.
+    smallest_J : the smallest det F in the body at any draw.
+    unstable, asked : the number of draws at which FEM is at a saddle, of the number examined.
+    """
+
+    runs: int
+    failed: int
+    failed_mass: float
+    smallest_J: float
+    unstable: int
+    asked: int
+
+
+@dataclass(frozen=True)
+class Tail:
+    """The importance weights of the FEM runs that test the corrected map.
+
+    k_hat : the Pareto shape of the tail of their weights.
+    k_threshold : the largest Pareto shape at which their errors are trusted.
+    ess : the effective number of runs.
+    largest : the largest weight over the mean weight.
+    spread : the sd of the log ratio of FEM's likelihood over the corrected map's.
+    pool : the effective number of points under the corrected map.
+    missed : the number of runs that FEM finds likely and the corrected map does not, where tests
+        are too few to meet the mode that may be there.
+    ends : the number of modes of FEM, found by descents, that neither draws nor map know.
+    """
+
+    k_hat: float
+    k_threshold: float
+    ess: float
+    largest: float
+    spread: float
+    pool: float
+    missed: int
+    ends: int = 0
+
+    @property
+    def heavy(self) -> bool:
+        """Whether the tail is too heavy for errors to be trusted; NaN counts as heavy."""
+        return not (self.k_hat < self.k_threshold or self.largest < NO_TAIL)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything that the verdict depends on.
+
+    draws : the changes from the draws to FEM's posterior.
+    corrected : the changes from the corrected map's posterior to FEM's.
+    mean, sd : the mean and sd of each parameter under FEM, in its unit.
+    misfit : the posterior predictive check of each observation.
+    mesh : the changes by a finer mesh.
+    """
+
+    draws: Changes
+    corrected: Changes
+    mean: dict[str, Figure]
+    sd: dict[str, Figure]
+    sampling: Sampling
+    physics: Physics
+    tail: Tail
+    misfit: dict[str, Misfit]
+    mesh: MeshChange = MeshChange(why="not asked")
+
+
 class Finding(NamedTuple):
-    """What was found, and what to do about it where something is to be done."""
+    """A statement about the posterior, and a remedy where there is one."""
 
     what: str
     remedy: str = ""
 
     def __str__(self) -> str:
-        """Both, as they are told."""
+        """Return the statement with its remedy."""
         return f"{self.what}: {self.remedy}" if self.remedy else self.what
 
 
@@ -51,7 +262,7 @@ class Certificate(TableRepr):
 
     verdict : ``accepted`` (use the posterior as it is), ``reweight`` (use the reweighted one),
         ``undecided`` (give more FEM runs), or ``not certified``.
-    reason : what decides, in words. findings : all that was found, each with what to do.
+    reason : the statement that decides. findings : all statements, each with its remedy.
     evidence : the figures.
     """
 
@@ -61,11 +272,11 @@ class Certificate(TableRepr):
     evidence: Evidence
 
     def __str__(self) -> str:
-        """Verdict, every finding, and what they cost."""
+        """Return verdict, every finding, and the number of FEM runs."""
         return f"{self.verdict}: {'; '.join(self.findings)} ({self.evidence.physics.runs} FEM runs)"
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
-        """Verdict, findings, and what they cost."""
+        """Return title and rows of the table: verdict, findings, and the number of FEM runs."""
         rows = [("verdict", str(self.verdict)), *(("finding", each) for each in self.findings)]
         return "Certificate", [*rows, ("FEM runs", str(self.evidence.physics.runs))]
 
@@ -76,11 +287,11 @@ class Certificate(TableRepr):
 
     @property
     def shift(self) -> dict[str, float]:
-        """Per parameter, mean under FEM less mean of the draws, in posterior sd."""
+        """By parameter, mean under FEM less mean of the draws, in posterior sd."""
         return {name: figure.value for name, figure in self.evidence.draws.shift.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON: figures by name, each error beside its figure."""
+        """Return plain JSON: figures by name, the error of each beside it."""
         e = self.evidence
         return {
             "verdict": self.verdict,
@@ -91,17 +302,18 @@ class Certificate(TableRepr):
             "ess": e.tail.ess,
             "draws": e.physics.runs,
             "failed": e.physics.failed,
-            **_columns("shift", e.draws.shift),
-            **_columns("log_sd_change", e.draws.log_sd),
-            **_columns("correlation_change", e.draws.correlation),
+            **_with_errors("shift", e.draws.shift),
+            **_with_errors("log_sd_change", e.draws.log_sd),
+            **_with_errors("correlation_change", e.draws.correlation),
             "mass_change": {
-                f"{level:g}": _columns("below", figures) for level, figures in e.draws.mass.items()
+                f"{level:g}": _with_errors("below", figures)
+                for level, figures in e.draws.mass.items()
             },
-            **_columns("mean_fem", e.mean),
-            **_columns("sd_fem", e.sd),
+            **_with_errors("mean_fem", e.mean),
+            **_with_errors("sd_fem", e.sd),
             "mesh": {
-                **_columns("shift", e.mesh.shift),
-                **_columns("log_sd_change", e.mesh.log_sd),
+                **_with_errors("shift", e.mesh.shift),
+                **_with_errors("log_sd_change", e.mesh.log_sd),
                 "nodes": e.mesh.nodes,
                 "runs": e.mesh.runs,
                 "failed": e.mesh.failed,
@@ -114,32 +326,39 @@ class Certificate(TableRepr):
         }
 
 
+def _with_errors(name: str, figures: dict[str, Figure]) -> dict[str, dict[str, float]]:
+    return {
+        name: {k: f.value for k, f in figures.items()},
+        f"{name}_error": {k: f.error for k, f in figures.items()},
+    }
+
+
 def shifts(certificate: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """How far FEM, and a finer mesh, would move each mean, in sd: of a certificate's JSON."""
-    found = {"FEM": certificate.get("shift"), "mesh": certificate.get("mesh", {}).get("shift")}
-    return {what: shift for what, shift in found.items() if shift}
+    """Return the shifts of means by FEM and by a finer mesh, in sd, from a certificate's JSON."""
+    by_cause = {"FEM": certificate.get("shift"), "mesh": certificate.get("mesh", {}).get("shift")}
+    return {cause: shift for cause, shift in by_cause.items() if shift}
 
 
 def judge(evidence: Evidence) -> Certificate:
-    """The verdict: the first of not certified, undecided, reweight and accepted with a reason.
+    """Return the certificate: not certified, undecided, reweight or accepted, the first that holds.
 
     Every comparison is written so that NaN fails it.
     """
-    wrong = [*_sampling(evidence.sampling), *_physics(evidence.physics), *_misfit(evidence.misfit)]
-    verdict, words = _agreement(evidence)
-    fine, mesh = _mesh(evidence.mesh)
-    if wrong or fine is False:
+    faults = [*_sampling(evidence.sampling), *_physics(evidence.physics), *_misfit(evidence.misfit)]
+    verdict, agreement = _agreement(evidence)
+    mesh_is_fine, mesh = _mesh(evidence.mesh)
+    if faults or mesh_is_fine is False:
         verdict = "not certified"
-    elif fine is None and verdict in ("accepted", "reweight"):
+    elif mesh_is_fine is None and verdict in ("accepted", "reweight"):
         verdict = "undecided"
     if evidence.mesh.why and verdict == "accepted":
-        words = [Finding(f"{words[0].what} on this mesh")]
-    findings = [*wrong, *words, *mesh] if fine else [*wrong, *mesh, *words]
+        agreement = [Finding(f"{agreement[0].what} on this mesh")]
+    findings = [*faults, *agreement, *mesh] if mesh_is_fine else [*faults, *mesh, *agreement]
     return Certificate(verdict, findings[0].what, tuple(map(str, findings)), evidence)
 
 
 def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
-    """Whether a finer mesh leaves the posterior as it is, ``None`` where that is open; findings."""
+    """Return whether the posterior stays on a finer mesh, ``None`` if undecided, and findings."""
     if mesh.why:
         return True, [Finding(f"no finer mesh was asked: {mesh.why}")]
     finer = f"on a finer mesh ({mesh.nodes} nodes)"
@@ -149,30 +368,53 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
     within = mesh.within()
     if within:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
-        told = f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"
-        return True, [Finding(f"{told}, which is widened for it" if mesh.widened else told)]
-    words = [w for w, figure, limit in mesh.judged() if figure.within(limit) is within]
+        words = f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"
+        return True, [Finding(f"{words}, which is widened for it" if mesh.widened else words)]
+    decisive = [w for w, figure, limit in mesh.comparisons() if figure.within(limit) is within]
     if within is None:
-        near = f"{finer} the {words[0]}, too close to the limit for its error"
-        return None, [Finding(near, "give more runs on the finer mesh (--mesh-runs)")]
+        close = f"{finer} the {decisive[0]}, too close to the limit for its error"
+        return None, [Finding(close, "give more runs on the finer mesh (--mesh-runs)")]
     remedy = _QUADRATIC if mesh.linear else _REFINE
     if mesh.widened:
         remedy = "learn the error of the mesh from more runs, or emulate the finer mesh"
-    return False, [Finding(f"{finer} the {each}", remedy) for each in words]
+    return False, [Finding(f"{finer} the {each}", remedy) for each in decisive]
 
 
 def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
-    """Verdict and findings on draws against FEM."""
-    tail, draws, corrected = evidence.tail, evidence.draws, evidence.corrected
+    """Return verdict and findings on the draws against FEM."""
+    tail, draws = evidence.tail, evidence.draws
+    verdict_of_weights = _weights(tail)
+    if verdict_of_weights is not None:
+        return verdict_of_weights
+    agree = draws.within()
+    if agree:
+        worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
+        return "accepted", [Finding(f"no mean moves by more than {worst:.2f} posterior sd")]
+    decisive = [each for each in draws.comparisons() if each[1].within(each[2]) is agree]
+    if agree is None:
+        factor = max(figure.factor_to_decide(limit) for _, figure, limit in decisive)
+        some = f", some {_rounded_up(evidence.physics.runs * factor)}" if factor < _MANY else ""
+        close = f"{decisive[0][0]}, too close to the limit for its error"
+        return "undecided", [Finding(close, _MORE + some)]
+    repaired = evidence.corrected.within()
+    if repaired:
+        remedy = "use the reweighted posterior"
+        return "reweight", [Finding(words, remedy) for words, _, _ in decisive]
+    verdict: Verdict = "undecided" if repaired is None else "not certified"
+    remedy = _MORE if repaired is None else "train a better map"
+    still = "and reweighting does not repair it"
+    return verdict, [Finding(f"{words}, {still}", remedy) for words, _, _ in decisive]
+
+
+def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
+    """Return verdict and finding where the weights of the FEM runs forbid any other figure."""
     if tail.ess == 0.0:
-        return "not certified", [
-            Finding("no FEM run supports the posterior", "check map and FEM options")
-        ]
+        finding = Finding("no FEM run supports the posterior", "check map and FEM options")
+        return "not certified", [finding]
     if tail.spread > LARGEST_SPREAD:
         apart = f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}"
-        return "not certified", [
-            Finding(apart, "train a better map, or put FEM into the likelihood")
-        ]
+        remedy = "train a better map, or put FEM into the likelihood"
+        return "not certified", [Finding(apart, remedy)]
     if np.isnan(tail.k_hat):
         few = "too few FEM runs to judge the tail of their weights"
         return "undecided", [Finding(few, "100 FEM runs or more")]
@@ -187,24 +429,7 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
         missed = f"{tail.missed} FEM runs are likely where the corrected map says they are not"
         hidden = f"{missed}, so the map may hide a part of the posterior"
         return "undecided", [Finding(hidden, f"train a better map, or {_MORE}")]
-    agree = draws.within()
-    beyond = [words for words, f, limit in draws.judged() if f.within(limit) is False]
-    if agree:
-        worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
-        return "accepted", [Finding(f"no mean moves by more than {worst:.2f} posterior sd")]
-    if agree is None:
-        near = [each for each in draws.judged() if each[1].within(each[2]) is None]
-        close = f"{near[0][0]}, too close to the limit for its error"
-        times = max(figure.more(limit) for _, figure, limit in near)
-        some = f", some {_rounded(evidence.physics.runs * times)}" if times < _MANY else ""
-        return "undecided", [Finding(close, _MORE + some)]
-    repaired = corrected.within()
-    if repaired:
-        return "reweight", [Finding(words, "use the reweighted posterior") for words in beyond]
-    verdict: Verdict = "undecided" if repaired is None else "not certified"
-    remedy = _MORE if repaired is None else "train a better map"
-    still = "and reweighting does not repair it"
-    return verdict, [Finding(f"{words}, {still}", remedy) for words in beyond]
+    return None
 
 
 def _sampling(s: Sampling) -> Iterator[Finding]:
@@ -256,13 +481,6 @@ def _misfit(observations: dict[str, Misfit]) -> Iterator[Finding]:
             yield Finding(close, "its noise sd is too large")
 
 
-def _rounded(number: float) -> int:
-    """Up to the next hundred."""
+def _rounded_up(number: float) -> int:
+    """Return the next multiple of 100."""
     return int(np.ceil(number / 100.0)) * 100
-
-
-def _columns(name: str, figures: dict[str, Figure]) -> dict[str, dict[str, float]]:
-    return {
-        name: {k: f.value for k, f in figures.items()},
-        f"{name}_error": {k: f.error for k, f in figures.items()},
-    }

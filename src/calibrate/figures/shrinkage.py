@@ -10,7 +10,7 @@ import numpy as np
 from calibrate.figures.drawing import pyplot, save
 from calibrate.figures.palette import BLUE, VERMILION
 from calibrate.population import Hierarchy
-from calibrate.population.tree import ALONE
+from calibrate.population.posterior import ALONE
 
 _ALONE, _TOGETHER, _POPULATION = "0.55", BLUE, VERMILION
 APART = 0.16  # of the rows' distance, between a member's two intervals

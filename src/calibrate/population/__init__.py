@@ -1,14 +1,17 @@
-"""Several bodies drawn from one population: members, what they share, and those not yet seen."""
+"""Populations: several bodies, the members, that share the distribution of some unknowns.
 
-from calibrate.population.model import HierarchicalModel, hierarchical_model
+:func:`hierarchy` calibrates a population and its members together, as a hierarchical model.
+"""
+
+from calibrate.population.model import PopulationModel, population_model
 from calibrate.population.posterior import Hierarchy, read_hierarchy
-from calibrate.population.sample import hierarchy, sample_hierarchy
+from calibrate.population.sample import hierarchy, sample_population
 
 __all__ = [
-    "HierarchicalModel",
     "Hierarchy",
-    "hierarchical_model",
+    "PopulationModel",
     "hierarchy",
+    "population_model",
     "read_hierarchy",
-    "sample_hierarchy",
+    "sample_population",
 ]

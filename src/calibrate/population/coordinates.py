@@ -1,10 +1,20 @@
 r"""Coordinates of members in which a population is easy to sample.
 
-Given the population, :math:`x_i = x(q_i)` (``cut_normal``) with scores :math:`q_i = L z_i`. A
-member whose data says nothing wants :math:`z_i` as its coordinates, one whose data fixes
-:math:`x_i` wants :math:`x_i`: in the others the posterior is a funnel, or a thin sheet. Take the
-member's log likelihood for quadratic around a value :math:`\bar x_i`, with slope :math:`g_i` and
-precision :math:`\Lambda_i`, and :math:`x(q)` for linear around the score :math:`\bar q_i` of
+A normal of mean m and sd s, cut to (l, h), has the normal score q of a value x,
+
+.. math:: x = m + s\,\Phi^{-1}\big(\Phi(a) + \Phi(q)\,[\Phi(b) - \Phi(a)]\big), \qquad
+          a = \frac{l - m}{s}, \quad b = \frac{h - m}{s}
+
+so that its distribution function at x is :math:`\Phi(q)`. Where both ends are many sd away,
+:math:`x = m + s q`. The map is smooth in m, s and q, and never leaves the interval. Its slope is
+
+.. math:: \frac{dx}{dq} = s\, \frac{\phi(q)}{\phi(t)}\, [\Phi(b) - \Phi(a)], \qquad t = (x - m) / s
+
+Given the population, :math:`x_i = x(q_i)` with scores :math:`q_i = L z_i`. A member without
+informative data wants :math:`z_i` as its coordinates, one whose data fixes :math:`x_i` wants
+:math:`x_i`: in the others the posterior is a funnel, or a thin sheet. Take the member's log
+likelihood for quadratic around a value :math:`\bar x_i`, with slope :math:`g_i` and precision
+:math:`\Lambda_i`, and :math:`x(q)` for linear around the score :math:`\bar q_i` of
 :math:`\bar x_i`, with slopes :math:`D = \text{diag}(dx_k/dq_k)`. Then :math:`z_i` given the
 population is Gaussian, and in
 
@@ -14,7 +24,7 @@ population is Gaussian, and in
 :math:`e_i` is standard normal and independent of the population. The change of variables has the
 determinant :math:`\prod_k C_{kk}^{-1}` and is exact for *any* :math:`\bar x_i`, :math:`g_i` and
 :math:`\Lambda_i`; good ones make the posterior round. They come from the member's own posterior, by
-taking its prior off (both as Gaussians),
+dividing by its prior (both as Gaussians),
 
 .. math:: \Lambda_i = A^{-1} - B^{-1}, \qquad g_i = B^{-1} (\bar x_i - \bar b_i)
 
@@ -30,14 +40,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import ndtr, ndtri
+from jax.typing import ArrayLike
 
-from calibrate.population.cut_normal import to_score
+_LEAST = 1e-300  # a mass of which ndtri is finite
+_FARTHEST = 30.0  # sd, beyond which a value's score is taken to be that of 30 sd
 
 
 class Information(NamedTuple):
-    """What each member's data says of its shared unknowns, near a value, on their scales.
+    """The information of each member's data on its shared unknowns, on their scales.
 
-    value : (n, k). slope : (n, k) of the log likelihood there. precision : (n, k, k).
+    value : the point (n, k) at which the log likelihood is expanded.
+    slope, precision : its slope (n, k) there, and minus its Hessian (n, k, k).
     """
 
     value: jax.Array
@@ -45,8 +59,12 @@ class Information(NamedTuple):
     precision: jax.Array
 
 
-class Cut(NamedTuple):
-    """A population on the parameters' scales: mean, sd, low and high end (k,), factor L (k, k)."""
+class CutNormal(NamedTuple):
+    """A population on the parameters' scales.
+
+    mean, sd : mean and sd (k,) before the cut. low, high : both ends (k,) of the range.
+    factor : the lower factor L (k, k) of the correlation of the scores.
+    """
 
     mean: jax.Array
     sd: jax.Array
@@ -55,41 +73,78 @@ class Cut(NamedTuple):
     factor: jax.Array
 
 
+def from_score(
+    score: jax.Array, mean: ArrayLike, sd: ArrayLike, low: ArrayLike, high: ArrayLike
+) -> jax.Array:
+    """Return the value in (``low``, ``high``) of a normal ``score``; all arguments broadcast.
+
+    ``mean`` lies between ``low`` and ``high``.
+    """
+    a, b = (low - jnp.asarray(mean)) / sd, (high - jnp.asarray(mean)) / sd
+    # Scores above 0 are counted from the upper end: 1 - 1e-17 is 1, 1e-17 is not 0.
+    upper = score > 0.0
+    q = jnp.where(upper, -score, score)
+    near, far = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
+    mass = ndtr(near) + ndtr(q) * (ndtr(far) - ndtr(near))
+    t = ndtri(jnp.maximum(mass, _LEAST))
+    # Round-off may leave the interval by its last digit.
+    return jnp.clip(mean + sd * jnp.where(upper, -t, t), low, high)
+
+
+def to_score(
+    value: jax.Array, mean: ArrayLike, sd: ArrayLike, low: ArrayLike, high: ArrayLike
+) -> tuple[jax.Array, jax.Array]:
+    """Return the normal score q of ``value``, the inverse of :func:`from_score`, and dx/dq."""
+    a, b = (low - jnp.asarray(mean)) / sd, (high - jnp.asarray(mean)) / sd
+    t = jnp.clip((value - jnp.asarray(mean)) / sd, -_FARTHEST, _FARTHEST)
+    upper = t > 0.0
+    near, far = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
+    whole = ndtr(far) - ndtr(near)
+    mass = (ndtr(jnp.where(upper, -t, t)) - ndtr(near)) / whole
+    q = ndtri(jnp.maximum(mass, _LEAST))
+    slope = jnp.asarray(sd) * whole * jnp.exp(0.5 * (t**2 - q**2))
+    return jnp.where(upper, -q, q), slope
+
+
 def information_of(draws: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Value (k,), slope (k,) and precision (k, k) from draws (s, k), and the prior's."""
+    """Return value (k,), slope (k,) and precision (k, k) from draws (s, k), and the prior's."""
     root = np.linalg.cholesky(np.atleast_2d(np.cov(prior.T)))
     whitened = np.linalg.solve(root, (draws - prior.mean(axis=0)).T)
     sizes, axes = np.linalg.eigh(np.atleast_2d(np.cov(whitened)))
     # Directions in which draws happen to spread more than the prior are left out.
-    gained = np.maximum(1.0 / np.maximum(sizes, 1e-12) - 1.0, 0.0)
-    moved = np.where(gained > 0.0, axes.T @ whitened.mean(axis=1), 0.0)
+    precision = np.maximum(1.0 / np.maximum(sizes, 1e-12) - 1.0, 0.0)
+    shift = np.where(precision > 0.0, axes.T @ whitened.mean(axis=1), 0.0)
     back = np.linalg.solve(root.T, axes)
-    return draws.mean(axis=0), back @ moved, (back * gained) @ back.T
+    return draws.mean(axis=0), back @ shift, (back * precision) @ back.T
 
 
 def scores_of(
-    e: jax.Array, information: Information, population: Cut
+    e: jax.Array, information: Information, population: CutNormal
 ) -> tuple[jax.Array, jax.Array]:
-    """Scores z (n, k) at coordinates ``e`` (n, k), and the log of the determinant dz/de, ()."""
-    z, heights = jax.vmap(_of_one, in_axes=(0, 0, None))(e, information, population)
-    return z, jnp.sum(heights)
+    """Return scores z (n, k) at coordinates ``e`` (n, k), and the log determinant of dz/de, ()."""
+    z, log_determinants = jax.vmap(_scores_of_member, in_axes=(0, 0, None))(
+        e, information, population
+    )
+    return z, jnp.sum(log_determinants)
 
 
-def _of_one(e: jax.Array, information: Information, population: Cut) -> tuple[jax.Array, jax.Array]:
+def _scores_of_member(
+    e: jax.Array, information: Information, population: CutNormal
+) -> tuple[jax.Array, jax.Array]:
     *cut, factor = population
     score, slope = to_score(information.value, *cut)
     root = slope[:, None] * factor
     C = _cholesky(jnp.eye(len(e)) + root.T @ information.precision @ root)
-    pull = information.slope + information.precision @ (slope * score)
-    z = _substitute_back(C, _substitute(C, root.T @ pull) + e)
+    gradient = information.slope + information.precision @ (slope * score)
+    z = _substitute_back(C, _substitute(C, root.T @ gradient) + e)
     return z, -sum((jnp.log(C[k][k]) for k in range(len(e))), jnp.zeros(()))
 
 
-# LAPACK on batches of small matrices can hang, so these are written out; count is 1 to 10.
+# LAPACK on batches of small matrices can hang, so these are written out; k is 1 to 10.
 
 
 def _cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
-    """Rows of the lower factor of a positive definite matrix (k, k)."""
+    """Return the rows of the lower factor of a positive definite matrix (k, k)."""
     rows: list[list[jax.Array]] = []
     for i in range(len(matrix)):
         row: list[jax.Array] = []
@@ -102,18 +157,18 @@ def _cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
 
 
 def _substitute(C: list[list[jax.Array]], b: jax.Array) -> jax.Array:
-    """``C^-1 b`` (k,) of the lower factor C."""
-    found: list[jax.Array] = []
+    """Return ``C^-1 b`` (k,) for the lower factor C."""
+    x: list[jax.Array] = []
     for i, row in enumerate(C):
-        rest = sum((row[j] * found[j] for j in range(i)), jnp.zeros(()))
-        found.append((b[i] - rest) / row[i])
-    return jnp.stack(found)
+        rest = sum((row[j] * x[j] for j in range(i)), jnp.zeros(()))
+        x.append((b[i] - rest) / row[i])
+    return jnp.stack(x)
 
 
 def _substitute_back(C: list[list[jax.Array]], b: jax.Array) -> jax.Array:
-    """``C^-T b`` (k,) of the lower factor C."""
-    found: dict[int, jax.Array] = {}
+    """Return ``C^-T b`` (k,) for the lower factor C."""
+    x: dict[int, jax.Array] = {}
     for i in reversed(range(len(C))):
-        rest = sum((C[j][i] * found[j] for j in range(i + 1, len(C))), jnp.zeros(()))
-        found[i] = (b[i] - rest) / C[i][i]
-    return jnp.stack([found[i] for i in range(len(C))])
+        rest = sum((C[j][i] * x[j] for j in range(i + 1, len(C))), jnp.zeros(()))
+        x[i] = (b[i] - rest) / C[i][i]
+    return jnp.stack([x[i] for i in range(len(C))])

@@ -1,7 +1,8 @@
-r"""The log density of a hierarchy on real coordinates, in which its members are independent.
+r"""The log density of a population and its members on real coordinates.
 
-NumPyro maps population and own unknowns to the real line, as of any model; the members' scores are
-replaced by the coordinates of :mod:`calibrate.population.coordinates`, with their Jacobian.
+NumPyro maps the population and own unknowns to the real line, as of any model; the members' scores
+are replaced by the coordinates of :mod:`calibrate.population.coordinates`, in which the members are
+independent, with their Jacobian.
 """
 
 from __future__ import annotations
@@ -18,92 +19,92 @@ from numpyro import handlers
 from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import potential_energy
 
-from calibrate.population.coordinates import Cut, Information, scores_of
-from calibrate.population.model import CHOLESKY, MEDIAN, SCORES, SD, HierarchicalModel
-from calibrate.population.shared import ends, to_scale
+from calibrate.population.coordinates import CutNormal, Information, scores_of
+from calibrate.population.model import CHOLESKY, MEDIAN, SCORES, SD, PopulationModel, ends, to_scale
 from calibrate.samplers.density import threads_for
 from calibrate.statistical_model import Data
 
 
-class Observed(NamedTuple):
-    """What a hierarchy is conditioned on.
+class Conditions(NamedTuple):
+    """What the posterior of a population depends on.
 
-    data : by member and observation; members that say nothing are missing.
-    information : what the coordinates are made of; it does not change the posterior.
+    data : data by member and observation; members without data are missing.
+    information : the information from which the coordinates are made; it does not change the
+        posterior.
     """
 
     data: Mapping[str, Data]
     information: Information
 
 
-class Population(NamedTuple):
-    """Numbers of the population: each (k,), and the lower factor L (k, k) of its correlation."""
+class PopulationDraws(NamedTuple):
+    """Median and sd (k,) of a population, and the lower factor L (k, k) of its correlation."""
 
     median: jax.Array
     sd: jax.Array
     factor: jax.Array
 
 
-class HierarchicalDensity(NamedTuple):
+class PopulationDensity(NamedTuple):
     """A log density on real coordinates; see :class:`calibrate.samplers.density.Target`.
 
     constrain : (z (s, p), information) -> population, scores (s, n, k), own unknowns by site (s,).
     values : (*population (s, ...), scores (s, ..., k)) -> shared unknowns by name (s, ...).
     """
 
-    log_density: Callable[[jax.Array, Observed], jax.Array]
-    constrain: Callable[[jax.Array, Information], tuple[Population, jax.Array, dict[str, Any]]]
+    log_density: Callable[[jax.Array, Conditions], jax.Array]
+    constrain: Callable[[jax.Array, Information], tuple[PopulationDraws, jax.Array, dict[str, Any]]]
     values: Callable[..., dict[str, jax.Array]]
     dimension: int
     at_once: int
 
     @property
     def piloted(self) -> bool:
-        """No: the monomials of a transport map are too many, the members straightened already."""
+        """Always false: a transport map has too many monomials; members are straight already."""
         return False
 
 
 @lru_cache(maxsize=4)
-def density_of_hierarchy(model: HierarchicalModel) -> HierarchicalDensity:
-    """The density of the posterior of all members, up to a constant."""
+def density_of_population(model: PopulationModel) -> PopulationDensity:
+    """Return the density of the posterior of population and members, up to a constant."""
     sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace()
     sampled = {name: site for name, site in sites.items() if site["type"] == "sample"}
     transforms = {name: biject_to(site["fn"].support) for name, site in sampled.items()}
     example = {name: transforms[name].inv(site["value"]) for name, site in sampled.items()}
     flat, unravel = ravel_pytree(example)
 
-    def population(values: Mapping[str, jax.Array]) -> Population:
+    def population_at(values: Mapping[str, jax.Array]) -> PopulationDraws:
         medians, sds = (
             jnp.stack([transforms[f"{role}[{k}]"](values[f"{role}[{k}]"]) for k in model.shared])
             for role in (MEDIAN, SD)
         )
-        alone = CHOLESKY not in values
-        factor = jnp.eye(1) if alone else transforms[CHOLESKY](values[CHOLESKY])
-        return Population(medians, sds, factor)
+        single = CHOLESKY not in values
+        factor = jnp.eye(1) if single else transforms[CHOLESKY](values[CHOLESKY])
+        return PopulationDraws(medians, sds, factor)
 
-    def scores(z: jax.Array, information: Information) -> Any:
+    def with_scores(z: jax.Array, information: Information) -> Any:
         values = unravel(z)
-        found = population(values)
-        mean = [to_scale(p, found.median[k]) for k, p in enumerate(model.shared.values())]
+        population = population_at(values)
+        mean = [to_scale(p, population.median[k]) for k, p in enumerate(model.shared.values())]
         low, high = jnp.array([ends(parameter) for parameter in model.shared.values()]).T
-        cut = Cut(jnp.stack(mean), found.sd, low, high, found.factor)
-        drawn, height = scores_of(values[SCORES], information, cut)
-        return {**values, SCORES: drawn}, found, height
+        cut = CutNormal(jnp.stack(mean), population.sd, low, high, population.factor)
+        scores, log_determinant = scores_of(values[SCORES], information, cut)
+        return {**values, SCORES: scores}, population, log_determinant
 
-    def log_density(z: jax.Array, observed: Observed) -> jax.Array:
-        values, _, height = scores(z, observed.information)
-        return height - potential_energy(model, (observed.data,), {}, values)
+    def log_density(z: jax.Array, conditions: Conditions) -> jax.Array:
+        values, _, log_determinant = with_scores(z, conditions.information)
+        return log_determinant - potential_energy(model, (conditions.data,), {}, values)
 
     def constrain(z: jax.Array, information: Information) -> Any:
-        values, found, _ = scores(z, information)
+        values, population, _ = with_scores(z, information)
         own = {
             f"{name}[{member}]": transforms[f"{name}[{member}]"](values[f"{name}[{member}]"])
             for member, names in model.own.items()
             for name in names
         }
-        return found, values[SCORES], own
+        return population, values[SCORES], own
 
-    return HierarchicalDensity(
+    return PopulationDensity(
         log_density,
         jax.jit(jax.vmap(constrain, in_axes=(0, None))),
         jax.jit(jax.vmap(model.shared_values)),

@@ -1,18 +1,20 @@
-"""What members of one population, calibrated together, say: population, members, and new ones."""
+"""Draws of a population, of its members, and of a member not seen: the DataTree and its views."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from calibrate.population.model import MEDIAN, SD
-from calibrate.population.tree import ALONE, CORRELATION, MEMBER, NEW, PARAMETER
+from calibrate.arviz import base
+from calibrate.population.density import PopulationDraws, density_of_population
+from calibrate.population.model import MEDIAN, SD, PopulationModel
 from calibrate.posterior import predictions, read_tree
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.posterior.summary import summary_of
@@ -22,9 +24,13 @@ from emulator.core.errors import InputError, look_up
 from emulator.core.representation import TableRepr
 from emulator.core.store import write_netcdf
 
+ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
+PARAMETER, MEMBER = "parameter", "member"
+_OTHER = "other_parameter"
+
 
 class Shrinkage(NamedTuple):
-    """Mean and sd of a member's unknown: alone, under its model's prior, and with the others."""
+    """Mean and sd of a member's unknown: alone, under its model's prior, and in the population."""
 
     alone_mean: float
     alone_sd: float
@@ -36,11 +42,11 @@ class Shrinkage(NamedTuple):
 class Hierarchy(TableRepr):
     """Draws of a population, of its members, and of a member not seen.
 
-    tree : DataTree. Group ``posterior`` has ``median`` and ``sd`` (chain, draw, parameter) of the
-        population, before the cut to the range, ``correlation`` of the normal scores, each shared
-        unknown (chain, draw, member), and what members have to themselves as ``name[member]``;
-        ``new_member`` each shared unknown of a member not seen; ``alone`` draws of each member by
-        itself; ``sample_stats``. Attributes hold the provenance.
+    tree : the DataTree. Its group ``posterior`` has ``median`` and ``sd`` (chain, draw, parameter)
+        of the population, before the cut to the range, ``correlation`` of the normal scores, each
+        shared unknown (chain, draw, member), and own unknowns as ``name[member]``; ``new_member``
+        has each shared unknown of a member not seen; ``alone`` has draws of each member by itself;
+        ``sample_stats``. Attributes hold the provenance.
     """
 
     tree: xr.DataTree
@@ -56,7 +62,7 @@ class Hierarchy(TableRepr):
         return tuple(map(str, np.asarray(self.tree["posterior"][MEMBER])))
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
-        """Median and sd of the population by parameter, draws, and what is wrong with them."""
+        """Return median and sd of the population by parameter, number of draws, and warnings."""
         table = self.summary()
         rows = [
             (name, f"{table[name]['mean']:.4g} +- {table[name]['sd']:.2g}")
@@ -70,43 +76,43 @@ class Hierarchy(TableRepr):
         return f"Population of {len(self.members)} members", rows
 
     def draws(self) -> dict[str, np.ndarray]:
-        """All draws by name, each (chains, draws).
+        """Return all draws by name, each (chains, draws).
 
-        ``median[mu]``, ``sd[mu]``, ``correlation[mu, lam]``; ``mu[beam1]`` and the like of members.
+        Names are ``median[mu]``, ``sd[mu]``, ``correlation[mu, lam]``, and ``mu[beam1]``.
         """
-        every = self.tree["posterior"].to_dataset().data_vars
-        posterior = {str(name): np.asarray(values) for name, values in every.items()}
-        found = {
+        variables = self.tree["posterior"].to_dataset().data_vars
+        posterior = {str(name): np.asarray(values) for name, values in variables.items()}
+        draws = {
             f"{role}[{name}]": posterior[role][..., k]
             for k, name in enumerate(self.shared)
             for role in (MEDIAN, SD)
         }
         for k, name in enumerate(self.shared):
             for j, earlier in enumerate(self.shared[:k]):
-                found[f"{CORRELATION}[{earlier}, {name}]"] = posterior[CORRELATION][..., j, k]
+                draws[f"{CORRELATION}[{earlier}, {name}]"] = posterior[CORRELATION][..., j, k]
         for name in self.shared:
             for i, member in enumerate(self.members):
-                found[f"{name}[{member}]"] = posterior[name][..., i]
-        return found | {name: values for name, values in posterior.items() if values.ndim == 2}
+                draws[f"{name}[{member}]"] = posterior[name][..., i]
+        return draws | {name: values for name, values in posterior.items() if values.ndim == 2}
 
     def member(self, name: str) -> dict[str, np.ndarray]:
-        """All draws of what a member has, shared and own, by the names of its model, each (s,)."""
+        """Return draws (s,) of a member's unknowns, shared and own, by the names of its model."""
         look_up(dict.fromkeys(self.members), name, "member")
-        mine = f"[{name}]"
+        suffix = f"[{name}]"
         return {
-            key.removesuffix(mine): values.reshape(-1)
+            key.removesuffix(suffix): values.reshape(-1)
             for key, values in self.draws().items()
-            if key.endswith(mine) and not key.startswith((f"{MEDIAN}[", f"{SD}["))
+            if key.endswith(suffix) and not key.startswith((f"{MEDIAN}[", f"{SD}["))
         }
 
     def new_member(self) -> dict[str, np.ndarray]:
-        """Draws (s,) of the shared unknowns of a member not seen."""
+        """Return draws (s,) of the shared unknowns of a member not seen."""
         return {n: np.asarray(self.tree[NEW][n]).reshape(-1) for n in self.shared}
 
     def predict(self, model: Model, *, seed: int = 0) -> dict[str, np.ndarray]:
-        """Data that a member not seen would give, noise included: ``(s, *shape)`` by observation.
+        """Return data of a member not seen, noise included: ``(s, *shape)`` by observation.
 
-        At about 500 draws. What ``model`` has besides the shared unknowns is drawn from its prior.
+        There are about 500 draws. Own unknowns of ``model`` are drawn from its prior.
 
         Raises
         ------
@@ -126,15 +132,14 @@ class Hierarchy(TableRepr):
             strict=True,
         ):
             if name not in self.shared:
-                given = model.given_earlier(name, prior, draws)
-                draws[name] = given.sample(key, shape)
-        made = predictions.replicates(model, draws, data_key)
-        return {name: values.reshape(-1, *values.shape[2:]) for name, values in made.items()}
+                draws[name] = model.given_earlier(name, prior, draws).sample(key, shape)
+        data = predictions.replicates(model, draws, data_key)
+        return {name: values.reshape(-1, *values.shape[2:]) for name, values in data.items()}
 
     def as_prior(self, source: str = "") -> Population:
-        """The population as a prior of the next member: log-normals fitted to :meth:`new_member`.
+        """Return the population as a prior: log-normals fitted to :meth:`new_member`.
 
-        What is not known of the population widens it.
+        The uncertainty of the population widens it.
 
         Raises
         ------
@@ -145,22 +150,22 @@ class Hierarchy(TableRepr):
         return population_of_fits({n: v.tolist() for n, v in self.new_member().items()}, source)
 
     def shrinkage(self) -> dict[str, dict[str, Shrinkage]]:
-        """By shared unknown and member: mean and sd alone, and among the others."""
-        found: dict[str, dict[str, Shrinkage]] = {name: {} for name in self.shared}
+        """Return mean and sd alone and in the population, by shared unknown and member."""
+        table: dict[str, dict[str, Shrinkage]] = {name: {} for name in self.shared}
         for name in self.shared:
             for i, member in enumerate(self.members):
                 alone = np.asarray(self.tree[ALONE][name])[i]
                 together = np.asarray(self.tree["posterior"][name])[..., i]
                 numbers = (alone.mean(), alone.std(ddof=1), together.mean(), together.std(ddof=1))
-                found[name][member] = Shrinkage(*map(float, numbers))
-        return found
+                table[name][member] = Shrinkage(*map(float, numbers))
+        return table
 
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
-        """Per entry of :meth:`draws`: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
+        """Return mean, sd, equal-tailed interval, R-hat, bulk and tail ESS of :meth:`draws`."""
         return summary_of(self.draws(), probability)
 
     def warnings(self) -> list[str]:
-        """What is wrong with the run and what to do, a sentence each; empty if nothing is."""
+        """Return a sentence for each fault of the run, with what to do; empty if there is none."""
         statistics = {str(n): v.values for n, v in self.tree["sample_stats"].data_vars.items()}
         return diagnose(self.draws(), statistics, self.summary(), {})
 
@@ -170,8 +175,65 @@ class Hierarchy(TableRepr):
 
 
 def read_hierarchy(path: str | Path) -> Hierarchy:
-    """A saved hierarchy; :class:`InputError` where the file holds none."""
+    """Return a saved hierarchy; :class:`InputError` where the file holds none."""
     tree = read_tree(path)
     if NEW not in tree.children:
         raise InputError(f"{path} holds no hierarchy; Hierarchy.save writes one")
     return Hierarchy(tree)
+
+
+def make_tree(
+    model: PopulationModel,
+    draws: tuple[PopulationDraws, jax.Array, Mapping[str, Any]],
+    shape: tuple[int, int],
+    statistics: Mapping[str, Any],
+    rng_key: jax.Array,
+) -> xr.DataTree:
+    """Return the groups ``posterior``, ``new_member`` and ``sample_stats``.
+
+    Parameters
+    ----------
+    draws : population, scores and own unknowns (s, ...), of ``shape`` (chains, draws).
+    rng_key : the key of the member not seen.
+    """
+    population, scores, own = draws
+    new = jax.random.normal(rng_key, (len(scores), scores.shape[-1]))
+    values = density_of_population(model).values
+    correlation = np.einsum("...ik,...jk->...ij", population.factor, population.factor)
+    posterior = {
+        MEDIAN: population.median,
+        SD: population.sd,
+        CORRELATION: correlation,
+        **values(*population, scores),
+        **own,
+    }
+
+    def by_chain(draws: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        return {n: np.asarray(v).reshape(*shape, *v.shape[1:]) for n, v in draws.items()}
+
+    names = list(model.shared)
+    dims = {MEDIAN: [PARAMETER], SD: [PARAMETER], CORRELATION: [PARAMETER, _OTHER]}
+    tree = base.from_dict(
+        {"posterior": by_chain(posterior), "sample_stats": dict(statistics)},
+        dims=dims | {name: [MEMBER] for name in names},
+        coords={PARAMETER: names, _OTHER: names, MEMBER: list(model.members)},
+    )
+    tree[NEW] = xr.DataTree(base.dict_to_dataset(by_chain(values(*population, new))))
+    for name, parameter in model.shared.items():
+        for group in ("posterior", NEW):
+            tree[group][name].attrs.update(units=parameter.unit or "1", scale=parameter.scale)
+    return tree
+
+
+def tree_of_alone(draws: Mapping[str, Mapping[str, np.ndarray]], count: int = 1000) -> xr.DataTree:
+    """Return the group ``alone``: ``count`` draws of each member, evenly spaced."""
+    first = next(iter(draws.values()))
+
+    def spaced(values: np.ndarray) -> np.ndarray:
+        return values[np.linspace(0, len(values) - 1, count).astype(int)]
+
+    variables = {
+        name: ((MEMBER, "draw"), np.stack([spaced(by[name]) for by in draws.values()]))
+        for name in first
+    }
+    return xr.DataTree(xr.Dataset(variables, coords={MEMBER: list(draws)}))

@@ -1,4 +1,4 @@
-"""Draws of a hierarchy: each member alone, then all of them together."""
+"""Sampling of a population: each member alone, then population and members together."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ import numpy as np
 import numpyro.distributions as dist
 
 from calibrate.population.coordinates import Information, information_of
-from calibrate.population.density import Observed, density_of_hierarchy
-from calibrate.population.model import HierarchicalModel, hierarchical_model
-from calibrate.population.posterior import Hierarchy
-from calibrate.population.shared import to_scale
-from calibrate.population.tree import ALONE, make_tree, tree_of_alone
+from calibrate.population.density import Conditions, density_of_population
+from calibrate.population.model import PopulationModel, population_model, to_scale
+from calibrate.population.posterior import ALONE, Hierarchy, make_tree, tree_of_alone
 from calibrate.posterior import sample
 from calibrate.posterior.posterior import describe_distribution
 from calibrate.provenance import versions
@@ -30,7 +28,7 @@ from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
 
 _PRIOR_DRAWS = 2000
-# The spread of few members reaches towards 0, where steps have to be short (docs/experiments.md,
+# The spread of few members may be near 0, where steps have to be short (docs/experiments.md,
 # "Members of one population").
 TARGET_ACCEPT = 0.98
 _NEW, _OF_PRIOR = 0x9E3779B9, 0x85EBCA6B  # keep these keys apart from the sampler's
@@ -39,7 +37,7 @@ Alone = Mapping[str, Mapping[str, np.ndarray]]
 """Draws (s,) of the shared unknowns, by member and name."""
 
 Members = Mapping[str, tuple[Model, Any]]
-"""Model and data of each member; data as :func:`calibrate.sample` takes it, ``None`` of none."""
+"""Model and data of each member; data as :func:`calibrate.sample` takes it, or ``None``."""
 
 
 def hierarchy(
@@ -54,20 +52,21 @@ def hierarchy(
     seed: int = 0,
     progress: bool = False,
 ) -> Hierarchy:
-    """Members of one population, calibrated together (:mod:`calibrate.population.model`).
+    """Calibrate the members of a population together (:mod:`calibrate.population.model`).
 
     Parameters
     ----------
-    members : name to ``(model, data)``; data ``None`` of a member that was not measured.
-    shared : unknowns that follow the population; by default all that every member has and that are
-        no parameters of its loads.
-    median : prior of the population's median, by shared name, in the parameter's unit.
-    spread : prior of the population's sd, of the logarithm where the scene's scale is logarithmic;
-        a number is the scale of a half-normal.
-    eta : of the prior of correlations; 1 is uniform, more prefers none.
-    options : of NUTS, for all members together; by default its own, with target_accept 0.98.
-    alone : sampler of each member alone, for comparison and for good coordinates; ``laplace`` is
-        cheap and as good for the latter.
+    members : by name, ``(model, data)``; the data of a member that was not measured is ``None``.
+    shared : the unknowns that follow the population; by default all that every member has and that
+        are no parameters of its loads.
+    median : the prior of the population's median, by shared name, in the parameter's unit.
+    spread : the prior of the population's sd, of the logarithm where the scene's scale is
+        logarithmic; a number is the scale of a half-normal.
+    eta : the parameter of the prior of correlations; 1 is uniform, more prefers none.
+    options : the options of NUTS for all members together; by default its own, with target_accept
+        0.98.
+    alone : the sampler of each member alone, for comparison and for good coordinates; ``laplace``
+        is cheap and as good for the latter.
 
     Raises
     ------
@@ -75,22 +74,24 @@ def hierarchy(
         Members that do not fit each other, data that does not fit a member, an unknown sampler or
         the options of another.
     """
-    fitting = {
+    checked = {
         m: (model, None) if y is None else model.given(y) for m, (model, y) in members.items()
     }
-    model = hierarchical_model(
-        {member: model for member, (model, _) in fitting.items()},
+    model = population_model(
+        {member: model for member, (model, _) in checked.items()},
         shared=shared,
         median=median,
         spread=spread,
         eta=eta,
     )
-    data = {member: dict(y) for member, (_, y) in fitting.items() if y is not None}
-    return sample_hierarchy(model, data, options=options, alone=alone, seed=seed, progress=progress)
+    data = {member: dict(y) for member, (_, y) in checked.items() if y is not None}
+    return sample_population(
+        model, data, options=options, alone=alone, seed=seed, progress=progress
+    )
 
 
-def sample_hierarchy(
-    model: HierarchicalModel,
+def sample_population(
+    model: PopulationModel,
     data: Mapping[str, Data],
     *,
     options: NUTSOptions | None = None,
@@ -99,12 +100,12 @@ def sample_hierarchy(
     progress: bool = False,
     checkpoint: str | Path | None = None,
 ) -> Hierarchy:
-    """The posterior of ``model`` given ``data`` by member, checked before.
+    """Sample the posterior of ``model`` given ``data`` by member, which was checked before.
 
     Parameters
     ----------
-    alone : sampler of each member alone, or draws of it by member.
-    checkpoint : as of :func:`calibrate.sample`, for all members together.
+    alone : the sampler of each member alone, or draws of each member alone.
+    checkpoint : the file of the run's state, as of :func:`calibrate.sample`.
     """
     options = check_options(NUTS, options or NUTSOptions(target_accept=TARGET_ACCEPT))
     if isinstance(alone, str):
@@ -112,58 +113,60 @@ def sample_hierarchy(
     else:
         by_member, sampler = {m: dict(alone[m]) for m in model.members}, "given"
     information = _information(model, by_member, data)
-    density = density_of_hierarchy(model)
-    observed = Observed(dict(data), information)
-    made = _provenance(model, options, sampler, seed)
-    state = Checkpoint(checkpoint, _identity(made, data, by_member))
-    found = NUTS.sample(density, observed, options, seed, Context(progress, state))
+    density = density_of_population(model)
+    provenance = _provenance(model, options, sampler, seed)
+    state = Checkpoint(checkpoint, _identity(provenance, data, by_member))
+    conditions = Conditions(dict(data), information)
+    draws = NUTS.sample(density, conditions, options, seed, Context(progress, state))
     key = jax.random.fold_in(jax.random.key(seed), _NEW)
-    flat = jnp.asarray(found.z).reshape(-1, density.dimension)
-    drawn = density.constrain(flat, information)
-    tree = make_tree(model, drawn, found.z.shape[:2], found.statistics, key)
+    flat = jnp.asarray(draws.z).reshape(-1, density.dimension)
+    values = density.constrain(flat, information)
+    tree = make_tree(model, values, draws.z.shape[:2], draws.statistics, key)
     tree[ALONE] = tree_of_alone(by_member)
-    for name, value in made.items():
+    for name, value in provenance.items():
         tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
     state.remove()
     return Hierarchy(tree)
 
 
-def _identity(made: Mapping[str, Any], data: Mapping[str, Data], alone: Alone) -> dict[str, str]:
-    """What a run is of: its provenance, and a hash of data and of the members' draws."""
+def _identity(
+    provenance: Mapping[str, Any], data: Mapping[str, Data], alone: Alone
+) -> dict[str, str]:
+    """Return what a run depends on: its provenance, and a hash of data and members' draws."""
     digest = hashlib.sha256()
     for member in sorted(alone):
         for values in (data.get(member, {}), alone[member]):
             for name in sorted(values):
                 digest.update(f"{member} {name}".encode() + np.asarray(values[name]).tobytes())
-    described = {name: json.dumps(value) for name, value in made.items()}
+    described = {name: json.dumps(value) for name, value in provenance.items()}
     return {**described, "data": digest.hexdigest()[:16]}
 
 
 def _alone(
-    model: HierarchicalModel, data: Mapping[str, Data], sampler: str, seed: int, *, progress: bool
+    model: PopulationModel, data: Mapping[str, Data], sampler: str, seed: int, *, progress: bool
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Draws (s,) of the shared unknowns by member, each member alone; of its prior without data."""
-    found = {}
+    """Return draws (s,) of shared unknowns by member, each alone; from its prior without data."""
+    by_member = {}
     for i, (member, own) in enumerate(model.members.items()):
         if member in data:
-            given = {name: np.asarray(values) for name, values in data[member].items()}
+            values = {name: np.asarray(y) for name, y in data[member].items()}
             posterior = sample(
-                own, given, sampler=sampler, seed=seed + i, progress=progress,
+                own, values, sampler=sampler, seed=seed + i, progress=progress,
                 predictions=False,
             )  # fmt: skip
             draws: Mapping[str, Any] = posterior.draws()
         else:
             draws = own.prior_draws(jax.random.key(seed + i), _PRIOR_DRAWS)
-        found[member] = {name: np.asarray(draws[name]) for name in model.shared}
-    return found
+        by_member[member] = {name: np.asarray(draws[name]) for name in model.shared}
+    return by_member
 
 
 def _information(
-    model: HierarchicalModel,
+    model: PopulationModel,
     alone: Mapping[str, Mapping[str, np.ndarray]],
     data: Mapping[str, Data],
 ) -> Information:
-    """What each member's data says, from its posterior alone and its prior."""
+    """Return the information of each member's data, from its posterior alone and its prior."""
     rows, priors = [], {}
     for member, own in model.members.items():
         draws = _on_scales(model, alone[member])
@@ -174,16 +177,16 @@ def _information(
     return Information(*(jnp.stack(column) for column in zip(*rows, strict=True)))
 
 
-def _on_scales(model: HierarchicalModel, draws: Mapping[str, Any]) -> np.ndarray:
-    """Draws (s, k) of the shared unknowns on their parameters' scales."""
+def _on_scales(model: PopulationModel, draws: Mapping[str, Any]) -> np.ndarray:
+    """Return draws (s, k) of the shared unknowns on their parameters' scales."""
     columns = [to_scale(parameter, draws[name]) for name, parameter in model.shared.items()]
     return np.stack([np.asarray(column) for column in columns], axis=1)
 
 
 def _provenance(
-    model: HierarchicalModel, options: NUTSOptions, alone: str, seed: int
+    model: PopulationModel, options: NUTSOptions, alone: str, seed: int
 ) -> dict[str, Any]:
-    """What a hierarchy was made of; plain JSON values."""
+    """Return what a posterior was made of, as plain JSON values."""
     return {
         "shared": list(model.shared),
         "prior_median": {name: describe_distribution(d) for name, d in model.median.items()},

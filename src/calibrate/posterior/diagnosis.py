@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.samplers.modes import MISSED_AT, MISSED_BY
-from calibrate.samplers.stopping import ENOUGH_ESS, WARN_ABOVE_R_HAT
+from calibrate.samplers.diagnostics import ENOUGH_ESS, WARN_ABOVE_R_HAT
+from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 
 _LARGEST_K = 0.7  # Vehtari et al. (2024)
 _LOWEST_EFFICIENCY = 0.2

@@ -8,7 +8,7 @@ that a posterior keeps, with mean :math:`m_j` and sd :math:`s_j` of each datum,
 .. math:: T_1(y) = \sum_j (y_j - m_j)^2 / s_j^2, \qquad T_2(y) = \max_j |y_j - m_j| / s_j
 
 This costs no evaluation and trusts the forward map; a certificate's check
-(:mod:`calibrate.certificate.misfit`) trusts FEM, and knows theta.
+(:mod:`calibrate.certificate.estimates`) trusts FEM, and knows theta.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from calibrate.posterior.tree import make_tree
 from calibrate.provenance import versions
 from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws
 from calibrate.samplers.checkpoint import Checkpoint
-from calibrate.samplers.modes import MISSED_BY, find_modes, missed_mode
+from calibrate.samplers.laplace import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, FEMLikelihood, Model
 from emulator.core.errors import InputError

@@ -17,9 +17,9 @@ import numpyro.distributions as dist
 from calibrate.figures import shrinkage
 from calibrate.population import (
     Hierarchy,
-    hierarchical_model,
+    population_model,
     read_hierarchy,
-    sample_hierarchy,
+    sample_population,
 )
 from calibrate.population.sample import TARGET_ACCEPT
 from calibrate.posterior import Posterior
@@ -189,14 +189,14 @@ def _together(
         draws=run.draws,
         chains=run.chains,
     )
-    model = hierarchical_model(
+    model = population_model(
         _models(alone),
         shared=given.shared,
         median=_medians(given),
         spread=given.spread,
         eta=given.eta,
     )
-    return sample_hierarchy(
+    return sample_population(
         model,
         {name: posterior.data for name, posterior in alone.items()},
         options=options,

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.certificate import Certificate, examine
-from calibrate.certificate.reweight import keeps, reweighted
+from calibrate.certificate.check import can_reweight, reweighted
 from calibrate.measurements import Observations, observations_from_json, parse_observation
 from calibrate.measurements.data import read_data, read_known, write_data
 from calibrate.measurements.present import missing_values
@@ -358,7 +358,7 @@ def certify_and_keep(
     ``at_most`` and ``mesh`` as of :func:`calibrate.certify`. ``load_steps`` are those of every
     solve. ``scheduler`` is the address of a Dask scheduler whose workers solve. With
     ``reweight_to``, the reweighted posterior is kept in that folder, ready to be certified in its
-    turn, where the verdict allows it (:func:`calibrate.certificate.reweight.keeps`).
+    turn, where the verdict allows it (:func:`calibrate.certificate.check.can_reweight`).
 
     Raises
     ------
@@ -377,7 +377,7 @@ def certify_and_keep(
     )
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     _remove_pages(Path(folder).resolve())
-    if reweight_to is not None and keeps(check.certificate):
+    if reweight_to is not None and can_reweight(check.certificate):
         _keep_reweighted(reweighted(check), Path(folder), Path(reweight_to))
     return check.certificate
 

@@ -13,8 +13,7 @@ import numpy as np
 import numpyro.distributions as dist
 
 from calibrate.analysis.identifiability.combinations import identify, in_words
-from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
-from calibrate.certificate.verdict import shifts
+from calibrate.certificate.verdict import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT, shifts
 from calibrate.posterior import Posterior
 from calibrate.posterior.posterior import describe_distribution
 from calibrate.project import Run, holds_population, read_posterior, simulator_of

@@ -18,7 +18,7 @@ import xarray as xr
 from calibrate.figures.shrinkage import label_of
 from calibrate.population import Hierarchy
 from calibrate.population.model import MEDIAN, SD
-from calibrate.population.tree import CORRELATION
+from calibrate.population.posterior import CORRELATION
 from calibrate.posterior import read_tree
 from calibrate.posterior.fit import misfits
 from calibrate.project.cohort import NOT_CERTIFIED, kept_verdicts

@@ -1,20 +1,20 @@
 """Samplers behind one protocol: ``protocol`` says what they give, ``registry`` finds them."""
 
-from calibrate.samplers.blackjax_nuts import BlackJAXNUTSOptions
+from calibrate.samplers.chains import ChainSampler
 from calibrate.samplers.delayed_acceptance import DelayedAcceptanceOptions
 from calibrate.samplers.density import Density, density_of, named_draws
+from calibrate.samplers.diagnostics import r_hat
 from calibrate.samplers.laplace import LaplaceOptions
 from calibrate.samplers.mclmc import MCLMCOptions
-from calibrate.samplers.nuts import NUTSOptions
-from calibrate.samplers.protocol import Context, Draws, Kernel, Sampler
+from calibrate.samplers.nuts import BlackJAXNUTSOptions, NUTSOptions
+from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler
 from calibrate.samplers.registry import SAMPLERS, check_options, find_sampler, options_from
-from calibrate.samplers.run import ChainSampler
 from calibrate.samplers.smc import SMCOptions
-from calibrate.samplers.stopping import r_hat
 
 __all__ = [
     "SAMPLERS",
     "BlackJAXNUTSOptions",
+    "ChainOptions",
     "ChainSampler",
     "Context",
     "DelayedAcceptanceOptions",

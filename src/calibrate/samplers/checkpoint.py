@@ -1,7 +1,7 @@
-"""A run's state on disk, from which a run that was killed goes on.
+"""A run's state on disk, from which a killed run continues.
 
 A state is a pytree of arrays. It is written every few seconds, whole or not at all, together with
-what the run is of: model, data, options and seed. Nothing of the clock enters the state, so a
+the run's identity: model, data, options and seed. The state does not depend on the clock, so a
 resumed run gives the draws of an uninterrupted one, bit for bit.
 """
 
@@ -20,18 +20,18 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.core.store import named_leaves, read_arrays, save_arrays
 
-FORMAT = "1"  # of the states; a file of another format is refused
+FORMAT = "1"  # format of the states; a file of another format is refused
 _LONG = 60  # characters of a value that a message leaves out
 
 
 class Checkpoint:
-    """The file that a run's state is kept in.
+    """The file that a run's state is written to.
 
     Parameters
     ----------
-    path : a safetensors file; ``None`` keeps nothing.
-    identity : what the run is of, by name: a file with another identity is refused.
-    every : seconds between two writes.
+    path : a safetensors file; ``None`` for no checkpoint.
+    identity : what the run depends on, by name: a file with another identity is refused.
+    every : the seconds between two writes.
     """
 
     def __init__(
@@ -46,12 +46,12 @@ class Checkpoint:
         self._written = time.monotonic()
 
     def restore(self, template: Callable[[], Any]) -> Any | None:
-        """The state kept, ``None`` where there is none.
+        """Return the state in the file, ``None`` where there is no file.
 
         Parameters
         ----------
         template : () -> a pytree of the state's structure; its leaves have ``dtype``. Their shapes
-            may differ from the kept ones, because draws become more.
+            may differ from those in the file, because the number of draws grows.
 
         Raises
         ------
@@ -62,35 +62,35 @@ class Checkpoint:
             return None
         arrays, metadata = read_arrays(self.path)
         self._check(metadata)
-        wanted = template()
-        named = named_leaves(wanted)
+        tree = template()
+        named = named_leaves(tree)
         if named.keys() != arrays.keys():
             raise InputError(f"checkpoint {self.path} has other arrays than this run; remove it")
-        leaves = [_leaf(arrays[name], leaf.dtype) for name, leaf in named.items()]
-        return jax.tree.unflatten(jax.tree.structure(wanted), leaves)
+        leaves = [_to_leaf(arrays[name], leaf.dtype) for name, leaf in named.items()]
+        return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
     def keep(self, state: Callable[[], Any]) -> None:
         """Write ``state()``, if the last write is long enough ago."""
         if self.path is None or time.monotonic() - self._written < self.every:
             return
-        arrays = {name: _array(leaf) for name, leaf in named_leaves(state()).items()}
+        arrays = {name: _to_array(leaf) for name, leaf in named_leaves(state()).items()}
         save_arrays(self.path, arrays, {"identity": json.dumps(self.identity)})
         self._written = time.monotonic()
 
     def remove(self) -> None:
-        """Delete the file: its run is over."""
+        """Delete the file, because its run is complete."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
     def _check(self, metadata: Mapping[str, str]) -> None:
-        kept = json.loads(metadata.get("identity", "{}"))
-        for name in self.identity | kept:
-            was, now = kept.get(name), self.identity.get(name)
-            if was != now:
-                short = max(len(str(was)), len(str(now))) < _LONG
+        identity = json.loads(metadata.get("identity", "{}"))
+        for name in self.identity | identity:
+            in_file, here = identity.get(name), self.identity.get(name)
+            if in_file != here:
+                short = max(len(str(in_file)), len(str(here))) < _LONG
                 raise InputError(
                     f"checkpoint {self.path} belongs to another run: its {name} is "
-                    + (f"{was}, not {now}" if short else "another")
+                    + (f"{in_file}, not {here}" if short else "another")
                     + "; repeat that run, or remove the file"
                 )
 
@@ -99,10 +99,10 @@ def _is_key(dtype: Any) -> bool:
     return jnp.issubdtype(dtype, jax.dtypes.prng_key)
 
 
-def _array(leaf: Any) -> np.ndarray:
+def _to_array(leaf: Any) -> np.ndarray:
     is_key = isinstance(leaf, jax.Array) and _is_key(leaf.dtype)
     return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
 
 
-def _leaf(array: np.ndarray, dtype: Any) -> Any:
+def _to_leaf(array: np.ndarray, dtype: Any) -> Any:
     return jax.random.wrap_key_data(jnp.asarray(array)) if _is_key(dtype) else array

@@ -31,14 +31,13 @@ import numpy as np
 from tqdm import tqdm
 
 from calibrate.samplers import transport
-from calibrate.samplers.blackjax_nuts import BLACKJAX_NUTS, BlackJAXNUTSOptions
+from calibrate.samplers.chains import Chains, compile_chains, join
 from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.density import Density, tempered
-from calibrate.samplers.options import ChainOptions, check_counts, check_target_accept
-from calibrate.samplers.protocol import Context, Draws
-from calibrate.samplers.run import Chains, compile_chains, join
-from calibrate.samplers.stopping import converged
-from calibrate.statistical_model import Data
+from calibrate.samplers.diagnostics import converged
+from calibrate.samplers.nuts import BLACKJAX_NUTS, BlackJAXNUTSOptions
+from calibrate.samplers.protocol import ChainOptions, Context, Draws, Sampler
+from calibrate.statistical_model import Data, FEMLikelihood
 from emulator.core.errors import InputError, SolverError
 from emulator.core.progress import counting
 
@@ -47,13 +46,14 @@ from emulator.core.progress import counting
 class DelayedAcceptanceOptions(ChainOptions):
     """Length of a run.
 
-    warmup : adapting iterations of the cheap sampler.
-    draws : kept iterations of a round, each decided by FEM.
-    transitions : of the cheap sampler between two FEM solves.
-    power : of the cheap likelihood in proposals, in (0, 1]. At 0.8 a perfect map keeps three
-        quarters of its effective draws in 5 dimensions and half in 17; a poor one gains.
-    discarded : first draws of each chain that are not kept: chains start from the cheap posterior.
-    target_accept : acceptance rate in (0, 1) that the cheap sampler's step size adapts to.
+    warmup : the number of adapting iterations of the cheap sampler.
+    draws : the number of draws of a round, each decided by FEM.
+    transitions : the number of transitions of the cheap sampler between two FEM solves.
+    power : the power of the cheap likelihood in proposals, in (0, 1]. At 0.8 a perfect map keeps
+        three quarters of its effective draws in 5 dimensions and half in 17; a poor one gains.
+    discarded : the number of first draws of each chain that are dropped: chains start from the
+        cheap posterior.
+    target_accept : the acceptance rate in (0, 1) that the cheap sampler's step size adapts to.
     """
 
     draws: int = 250
@@ -64,25 +64,32 @@ class DelayedAcceptanceOptions(ChainOptions):
     target_accept: float = 0.85
 
     label: ClassVar[str] = "delayed acceptance"
+    counts: ClassVar[tuple[str, ...]] = (*ChainOptions.counts, "transitions", "discarded")
+    shares: ClassVar[tuple[str, ...]] = ("target_accept",)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_counts(self, "transitions", "discarded")
-        check_target_accept(self.label, self.target_accept)
         if not 0.0 < self.power <= 1.0:
             raise InputError(f"{self.label}: power is {self.power}; give one in (0, 1]")
 
     def cheap(self) -> BlackJAXNUTSOptions:
-        """Options of the cheap sampler; its pilot run is as long as its warm-up."""
+        """Return options of the cheap sampler; its pilot run is as long as its warm-up."""
         return BlackJAXNUTSOptions(
-            self.warmup, self.warmup, self.chains, 1, 2.0, 0.0, self.start, self.target_accept
+            warmup=self.warmup,
+            draws=self.warmup,
+            chains=self.chains,
+            rounds=1,
+            r_hat=2.0,
+            ess=0.0,
+            start=self.start,
+            target_accept=self.target_accept,
         )
 
 
-class _Place(NamedTuple):
-    """Where the chains are; arrays (chains, ...)."""
+class _Position(NamedTuple):
+    """The current positions of the chains; arrays (chains, ...)."""
 
-    states: Any  # of the cheap sampler, each chain's
+    states: Any  # the cheap sampler's state of each chain
     z: Any
     cheap_lp: Any
     log_w: Any
@@ -90,12 +97,12 @@ class _Place(NamedTuple):
 
 
 class _State(NamedTuple):
-    """All that a run goes on from."""
+    """Everything that a killed run needs to go on."""
 
     map_: transport.StandardMap
-    place: _Place
-    count: Any  # draws made, the discarded ones included
-    solves: Any  # FEM's, those of starts and discarded draws included
+    position: _Position
+    count: Any  # draws so far, the discarded ones included
+    solves: Any  # FEM solves so far, those of starts and discarded draws included
     draws: Draws
 
 
@@ -110,14 +117,10 @@ _STATISTICS = {
 }
 
 
-@dataclass(frozen=True)
-class DelayedAcceptance:
-    """The sampler; see :class:`~calibrate.samplers.protocol.Sampler`."""
+class DelayedAcceptance(Sampler):
+    """The sampler."""
 
-    name: str = "delayed_acceptance"
-    options: type[DelayedAcceptanceOptions] = DelayedAcceptanceOptions
-    statistics: tuple[str, ...] = tuple(_STATISTICS)
-    solves_fem: bool = True
+    solves_fem: ClassVar[bool] = True
 
     def sample(
         self,
@@ -129,7 +132,7 @@ class DelayedAcceptance:
     ) -> Draws:
         """Draw from FEM's posterior in rounds, until the chains agree.
 
-        The attribute ``fem_solves`` counts all solves; the statistic those of the draws kept.
+        The attribute ``fem_solves`` counts all solves; the statistic counts those of each draw.
 
         Raises
         ------
@@ -141,7 +144,7 @@ class DelayedAcceptance:
         if context.fem is None:
             raise InputError(f"{options.label}: there is no FEM likelihood to decide by")
         with counting(desc=self.name, total=0, disable=not context.progress, unit="draw") as bar:
-            run = _Run(density, data, options, seed, context, bar)
+            run = _Run(density, data, options, seed, context.fem, context.checkpoint, bar)
             for rounds in range(1, options.rounds + 1):
                 draws = run.draw(rounds * options.draws)
                 if converged(draws.z, options.r_hat, options.ess):
@@ -158,22 +161,23 @@ class _Run:
         data: Data,
         options: DelayedAcceptanceOptions,
         seed: int,
-        context: Context,
+        fem: FEMLikelihood,
+        checkpoint: Checkpoint,
         bar: tqdm,
     ) -> None:
         self.density, self.data, self.options, self.bar = density, data, options, bar
-        self.fem, self.checkpoint = context.fem, context.checkpoint
+        self.fem, self.checkpoint = fem, checkpoint
         self.wide = tempered(density, options.power)
         self.programs = compile_chains(BLACKJAX_NUTS, self.wide, options.cheap())
         start_key, self.key = jax.random.split(jax.random.key(seed))
         state = self.checkpoint.restore(self._template) or self._begin(start_key)
-        self.map_, self.place = state.map_, state.place
+        self.map_, self.position = state.map_, state.position
         self.count, self.solves = int(state.count), int(state.solves)
         self.parts = [state.draws]
         bar.update(self.count)
 
     def draw(self, total: int) -> Draws:
-        """The first ``total`` kept draws of each chain."""
+        """Return the first ``total`` draws of each chain after the discarded ones."""
         last = self.bar.total = self.options.discarded + total
         while self.count < last:
             draws = self._step()
@@ -187,9 +191,9 @@ class _Run:
         return jax.tree.map(lambda array: array[:, :total], join(self.parts))
 
     def _begin(self, key: jax.Array) -> _State:
-        """Chains at draws of the cheap posterior.
+        """Start chains at draws of the cheap posterior.
 
-        A killed run does this part again, or it is already beyond it: it solves no FEM.
+        This part has no checkpoint, because it solves no FEM: a killed run repeats it.
         """
         with counting(disable=True, total=0) as bar:
             cheap = Chains(
@@ -197,69 +201,72 @@ class _Run:
             )
             cheap.start_straightened(*jax.random.split(key))
         self.map_ = cheap.map_
-        proposed, _ = self._propose(cheap.states)
-        every = np.full(len(proposed.z), True)
-        log_w, means = self._by_fem(proposed.z, every, self._no_means((len(every),)))
-        place = proposed._replace(log_w=log_w, means=means)
-        return _State(self.map_, place, 0, len(proposed.z), self._no_draws())
+        proposal, _ = self._propose(cheap.states)
+        every = np.full(len(proposal.z), True)
+        log_w, means = self._by_fem(proposal.z, every, self._no_means((len(every),)))
+        position = proposal._replace(log_w=log_w, means=means)
+        return _State(self.map_, position, 0, len(proposal.z), self._no_draws())
 
     def _step(self) -> Draws:
-        """One draw of each chain, (chains, 1)."""
-        proposed, cheap = self._propose(self.place.states)
-        moved = (proposed.z != self.place.z).any(axis=1)
-        self.solves += int(moved.sum())
-        found, means = self._by_fem(proposed.z, moved, self.place.means)
-        log_w = np.where(moved, found, self.place.log_w)
+        """Return one draw of each chain, (chains, 1)."""
+        current = self.position
+        proposal, cheap = self._propose(current.states)
+        is_new = (proposal.z != current.z).any(axis=1)
+        self.solves += int(is_new.sum())
+        log_w, means = self._by_fem(proposal.z, is_new, current.means)
+        log_w = np.where(is_new, log_w, current.log_w)
         # Where FEM fails the weight is 0: never accepted, and left at the first chance.
         with np.errstate(invalid="ignore", over="ignore"):
-            probability = np.nan_to_num(np.exp(np.minimum(log_w - self.place.log_w, 0.0)), nan=0.0)
+            probability = np.nan_to_num(np.exp(np.minimum(log_w - current.log_w, 0.0)), nan=0.0)
         key = jax.random.fold_in(self.key, self.count)
         accepted = np.asarray(jax.random.uniform(key, probability.shape)) < probability
-        self.place = _choose(accepted, proposed._replace(log_w=log_w, means=means), self.place)
+        self.position = _choose(accepted, proposal._replace(log_w=log_w, means=means), current)
         statistics = {
             "acceptance_rate": probability,
-            "accepted": accepted & moved,
-            "fem_solves": moved.astype(int),
-            "log_w": self.place.log_w,
-            "lp": self.place.cheap_lp + self.place.log_w,
+            "accepted": accepted & is_new,
+            "fem_solves": is_new.astype(int),
+            "log_w": self.position.log_w,
+            "lp": self.position.cheap_lp + self.position.log_w,
             "n_steps": cheap["n_steps"].sum(axis=1),
             "diverging": cheap["diverging"].any(axis=1),
         }
-        draws = Draws(self.place.z, statistics, means=self.place.means)
+        draws = Draws(self.position.z, statistics, means=self.position.means)
         return jax.tree.map(lambda array: array[:, None], draws)
 
-    def _propose(self, states: Any) -> tuple[_Place, Mapping[str, np.ndarray]]:
-        """Where the cheap sampler leads, without weights; its statistics (chains, transitions)."""
+    def _propose(self, states: Any) -> tuple[_Position, Mapping[str, np.ndarray]]:
+        """Return the cheap sampler's proposal without weights, and its statistics.
+
+        The statistics are (chains, transitions).
+        """
         transitions = self.options.transitions
         states, draws = self.programs.advance(states, self.data, self.map_, transitions)
-        place = _Place(states, draws.z[:, -1], draws.statistics["lp"][:, -1], None, None)
-        return place, draws.statistics
+        position = _Position(states, draws.z[:, -1], draws.statistics["lp"][:, -1], None, None)
+        return position, draws.statistics
 
     def _by_fem(
-        self, z: np.ndarray, wanted: np.ndarray, means: Mapping[str, np.ndarray]
+        self, z: np.ndarray, solved: np.ndarray, means: Mapping[str, np.ndarray]
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """FEM's less the tempered log likelihood (chains,), where wanted; ``-inf`` elsewhere.
+        """Solve FEM at the ``solved`` points of z (chains, p).
 
-        And FEM's data without noise there, elsewhere and where FEM fails as in ``means``.
+        Return FEM's log likelihood less the tempered one (chains,), ``-inf`` where FEM fails or is
+        not solved, and FEM's data without noise, there as in ``means``.
         """
-        assert self.fem is not None
         named = jax.tree.map(np.asarray, self.density.constrain(jnp.asarray(z)))
-        log_w, there = np.full(len(z), -np.inf), {n: np.array(m) for n, m in means.items()}
-        for k in np.flatnonzero(wanted):
-            found = self.fem({name: values[k] for name, values in named.items()}, self.data)
-            ratio = found.fem - self.options.power * found.cheap
+        log_w, new_means = np.full(len(z), -np.inf), {n: np.array(m) for n, m in means.items()}
+        for k in np.flatnonzero(solved):
+            likelihoods = self.fem({name: values[k] for name, values in named.items()}, self.data)
+            ratio = likelihoods.fem - self.options.power * likelihoods.cheap
             log_w[k] = ratio if np.isfinite(ratio) else -np.inf
-            for name, mean in found.means.items():
-                there[name][k] = mean
-        return log_w, there
+            for name, mean in likelihoods.means.items():
+                new_means[name][k] = mean
+        return log_w, new_means
 
     def _no_means(self, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-        assert self.fem is not None
         shapes = self.fem.model.observe.shapes
         return {name: np.full((*shape, *of), np.nan) for name, of in shapes.items()}
 
     def _check_start(self) -> None:
-        if not np.isfinite(self.place.log_w).all():
+        if not np.isfinite(self.position.log_w).all():
             raise SolverError(
                 f"FEM converged at none of a chain's first {self.count + 1} proposals: the cheap "
                 "map leads to where FEM has no solution"
@@ -274,28 +281,30 @@ class _Run:
         return Draws(z, statistics, means=self._no_means((chains, 0)))
 
     def _state(self) -> _State:
-        return _State(self.map_, self.place, self.count, self.solves, join(self.parts))
+        return _State(self.map_, self.position, self.count, self.solves, join(self.parts))
 
     def _template(self) -> _State:
         map_ = transport.standard_identity(self.density.dimension)
         states, _ = self.programs.shapes(self.options.chains, self.data, map_)
         number = np.zeros(())
-        place = _Place(states, number, number, number, self._no_means(()))
+        position = _Position(states, number, number, number, self._no_means(()))
         count = np.zeros((), int)
-        return _State(map_, place, count, count, self._no_draws())
+        return _State(map_, position, count, count, self._no_draws())
 
 
-def _choose(accepted: np.ndarray, proposed: _Place, current: _Place) -> _Place:
-    """The proposed place of each chain where accepted; random keys go on either way."""
+def _choose(accepted: np.ndarray, proposal: _Position, current: _Position) -> _Position:
+    """Return the proposal of each chain where accepted; random keys advance either way."""
     states = tuple(
         new if yes else old._replace(rng_key=new.rng_key)
-        for yes, new, old in zip(accepted, proposed.states, current.states, strict=True)
+        for yes, new, old in zip(accepted, proposal.states, current.states, strict=True)
     )
 
     def chosen(new: np.ndarray, old: np.ndarray) -> np.ndarray:
         return np.where(accepted.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
-    return _Place(states, *jax.tree.map(chosen, proposed[1:], current[1:]))
+    return _Position(states, *jax.tree.map(chosen, proposal[1:], current[1:]))
 
 
-DELAYED_ACCEPTANCE = DelayedAcceptance()
+DELAYED_ACCEPTANCE = DelayedAcceptance(
+    "delayed_acceptance", DelayedAcceptanceOptions, tuple(_STATISTICS)
+)

@@ -29,9 +29,9 @@ class Target(Protocol):
     """What Markov chains need of a density.
 
     log_density : (z (p,), data) -> ().
-    dimension : number of coordinates, p.
-    piloted : whether a pilot run straightens it (:mod:`calibrate.samplers.transport`).
-    at_once : threads that may ask for it at the same time.
+    dimension : the number of coordinates, p.
+    piloted : whether a pilot run straightens the density (:mod:`calibrate.samplers.transport`).
+    at_once : the number of threads that may evaluate it at the same time.
     """
 
     @property
@@ -53,13 +53,13 @@ class Density(NamedTuple):
     """A log density on real coordinates.
 
     log_density : (z (p,), data) -> (); the sum of the next two.
-    log_prior : (z (p,),) -> (); the prior's density of ``z``, which integrates to 1.
+    log_prior : (z (p,),) -> (); the log prior density of ``z``, which integrates to 1.
     log_likelihood : (z (p,), data) -> (); ``-inf`` where the forward map has no answer.
     prior_draw : (rng_key,) -> z (p,) from the prior.
     constrain : (z (s, p),) -> draws by name, each (s,).
     unconstrain : (draw by name, each ()) -> z (p,).
-    names : of the coordinates, (p,), in their order.
-    at_once : threads that may ask for it at the same time.
+    names : the names of the coordinates, (p,), in their order.
+    at_once : the number of threads that may evaluate it at the same time.
     """
 
     log_density: Callable[[jax.Array, Data], jax.Array]
@@ -84,7 +84,7 @@ class Density(NamedTuple):
 
 @lru_cache(maxsize=4)
 def density_of(model: Model) -> Density:
-    """The density of a model's posterior, up to a constant."""
+    """Return the density of a model's posterior, up to a constant."""
     names = tuple(sorted(model.sampled_priors))
     transforms = {name: biject_to(model.sampled_priors[name].support) for name in names}
     example = {name: np.zeros(shape) for name, shape in model.observe.shapes.items()}
@@ -127,13 +127,13 @@ def density_of(model: Model) -> Density:
 
 
 def threads_for(forward: ForwardMap) -> int:
-    """Evaluations at once: one a core; FEM's need memory, too."""
+    """Return the number of evaluations at once: one a core, fewer where FEM needs the memory."""
     return at_once(forward.simulator) if isinstance(forward, FEMForward) else cores()
 
 
 @lru_cache(maxsize=4)
 def tempered(density: Density, power: float) -> Density:
-    """``density`` with its likelihood to a power in (0, 1]: a wider posterior below 1."""
+    """Return ``density`` with its likelihood to a power in (0, 1]: wider for a power below 1."""
     if power == 1.0:
         return density
 
@@ -144,18 +144,18 @@ def tempered(density: Density, power: float) -> Density:
 
 
 def _observed_sites(model: Model, data: dict[str, np.ndarray]) -> list[str]:
-    """Names of what is observed, and of the factors; nothing is computed."""
-    found: list[str] = []
+    """Return the names of observed sites and of factors, without computing anything."""
+    names: list[str] = []
 
     def trace() -> None:
         sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(data)
-        found.extend(name for name, site in sites.items() if site.get("is_observed", False))
+        names.extend(name for name, site in sites.items() if site.get("is_observed", False))
 
     jax.eval_shape(trace)
-    return found
+    return names
 
 
 def named_draws(model: Model, z: np.ndarray) -> dict[str, np.ndarray]:
-    """Draws by parameter name, each (chains, draws), from ``z`` (chains, draws, p)."""
+    """Return draws by parameter name, each (chains, draws), from ``z`` (chains, draws, p)."""
     named = density_of(model).constrain(jnp.asarray(z.reshape(-1, z.shape[-1])))
     return {name: np.asarray(named[name]).reshape(z.shape[:2]) for name in model.names}

@@ -1,4 +1,6 @@
-r"""The Laplace approximation: a Gaussian at the posterior's mode, in unconstrained coordinates.
+r"""The modes of a posterior: the Laplace approximation there, and modes that draws have missed.
+
+**The Laplace approximation** is a Gaussian at the mode, in unconstrained coordinates,
 
 .. math:: z \sim \mathcal{N}\!\left(\hat z, H^{-1}\right), \qquad
           H = -\nabla^2 \log p(\hat z \mid y)
@@ -6,8 +8,21 @@ r"""The Laplace approximation: a Gaussian at the posterior's mode, in unconstrai
 (Gelman et al. 2013, Sec. 4.1, 13.3). Draws are independent, so R-hat and effective sample size say
 nothing of the error. The ratios :math:`p(z \mid y) / q(z)` do: the Pareto shape k of their tail is
 recorded, and above 0.7 the Gaussian should not be trusted (Yao et al. 2018). A Gaussian that is too
-wide has no such tail; few of its draws then count, and what fraction is recorded too. Neither sees
-another mode, where no draw is; the optimiser's other starts do (:mod:`calibrate.samplers.modes`).
+wide has no such tail; few of its draws then count, and their fraction is recorded too. Neither sees
+another mode, where no draw is.
+
+**A missed mode.** Chains that start beside the same of two modes agree with each other: R-hat sees
+nothing. So an optimiser starts at draws of the prior, and a mode in which it ends counts as missed
+if
+
+- a valley lies before it: on the way to the nearest draw the log density falls below both ends;
+- its mass counts. The mass at a mode is Laplace's, :math:`\log p(\hat z) + \tfrac{d}{2} \log 2\pi -
+  \tfrac12 \log\det H`, against that of the draws, :math:`\log Z = \mathrm{E}[\log p] +
+  \mathrm{H}[p] \le \mathrm{E}[\log p] + \tfrac12 \log\det (2\pi e \Sigma)`, as no density of
+  covariance :math:`\Sigma` has more entropy than the Gaussian.
+
+A funnel's neck is high and far from all draws, but no valley lies before it. Because of the bound
+the test is conservative: draws on a bent ridge look heavier than they are.
 """
 
 from __future__ import annotations
@@ -23,60 +38,69 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from calibrate.samplers.density import Density
-from calibrate.samplers.importance import FEWEST, efficiency, pareto_shape
-from calibrate.samplers.modes import Modes, find_modes, missed_mode, precision_at, slope_of
-from calibrate.samplers.options import check_counts
-from calibrate.samplers.protocol import Context, Draws
+from calibrate.samplers.diagnostics import FEWEST_WEIGHTS, efficiency, pareto_shape
+from calibrate.samplers.protocol import Context, Draws, Sampler, check_numbers
 from calibrate.statistical_model import Data
 from emulator.core.errors import InputError, SolverError
+from emulator.core.minimise import minimise
 
-_AWAY = 0.05  # sd that the optimiser may stop from the mode
+# Attributes of a run: log of the draws' mass over the missed mode's, infinite where none is missed;
+# and, only where one is missed, its coordinates in words.
+MISSED_BY, MISSED_AT = "missed_mode_nats", "missed_mode"
+
+_STARTS = 8  # draws of the prior from which modes are searched
+_MOST = 500  # iterations of the optimiser
+_STEP = 1e-4  # step of central differences of the gradient; coordinates are about 1 wide
+_AWAY = 0.05  # sd from the mode that the optimiser may stop, for a Gaussian there
+_AWAY_OF_MASS = 0.3  # likewise, for the mass at a mode
+_LIGHTER = 3.0  # nats: a mode of a twentieth of the draws' mass
+_BESIDE = 0.5  # sd from the nearest draw, within which a mode is not missed
+_VALLEY = 2.0  # nats below both ends
+_ON_THE_WAY = 16  # points between mode and draw
+_SAMPLE = 64  # draws from which the mean log density is computed
 
 
 @dataclass(frozen=True)
 class LaplaceOptions:
     """Size of a run.
 
-    draws, chains : independent draws, and how many sets of them.
-    starts : draws of the prior that the optimiser starts from; the best mode is taken.
+    draws, chains : the number of independent draws of a set, and of sets.
+    starts : the number of draws of the prior that the optimiser starts from; the highest mode is
+        taken.
     """
 
     draws: int = 1000
     chains: int = 4
-    starts: int = 8
+    starts: int = _STARTS
 
     label: ClassVar[str] = "Laplace"
+    counts: ClassVar[tuple[str, ...]] = ("draws", "chains", "starts")
+    shares: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def sized(cls, *, warmup: int, draws: int, chains: int) -> Self:  # noqa: ARG003
-        """Options of a run of this size; there is no warm-up."""
+        """Return options of a run of this size; there is no warm-up."""
         return cls(draws=draws, chains=chains)
 
     def __post_init__(self) -> None:
-        check_counts(self, "draws", "chains", "starts")
-        if self.draws * self.chains < FEWEST:
+        check_numbers(self)
+        if self.draws * self.chains < FEWEST_WEIGHTS:
             raise InputError(
-                f"{self.label}: {self.draws} draws of {self.chains} chains; give {FEWEST} or more "
-                "together, or its error cannot be estimated"
+                f"{self.label}: {self.draws} draws of {self.chains} chains; give {FEWEST_WEIGHTS} "
+                "or more together, or its error cannot be estimated"
             )
 
 
 class _Gaussian(NamedTuple):
-    """Mode (p,), precision H (p, p), and all modes that were found, the highest first."""
+    """Mode (p,), precision H (p, p), and all modes, the highest first."""
 
     mode: Any
     precision: Any
     modes: Any
 
 
-@dataclass(frozen=True)
-class Laplace:
-    """The sampler; see :class:`~calibrate.samplers.protocol.Sampler`."""
-
-    name: str = "laplace"
-    options: type[LaplaceOptions] = LaplaceOptions
-    statistics: tuple[str, ...] = ("lp", "log_ratio")
-    solves_fem: bool = False
+class Laplace(Sampler):
+    """The sampler of the Laplace approximation."""
 
     def sample(
         self,
@@ -86,7 +110,7 @@ class Laplace:
         seed: int,
         context: Context = Context(),
     ) -> Draws:
-        """Independent draws of the Gaussian where the density is not zero.
+        """Return independent draws of the Gaussian where the density is not zero.
 
         The statistic ``log_ratio`` is log p(z, y) - log q(z). The attribute ``pareto_k`` is the
         shape of its tail, ``importance_efficiency`` the effective fraction of the draws, were they
@@ -95,7 +119,7 @@ class Laplace:
         Raises
         ------
         SolverError
-            No mode was found, the density is flat there, or half of the Gaussian lies where it is
+            No mode exists, the density is flat there, or half of the Gaussian lies where it is
             zero.
         """
         start_key, key = jax.random.split(jax.random.key(seed))
@@ -120,28 +144,22 @@ class Laplace:
         return Draws(z.reshape(*shape, -1), statistics, attributes)
 
 
+LAPLACE = Laplace("laplace", LaplaceOptions, ("lp", "log_ratio"))
+
+
 def _empty(size: int) -> _Gaussian:
     modes = Modes(np.zeros((0, size)), np.zeros(0))
     return _Gaussian(np.zeros(size), np.zeros((size, size)), modes)
 
 
-@lru_cache(maxsize=4)
-def _heights(density: Density) -> Callable[..., Any]:
-    """``(z (s, p), data) -> log densities (s,)``."""
-    return jax.jit(lambda z, data: jax.lax.map(lambda row: density.log_density(row, data), z))
-
-
 def _precision(density: Density, data: Data, mode: np.ndarray) -> np.ndarray:
-    """Minus the Hessian at the mode; :class:`SolverError` where it is none."""
-    precision = precision_at(density, data, mode)
-    smallest = np.linalg.eigvalsh(precision)[0] if np.isfinite(precision).all() else np.nan
+    """Return minus the Hessian at the mode; :class:`SolverError` where it is no mode."""
+    precision, smallest, away = _curvature(density, data, mode)
     if not smallest > 0.0:
         raise SolverError(
             f"the posterior has no curvature at its mode in some direction ({smallest:.2g}): it is "
             "flat there, or ends; use a sampler, such as nuts"
         )
-    here = slope_of(density, data)(mode)
-    away = float(np.sqrt(here @ np.linalg.solve(precision, here)))
     if not away < _AWAY:
         raise SolverError(
             f"the optimiser stopped {away:.2g} sd from a mode: the posterior density ends or bends "
@@ -153,15 +171,15 @@ def _precision(density: Density, data: Data, mode: np.ndarray) -> np.ndarray:
 def _draw(
     density: Density, gaussian: _Gaussian, data: Data, options: LaplaceOptions, key: jax.Array
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draws (s, p), log densities and the Gaussian's, (s,); twice as many are tried."""
-    wanted, size = options.chains * options.draws, len(gaussian.mode)
-    noise = np.asarray(jax.random.normal(key, (2 * wanted, size)))
+    """Return draws (s, p), log densities and the Gaussian's, (s,), of twice as many trials."""
+    count, size = options.chains * options.draws, len(gaussian.mode)
+    noise = np.asarray(jax.random.normal(key, (2 * count, size)))
     # H = L L^T, so L^-T times white noise has covariance H^-1.
     factor = np.linalg.cholesky(gaussian.precision)
     z = gaussian.mode + solve_triangular(factor, noise.T, lower=True, trans="T").T
-    lp = np.asarray(_heights(density)(jnp.asarray(z), data))
-    rows = np.flatnonzero(np.isfinite(lp))[:wanted]
-    if len(rows) < wanted:
+    lp = np.asarray(_compile(density).heights(jnp.asarray(z), data))
+    rows = np.flatnonzero(np.isfinite(lp))[:count]
+    if len(rows) < count:
         raise SolverError(
             "half of the Gaussian at the mode lies where the posterior density is zero; use a "
             "sampler, such as nuts"
@@ -170,4 +188,138 @@ def _draw(
     return z[rows], lp[rows], log_q[rows] - 0.5 * size * np.log(2.0 * np.pi)
 
 
-LAPLACE = Laplace()
+class _Programs(NamedTuple):
+    """Compiled functions of a density.
+
+    starts : (keys (s,)) -> draws of the prior (s, p).
+    value_and_gradient : (z (p,), data) -> log density (), gradient (p,).
+    heights : (z (s, p), data) -> log densities (s,).
+    """
+
+    starts: Callable[..., Any]
+    value_and_gradient: Callable[..., Any]
+    heights: Callable[..., Any]
+
+
+@lru_cache(maxsize=4)
+def _compile(density: Density) -> _Programs:
+    return _Programs(
+        jax.jit(jax.vmap(density.prior_draw)),
+        jax.jit(jax.value_and_grad(density.log_density)),
+        jax.jit(lambda z, data: jax.lax.map(lambda row: density.log_density(row, data), z)),
+    )
+
+
+class Modes(NamedTuple):
+    """Points ``z`` (m, p) where the optimiser ended, and log densities (m,), the highest first."""
+
+    z: Any
+    heights: Any
+
+
+def find_modes(
+    density: Density,
+    data: Data,
+    key: jax.Array,
+    starts: int = _STARTS,
+    draws: np.ndarray | None = None,
+) -> Modes:
+    """Return where L-BFGS ends from ``starts`` draws of the prior; none where the density is zero.
+
+    draws : draws (s, p) of the posterior, if there are any; in coordinates in which they are white
+        the optimiser takes a few steps, where a sharp posterior takes thousands.
+    """
+    programs = _compile(density)
+    # From white coordinates w to z = factor w.
+    factor = np.eye(density.dimension)
+    if draws is not None and (covariance := _covariance(draws)) is not None:
+        factor = np.linalg.cholesky(covariance)
+
+    def negative(w: np.ndarray) -> tuple[float, np.ndarray]:
+        height, slope = programs.value_and_gradient(jnp.asarray(factor @ w), data)
+        return -float(height), -(np.asarray(slope) @ factor)
+
+    minima = [
+        minimise(negative, np.linalg.solve(factor, start), iterations=_MOST, tolerance=1e-12)
+        for start in np.asarray(programs.starts(jax.random.split(key, starts)))
+    ]
+    minima = sorted((m for m in minima if np.isfinite(m.value)), key=lambda m: m.value)
+    z = np.array([factor @ m.x for m in minima]).reshape(len(minima), density.dimension)
+    return Modes(z, np.array([-m.value for m in minima]))
+
+
+def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> dict[str, Any]:
+    """Return attributes of a run with draws ``z`` (s, p): the heaviest of ``modes`` missed."""
+    program = _compile(density).value_and_gradient
+
+    def height(point: np.ndarray) -> float:
+        value = float(program(jnp.asarray(point), data)[0])
+        return value if np.isfinite(value) else -np.inf
+
+    attributes: dict[str, Any] = {MISSED_BY: np.inf}
+    covariance = _covariance(z)
+    if len(modes.z) == 0 or covariance is None:
+        return attributes
+    log_det = np.linalg.slogdet(covariance)[1]
+    whitener = np.linalg.cholesky(np.linalg.inv(covariance))
+    some = z[np.linspace(0, len(z) - 1, min(_SAMPLE, len(z))).astype(int)]
+    drawn = np.mean([height(each) for each in some])
+    drawn += 0.5 * (len(covariance) * (1.0 + np.log(2.0 * np.pi)) + log_det)
+    for mode, top in zip(*modes, strict=True):
+        distances = (((z - mode) @ whitener) ** 2).sum(axis=1)
+        if distances.min() < _BESIDE**2:
+            continue
+        nearest = z[np.argmin(distances)]
+        way = np.linspace(0.0, 1.0, _ON_THE_WAY + 2)[1:-1, None]
+        lowest = min(height(each) for each in mode + way * (nearest - mode))
+        if not lowest < min(top, height(nearest)) - _VALLEY:
+            continue
+        lighter = float(drawn - _log_mass(density, data, mode, top))
+        if lighter < min(attributes[MISSED_BY], _LIGHTER):
+            attributes = {MISSED_BY: lighter, MISSED_AT: _in_words(density, mode)}
+    return attributes
+
+
+def _covariance(draws: np.ndarray) -> np.ndarray | None:
+    """Return the covariance (p, p) of draws (s, p), unless they do not vary in some direction."""
+    covariance = np.atleast_2d(np.cov(draws, rowvar=False))
+    if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance)[0] > 0.0:
+        return None
+    return covariance
+
+
+def _in_words(density: Density, z: np.ndarray) -> str:
+    named = density.constrain(jnp.asarray(z)[None])
+    return ", ".join(f"{name} {float(value[0]):.4g}" for name, value in named.items())
+
+
+def _log_mass(density: Density, data: Data, mode: np.ndarray, top: float) -> float:
+    """Return the log of Laplace's mass; none where the density is flat or ``mode`` is no mode."""
+    precision, smallest, away = _curvature(density, data, mode)
+    if not (smallest > 0.0 and away < _AWAY_OF_MASS):
+        return -np.inf
+    log_det = np.linalg.slogdet(precision)[1]
+    return float(top + 0.5 * (len(mode) * np.log(2.0 * np.pi) - log_det))
+
+
+def _curvature(density: Density, data: Data, z: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Return minus the Hessian (p, p), its smallest eigenvalue, and the distance to a mode.
+
+    The Hessian is by central differences of the gradient, because forward maps that solve have a
+    first derivative only. The distance is in sd; it is NaN where the Hessian is not definite.
+    """
+    program = _compile(density).value_and_gradient
+
+    def slope(z: np.ndarray) -> np.ndarray:
+        return np.asarray(program(jnp.asarray(z), data)[1])
+
+    offsets = _STEP * np.eye(len(z))
+    hessian = np.array([slope(z + d) - slope(z - d) for d in offsets]) / (2.0 * _STEP)
+    precision = -0.5 * (hessian + hessian.T)
+    if not np.isfinite(precision).all():
+        return precision, np.nan, np.nan
+    smallest = float(np.linalg.eigvalsh(precision)[0])
+    if not smallest > 0.0:
+        return precision, smallest, np.nan
+    gradient = slope(z)
+    return precision, smallest, float(np.sqrt(gradient @ np.linalg.solve(precision, gradient)))

@@ -1,7 +1,8 @@
 """BlackJAX's adjusted microcanonical Langevin sampler (Robnik et al. 2025) and its tuning.
 
 Hamiltonian dynamics at constant speed with partial refreshment of the direction, corrected by a
-Metropolis step. Its cost per transition is fixed, where NUTS's is that of the trajectory's turn.
+Metropolis step. The cost of a transition is fixed, where the cost of a NUTS transition is that of
+the trajectory until it turns.
 """
 
 from __future__ import annotations
@@ -9,14 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from calibrate.samplers.options import ChainOptions, check_target_accept
-from calibrate.samplers.protocol import Kernel
-from calibrate.samplers.run import ChainSampler
+from calibrate.samplers.chains import ChainSampler
+from calibrate.samplers.protocol import ChainOptions, Kernel, Statistics, TunedState
 from emulator.core.errors import InputError
 
 # Parts of the warm-up: step size, then the metric, then the step size again.
@@ -30,33 +30,24 @@ _LONGEST = 8.0
 class MCLMCOptions(ChainOptions):
     """Length of a run.
 
-    target_accept : acceptance rate in (0, 1) that the step size adapts to.
-    leapfrogs : mean number of integration steps of a transition, above 1.1.
+    target_accept : the acceptance rate in (0, 1) that the step size adapts to.
+    leapfrogs : the mean number of integration steps of a transition, above 1.1.
     """
 
     target_accept: float = 0.9
     leapfrogs: float = 4.0
 
     label: ClassVar[str] = "MCLMC"
+    shares: ClassVar[tuple[str, ...]] = ("target_accept",)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_target_accept(self.label, self.target_accept)
         if not self.leapfrogs > 1.1:
             raise InputError(f"{self.label}: leapfrogs is {self.leapfrogs}; it must be above 1.1")
 
 
-class State(NamedTuple):
-    """Random key, BlackJAX's state and the tuned parameters."""
-
-    rng_key: jax.Array
-    mclmc: Any
-    step_size: jax.Array
-    inverse_mass_matrix: jax.Array
-
-
 def kernel(log_density: Callable[..., jax.Array], options: MCLMCOptions) -> Kernel:
-    """BlackJAX's kernel; ``init`` runs the whole tuning."""
+    """Return BlackJAX's kernel; ``init`` runs the whole tuning."""
     from blackjax.adaptation.adjusted_mclmc_adaptation import adjusted_mclmc_find_L_and_step_size
     from blackjax.mcmc import adjusted_mclmc_dynamic as mclmc
 
@@ -68,15 +59,15 @@ def kernel(log_density: Callable[..., jax.Array], options: MCLMCOptions) -> Kern
 
     transition = mclmc.build_kernel(length)
 
-    def init(rng_key: jax.Array, position: jax.Array, *arguments: Any) -> State:
+    def init(rng_key: jax.Array, position: jax.Array, *arguments: Any) -> TunedState:
         if position.size == 1:
             raise InputError("sampler 'mclmc' needs two parameters or more; use nuts for one")
-        start_key, tuning_key, onwards = jax.random.split(rng_key, 3)
+        start_key, tuning_key, next_key = jax.random.split(rng_key, 3)
 
         def target(zeta: jax.Array) -> jax.Array:
             return log_density(zeta, *arguments)
 
-        state, found, _ = adjusted_mclmc_find_L_and_step_size(
+        state, tuned, _ = adjusted_mclmc_find_L_and_step_size(
             mclmc_kernel=transition,
             logdensity_fn=target,
             num_steps=options.warmup,
@@ -87,13 +78,13 @@ def kernel(log_density: Callable[..., jax.Array], options: MCLMCOptions) -> Kern
             frac_tune2=_METRIC,
             target_num_integration_steps=options.leapfrogs,
         )
-        return State(onwards, state, found.step_size, found.inverse_mass_matrix)
+        return TunedState(next_key, state, tuned.step_size, tuned.inverse_mass_matrix)
 
-    def step(state: State, *arguments: Any) -> tuple[State, jax.Array, dict[str, jax.Array]]:
-        here, onwards = jax.random.split(state.rng_key)
-        moved, info = transition(
-            here,
-            state.mclmc,
+    def step(state: TunedState, *arguments: Any) -> tuple[TunedState, jax.Array, Statistics]:
+        transition_key, next_key = jax.random.split(state.rng_key)
+        inner, info = transition(
+            transition_key,
+            state.state,
             lambda zeta: log_density(zeta, *arguments),
             state.step_size,
             inverse_mass_matrix=state.inverse_mass_matrix,
@@ -103,9 +94,9 @@ def kernel(log_density: Callable[..., jax.Array], options: MCLMCOptions) -> Kern
             "diverging": info.is_divergent,
             "acceptance_rate": info.acceptance_rate,
             "n_steps": info.num_integration_steps,
-            "lp": moved.logdensity,
+            "lp": inner.logdensity,
         }
-        return state._replace(rng_key=onwards, mclmc=moved), moved.position, statistics
+        return state._replace(rng_key=next_key, state=inner), inner.position, statistics
 
     return Kernel(init, step)
 

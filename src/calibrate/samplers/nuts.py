@@ -1,7 +1,10 @@
-"""NumPyro's No-U-Turn sampler (Hoffman and Gelman 2014), dense metric.
+"""The No-U-Turn sampler (Hoffman and Gelman 2014), dense metric: NumPyro's and BlackJAX's.
 
-Its functional interface is used: compiled once a model, where its ``MCMC`` class compiles for every
-run.
+Which of the two is faster depends on the posterior: BlackJAX's on landmarks and strains, NumPyro's
+on a volume (studies/decoder_speed). NumPyro's kernel adapts step size and metric in its first steps
+and is compiled once a model, where its ``MCMC`` class compiles for every run. BlackJAX's runs
+Stan's window adaptation in ``init``, after which its transitions are reversible, as delayed
+acceptance needs them.
 """
 
 from __future__ import annotations
@@ -13,29 +16,35 @@ from typing import Any, ClassVar
 import jax
 from numpyro.infer.hmc import hmc
 
-from calibrate.samplers.options import ChainOptions, check_target_accept
-from calibrate.samplers.protocol import Kernel
-from calibrate.samplers.run import ChainSampler
+from calibrate.samplers.chains import ChainSampler
+from calibrate.samplers.protocol import ChainOptions, Kernel, Statistics, TunedState
 
 
 @dataclass(frozen=True)
 class NUTSOptions(ChainOptions):
     """Length of a run.
 
-    target_accept : acceptance rate in (0, 1) that the step size adapts to.
+    target_accept : the acceptance rate in (0, 1) that the step size adapts to.
     """
 
     target_accept: float = 0.85
 
     label: ClassVar[str] = "NUTS"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_target_accept(self.label, self.target_accept)
+    shares: ClassVar[tuple[str, ...]] = ("target_accept",)
 
 
-def kernel(log_density: Callable[..., jax.Array], options: NUTSOptions) -> Kernel:
-    """NumPyro's kernel; its first ``options.warmup`` steps adapt step size and metric."""
+@dataclass(frozen=True)
+class BlackJAXNUTSOptions(NUTSOptions):
+    """Length of a run.
+
+    target_accept : the acceptance rate in (0, 1) that the step size adapts to.
+    """
+
+    label: ClassVar[str] = "BlackJAX NUTS"
+
+
+def numpyro_kernel(log_density: Callable[..., jax.Array], options: NUTSOptions) -> Kernel:
+    """Return NumPyro's kernel; its first ``options.warmup`` steps adapt step size and metric."""
 
     def potential(*arguments: Any) -> Callable[[jax.Array], jax.Array]:
         return lambda zeta: -log_density(zeta, *arguments)
@@ -52,7 +61,7 @@ def kernel(log_density: Callable[..., jax.Array], options: NUTSOptions) -> Kerne
             rng_key=rng_key,
         )
 
-    def step(state: Any, *arguments: Any) -> tuple[Any, jax.Array, dict[str, jax.Array]]:
+    def step(state: Any, *arguments: Any) -> tuple[Any, jax.Array, Statistics]:
         state = sample_kernel(state, arguments, {})
         statistics = {
             "diverging": state.diverging,
@@ -66,6 +75,53 @@ def kernel(log_density: Callable[..., jax.Array], options: NUTSOptions) -> Kerne
     return Kernel(init, step)
 
 
-NUTS = ChainSampler(
-    "nuts", NUTSOptions, ("diverging", "acceptance_rate", "n_steps", "lp", "energy"), kernel
+def blackjax_kernel(log_density: Callable[..., jax.Array], options: BlackJAXNUTSOptions) -> Kernel:
+    """Return BlackJAX's kernel; ``init`` runs the whole window adaptation."""
+    import blackjax  # here: other samplers need not wait for it
+    from blackjax.adaptation.base import get_filter_adapt_info_fn
+
+    transition = blackjax.nuts.build_kernel()
+
+    def init(rng_key: jax.Array, position: jax.Array, *arguments: Any) -> TunedState:
+        adaptation_key, next_key = jax.random.split(rng_key)
+        adaptation = blackjax.window_adaptation(
+            blackjax.nuts,
+            lambda zeta: log_density(zeta, *arguments),
+            is_mass_matrix_diagonal=False,
+            target_acceptance_rate=options.target_accept,
+            adaptation_info_fn=get_filter_adapt_info_fn(),
+        )
+        (state, tuned), _ = adaptation.run(adaptation_key, position, options.warmup)
+        return TunedState(next_key, state, tuned["step_size"], tuned["inverse_mass_matrix"])
+
+    def step(state: TunedState, *arguments: Any) -> tuple[TunedState, jax.Array, Statistics]:
+        transition_key, next_key = jax.random.split(state.rng_key)
+        nuts, info = transition(
+            transition_key,
+            state.state,
+            lambda zeta: log_density(zeta, *arguments),
+            state.step_size,
+            state.inverse_mass_matrix,
+        )
+        statistics = {
+            "diverging": info.is_divergent,
+            "acceptance_rate": info.acceptance_rate,
+            "n_steps": info.num_integration_steps,
+            "lp": nuts.logdensity,
+            "energy": info.energy,
+            "tree_depth": info.num_trajectory_expansions,
+        }
+        return state._replace(rng_key=next_key, state=nuts), nuts.position, statistics
+
+    return Kernel(init, step)
+
+
+_STATISTICS = ("diverging", "acceptance_rate", "n_steps", "lp", "energy")
+NUTS = ChainSampler("nuts", NUTSOptions, _STATISTICS, numpyro_kernel)
+BLACKJAX_NUTS = ChainSampler(
+    "blackjax_nuts",
+    BlackJAXNUTSOptions,
+    (*_STATISTICS, "tree_depth"),
+    blackjax_kernel,
+    adapts_in_steps=False,
 )

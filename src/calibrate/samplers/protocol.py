@@ -1,21 +1,26 @@
-"""What a sampler provides.
+"""What a sampler provides: its name, options, statistics, and draws from a density.
 
-A sampler draws from a :class:`~calibrate.samplers.density.Density` and knows its own name, options
-and statistics; :mod:`calibrate.samplers.registry` finds it by name. Samplers that are Markov chains
-give a kernel and leave the rest to :class:`~calibrate.samplers.run.ChainSampler`; a sampler of
-another kind (particles, an approximation) implements :meth:`Sampler.sample` itself.
+:mod:`calibrate.samplers.registry` finds a sampler by name. Samplers that are Markov chains give a
+:class:`Kernel` and options that extend :class:`ChainOptions`, and leave the rest to
+:class:`~calibrate.samplers.chains.ChainSampler`; a sampler of another kind (particles, an
+approximation) implements :meth:`Sampler.sample` itself.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 
 from calibrate.samplers.checkpoint import Checkpoint
-from calibrate.samplers.density import Density
-from calibrate.statistical_model import Data, FEMLikelihood
+from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT
+from calibrate.statistical_model import FEMLikelihood
+from emulator.core.errors import InputError
+
+RANDOM, PATHFINDER = "random", "pathfinder"
 
 Statistics = Mapping[str, Any]
 """Statistics by ArviZ's names: ``diverging``, ``acceptance_rate``, ``n_steps``, ``lp``, ..."""
@@ -25,8 +30,8 @@ class Draws(NamedTuple):
     """Draws ``z`` (chains, draws, p) in unconstrained coordinates; statistics (chains, draws).
 
     attributes : facts of the whole run, plain JSON, e.g. ``log_evidence``.
-    means : data without noise at the draws, (chains, draws, *shape) by the observation's name, of
-        a sampler that does not draw from the model's own posterior but from FEM's.
+    means : data without noise at the draws, (chains, draws, *shape) by the observation's name, from
+        a sampler that draws from FEM's posterior in place of the model's own.
     """
 
     z: Any
@@ -36,10 +41,10 @@ class Draws(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What a run is given besides its density.
+    """What a run needs besides its density.
 
-    progress : whether to show it.
-    checkpoint : where the run's state is kept, and found again after a kill.
+    progress : whether a progress bar is shown.
+    checkpoint : the file that the run's state is written to, and restored from after a kill.
     fem : FEM's log likelihood, for samplers with FEM in a second stage.
     """
 
@@ -48,43 +53,33 @@ class Context(NamedTuple):
     fem: FEMLikelihood | None = None
 
 
-class Sampler(Protocol):
+@dataclass(frozen=True)
+class Sampler(ABC):
     """A way to draw from a posterior.
 
-    name : as in the registry and on the command line.
-    options : frozen dataclass of its settings; its defaults are the sampler's.
-    statistics : names of the statistics that come with every draw.
-    solves_fem : whether it needs FEM's likelihood (:attr:`Context.fem`).
+    name : the name in the registry and on the command line.
+    options : the frozen dataclass of its settings; its defaults are the sampler's.
+    statistics : the names of the statistics that come with every draw.
     """
 
-    @property
-    def name(self) -> str: ...  # noqa: D102
+    name: str
+    options: type[Any]
+    statistics: tuple[str, ...]
 
-    @property
-    def options(self) -> type[Any]: ...  # noqa: D102
+    solves_fem: ClassVar[bool] = False
+    """Whether the sampler needs FEM's likelihood (:attr:`Context.fem`)."""
 
-    @property
-    def statistics(self) -> tuple[str, ...]: ...  # noqa: D102
-
-    @property
-    def solves_fem(self) -> bool: ...  # noqa: D102
-
+    @abstractmethod
     def sample(
-        self,
-        density: Density,
-        data: Data,
-        options: Any,
-        seed: int,
-        context: Context = Context(),
+        self, density: Any, data: Any, options: Any, seed: int, context: Context = Context()
     ) -> Draws:
         """Draw from ``density`` given ``data``."""
-        ...
 
 
 class Kernel(NamedTuple):
     """A Markov transition, written for one chain.
 
-    init : (rng_key, position (p,), *arguments) -> state. The state is a pytree of arrays that holds
+    init : (rng_key, position (p,), *arguments) -> state. The state is a pytree of arrays with
         everything the next step needs, its random key included.
     step : (state, *arguments) -> (state, position (p,), statistics by name, each ()).
 
@@ -93,3 +88,64 @@ class Kernel(NamedTuple):
 
     init: Callable[..., Any]
     step: Callable[..., tuple[Any, jax.Array, Statistics]]
+
+
+class TunedState(NamedTuple):
+    """State of a kernel whose ``init`` adapts: random key, BlackJAX's state, fixed parameters."""
+
+    rng_key: jax.Array
+    state: Any
+    step_size: jax.Array
+    inverse_mass_matrix: jax.Array
+
+
+@dataclass(frozen=True)
+class ChainOptions:
+    """Length of a run.
+
+    warmup : the number of adapting iterations, whose draws are dropped.
+    draws : the number of draws of a round; the pilot is shorter.
+    chains : the number of independent chains.
+    rounds : the largest number of rounds; another one begins while R-hat or ESS miss their limits.
+    r_hat, ess : the largest R-hat, and smallest bulk and tail ESS of any parameter, to stop at.
+    start : where chains start: ``random``, within two units of the centre, or ``pathfinder``
+        (:func:`calibrate.samplers.chains.pathfinder_start`).
+    """
+
+    warmup: int = 500
+    draws: int = 1000
+    chains: int = 4
+    rounds: int = 8
+    r_hat: float = RUN_UNTIL_R_HAT
+    ess: float = ENOUGH_ESS
+    start: str = RANDOM
+
+    label: ClassVar[str] = "chains"
+    counts: ClassVar[tuple[str, ...]] = ("warmup", "draws", "chains", "rounds")
+    shares: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def sized(cls, *, warmup: int, draws: int, chains: int) -> Self:
+        """Return options of a run of this length, all else by default."""
+        return cls(warmup=warmup, draws=draws, chains=chains)
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        if self.start not in (RANDOM, PATHFINDER):
+            raise InputError(
+                f"{self.label}: start is '{self.start}'; it is {RANDOM} or {PATHFINDER}"
+            )
+        if not self.r_hat > 1.0:
+            raise InputError(f"{self.label}: r_hat is {self.r_hat}; it must be above 1")
+        if not self.ess >= 0.0:
+            raise InputError(f"{self.label}: ess is {self.ess}; it must be 0 or more")
+
+
+def check_numbers(options: Any) -> None:
+    """Raise an :class:`InputError` unless ``counts`` are 1 or more and ``shares`` in (0, 1)."""
+    for name in options.counts:
+        if (value := getattr(options, name)) < 1:
+            raise InputError(f"{options.label}: {name} is {value}; it must be 1 or more")
+    for name in options.shares:
+        if not 0.0 < (value := getattr(options, name)) < 1.0:
+            raise InputError(f"{options.label}: {name} is {value}; give one in (0, 1)")

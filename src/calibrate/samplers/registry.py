@@ -3,36 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
-from calibrate.samplers.blackjax_nuts import BLACKJAX_NUTS
 from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE
 from calibrate.samplers.laplace import LAPLACE
 from calibrate.samplers.mclmc import MCLMC
-from calibrate.samplers.nuts import NUTS
+from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS
 from calibrate.samplers.protocol import Sampler
 from calibrate.samplers.smc import SMC
 from emulator.core.errors import InputError, look_up
+from emulator.core.schema import parse, table_of
 
-_ALL: tuple[Sampler, ...] = (
-    NUTS,
-    BLACKJAX_NUTS,
-    MCLMC,
-    DELAYED_ACCEPTANCE,
-    SMC,
-    LAPLACE,
-)
+_ALL: tuple[Sampler, ...] = (NUTS, BLACKJAX_NUTS, MCLMC, DELAYED_ACCEPTANCE, SMC, LAPLACE)
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
 
 def find_sampler(name: str) -> Sampler:
-    """The sampler of that name; :class:`InputError` names the known ones."""
+    """Return the sampler of that name; :class:`InputError` names the known ones."""
     return look_up(SAMPLERS, name, "sampler")
 
 
 def check_options(sampler: Sampler, options: Any | None) -> Any:
-    """``options``, the sampler's defaults for ``None``; :class:`InputError` for another's."""
+    """Return ``options``, or the sampler's defaults for ``None``.
+
+    Raises
+    ------
+    InputError
+        The options are those of another sampler.
+    """
     if options is None:
         return sampler.options()
     if type(options) is not sampler.options:
@@ -44,9 +43,9 @@ def check_options(sampler: Sampler, options: Any | None) -> Any:
 
 
 def options_from(
-    sampler: Sampler, given: Mapping[str, Any], *, warmup: int, draws: int, chains: int
+    sampler: Sampler, values: Mapping[str, Any], *, warmup: int, draws: int, chains: int
 ) -> Any:
-    """Options of a run of this length, with those of ``given`` by name.
+    """Return options of a run of this length, with ``values`` by name for the others.
 
     Raises
     ------
@@ -54,15 +53,5 @@ def options_from(
         A name that the sampler has no option of, or a value of another type.
     """
     options = sampler.options.sized(warmup=warmup, draws=draws, chains=chains)
-    known = {field.name: getattr(options, field.name) for field in fields(options)}
-    for name, value in given.items():
-        if name not in known:
-            raise InputError(
-                f"sampler '{sampler.name}' has no option '{name}'; it has {', '.join(known)}"
-            )
-        wanted = (int, float) if isinstance(known[name], float) else type(known[name])
-        if isinstance(value, bool) or not isinstance(value, wanted):
-            raise InputError(
-                f"sampler '{sampler.name}': {name} is {value!r}; give one like {known[name]!r}"
-            )
-    return replace(options, **given)
+    table = parse(table_of(sampler.options), dict(values), f"sampler '{sampler.name}'", toml=False)
+    return replace(options, **{name: getattr(table, name) for name in table.model_fields_set})

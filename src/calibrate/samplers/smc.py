@@ -12,8 +12,8 @@ to cross between modes, so several modes keep their shares. The evidence follows
 
 .. math:: \hat Z = \prod_t \frac{1}{n} \sum_i w_i^{(t)}
 
-(Neal 2001). Independent populations take the place of chains: their R-hat tells whether a
-population has particles enough, their spread is the error of the evidence.
+(Neal 2001). Independent sets of particles take the place of chains: their R-hat shows whether a set
+is large enough, their spread is the error of the evidence.
 """
 
 from __future__ import annotations
@@ -30,10 +30,9 @@ from jax.scipy.special import logsumexp
 from tqdm import tqdm
 
 from calibrate.samplers.density import Density
-from calibrate.samplers.options import check_counts, check_target_accept
-from calibrate.samplers.protocol import Context, Draws
+from calibrate.samplers.protocol import Context, Draws, Sampler, check_numbers
 from calibrate.statistical_model import Data
-from emulator.core.errors import InputError, SolverError
+from emulator.core.errors import SolverError
 from emulator.core.progress import counting
 
 # Log likelihood of particles where the forward map has no answer. Finite, because its product with
@@ -45,13 +44,13 @@ _LOWEST = -1e10
 class SMCOptions:
     """Size of a run.
 
-    draws : particles of a population.
-    chains : independent populations.
-    survivors : effective sample size that a step leaves, as a fraction in (0, 1).
-    transitions : Hamiltonian transitions of a particle at each temperature.
-    leapfrogs : of a transition.
-    target_accept : acceptance rate in (0, 1) that the step size adapts to.
-    temperatures : largest number of temperatures before the run is given up.
+    draws : the number of particles of a set.
+    chains : the number of independent sets of particles.
+    survivors : the effective sample size that a step leaves, as a fraction in (0, 1).
+    transitions : the number of Hamiltonian transitions of a particle at each temperature.
+    leapfrogs : the number of leapfrog steps of a transition.
+    target_accept : the acceptance rate in (0, 1) that the step size adapts to.
+    temperatures : the largest number of temperatures before the run is given up.
     """
 
     draws: int = 1000
@@ -63,46 +62,41 @@ class SMCOptions:
     temperatures: int = 200
 
     label: ClassVar[str] = "SMC"
+    counts: ClassVar[tuple[str, ...]] = (
+        "draws", "chains", "transitions", "leapfrogs", "temperatures",
+    )  # fmt: skip
+    shares: ClassVar[tuple[str, ...]] = ("target_accept", "survivors")
 
     @classmethod
     def sized(cls, *, warmup: int, draws: int, chains: int) -> Self:  # noqa: ARG003
-        """Options of a run of this size; particles have no warm-up."""
+        """Return options of a run of this size; particles have no warm-up."""
         return cls(draws=draws, chains=chains)
 
     def __post_init__(self) -> None:
-        check_counts(self, "draws", "chains", "transitions", "leapfrogs", "temperatures")
-        check_target_accept(self.label, self.target_accept)
-        if not 0.0 < self.survivors < 1.0:
-            raise InputError(f"{self.label}: survivors is {self.survivors}; give one in (0, 1)")
+        check_numbers(self)
 
 
-class _Population(NamedTuple):
-    """One population at one temperature; with a leading axis, several."""
+class _Particles(NamedTuple):
+    """One set of particles at one temperature; with a leading axis, several."""
 
-    key_data: Any  # of the next key
+    key_data: Any  # data of the next key
     particles: Any  # (n, p)
     temperature: Any
     log_evidence: Any
-    step_size: Any  # of leapfrogs, in units of the particles' spread
-    acceptance_rate: Any  # of each particle's last transitions, (n,)
-    steps: Any  # temperatures passed
+    step_size: Any  # leapfrog step, in units of the particles' spread
+    acceptance_rate: Any  # rate of each particle's last transitions, (n,)
+    steps: Any  # number of temperatures so far
 
 
 class _State(NamedTuple):
-    """All that a run goes on from: populations that are done, and the one under way."""
+    """Everything that a killed run needs to go on: finished sets, and the one under way."""
 
-    done: _Population
-    current: _Population
+    done: _Particles
+    current: _Particles
 
 
-@dataclass(frozen=True)
-class TemperedSMC:
-    """The sampler; see :class:`~calibrate.samplers.protocol.Sampler`."""
-
-    name: str = "smc"
-    options: type[SMCOptions] = SMCOptions
-    statistics: tuple[str, ...] = ("acceptance_rate", "lp")
-    solves_fem: bool = False
+class TemperedSMC(Sampler):
+    """The sampler."""
 
     def sample(
         self,
@@ -112,51 +106,51 @@ class TemperedSMC:
         seed: int,
         context: Context = Context(),
     ) -> Draws:
-        """Populations one after the other, and the evidence as attributes.
+        """Return the particles of all sets, one set after the other, and the evidence.
 
-        ``log_evidence`` is the logarithm of the populations' mean evidence, ``log_evidence_error``
-        its standard error, missing for a single population, and ``temperatures`` the mean number of
-        steps.
+        The attribute ``log_evidence`` is the logarithm of the sets' mean evidence,
+        ``log_evidence_error`` its standard error, missing for a single set, and ``temperatures``
+        the mean number of steps.
 
         Raises
         ------
         SolverError
-            A population did not reach the posterior in ``options.temperatures`` steps.
+            A set of particles did not reach the posterior in ``options.temperatures`` steps.
         """
         programs = _compile(density, options)
         with counting(desc=self.name, total=options.chains, disable=not context.progress) as bar:
-            found = _run(programs, data, options, seed, context, bar)
-        heights = programs.finish(found.particles, data)
-        rates = np.asarray(found.acceptance_rate)
-        statistics = {"acceptance_rate": rates, "lp": np.asarray(heights)}
-        return Draws(np.asarray(found.particles), statistics, evidence(found.log_evidence) | {
-            "temperatures": float(np.mean(found.steps))
-        })  # fmt: skip
+            sets = _run(programs, data, options, seed, context, bar)
+        statistics = {
+            "acceptance_rate": np.asarray(sets.acceptance_rate),
+            "lp": np.asarray(programs.finish(sets.particles, data)),
+        }
+        attributes = evidence(sets.log_evidence) | {"temperatures": float(np.mean(sets.steps))}
+        return Draws(np.asarray(sets.particles), statistics, attributes)
 
 
 def evidence(logarithms: np.ndarray) -> dict[str, float]:
-    r"""Attributes from :math:`\log \hat Z` of K populations, (K,): mean evidence and its error.
+    r"""Return attributes from K estimates :math:`\log \hat Z`, (K,): log of their mean, its error.
 
     The estimates :math:`\hat Z` are unbiased, so their mean is taken, not that of the logarithms.
     The error of its logarithm is the relative standard error of the mean.
     """
     shifted = np.exp(np.asarray(logarithms) - np.max(logarithms))
     mean, count = shifted.mean(), len(shifted)
-    found = {"log_evidence": float(np.max(logarithms) + np.log(mean))}
+    attributes = {"log_evidence": float(np.max(logarithms) + np.log(mean))}
     if count > 1:
-        found["log_evidence_error"] = float(shifted.std(ddof=1) / np.sqrt(count) / mean)
-    return found
+        attributes["log_evidence_error"] = float(shifted.std(ddof=1) / np.sqrt(count) / mean)
+    return attributes
 
 
 def _run(
     programs: _Programs, data: Data, options: SMCOptions, seed: int, context: Context, bar: tqdm
-) -> _Population:
-    """All populations at temperature 1, stacked."""
+) -> _Particles:
+    """Return all sets of particles at temperature 1, stacked."""
     keys = jax.random.split(jax.random.key(seed), options.chains)
     template = jax.eval_shape(programs.start, keys[0])
-    kept = context.checkpoint.restore(lambda: _State(template, template))
-    done = [] if kept is None else _unstack(kept.done)
-    current = programs.start(keys[0]) if kept is None else kept.current
+    state = context.checkpoint.restore(lambda: _State(template, template))
+    done = [] if state is None else _unstack(state.done)
+    current = programs.start(keys[0]) if state is None else state.current
     bar.update(len(done))
     while True:
         while current.temperature < 1.0:
@@ -176,20 +170,20 @@ def _run(
         current = programs.start(keys[len(done)])
 
 
-def _stack(populations: list[_Population], template: Any) -> _Population:
-    if not populations:
+def _stack(sets: list[_Particles], template: Any) -> _Particles:
+    if not sets:
         return jax.tree.map(lambda leaf: np.zeros((0, *leaf.shape), leaf.dtype), template)
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *populations)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
 
 
-def _unstack(populations: _Population) -> list[_Population]:
-    count = len(populations.temperature)
-    return [jax.tree.map(lambda leaf: leaf[k], populations) for k in range(count)]  # noqa: B023
+def _unstack(sets: _Particles) -> list[_Particles]:
+    count = len(sets.temperature)
+    return [jax.tree.map(lambda leaf: leaf[k], sets) for k in range(count)]  # noqa: B023
 
 
 class _Programs(NamedTuple):
-    start: Callable[..., Any]  # (rng_key) -> population at temperature 0
-    step: Callable[..., Any]  # (population, data) -> population at the next temperature
+    start: Callable[..., Any]  # (rng_key) -> a set at temperature 0
+    step: Callable[..., Any]  # (set, data) -> the set at the next temperature
     finish: Callable[..., Any]  # (particles (k, n, p), data) -> log densities (k, n)
 
 
@@ -204,18 +198,18 @@ def _compile(density: Density, options: SMCOptions) -> _Programs:
     def log_likelihood(z: jax.Array, data: Data) -> jax.Array:
         return jnp.maximum(density.log_likelihood(z, data), _LOWEST)
 
-    def start(rng_key: jax.Array) -> _Population:
-        here, onwards = jax.random.split(rng_key)
-        particles = jax.vmap(density.prior_draw)(jax.random.split(here, count))
+    def start(rng_key: jax.Array) -> _Particles:
+        prior_key, next_key = jax.random.split(rng_key)
+        particles = jax.vmap(density.prior_draw)(jax.random.split(prior_key, count))
         # The step that is best for a normal density shrinks with its dimension to the power 1/4.
         step_size = jnp.asarray(density.dimension**-0.25)
         zero = jnp.zeros(())
-        key_data = jax.random.key_data(onwards)
-        return _Population(key_data, particles, zero, zero, step_size, jnp.ones(count), 0)
+        key_data = jax.random.key_data(next_key)
+        return _Particles(key_data, particles, zero, zero, step_size, jnp.ones(count), 0)
 
-    def step(population: _Population, data: Data) -> _Population:
-        here, onwards = jax.random.split(jax.random.wrap_key_data(population.key_data))
-        particles, temperature = population.particles, population.temperature
+    def step(current: _Particles, data: Data) -> _Particles:
+        step_key, next_key = jax.random.split(jax.random.wrap_key_data(current.key_data))
+        particles, temperature = current.particles, current.temperature
         heights = jax.vmap(log_likelihood, (0, None))(particles, data)
         increment = _increment(heights, 1.0 - temperature, options.survivors)
         # Sums of increments may miss 1 by round-off.
@@ -229,30 +223,30 @@ def _compile(density: Density, options: SMCOptions) -> _Programs:
             return density.log_prior(z) + temperature * log_likelihood(z, data)
 
         def transition(rng_key: jax.Array, state: Any, log_density: Any) -> Any:
-            # Trajectories of one length could come back to where they began, again and again.
+            # Trajectories of one length could return to their start, again and again.
             length_key, hmc_key = jax.random.split(rng_key)
-            size = population.step_size * jax.random.uniform(length_key, minval=0.5)
+            size = current.step_size * jax.random.uniform(length_key, minval=0.5)
             return hmc(hmc_key, state, log_density, size, covariance, options.leapfrogs)
 
         move, _ = base.update_and_take_last(
             blackjax.hmc.init, tempered, transition, options.transitions, count
         )
-        moved, info = base.step(
-            here,
+        resampled, info = base.step(
+            step_key,
             base.SMCState(particles, weights, {}),
             move,
             lambda particles: jnp.zeros(len(particles)),
             resampling.systematic,
         )
         rates = info.update_info.acceptance_rate.mean(axis=1)
-        return _Population(
-            jax.random.key_data(onwards),
-            moved.particles,
+        return _Particles(
+            jax.random.key_data(next_key),
+            resampled.particles,
             temperature,
-            population.log_evidence + logsumexp(log_weights) - jnp.log(count),
-            population.step_size * jnp.exp(rates.mean() - options.target_accept),
+            current.log_evidence + logsumexp(log_weights) - jnp.log(count),
+            current.step_size * jnp.exp(rates.mean() - options.target_accept),
             rates,
-            population.steps + 1,
+            current.steps + 1,
         )
 
     def finish(particles: jax.Array, data: Data) -> jax.Array:
@@ -261,14 +255,14 @@ def _compile(density: Density, options: SMCOptions) -> _Programs:
     return _Programs(jax.jit(start), jax.jit(step), jax.jit(finish))
 
 
-def _increment(heights: jax.Array, left: jax.Array, survivors: float) -> jax.Array:
-    """The largest step of the temperature that leaves the wanted effective sample size."""
+def _increment(heights: jax.Array, remaining: jax.Array, survivors: float) -> jax.Array:
+    """Return the largest step of the temperature that leaves the wanted effective sample size."""
     from blackjax.smc import ess, solver
 
     def surplus(increment: jax.Array) -> jax.Array:
         return ess.log_ess(increment * heights) - jnp.log(survivors * len(heights))
 
-    return solver.dichotomy(surplus, 0.0, left)
+    return solver.dichotomy(surplus, 0.0, remaining)
 
 
-SMC = TemperedSMC()
+SMC = TemperedSMC("smc", SMCOptions, ("acceptance_rate", "lp"))

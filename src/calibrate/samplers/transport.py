@@ -31,14 +31,21 @@ _LEAST_SD = 1e-9
 
 
 class TransportMap(NamedTuple):
-    """A triangular map: ``order`` (p,), least determined first; ``coefficients`` (p, features)."""
+    """A triangular map.
+
+    order : the coordinates (p,), the least determined first.
+    coefficients : the weights (p, features) of the monomials in each coordinate.
+    """
 
     order: jax.Array
     coefficients: jax.Array
 
 
 class StandardMap(NamedTuple):
-    """From w (p,), of about zero mean and unit sd, to z; ``centre`` and ``scale`` (p,) of zeta."""
+    """The map from w (p,), of about zero mean and unit sd, to z.
+
+    bend : the map from zeta to z. centre, scale : mean and sd (p,) of zeta.
+    """
 
     bend: TransportMap
     centre: jax.Array
@@ -50,7 +57,7 @@ def _degree(count: int) -> int:
 
 
 def monomials(values: Any, count: int) -> Any:
-    """Monomials (..., f) of the first ``count`` columns of ``values`` (..., p), centred on 1/2."""
+    """Return monomials (..., f) of the first ``count`` columns of ``values``, centred on 1/2."""
     centred = [values[..., k] - 0.5 for k in range(count)]
     terms = []
     for degree in range(1, _degree(count) + 1):
@@ -59,25 +66,25 @@ def monomials(values: Any, count: int) -> Any:
             for k in chosen[1:]:
                 product = product * centred[k]
             terms.append(product)
-    # NumPy's arrays stay NumPy's: one operation at a time, JAX would compile each.
+    # NumPy arrays stay with NumPy: JAX would compile each operation.
     stack = np.stack if isinstance(values, np.ndarray) else jnp.stack
     return stack(terms, axis=-1)
 
 
 def coefficient_count(dimension: int) -> int:
-    """The most coefficients that a coordinate has."""
+    """Return the largest number of coefficients of a coordinate."""
     counts = (comb(k + _degree(k), k) - 1 for k in range(1, dimension))
     return max(counts, default=0)
 
 
 def identity(dimension: int) -> TransportMap:
-    """The map that changes nothing."""
+    """Return the identity map."""
     shape = (dimension, coefficient_count(dimension))
     return TransportMap(jnp.arange(dimension), jnp.zeros(shape))
 
 
 def apply(map_: TransportMap, zeta: jax.Array) -> jax.Array:
-    """``z`` (p,) from ``zeta`` (p,)."""
+    """Return ``z`` (p,) from ``zeta`` (p,)."""
     if not map_.coefficients.size:
         return zeta
     ordered = zeta[map_.order]
@@ -92,7 +99,7 @@ def apply(map_: TransportMap, zeta: jax.Array) -> jax.Array:
 
 
 def straighten(map_: TransportMap, z: np.ndarray) -> np.ndarray:
-    """``zeta`` (s, p) from ``z`` (s, p): the inverse of :func:`apply`.
+    """Return ``zeta`` (s, p) from ``z`` (s, p): the inverse of :func:`apply`.
 
     The map is triangular: each coordinate's shift depends on coordinates of ``z`` alone.
     """
@@ -106,7 +113,7 @@ def straighten(map_: TransportMap, z: np.ndarray) -> np.ndarray:
 
 
 def bend(map_: TransportMap, zeta: np.ndarray) -> np.ndarray:
-    """``z`` (s, p) from ``zeta`` (s, p): :func:`apply` to many points, uncompiled."""
+    """Return ``z`` (s, p) from ``zeta`` (s, p): :func:`apply` to many points, uncompiled."""
     order, coefficients = np.asarray(map_.order), np.asarray(map_.coefficients)
     z = np.array(zeta)
     squashed = expit(z[:, order])
@@ -118,7 +125,7 @@ def bend(map_: TransportMap, zeta: np.ndarray) -> np.ndarray:
 
 
 def fit(draws: np.ndarray) -> TransportMap:
-    """The map fitted to pilot draws (s, p) of ``z``."""
+    """Return the map fitted to pilot draws (s, p) of ``z``."""
     dimension = draws.shape[1]
     squashed = expit(draws)
     order = np.argsort(-squashed.std(axis=0), kind="stable")
@@ -135,13 +142,13 @@ def fit(draws: np.ndarray) -> TransportMap:
                 1e-3 * np.eye(terms.shape[1]) * len(terms) ** 0.5,
             ]
         )
-        wanted = np.concatenate([target - target.mean(), np.zeros(terms.shape[1])])
-        coefficients[k, : terms.shape[1]] = np.linalg.lstsq(design, wanted, rcond=None)[0] / sd
+        values = np.concatenate([target - target.mean(), np.zeros(terms.shape[1])])
+        coefficients[k, : terms.shape[1]] = np.linalg.lstsq(design, values, rcond=None)[0] / sd
     return TransportMap(jnp.asarray(order), jnp.asarray(coefficients))
 
 
 def standard_identity(dimension: int, *, bends: bool = True) -> StandardMap:
-    """The map that changes nothing; without ``bends`` it has no coefficients at all."""
+    """Return the identity map; without ``bends`` it has no coefficients at all."""
     bend = identity(dimension)
     if not bends:
         bend = TransportMap(bend.order, jnp.zeros((dimension, 0)))
@@ -149,15 +156,15 @@ def standard_identity(dimension: int, *, bends: bool = True) -> StandardMap:
 
 
 def apply_standard(map_: StandardMap, w: jax.Array) -> jax.Array:
-    """``z`` (p,) from ``w`` (p,)."""
+    """Return ``z`` (p,) from ``w`` (p,)."""
     return apply(map_.bend, map_.centre + map_.scale * w)
 
 
 def fit_standard(draws: np.ndarray) -> StandardMap:
-    """The map fitted to pilot draws (s, p) of ``z``."""
+    """Return the map fitted to pilot draws (s, p) of ``z``."""
     bend = fit(draws)
     straight = straighten(bend, draws)
     sd = straight.std(axis=0)
-    # A pilot that stood still has no scale.
+    # A pilot whose chains did not move has no scale.
     scale = np.where(sd > _LEAST_SD, sd, 1.0)
     return StandardMap(bend, jnp.asarray(straight.mean(axis=0)), jnp.asarray(scale))

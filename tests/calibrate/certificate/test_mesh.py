@@ -9,9 +9,8 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.certificate import examine
-from calibrate.certificate.evidence import Figure, MeshChange
-from calibrate.certificate.mesh import changed, points_for
-from calibrate.certificate.verdict import judge
+from calibrate.certificate.mesh import change_by, points_for
+from calibrate.certificate.verdict import Figure, MeshChange, judge
 from calibrate.statistical_model import with_error
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
 from emulator.surrogates.taylor import expand
@@ -48,10 +47,8 @@ def test_shifts_are_those_of_the_quadrature(fem, check, stretch, shift):
     data, found = check
     model = found.posterior.model
     fine, differences = finer_than(fem, model, stretch, shift)
-    told = changed(
-        found.predictive, lambda z: differences(z, found.predictive),
-        found.tests.runs, found.pool, 8, np.random.default_rng(0),
-    )  # fmt: skip
+    by_fem = lambda z: differences(z, found.predictive)
+    told = change_by(by_fem, found.pool, found.tests.runs, 8, np.random.default_rng(0))
     points, weights, moved = grid_of(), quadrature(fem, data), quadrature(fine, data)
     mean, after = weights @ points, moved @ points
     sd, sd_after = (np.sqrt(w @ (points - m) ** 2) for w, m in ((weights, mean), (moved, after)))
@@ -66,10 +63,8 @@ def test_shifts_are_those_of_the_quadrature(fem, check, stretch, shift):
 
 def test_failures_on_the_finer_mesh_leave_it_open(check):
     _, found = check
-    told = changed(
-        found.predictive, lambda z: [None] * len(z),
-        found.tests.runs, found.pool, 8, np.random.default_rng(0),
-    )  # fmt: skip
+    failures = lambda z: [None] * len(z)
+    told = change_by(failures, found.pool, found.tests.runs, 8, np.random.default_rng(0))
     assert told.failed == 8
     assert told.within() is None
     certificate = judge(replace(found.certificate.evidence, mesh=told))

@@ -1,12 +1,13 @@
+"""Pools of cheap points, and the kernels they are drawn from."""
+
 import jax
 import numpy as np
 import pytest
 
-from calibrate.certificate.correction import nothing
-from calibrate.certificate.pool import redrawn, search, tempered, with_guests
-from calibrate.certificate.predictive import Predictive
-from calibrate.samplers import density_of
-from calibrate.samplers.importance import effective, normalised
+from calibrate.certificate.pool import Kernels, Pool, tempered
+from calibrate.certificate.predictive import Predictive, no_correction
+from calibrate.samplers import density_of, transport
+from calibrate.samplers.diagnostics import effective, normalised
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
 
 
@@ -25,7 +26,7 @@ def predictive(case):
 def test_densities_are_the_samplers(case, predictive):
     """Prior and likelihood, each by itself, add up to the density that NUTS sees."""
     z = predictive.prior_draws(jax.random.key(0), 7)
-    at = predictive.evaluate(z, nothing(1, 2, 9))
+    at = predictive.evaluate(z, no_correction(1, 2, 9))
     density = density_of(case[0].model)
     seen = [float(density.log_density(x, case[0].data)) for x in z]
     np.testing.assert_allclose(at.prior + at.cheap, seen, rtol=1e-12)
@@ -61,7 +62,7 @@ def test_the_pool_is_the_posterior_wherever_the_draws_are(case, predictive):
         {"mu": 52.0 + np.arange(50.0) / 50, "lam": 90 + np.zeros(50)},
     ):
         z = predictive.unconstrain(values)
-        pool = search(predictive, nothing(1, 2, 9), z, (), np.random.default_rng(0))
+        pool = Pool.search(predictive, no_correction(1, 2, 9), z, (), np.random.default_rng(0))
         assert effective(pool.corrected) > 500.0
         mean, sd = mean_and_sd(pool.corrected, predictive.constrain(pool.z)["mu"])
         assert abs(mean - exact[0]) < 0.15 * exact[1]
@@ -86,11 +87,11 @@ def test_no_density_has_no_weights():
 
 def test_tests_are_where_they_are_said_to_be(case, predictive):
     """Distinct points that tests take in a cell, counted in pool after pool."""
-    rng, correction = np.random.default_rng(5), nothing(1, 2, 9)
+    rng = np.random.default_rng(5)
     draws = predictive.unconstrain(case[0].draws())
     mean, sd = draws.mean(axis=0), draws.std(axis=0)
-    pool = search(predictive, correction, draws[:500], (), rng)
-    pools = [redrawn(pool, predictive, correction, rng) for _ in range(40)]
+    pool = Pool.search(predictive, no_correction(1, 2, 9), draws[:500], (), rng)
+    pools = [pool.redrawn(rng) for _ in range(40)]
     side = (np.arange(12) + 0.5) / 6.0 - 1.0
     square = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     # Where the draws are, at their edge, and where only the prior is: there every point is taken.
@@ -101,9 +102,9 @@ def test_tests_are_where_they_are_said_to_be(case, predictive):
     ):
         found, said = [], []
         for each in pools:
-            guests = with_guests(each, predictive, correction, centre + square * width)
-            np.testing.assert_array_equal(guests.log_chances[: each.drawn], each.log_chances)
-            density = np.exp(guests.log_tested(tests)[each.drawn :])
+            more = each.with_points(centre + square * width)
+            np.testing.assert_array_equal(more.log_chances[: each.drawn], each.log_chances)
+            density = np.exp(more.log_tested(tests)[each.drawn :])
             said.append(density.mean() * np.prod(2.0 * width))
             chances = np.exp(each.log_chances)
             for _ in range(10):
@@ -111,3 +112,37 @@ def test_tests_are_where_they_are_said_to_be(case, predictive):
                 found.append(np.sum((np.abs(each.z[rows] - centre) < width).all(axis=1)))
         assert np.mean(found) > 1.0
         assert np.mean(found) == pytest.approx(np.mean(said), rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """Draws on a bent ridge."""
+    x = np.random.default_rng(0).normal(size=(600, 2))
+    return np.stack([x[:, 0], 0.1 * x[:, 1] + np.tanh(x[:, 0]) ** 2], axis=1)
+
+
+def test_straightening_inverts_the_samplers_map(bent):
+    map_ = transport.fit(bent)
+    zeta = transport.straighten(map_, bent)
+    back = jax.vmap(lambda one: transport.apply(map_, one))(zeta)
+    np.testing.assert_allclose(back, bent, atol=1e-12)
+    np.testing.assert_allclose(transport.bend(map_, zeta), bent, atol=1e-12)
+    assert np.std(zeta[:, 1]) < 0.6 * np.std(bent[:, 1])
+
+
+def test_the_density_integrates_to_one_and_is_the_draws(bent):
+    kernels = Kernels.around(bent, (0.3, 1.0), 5.0, np.random.default_rng(1))
+    axis = np.linspace(-8.0, 8.0, 321)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    density = np.exp(kernels.log_density(grid)) * 0.05**2
+    assert density.sum() == pytest.approx(1.0, abs=0.01)
+    z = kernels.sample(np.random.default_rng(2), 4000)
+    left = grid[:, 0] < -0.5
+    error = np.sqrt(0.25 / 4000)
+    assert abs(np.mean(z[:, 0] < -0.5) - density[left].sum()) < 4 * error
+
+
+def test_a_coordinate_that_does_not_vary_has_a_density(bent):
+    still = bent * np.array([1.0, 0.0])
+    kernels = Kernels.around(still, (0.5,), 5.0, np.random.default_rng(1))
+    assert np.isfinite(kernels.log_density(still)).all()

@@ -3,8 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.certificate.evidence import Changes, Evidence, Figure, Physics, Sampling, Tail
-from calibrate.certificate.verdict import judge
+from calibrate.certificate.verdict import (
+    Changes,
+    Evidence,
+    Figure,
+    Physics,
+    Sampling,
+    Tail,
+    judge,
+)
 from calibrate.posterior.fit import Misfit
 
 

@@ -7,7 +7,7 @@ import pytest
 from numpyro import handlers
 
 import calibrate as cal
-from calibrate.population import hierarchical_model, sample_hierarchy
+from calibrate.population import population_model, sample_population
 from calibrate.posterior.simulation_based import LOG_LIKELIHOOD, Replicate, calibration_of
 from calibrate.samplers import NUTSOptions
 from linear_support import linear_forward
@@ -50,12 +50,12 @@ def calibrated(beam, members, replicates, options, **more):
     whole = linear_forward(beam)
     observe = cal.nodal_displacements(beam, NODES)
     own = cal.model(whole, observe, cal.GaussianNoise(sd=NOISE), check_scale=False, **more)
-    model = hierarchical_model({f"b{i}": own for i in range(members)})
+    model = population_model({f"b{i}": own for i in range(members)})
     forward = whole.at(NODES)
 
     def one(seed):
         truth, data = twin(model, forward, seed)
-        found = sample_hierarchy(model, data, options=options, alone="laplace", seed=seed)
+        found = sample_population(model, data, options=options, alone="laplace", seed=seed)
         rows = np.linspace(0, options.chains * options.draws - 1, RANKED).astype(int)
         draws = {name: values.reshape(-1)[rows] for name, values in found.draws().items()}
         assert set(draws) == set(truth)

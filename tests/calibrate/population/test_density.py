@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 import calibrate as cal
-from calibrate.population import hierarchical_model
+from calibrate.population import population_model
 from calibrate.population.coordinates import Information, information_of
-from calibrate.population.density import Observed, density_of_hierarchy
+from calibrate.population.density import Conditions, density_of_population
 from linear_support import linear_forward
 
 LOW, HIGH = np.log(50.0), np.log(100.0)
@@ -21,7 +21,7 @@ def model(beam):
     forward, observe = linear_forward(beam), cal.nodal_displacements(beam, [3, 11, 20])
     known = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), check_scale=False)
     unknown = cal.model(forward, observe, cal.GaussianNoise(sd_scale=0.1), check_scale=False)
-    return hierarchical_model({"first": known, "second": unknown}, eta=3.0)
+    return population_model({"first": known, "second": unknown}, eta=3.0)
 
 
 def of_nothing():
@@ -41,7 +41,7 @@ def points(density):
 
 def test_coordinates_do_not_change_the_density(model):
     """p(w) = p(w') |det dw'/dw|, with w' the coordinates of members whose data say nothing."""
-    density = density_of_hierarchy(model)
+    density = density_of_population(model)
     data = {m: {"displacement": jnp.full((3, 3), 0.5)} for m in model.members}
     place = slice(_first_score(density), _first_score(density) + 4)
 
@@ -50,9 +50,9 @@ def test_coordinates_do_not_change_the_density(model):
         return w.at[place].set(scores.reshape(-1))
 
     for w in points(density):
-        height = density.log_density(plain(w), Observed(data, of_nothing()))
+        height = density.log_density(plain(w), Conditions(data, of_nothing()))
         _, change = np.linalg.slogdet(np.asarray(jax.jacfwd(plain)(w)))
-        found = density.log_density(w, Observed(data, of_data()))
+        found = density.log_density(w, Conditions(data, of_data()))
         np.testing.assert_allclose(found, height + change, rtol=1e-9)
 
 
@@ -65,7 +65,7 @@ def _first_score(density):
 
 def test_each_term_is_the_one_documented(model):
     """Up to a constant; positive and bounded unknowns have the Jacobian of their logarithm, ..."""
-    density = density_of_hierarchy(model)
+    density = density_of_population(model)
     data = {"first": {"displacement": jnp.full((3, 3), 0.8)}}
     different = []
     for w in points(density):
@@ -86,7 +86,7 @@ def test_each_term_is_the_one_documented(model):
         values = model.shared_values(*(part[0] for part in population), z[0])
         first = {name: float(v[0]) for name, v in values.items()}
         expected += float(model.members["first"].map_log_likelihood(first, data["first"]))
-        different.append(float(density.log_density(w, Observed(data, of_nothing()))) - expected)
+        different.append(float(density.log_density(w, Conditions(data, of_nothing()))) - expected)
     np.testing.assert_allclose(different, different[0], rtol=1e-8)
 
 

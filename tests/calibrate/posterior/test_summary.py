@@ -5,7 +5,7 @@ import pytest
 
 from calibrate.arviz import array_stats
 from calibrate.posterior.summary import summary_of
-from calibrate.samplers.stopping import least_ess
+from calibrate.samplers.diagnostics import least_ess
 
 
 def test_tail_ess_is_of_the_quantiles_that_a_run_is_stopped_by():

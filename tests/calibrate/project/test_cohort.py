@@ -73,7 +73,7 @@ def result(folder, tmp_path_factory):
         def killed(*_, **__):
             raise Killed
 
-        patch.setattr("calibrate.project.cohort.sample_hierarchy", killed)
+        patch.setattr("calibrate.project.cohort.sample_population", killed)
         with pytest.raises(Killed):
             infer(folder)
     members = {name: folder / "r" / "members" / name / "posterior.nc" for name in TRUTHS}

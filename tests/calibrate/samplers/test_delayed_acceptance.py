@@ -10,8 +10,9 @@ from scipy.stats import norm
 
 import calibrate as cal
 from calibrate.samplers import DelayedAcceptanceOptions, density_of
-from calibrate.samplers.delayed_acceptance import _choose, _Place
+from calibrate.samplers.delayed_acceptance import _choose, _Position
 from calibrate.samplers.density import tempered
+from calibrate.samplers.protocol import TunedState
 from emulator.core.errors import InputError, SolverError
 from linear_support import (
     PRIOR_MEAN,
@@ -124,21 +125,20 @@ def test_where_fem_fails_there_are_no_draws(beam, biased):
 
 
 def test_a_rejected_chain_stays_with_a_fresh_key(beam):
-    import jax
-
-    from calibrate.samplers.blackjax_nuts import State
-
     keys = jax.random.split(jax.random.key(0), 4)
     rng = np.random.default_rng(0)
 
-    def place(keys, z):
-        states = tuple(State(key, x, x[0], x) for key, x in zip(keys, z, strict=True))
-        return _Place(states, z, z[:, 0], z[:, 1], {"displacement": z})
+    def position(keys, z):
+        states = tuple(TunedState(key, x, x[0], x) for key, x in zip(keys, z, strict=True))
+        return _Position(states, z, z[:, 0], z[:, 1], {"displacement": z})
 
-    new, old = place(keys[:2], rng.normal(size=(2, 3))), place(keys[2:], rng.normal(size=(2, 3)))
+    new, old = (
+        position(keys[:2], rng.normal(size=(2, 3))),
+        position(keys[2:], rng.normal(size=(2, 3))),
+    )
     found = _choose(np.array([True, False]), new, old)
     np.testing.assert_array_equal(found.z, np.stack([new.z[0], old.z[1]]))
-    np.testing.assert_array_equal([state.nuts for state in found.states], found.z)
+    np.testing.assert_array_equal([state.state for state in found.states], found.z)
     np.testing.assert_array_equal(found.means["displacement"], found.z)
     assert [state.rng_key for state in found.states] == list(keys[:2])
 

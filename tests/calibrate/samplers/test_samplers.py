@@ -1,20 +1,20 @@
 """Every sampler of the registry against a closed form, and the rules that all of them share."""
 
-import threading
 from dataclasses import replace
 
-import arviz_stats
-import jax
 import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.samplers import SAMPLERS, BlackJAXNUTSOptions, density, find_sampler, r_hat
+from calibrate.samplers import (
+    SAMPLERS,
+    BlackJAXNUTSOptions,
+    ChainOptions,
+    density,
+    find_sampler,
+    options_from,
+)
 from calibrate.samplers.density import density_of
-from calibrate.samplers.nuts import NUTS, NUTSOptions
-from calibrate.samplers.options import ChainOptions
-from calibrate.samplers.run import Programs
-from calibrate.samplers.stopping import converged
 from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
 from linear_support import PRIOR_MEAN, PRIOR_SD, LinearFEM, closed_form, linear_problem
@@ -65,28 +65,6 @@ def test_one_chain_stops_and_has_an_r_hat(problem):
     assert all(1.0 <= row["r_hat"] + 1e-2 < 1.03 for row in posterior.summary().values())
 
 
-def test_r_hat_of_one_chain_sees_a_drift():
-    rng = np.random.default_rng(0)
-    still = rng.normal(size=(1, 2000))
-    assert r_hat(still) < 1.01
-    assert r_hat(still + np.linspace(0.0, 3.0, 2000)) > 1.1
-    assert np.isnan(r_hat(still[:, :7]))
-
-
-def test_r_hat_of_several_chains_is_arviz_s():
-    values = np.random.default_rng(1).normal(size=(4, 200))
-    values[0] += 1.0
-    assert r_hat(values) == pytest.approx(float(arviz_stats.rhat(values)))
-
-
-def test_the_stopping_rule_asks_for_agreement_and_for_enough_draws():
-    z = np.random.default_rng(2).normal(size=(4, 500, 2))
-    assert converged(z, 1.01, 400.0)
-    assert not converged(z, 1.01, 5000.0)
-    z[0, :, 1] += 1.0
-    assert not converged(z, 1.01, 400.0)
-
-
 def test_an_unknown_sampler_and_options_of_another_are_refused(problem):
     model, data = problem
     with pytest.raises(InputError, match="sampler 'hmc' is unknown; known: nuts, blackjax_nuts"):
@@ -101,41 +79,24 @@ def test_limits_that_cannot_work(bad):
         ChainOptions(**bad)
 
 
-def test_chains_run_side_by_side_and_draw_what_they_draw_alone(beam):
-    """Two chains meet inside the density: neither could go on without the other."""
-    model, data = linear_problem(beam)
-    posterior = density_of(model)
-    together = threading.Barrier(2, timeout=60.0)
-
-    def met(z, data):
-        value = posterior.log_density(z, data)
-        return value + jax.pure_callback(wait, jax.ShapeDtypeStruct((), float), value)
-
-    def wait(value):
-        together.wait()
-        return np.zeros_like(value)
-
-    def start(key, data, map_):
-        z = jax.random.normal(key, (posterior.dimension,))
-        return z, met(z, data)
-
-    keys = jax.random.split(jax.random.key(0), 4)
-    programs = Programs(start, lambda state, data, map_, count: (state, None), at_once=2)
-    states, heights = programs.start(keys, data, None)
-    for key, z, height in zip(keys, states, heights, strict=True):
-        np.testing.assert_array_equal(z, jax.random.normal(key, (posterior.dimension,)))
-        np.testing.assert_allclose(height, posterior.log_density(z, data), rtol=1e-12)
-
-    def drawn(at_once):
-        options = NUTSOptions(draws=40, warmup=40, rounds=1)
-        return NUTS.sample(posterior._replace(at_once=at_once), data, options, seed=3)
-
-    np.testing.assert_array_equal(drawn(3).z, drawn(1).z)
-
-
 def test_as_many_chains_at_once_as_the_map_bears(beam, simulator, monkeypatch):
     monkeypatch.setattr(density, "cores", lambda: 8)
     monkeypatch.setattr(density, "at_once", lambda simulator: 3)
     model, _ = linear_problem(beam)
     assert density_of.__wrapped__(model).at_once == 8
     assert density_of.__wrapped__(replace(model, forward=fem_forward(simulator))).at_once == 3
+
+
+def test_options_by_name():
+    nuts, length = find_sampler("nuts"), {"warmup": 5, "draws": 6, "chains": 7}
+    options = options_from(nuts, {"target_accept": 0.95, "start": "pathfinder"}, **length)
+    assert options == cal.NUTSOptions(5, 6, 7, target_accept=0.95, start="pathfinder")
+    with pytest.raises(InputError, match="'nuts': unknown key 'leapfrogs'; known: chains, draws"):
+        options_from(nuts, {"leapfrogs": 3}, **length)
+    with pytest.raises(InputError, match="'nuts': rounds = \"two\"; expected a whole number"):
+        options_from(nuts, {"rounds": "two"}, **length)
+    with pytest.raises(InputError, match="'nuts': target_accept = true; expected a number"):
+        options_from(nuts, {"target_accept": True}, **length)
+    with pytest.raises(InputError, match="NUTS: rounds is 0; it must be 1 or more"):
+        options_from(nuts, {"rounds": 0}, **length)
+    assert options_from(nuts, {"ess": 50}, **length).ess == 50

@@ -1,10 +1,17 @@
-"""Importance weights: the right tail is smoothed, and its shape is that of known ones."""
+"""R-hat and the stopping rule; importance weights and the shapes of known tails."""
 
+import arviz_stats
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from calibrate.samplers.importance import efficiency, pareto_shape, smoothed
+from calibrate.samplers.diagnostics import (
+    converged,
+    efficiency,
+    pareto_shape,
+    r_hat,
+    smoothed,
+)
 
 
 def test_smoothed_weights_move_draws_to_where_they_point():
@@ -43,3 +50,25 @@ def test_weights_without_a_tail_stay_as_they_are(log_weights, shape):
 def test_the_efficiency_of_two_weights():
     # (1 + 3)^2 / (2 (1 + 9))
     assert efficiency(np.log([1.0, 3.0]) - 700.0) == pytest.approx(0.8)
+
+
+def test_r_hat_of_one_chain_sees_a_drift():
+    rng = np.random.default_rng(0)
+    still = rng.normal(size=(1, 2000))
+    assert r_hat(still) < 1.01
+    assert r_hat(still + np.linspace(0.0, 3.0, 2000)) > 1.1
+    assert np.isnan(r_hat(still[:, :7]))
+
+
+def test_r_hat_of_several_chains_is_arviz_s():
+    values = np.random.default_rng(1).normal(size=(4, 200))
+    values[0] += 1.0
+    assert r_hat(values) == pytest.approx(float(arviz_stats.rhat(values)))
+
+
+def test_the_stopping_rule_asks_for_agreement_and_for_enough_draws():
+    z = np.random.default_rng(2).normal(size=(4, 500, 2))
+    assert converged(z, 1.01, 400.0)
+    assert not converged(z, 1.01, 5000.0)
+    z[0, :, 1] += 1.0
+    assert not converged(z, 1.01, 400.0)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.population import hierarchical_model
+from calibrate.population import population_model
 from emulator.core.errors import InputError
 from linear_support import linear_forward
 
@@ -18,12 +18,12 @@ def model_of(scene, *states):
 
 def test_loads_and_noise_are_a_member_s_own(ventricle):
     one, two = model_of(ventricle), model_of(ventricle, "p4", "p8")
-    found = hierarchical_model({"one": one, "two": two})
+    found = population_model({"one": one, "two": two})
     material = [n for n in ventricle.parameter_names if n not in ventricle.load_parameters]
     assert ventricle.load_parameters == ("pressure",)
     assert list(found.shared) == material
     assert found.own == {"one": ("pressure",), "two": ("pressure@p4", "pressure@p8")}
-    assert list(hierarchical_model({"one": one}, shared=("pressure",)).shared) == ["pressure"]
+    assert list(population_model({"one": one}, shared=("pressure",)).shared) == ["pressure"]
 
 
 def test_nothing_in_common_is_refused(ventricle):
@@ -34,11 +34,11 @@ def test_nothing_in_common_is_refused(ventricle):
         model.full, model.observe, cal.GaussianNoise(sd=0.1), known=known, check_scale=False
     )
     with pytest.raises(InputError, match="no unknown but those of loads is one of every member"):
-        hierarchical_model({"one": model, "two": bare})
+        population_model({"one": model, "two": bare})
 
 
 def test_priors_are_on_the_parameter_s_scale(beam):
-    found = hierarchical_model({"one": model_of(beam)})
+    found = population_model({"one": model_of(beam)})
     draws = np.asarray(found.spread["mu"].sample(jax.random.key(0), (20_000,)))
     assert np.sqrt(np.mean(draws**2)) == pytest.approx(0.25 * np.log(2.0), rel=0.03)
     medians = np.log(np.asarray(found.median["mu"].sample(jax.random.key(1), (5000,))))

@@ -1,8 +1,10 @@
+"""The correction of a map, as a Gaussian process of its errors."""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.certificate.correction import correct, fit, nothing
+from calibrate.certificate.predictive import correct, fit_correction, no_correction
 
 
 def points(count, seed=0):
@@ -18,12 +20,12 @@ def at(correction, x):
 
 
 def test_nothing_corrects_nothing():
-    np.testing.assert_array_equal(at(nothing(5, 2, 3), points(4)), np.zeros((4, 3)))
+    np.testing.assert_array_equal(at(no_correction(5, 2, 3), points(4)), np.zeros((4, 3)))
 
 
 def test_a_linear_error_is_learned_everywhere():
     x = points(20)
-    correction = fit(x, linear(x), np.ones(2), 30)
+    correction = fit_correction(x, linear(x), np.ones(2), 30)
     far = 3.0 * points(50, 1)
     np.testing.assert_allclose(at(correction, far), linear(far), rtol=1e-3, atol=1e-3)
     assert correction.at.shape == (30, 2)  # padded
@@ -32,14 +34,14 @@ def test_a_linear_error_is_learned_everywhere():
 def test_a_smooth_error_is_learned_between_its_points():
     x, new = points(60), 0.7 * points(50, 1)
     bend = lambda x: np.sin(x[:, :1]) * np.array([[1.0, -2.0]])
-    found = at(fit(x, bend(x), np.ones(2), 60), new)
+    found = at(fit_correction(x, bend(x), np.ones(2), 60), new)
     assert np.sqrt(np.mean((found - bend(new)) ** 2)) < 0.02
 
 
 def test_white_noise_is_not_learned():
     """Leave-one-out errors choose a large nugget, so that the correction stays small."""
     x, rng = points(60), np.random.default_rng(3)
-    found = at(fit(x, rng.normal(size=(60, 40)), np.ones(40), 60), points(50, 1))
+    found = at(fit_correction(x, rng.normal(size=(60, 40)), np.ones(40), 60), points(50, 1))
     assert np.sqrt(np.mean(found**2)) < 0.5
 
 
@@ -47,7 +49,7 @@ def test_it_matches_a_gaussian_process_solved_otherwise():
     """Prediction k K^-1 D with all of the kernel in one matrix, linear trend included."""
     x, new = points(12), points(3, 1)
     errors = np.sin(x @ np.ones((2, 1)))
-    correction = fit(x, errors, np.ones(1), 12)
+    correction = fit_correction(x, errors, np.ones(1), 12)
     kernel = lambda a, b: (
         1e2 * (1 + a @ b.T) + np.exp(-0.5 * ((a[:, None] - b) ** 2).sum(-1) / correction.length**2)
     )
@@ -64,8 +66,8 @@ def test_a_bump_far_from_what_is_likely_spoils_nothing():
     x = points(60)
     far = x[:, 0] > 1.0
     errors = np.where(far[:, None], 20.0, 0.0) * np.ones(2)
-    correction = fit(x, errors, np.ones(2), 60, ~far)
+    correction = fit_correction(x, errors, np.ones(2), 60, ~far)
     np.testing.assert_array_equal(at(correction, x), np.zeros((60, 2)))
     assert correction.scale > 0.0  # it is known to be uncertain
     # Wrong where it counts: a poor process is better than none.
-    assert np.abs(at(fit(x, errors, np.ones(2), 60, far), x)).max() > 1.0
+    assert np.abs(at(fit_correction(x, errors, np.ones(2), 60, far), x)).max() > 1.0

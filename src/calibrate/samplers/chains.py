@@ -7,6 +7,12 @@ wants no pilot gets the second run alone.
 That program is one chain's, and as many chains run at once as there are cores. Vectorised, every
 transition of all chains would take as many gradients as the longest trajectory among them
 (docs/experiments.md, "NUTS chains one after the other", "Chains on threads").
+
+Chains start at random points, or by multi-path Pathfinder (Zhang et al. 2022), BlackJAX's:
+quasi-Newton paths lead up the density from several points, the best Gaussian on each path is
+sampled, and one of all samples is drawn with probability proportional to posterior over Gaussian.
+Chains then start in the posterior's bulk, and in its modes about as often as their masses ask,
+where a random start may be far out or have density zero.
 """
 
 from __future__ import annotations
@@ -15,7 +21,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +31,8 @@ from tqdm import tqdm
 from calibrate.samplers import transport
 from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.density import Target
-from calibrate.samplers.options import PATHFINDER, ChainOptions
-from calibrate.samplers.pathfinder import pathfinder_start
-from calibrate.samplers.protocol import Context, Draws, Kernel
-from calibrate.samplers.stopping import converged
+from calibrate.samplers.diagnostics import converged
+from calibrate.samplers.protocol import PATHFINDER, ChainOptions, Context, Draws, Kernel, Sampler
 from emulator.core.errors import SolverError
 from emulator.core.progress import counting
 
@@ -36,29 +40,28 @@ _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
 _PILOT, _FINAL = 0, 1  # runs
 _PILOT_DRAWS = 1000  # of all chains, that a map is fitted to; more for maps of many coefficients
+_PATHS = 4  # Pathfinder's paths of a chain
+_SAMPLES = 20  # samples of a path's Gaussian
+_ITERATIONS = 30
+_MEMORY = 6  # pairs of steps and gradients that make a Gaussian's covariance
 
 
 @dataclass(frozen=True)
-class ChainSampler:
-    """A sampler made of a kernel; see :class:`~calibrate.samplers.protocol.Sampler`.
+class ChainSampler(Sampler):
+    """A sampler made of a kernel.
 
     kernel : (log_density(position, *arguments), options) -> :class:`Kernel`.
     adapts_in_steps : whether the first ``options.warmup`` steps adapt; otherwise ``init`` adapts.
     """
 
-    name: str
-    options: type[Any]
-    statistics: tuple[str, ...]
     kernel: Callable[[Callable[..., jax.Array], Any], Kernel]
     adapts_in_steps: bool = True
-
-    solves_fem: ClassVar[bool] = False
 
     def sample(
         self,
         density: Target,
         data: Any,
-        options: Any,
+        options: ChainOptions,
         seed: int,
         context: Context = Context(),
     ) -> Draws:
@@ -70,7 +73,7 @@ class ChainSampler:
         Raises
         ------
         SolverError
-            No starting point with a finite density was found.
+            No starting point has a finite density.
         """
         pilot_key, key = jax.random.split(jax.random.key(seed))
         with counting(desc=self.name, total=0, disable=not context.progress) as bar:
@@ -87,7 +90,7 @@ class ChainSampler:
 
 
 class Programs:
-    """Compiled functions of one chain, for as many at once as threads may ask for a density.
+    """Compiled functions of one chain, for as many at once as threads may evaluate a density.
 
     Parameters
     ----------
@@ -104,33 +107,33 @@ class Programs:
     def start(
         self, keys: jax.Array, data: Any, map_: transport.StandardMap
     ) -> tuple[tuple[Any, ...], np.ndarray]:
-        """States of chains, by ``keys`` (c,), and their log densities (c,)."""
-        begun = self._of_all("start", self._start, tuple(keys), data, map_)
-        states, heights = zip(*begun, strict=True)
+        """Return states of chains, by ``keys`` (c,), and their log densities (c,)."""
+        results = self._for_all("start", self._start, tuple(keys), data, map_)
+        states, heights = zip(*results, strict=True)
         return states, np.array(heights)
 
     def advance(
         self, states: tuple[Any, ...], data: Any, map_: transport.StandardMap, count: int
     ) -> tuple[tuple[Any, ...], Draws]:
-        """``count`` iterations of all chains: their states, and draws (c, count, ...)."""
+        """Return all chains' states after ``count`` iterations, and draws (c, count, ...)."""
         advance = partial(self._advance, count=count)
-        done = self._of_all(f"advance {count}", advance, states, data, map_)
-        states, draws = zip(*done, strict=True)
+        results = self._for_all(f"advance {count}", advance, states, data, map_)
+        states, draws = zip(*results, strict=True)
         return states, jax.tree.map(lambda *chains: np.stack(chains), *draws)
 
     def shapes(
         self, chains: int, data: Any, map_: transport.StandardMap
     ) -> tuple[tuple[Any, ...], Draws]:
-        """States and draws (c, 1, ...), as far as structure and types are concerned."""
+        """Return structure, shapes and types of states and draws (c, 1, ...)."""
         state, _ = jax.eval_shape(self._start, jax.random.key(0), data, map_)
         _, draws = jax.eval_shape(partial(self._advance, count=1), state, data, map_)
         every = jax.tree.map(lambda x: jax.ShapeDtypeStruct((chains, *x.shape), x.dtype), draws)
         return (state,) * chains, every
 
-    def _of_all(
+    def _for_all(
         self, name: str, function: Callable[..., Any], chains: tuple[Any, ...], *arrays: Any
     ) -> list[Any]:
-        """``function`` of each chain and the arrays, compiled before threads ask for it."""
+        """Return ``function`` of each chain and the arrays, compiled before threads call it."""
         key = name, *map(jax.typeof, jax.tree.leaves((chains[0], *arrays)))
         program = self._compiled.get(key)
         if program is None:
@@ -146,7 +149,7 @@ class Programs:
 
 @lru_cache(maxsize=4)
 def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions) -> Programs:
-    """The programs of one density in straightened coordinates; data and map are arguments."""
+    """Return the programs of a density in straightened coordinates; data and map are arguments."""
 
     def log_density(w: jax.Array, data: Any, map_: transport.StandardMap) -> jax.Array:
         return density.log_density(transport.apply_standard(map_, w), data)
@@ -154,19 +157,20 @@ def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions
     kernel = sampler.kernel(log_density, options)
 
     def start(key: jax.Array, data: Any, map_: transport.StandardMap) -> Any:
-        here, onwards = jax.random.split(key)
+        candidates_key, kernel_key = jax.random.split(key)
         shape = (_CANDIDATES, density.dimension)
-        candidates = jax.random.uniform(here, shape, float, -2.0, 2.0)
+        candidates = jax.random.uniform(candidates_key, shape, float, -2.0, 2.0)
 
         def height(w: jax.Array) -> jax.Array:
             return log_density(w, data, map_)
 
         heights = jax.lax.map(height, candidates)
         if options.start == PATHFINDER:
-            w = pathfinder_start(jax.random.fold_in(here, 1), height, candidates, heights)
-            return kernel.init(onwards, w, data, map_), height(w)
+            path_key = jax.random.fold_in(candidates_key, 1)
+            w = pathfinder_start(path_key, height, candidates, heights)
+            return kernel.init(kernel_key, w, data, map_), height(w)
         first = jnp.argmax(jnp.isfinite(heights))
-        return kernel.init(onwards, candidates[first], data, map_), heights[first]
+        return kernel.init(kernel_key, candidates[first], data, map_), heights[first]
 
     def advance(state: Any, data: Any, map_: transport.StandardMap, count: int) -> Any:
         def step(state: Any, _: None) -> Any:
@@ -178,11 +182,43 @@ def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions
     return Programs(start, advance, density.at_once)
 
 
+def pathfinder_start(
+    rng_key: jax.Array,
+    log_density: Callable[[jax.Array], jax.Array],
+    candidates: jax.Array,
+    heights: jax.Array,
+) -> jax.Array:
+    """Return a starting point (p,) by Pathfinder, a candidate where all its samples have density 0.
+
+    Parameters
+    ----------
+    candidates, heights : points (c, p), c of 4 or more, and their log densities (c,). Paths begin
+        at the first ones with a finite density.
+    """
+    from blackjax.vi.multipathfinder import multi_approximate  # here: others need not wait for it
+
+    path_key, choice_key = jax.random.split(rng_key)
+    finite_first = jnp.argsort(~jnp.isfinite(heights), stable=True)
+    paths, _ = multi_approximate(
+        path_key,
+        log_density,
+        candidates[finite_first[:_PATHS]],
+        _SAMPLES,
+        maxiter=_ITERATIONS,
+        maxcor=_MEMORY,
+    )
+    samples = paths.samples.reshape(-1, candidates.shape[1])
+    log_ratios = (paths.logp - paths.logq).ravel()
+    usable = jnp.isfinite(log_ratios) & jnp.isfinite(paths.logp.ravel())
+    chosen = jax.random.categorical(choice_key, jnp.where(usable, log_ratios, -jnp.inf))
+    return jnp.where(jnp.any(usable), samples[chosen], candidates[finite_first[0]])
+
+
 class _State(NamedTuple):
-    """All that a run goes on from."""
+    """Everything that a killed run needs to go on."""
 
     run: Any  # _PILOT or _FINAL
-    warmed: Any  # iterations of warm-up done
+    warmed: Any  # finished iterations of the warm-up
     map_: transport.StandardMap
     states: tuple[Any, ...]
     draws: Draws
@@ -200,7 +236,7 @@ class Chains:
         checkpoint: Checkpoint,
         bar: tqdm,
     ) -> None:
-        self.sampler, self.density, self.data, self.options = sampler, density, data, options
+        self.density, self.data, self.options = density, data, options
         self.checkpoint, self.bar = checkpoint, bar
         self.programs = compile_chains(sampler, density, options)
         self._warmup = options.warmup if sampler.adapts_in_steps else 0
@@ -210,7 +246,7 @@ class Chains:
         self._pilot = min(options.draws, -(-wanted // (options.chains * _CHUNK)) * _CHUNK)
 
     def start_straightened(self, pilot_key: jax.Array, key: jax.Array) -> None:
-        """A pilot run, if the density wants one, and the start of the final one."""
+        """Run the pilot, if the density wants one, and start the final run."""
         if self.density.piloted:
             self._start(_PILOT, self._identity(), pilot_key)
             self.straighten(key)
@@ -218,33 +254,33 @@ class Chains:
             self._start(_FINAL, self._identity(), key)
 
     def straighten(self, key: jax.Array) -> None:
-        """The rest of the pilot run, and the start of the final one."""
+        """Complete the pilot run, and start the final one on the map fitted to it."""
         z = self.draw(self._pilot).z
         self._start(_FINAL, transport.fit_standard(z.reshape(-1, self.density.dimension)), key)
 
     def draw(self, total: int) -> Draws:
-        """The first ``total`` kept iterations of this run."""
+        """Return the first ``total`` draws of this run, after its warm-up."""
         while self.warmed < self._warmup:
             self.warmed += self._advance(self._warmup - self.warmed)[1]
             self.checkpoint.keep(self._state)
-        while self._kept < total:
-            draws, count = self._advance(total - self._kept)
+        while self._count < total:
+            draws, count = self._advance(total - self._count)
             self._parts.append(draws)
-            self._kept += count
+            self._count += count
             self.checkpoint.keep(self._state)
         return jax.tree.map(lambda array: array[:, :total], join(self._parts))
 
     def resume(self) -> bool:
-        """Go on from the checkpoint; ``False`` where there is none."""
+        """Continue from the checkpoint; return ``False`` where there is none."""
         state = self.checkpoint.restore(self._template)
         if state is None:
             return False
         self.run, self.warmed = int(state.run), int(state.warmed)
         self.map_, self.states = state.map_, state.states
-        self._parts, self._kept = [state.draws], state.draws.z.shape[1]
+        self._parts, self._count = [state.draws], state.draws.z.shape[1]
         if self.run == _FINAL and self.density.piloted:
             self._show(self._warmup + self._pilot)
-        self._show(self.warmed + self._kept)
+        self._show(self.warmed + self._count)
         return True
 
     def _start(self, run: int, map_: transport.StandardMap, key: jax.Array) -> None:
@@ -253,10 +289,10 @@ class Chains:
         if not np.isfinite(heights).all():
             raise SolverError("the posterior density is zero wherever a chain could start")
         self.run, self.map_, self.warmed = run, map_, 0
-        self._parts, self._kept = [], 0
+        self._parts, self._count = [], 0
 
-    def _advance(self, wanted: int) -> tuple[Draws, int]:
-        count = min(_CHUNK, wanted)
+    def _advance(self, remaining: int) -> tuple[Draws, int]:
+        count = min(_CHUNK, remaining)
         self.states, draws = self.programs.advance(self.states, self.data, self.map_, count)
         self._show(count)
         return draws, count
@@ -268,8 +304,8 @@ class Chains:
         self.bar.update(count)
 
     def _state(self) -> _State:
-        # While they warm up, chains have no draws, but their names and shapes are known.
-        draws = join(self._parts) if self._parts else jax.tree.map(_none, self._template().draws)
+        # While they warm up, chains have no draws, but names and shapes of draws are known.
+        draws = join(self._parts) if self._parts else jax.tree.map(_empty, self._template().draws)
         return _State(self.run, self.warmed, self.map_, self.states, draws)
 
     def _identity(self) -> transport.StandardMap:
@@ -282,10 +318,10 @@ class Chains:
         return _State(number, number, map_, states, draws)
 
 
-def _none(draws: jax.ShapeDtypeStruct) -> np.ndarray:
+def _empty(draws: jax.ShapeDtypeStruct) -> np.ndarray:
     return np.zeros((draws.shape[0], 0, *draws.shape[2:]), draws.dtype)
 
 
 def join(parts: list[Draws]) -> Draws:
-    """Draws one after the other."""
+    """Return the draws of all parts, one after the other."""
     return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *parts)

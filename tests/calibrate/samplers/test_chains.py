@@ -1,4 +1,6 @@
-"""Starts by Pathfinder: in the bulk, in both modes, and where random ones fail."""
+"""Chains: starts by Pathfinder (in the bulk, in both modes, where random ones fail), threads."""
+
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +8,9 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.samplers import find_sampler, options_from
-from calibrate.samplers.pathfinder import pathfinder_start
+from calibrate.samplers import NUTSOptions, density_of
+from calibrate.samplers.chains import Programs, pathfinder_start
+from calibrate.samplers.nuts import NUTS
 from emulator.core.errors import InputError
 from linear_support import linear_problem
 
@@ -63,11 +66,33 @@ def test_chains_may_start_by_pathfinder(beam):
         cal.NUTSOptions(start="prior")
 
 
-def test_options_by_name():
-    nuts, length = find_sampler("nuts"), {"warmup": 5, "draws": 6, "chains": 7}
-    options = options_from(nuts, {"target_accept": 0.95, "start": "pathfinder"}, **length)
-    assert options == cal.NUTSOptions(5, 6, 7, target_accept=0.95, start="pathfinder")
-    with pytest.raises(InputError, match="'nuts' has no option 'leapfrogs'; it has warmup, draws"):
-        options_from(nuts, {"leapfrogs": 3}, **length)
-    with pytest.raises(InputError, match="'nuts': rounds is 'two'; give one like 8"):
-        options_from(nuts, {"rounds": "two"}, **length)
+def test_chains_run_side_by_side_and_draw_what_they_draw_alone(beam):
+    """Two chains meet inside the density: neither could go on without the other."""
+    model, data = linear_problem(beam)
+    posterior = density_of(model)
+    together = threading.Barrier(2, timeout=60.0)
+
+    def met(z, data):
+        value = posterior.log_density(z, data)
+        return value + jax.pure_callback(wait, jax.ShapeDtypeStruct((), float), value)
+
+    def wait(value):
+        together.wait()
+        return np.zeros_like(value)
+
+    def start(key, data, map_):
+        z = jax.random.normal(key, (posterior.dimension,))
+        return z, met(z, data)
+
+    keys = jax.random.split(jax.random.key(0), 4)
+    programs = Programs(start, lambda state, data, map_, count: (state, None), at_once=2)
+    states, heights = programs.start(keys, data, None)
+    for key, z, height in zip(keys, states, heights, strict=True):
+        np.testing.assert_array_equal(z, jax.random.normal(key, (posterior.dimension,)))
+        np.testing.assert_allclose(height, posterior.log_density(z, data), rtol=1e-12)
+
+    def drawn(at_once):
+        options = NUTSOptions(draws=40, warmup=40, rounds=1)
+        return NUTS.sample(posterior._replace(at_once=at_once), data, options, seed=3)
+
+    np.testing.assert_array_equal(drawn(3).z, drawn(1).z)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.certificate.descents import descend
 from calibrate.certificate.predictive import Predictive
-from calibrate.certificate.runs import Solver
+from calibrate.certificate.runs import Solver, descend
 from calibrate.statistical_model import FEMLikelihood
 from certificate_support import grid_of, linear_model, posterior_of
 from emulator.core.progress import counting
