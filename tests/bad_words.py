@@ -243,7 +243,7 @@ INFERENCES = [
     ("--truth mu=73 lam=61 --draws 0", "draws is 0; it must be 1 or more"),
     ("--truth mu=73 lam=61 --chains 0", "chains is 0; it must be 1 or more"),
     ("--truth mu=73 lam=61 --seed -1", "seed is -1; it must be 0 or more"),
-    ("--truth mu=73 lam=61 --sampler-options luck=1", "has no option 'luck'; it has warmup, draws"),
+    ("--truth mu=73 lam=61 --sampler-options luck=1", "unknown key 'luck'; known: chains, draws"),
     ("--truth mu=73 lam=61 --forward luck", "invalid choice: 'luck'"),
     ("--truth mu=73 lam=61 --fem-runs 9", "--fem-runs has no effect without --forward reduced"),
     ("--truth mu=73 lam=61 --forward reduced --fem-runs 0", "fem_runs is 0; it must be 3 or more"),

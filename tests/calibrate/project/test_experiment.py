@@ -112,7 +112,10 @@ MISTAKES = [
         ("draws = 40", "prior = {medians = {mu = 60.0}}"),
         "prior: unknown key 'medians'; known: corr",
     ),
-    (("draws = 40", "sampler_options = {jump = 2}"), "sampler 'nuts' has no option 'jump'; it has"),
+    (
+        ("draws = 40", "sampler_options = {jump = 2}"),
+        "sampler 'nuts': unknown key 'jump'; known:",
+    ),
     (("draws = 40", "truth = {mu = 60.0}"), "truth has no effect beside data file"),
     (("[noise]", "[population]\neta = 1.0\n[noise]"), "[population] is of members; give [member"),
 ]
