@@ -22,8 +22,8 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
+from calibrate.analysis.sbc import LEVELS, sbc
 from calibrate.measurements import spread_landmarks
-from calibrate.posterior.simulation_based import LEVELS, sbc
 from calibrate.project import by_fem
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "0.85"

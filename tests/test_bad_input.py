@@ -13,10 +13,10 @@ import xarray as xr
 import calibrate as cal
 import emulator as em
 from bad_words import COMMANDS, INFERENCES
+from calibrate.analysis.sbc import sbc
 from calibrate.cli import main
 from calibrate.cli.common import seconds
 from calibrate.measurements.data import read_data, write_data
-from calibrate.posterior.simulation_based import sbc
 from calibrate.project import Run, make_data
 from cli_support import write_block
 from emulator.core.errors import InputError

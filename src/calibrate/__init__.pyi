@@ -1,4 +1,5 @@
 from .analysis.identifiability import identify
+from .analysis.sbc import sbc
 from .analysis.sensitivity import sensitivity
 from .certificate import Certificate, certify, reweight
 from .measurements import (
@@ -20,7 +21,6 @@ from .population import Hierarchy, hierarchy, read_hierarchy
 from .posterior import Posterior, sample
 from .posterior.comparison import compare
 from .posterior.klotz_band import klotz_band
-from .posterior.simulation_based import sbc
 from .priors import (
     Dependence,
     JointPrior,

@@ -23,8 +23,7 @@ from studies.common.output import save
 
 import calibrate as cal
 from calibrate.certificate import certify
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import BLUE, GREEN, ORANGE, VERMILION
+from calibrate.figures.drawing import BLUE, GREEN, ORANGE, VERMILION, pyplot
 from calibrate.provenance import study_header
 from emulator import Simulator
 from emulator.core.store import write_json

@@ -19,9 +19,8 @@ from studies.effects.scenes import SCENES, observed, other_choices, points, publ
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.evaluation.effects import Comparison, Measured, recommend
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import BLUE, GREEN, VERMILION
+from calibrate.analysis.effects import Comparison, Measured, recommend
+from calibrate.figures.drawing import BLUE, GREEN, VERMILION, pyplot
 from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import run_campaign

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from studies.common.output import Case, save
 
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import BLUE, ORANGE, VERMILION
+from calibrate.figures.drawing import BLUE, ORANGE, VERMILION, pyplot
 
 COLOURS = {"unloaded": BLUE, "fibres known": ORANGE, "image at rest": VERMILION}
 LABELS = {

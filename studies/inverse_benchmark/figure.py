@@ -5,8 +5,7 @@ from pathlib import Path
 from studies.common.output import Case, save
 from studies.inverse_benchmark.problems import PROBLEMS
 
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import COLOURS
+from calibrate.figures.drawing import COLOURS, pyplot
 
 MARKS = "osv^DXP*<>"
 

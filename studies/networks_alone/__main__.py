@@ -24,8 +24,7 @@ import optax
 from studies.common.output import save
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import BLUE
+from calibrate.figures.drawing import BLUE, pyplot
 from calibrate.provenance import study_header
 from emulator.accuracy.comparison import case_errors, quantiles
 from emulator.core.store import write_json

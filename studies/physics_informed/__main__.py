@@ -31,8 +31,7 @@ from studies.physics_informed.judged import TEST_SEED, errors_of
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import BLUE, GREEN, ORANGE, PINK, VERMILION
+from calibrate.figures.drawing import BLUE, GREEN, ORANGE, PINK, VERMILION, pyplot
 from calibrate.measurements import parse_observation
 from emulator.core.errors import SolverError
 from emulator.fem import Runs, run_campaign, sobol

@@ -15,8 +15,8 @@ from typing import Any
 import numpyro.distributions as dist
 
 import calibrate as cal
-from calibrate.figures.calibration import draw
-from calibrate.posterior.simulation_based import Calibration, sbc
+from calibrate.analysis.sbc import Calibration, sbc
+from calibrate.figures.sensitivity import draw_calibration
 from calibrate.project import Run, by_fem, model_before_data
 from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
@@ -90,7 +90,7 @@ def examine(name: str, replicates: int, out: Path) -> dict[str, Any]:
     model = model_before_data(case.run)
     options = NUTSOptions(200, 250, 2, rounds=1)
     found: Calibration = sbc(model, replicates, truth=case.truth(model), options=options, seed=SEED)
-    draw(found, case.title, out / f"{name}.png")
+    draw_calibration(found, case.title, out / f"{name}.png")
     result = found.to_json()
     seconds = time.process_time() - began
     verdict = "calibrated" if found.passed else "not calibrated"

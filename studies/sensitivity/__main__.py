@@ -19,9 +19,8 @@ from studies.common.output import Case, Results, parser, save
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.sensitivity import Factors, analyse
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import BLUE, GREEN, ORANGE
+from calibrate.analysis.indices import Factors, analyse
+from calibrate.figures.drawing import BLUE, GREEN, ORANGE, pyplot
 from calibrate.figures.sensitivity import body_figure
 from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.priors import truncated_normal

@@ -36,8 +36,7 @@ from studies.ventricle_family.workers import (
 )
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import BLUE, GREEN, VERMILION
+from calibrate.figures.drawing import BLUE, GREEN, VERMILION, pyplot
 from calibrate.provenance import hardware, study_header, versions
 from emulator.accuracy.comparison import quantiles
 from emulator.core.store import read_arrays, write_json

@@ -26,8 +26,7 @@ from studies.common.two_meshes import on_mesh, on_two_meshes
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures.drawing import pyplot
-from calibrate.figures.palette import COLOURS
+from calibrate.figures.drawing import COLOURS, pyplot
 from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import Simulator, run_campaign

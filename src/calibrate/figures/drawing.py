@@ -1,4 +1,4 @@
-"""Helpers that all figures of posteriors use."""
+"""Shared by all figures: colours that every reader can tell apart, draws to picture, files."""
 
 from __future__ import annotations
 
@@ -15,6 +15,16 @@ from calibrate.measurements.points import DisplacementPoints
 from calibrate.posterior import Posterior
 from emulator.core.errors import InputError
 from emulator.core.store import replacing
+
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+GREEN = "#009E73"
+PINK = "#CC79A7"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+BLACK = "#000000"
+COLOURS = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY, BLACK)
+
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from calibrate.figures.drawing import pyplot, save
-from calibrate.figures.palette import BLUE, VERMILION
+from calibrate.figures.drawing import BLUE, VERMILION, pyplot, save
 from calibrate.population import Hierarchy
 from calibrate.population.posterior import ALONE
 

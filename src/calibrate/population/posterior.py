@@ -16,8 +16,7 @@ from calibrate.arviz import base
 from calibrate.population.density import PopulationDraws, density_of_population
 from calibrate.population.model import MEDIAN, SD, PopulationModel
 from calibrate.posterior import predictions, read_tree
-from calibrate.posterior.diagnosis import diagnose
-from calibrate.posterior.summary import summary_of
+from calibrate.posterior.diagnosis import diagnose, summary_of
 from calibrate.priors import Population, population_of_fits
 from calibrate.statistical_model import Model
 from emulator.core.errors import InputError, look_up

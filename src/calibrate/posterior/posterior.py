@@ -16,10 +16,9 @@ import xarray as xr
 
 from calibrate.measurements import Observation
 from calibrate.measurements.present import missing_values
-from calibrate.posterior.diagnosis import diagnose
+from calibrate.posterior.diagnosis import diagnose, summary_of
 from calibrate.posterior.fit import misfits
 from calibrate.posterior.predictions import predicted
-from calibrate.posterior.summary import summary_of
 from calibrate.posterior.tree import make_tree
 from calibrate.provenance import versions
 from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from calibrate.analysis.identifiability import identify
-from calibrate.figures.beam import beam_figure
+from calibrate.figures.demo import beam_figure, ventricle_figure
 from calibrate.figures.drawing import pyplot
-from calibrate.figures.ventricle import ventricle_figure
 from calibrate.project.run import Run
 from calibrate.project.workflow import certify_and_keep, infer, report, simulator_of
 from emulator.core.store import check_folder

@@ -12,8 +12,8 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from scipy.stats import rankdata
 
-from calibrate.analysis.identifiability.stress import stress_band
-from calibrate.figures.palette import BLUE, COLOURS, VERMILION
+from calibrate.analysis.identifiability import stress_band
+from calibrate.figures.drawing import BLUE, COLOURS, VERMILION
 from calibrate.measurements import Observation
 from calibrate.measurements.klotz import klotz_of
 from calibrate.measurements.pressure_volume import PressureVolume, in_mmhg, pressure_volume

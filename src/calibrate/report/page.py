@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpyro.distributions as dist
 
-from calibrate.analysis.identifiability.combinations import identify, in_words
+from calibrate.analysis.identifiability import identify, in_words
 from calibrate.certificate.verdict import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT, shifts
 from calibrate.posterior import Posterior
 from calibrate.posterior.posterior import describe_distribution

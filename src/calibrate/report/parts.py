@@ -93,7 +93,7 @@ def _cell(value: str) -> str:
 
 
 def summary_cells(row: Mapping[str, float]) -> list[str]:
-    """A row of :func:`calibrate.posterior.summary.summary_of` as text, titled by SUMMARY."""
+    """A row of :func:`calibrate.posterior.diagnosis.summary_of` as text, titled by SUMMARY."""
     numbers = [f"{row[key]:.4g}" for key in ("mean", "sd", "low", "high")]
     return [*numbers, f"{row['r_hat']:.4f}", f"{row['ess_bulk']:.0f}", f"{row['ess_tail']:.0f}"]
 

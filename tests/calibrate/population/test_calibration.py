@@ -7,8 +7,8 @@ import pytest
 from numpyro import handlers
 
 import calibrate as cal
+from calibrate.analysis.sbc import LOG_LIKELIHOOD, Replicate, calibration_of
 from calibrate.population import population_model, sample_population
-from calibrate.posterior.simulation_based import LOG_LIKELIHOOD, Replicate, calibration_of
 from calibrate.samplers import NUTSOptions
 from linear_support import linear_forward
 

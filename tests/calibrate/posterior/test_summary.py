@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrate.arviz import array_stats
-from calibrate.posterior.summary import summary_of
+from calibrate.posterior.diagnosis import summary_of
 from calibrate.samplers.diagnostics import least_ess
 
 

@@ -14,7 +14,7 @@ from calibrate.measurements.data import write_data
 from calibrate.posterior import read_tree
 from calibrate.project import holds_population
 from calibrate.project.cohort import read_cohort
-from calibrate.report.shrinkage import shrinkage
+from calibrate.report.population import shrinkage
 from cli_support import answer, complaint
 from emulator.scenes import registry
 

@@ -7,9 +7,9 @@ import pytest
 
 import calibrate as cal
 import emulator as em
+from calibrate.analysis.sbc import sbc
 from calibrate.certificate import examine
 from calibrate.cli import main
-from calibrate.posterior.simulation_based import sbc
 from cli_support import write_block
 
 pytestmark = pytest.mark.slow

@@ -136,8 +136,8 @@ def run_mesh(arguments: argparse.Namespace) -> int:
 
 def run_sbc(arguments: argparse.Namespace) -> int:
     """Simulation-based calibration of the model."""
-    from calibrate.figures.calibration import draw
-    from calibrate.posterior.simulation_based import sbc
+    from calibrate.analysis.sbc import sbc
+    from calibrate.figures.sensitivity import draw_calibration
     from calibrate.project import by_fem, model_before_data
     from calibrate.samplers import NUTSOptions
     from emulator.core.store import check_folder, write_json
@@ -165,7 +165,7 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     )
     result = found.to_json()
     write_json(folder / "calibration.json", result)
-    draw(found, f"{run.scene}, {run.forward}", folder / "calibration.png")
+    draw_calibration(found, f"{run.scene}, {run.forward}", folder / "calibration.png")
     rows = [
         (name, *(f"{100 * covered[0]:.0f}" for covered in by.values()), found.outside()[name])
         for name, by in found.coverage().items()
@@ -182,7 +182,7 @@ def run_prior(arguments: argparse.Namespace) -> int:
     import jax
     import numpy as np
 
-    from calibrate.figures.calibration import draw_prior_predictive
+    from calibrate.figures.sensitivity import draw_prior_predictive
     from calibrate.measurements.pressure_volume import in_mmhg
     from calibrate.posterior.predictions import prior_replicates
     from calibrate.project import model_before_data

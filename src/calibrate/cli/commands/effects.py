@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from calibrate.cli.common import DONE, add_scene, emit, scene_words, table
 
 if TYPE_CHECKING:
-    from calibrate.analysis.evaluation.effects import Measured, Recommendation
+    from calibrate.analysis.effects import Measured, Recommendation
 
 
 def register(commands: Any) -> None:
@@ -42,7 +42,7 @@ def register(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, and recommend."""
-    from calibrate.analysis.evaluation.effects import recommend, tolerances
+    from calibrate.analysis.effects import recommend, tolerances
     from calibrate.measurements import observations, parse_observation
     from emulator.catalogue import find_scene
     from emulator.core.errors import check_seed

@@ -35,8 +35,8 @@ def register(commands: Any) -> None:
 
 def run_before(arguments: argparse.Namespace) -> int:
     """What the observations would determine."""
-    from calibrate.analysis.identifiability import expected_precision
-    from calibrate.analysis.identifiability.combinations import products_in_words
+    from calibrate.analysis.expected import expected_precision
+    from calibrate.analysis.identifiability import products_in_words
     from calibrate.project import model_before_data
 
     run = run_of(arguments, seed=arguments.seed)
@@ -56,9 +56,9 @@ def run_after(arguments: argparse.Namespace) -> int:
         identify,
         in_words,
         next_measurement,
-        profile_likelihood,
         stress_band,
     )
+    from calibrate.analysis.profile import profile_likelihood
     from calibrate.measurements import parse_observation
     from calibrate.project import read_posterior
 

@@ -9,8 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from calibrate.analysis.sensitivity.analysis import Function, analyse
-from calibrate.analysis.sensitivity.factors import Factors, check_independent, densities, quantiles
+from calibrate.analysis.indices import (
+    Factors,
+    Function,
+    analyse,
+    check_independent,
+    densities,
+    quantiles,
+)
 from calibrate.measurements import Observation, Observations, observations
 from calibrate.measurements.outputs import FIELD, Outputs
 from calibrate.priors import Prior, box_prior
@@ -38,7 +44,7 @@ def sensitivity(
     ----------
     forward : over all nodes.
     prior : of independent parameters; uniform over the scene's box, on its scales, by default.
-    method, samples : as in :func:`~calibrate.analysis.sensitivity.analyse`.
+    method, samples : as in :func:`~calibrate.analysis.indices.analyse`.
     groups : parameters varied together, by the group's name.
     field : analyse the size of every node's displacement, too.
     scheduler : address of a Dask scheduler whose workers solve, for a map that is FEM.
@@ -46,7 +52,7 @@ def sensitivity(
     Returns
     -------
     A node for each observation, called like it, and ``field``; each a Dataset of
-    :func:`~calibrate.analysis.sensitivity.analyse` whose ``output`` runs over the observation's
+    :func:`~calibrate.analysis.indices.analyse` whose ``output`` runs over the observation's
     numbers, or over the mesh's nodes, and whose attributes have the unit.
 
     Raises

@@ -7,7 +7,7 @@ import pytest
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.identifiability.expected import expected_precision
+from calibrate.analysis.expected import expected_precision
 
 SETS, DRAWS, WITHIN = 50, 100_000, 0.1
 

@@ -10,14 +10,10 @@ import pytest
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.identifiability import (
-    expected,
-    expected_precision,
-    next_measurement,
-    profile_likelihood,
-    stress_band,
-)
-from calibrate.analysis.identifiability.stress import stresses
+from calibrate.analysis import expected
+from calibrate.analysis.expected import expected_precision
+from calibrate.analysis.identifiability import next_measurement, stress_band, stresses
+from calibrate.analysis.profile import profile_likelihood
 from calibrate.posterior import Posterior
 from emulator.core.errors import InputError
 from linear_support import closed_form, linear_forward

@@ -7,7 +7,7 @@ import numpyro.distributions as dist
 import pytest
 
 import calibrate as cal
-from calibrate.posterior.simulation_based import (
+from calibrate.analysis.sbc import (
     LOG_LIKELIHOOD,
     Calibration,
     Replicate,

@@ -36,9 +36,7 @@ def reference(folder):
 
 @pytest.mark.slow
 def test_newton_steps_square_the_error(folder, reference, monkeypatch):
-    monkeypatch.setattr(
-        "calibrate.analysis.evaluation.evaluation.fem_reference", lambda *_, **__: reference
-    )
+    monkeypatch.setattr("calibrate.analysis.evaluation.fem_reference", lambda *_, **__: reference)
     base = run_evaluation(Evaluation(folder)).report
     once, thrice = (
         run_evaluation(Evaluation(folder, forward="corrected", forward_options={"steps": k})).report

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.analysis.evaluation import effects
-from calibrate.analysis.evaluation.effects import Comparison, recommend, tolerances
+from calibrate.analysis import effects
+from calibrate.analysis.effects import Comparison, recommend, tolerances
 from calibrate.cli import main
 from calibrate.measurements import observations, spread_landmarks
 from emulator.core.errors import InputError, SolverError

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import halfnorm
 
 import calibrate as cal
-from calibrate.analysis.identifiability import expected_precision
-from calibrate.analysis.identifiability.combinations import prior_table
+from calibrate.analysis.expected import expected_precision
+from calibrate.analysis.identifiability import prior_table
 from calibrate.statistical_model.curve import curve_covariance
 from calibrate.statistical_model.systematic import Systematic
 from emulator.core.errors import InputError

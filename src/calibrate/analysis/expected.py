@@ -8,7 +8,7 @@ of a Student's t about a Newton step from :math:`x_r`,
                            {\beta\, p(x_i) + (1 - \beta)\, t_5(x_i;\, \hat x, Q)},
           \qquad Q = (F + P^{-1})^{-1},
 
-with the Fisher information F of :mod:`~calibrate.analysis.identifiability.fisher`, the prior's
+with the Fisher information F of :mod:`~calibrate.analysis.fisher`, the prior's
 covariance P and the share :math:`\beta` of draws from the prior; :math:`\hat x` and Q are
 then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000).
 Where too few draws carry the weight the covariance is Q. Posteriors are
@@ -17,7 +17,7 @@ the mean posterior covariance, and a box of a prior ends where a Gaussian does n
 :math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
 
 Errors that many numbers share are in the data and in :math:`p(y \mid x)`, which marginalises them
-(:mod:`~calibrate.analysis.identifiability.errors_of_sets`). Where the size of one is inferred, each
+(:mod:`~calibrate.analysis.fisher`). Where the size of one is inferred, each
 data set has another quantile of its prior, and F is that of x at this size: about x and
 the size together Gaussian data has no information in common, so that not to know
 the size widens x in second order only.
@@ -35,9 +35,8 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import gammaln
 
-from calibrate.analysis.identifiability.combinations import combinations, prior_table
-from calibrate.analysis.identifiability.errors_of_sets import Errors, log_ratio, of_each, sizes_of
-from calibrate.analysis.identifiability.fisher import information_at
+from calibrate.analysis.fisher import Errors, information_at, log_ratio, of_each, sizes_of
+from calibrate.analysis.identifiability import combinations, prior_table
 from calibrate.statistical_model import Model
 from calibrate.statistical_model.error_modes import ErrorModes
 from calibrate.statistical_model.shared_errors import errors_of_data
