@@ -1,1 +1,1 @@
-"""Questions asked of a model or of a posterior: what data can tell, and what its numbers depend on."""
+"""Questions asked of a model or posterior: what data can tell, what its numbers depend on."""

@@ -1,4 +1,4 @@
-r"""What a posterior's data determined, what it says of the tissue's stress, and what to measure next.
+r"""What data determined, what it says of the tissue's stress, and what to measure next.
 
 **Combinations.** Stiffness and load can rise together and leave the body where it is; a table of
 marginals hides that. In :math:`x = \log\theta`, with covariances :math:`S` of the posterior and
