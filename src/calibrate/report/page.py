@@ -1,11 +1,10 @@
-"""The page: verdict first, then data, parameters, body, what is known, and how to repeat it."""
+"""The page of a posterior: verdict, data, parameters, body, what is known, how to repeat it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +20,28 @@ from calibrate.project.cohort import read_cohort
 from calibrate.project.workflow import CERTIFICATE, REPORT
 from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
+from calibrate.report.parts import Block, Paragraph, Table, Verdict
 from emulator.core.store import read_json, replacing
 
-_MOVED = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
+_SHIFTS = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
 
 
 def write_report(folder: str | Path, out: str | Path | None = None, *, fem: bool = True) -> Path:
-    """Write one HTML file about a posterior, or a population, ``folder/report.html`` by default.
+    """Write one HTML file about a posterior or a population.
 
     Parameters
     ----------
-    folder : of :func:`calibrate.project.infer`, or of a population
+    folder : the folder that :func:`calibrate.project.infer` wrote, or that of a population
         (:func:`calibrate.project.cohort.infer_cohort`).
-    fem : solve once at the posterior's mean, to show the map's error on the body; nothing is solved
-        for a population.
+    out : the file to write, ``folder/report.html`` by default.
+    fem : whether to solve once at the posterior's mean, to show the map's error on the body;
+        nothing is solved for a population.
 
     Raises
     ------
     InputError
-        ``folder`` holds neither, or a posterior of another run or map.
+        ``folder`` holds neither a posterior nor a population, or the posterior of another run or
+        map.
     """
     folder = Path(folder)
     target = folder / REPORT if out is None else Path(out)
@@ -67,7 +69,7 @@ def html_of(
     fem: bool = True,
     made: str = "",
 ) -> str:
-    """The page as text; ``made``: the day of the certificate."""
+    """Return the page of a posterior as HTML; ``made`` is the day of the certificate."""
     scene = posterior.model.forward.scene
     simulator = simulator_of(scene) if fem else None
     sections = [
@@ -79,26 +81,28 @@ def html_of(
         ("Where this comes from, and how to repeat it", _provenance(run, posterior)),
     ]
     title = f"{scene.name}: posterior of {', '.join(posterior.model.names)}"
-    return parts.frame(title, scene.name, _verdict(run, posterior, certificate, made), sections)
+    return parts.render(title, scene.name, _verdict(run, posterior, certificate, made), sections)
 
 
-def _verdict(run: Run, posterior: Posterior, certificate: dict[str, Any] | None, made: str) -> str:
-    """The certificate's verdict and findings, by what it judged, and what is wrong with the run."""
-    judged = f"Data: {run.data}."
-    if certificate is None:
-        decided = "fem_solves" in posterior.tree.attrs
-        verdict = "decided by FEM" if decided else "not certified"
-        findings = [] if decided else ["no certificate yet: run calibrate certify on this folder"]
+def _verdict(
+    run: Run, posterior: Posterior, certificate: dict[str, Any] | None, made: str
+) -> Verdict:
+    """Return the certificate's verdict, findings and basis, with the run's warnings."""
+    basis = f"Data: {run.data}."
+    findings: Sequence[str] = ()
+    if certificate is not None:
+        text, findings = certificate["verdict"], certificate["findings"]
+        basis = " ".join([*_basis(certificate), basis, made])
+    elif "fem_solves" in posterior.tree.attrs:
+        text = "decided by FEM"
     else:
-        verdict, findings = certificate["verdict"], certificate["findings"]
-        judged = " ".join([*_judged(certificate), judged, made])
-    return parts.verdict_box(
-        verdict, parts.colour_of(verdict), findings, judged, posterior.warnings()
-    )
+        text = "not certified"
+        findings = ["no certificate yet: run calibrate certify on this folder"]
+    return Verdict(text, parts.colour_of(text), findings, basis, posterior.warnings())
 
 
-def _judged(certificate: dict[str, Any]) -> Iterator[str]:
-    """What a verdict rests on, and what it was held against."""
+def _basis(certificate: dict[str, Any]) -> Iterator[str]:
+    """Yield the sentences that say what a verdict rests on, and its limits."""
     finer = (certificate.get("mesh") or {}).get("runs", 0)
     runs = f"Judged by {certificate['draws']} FEM runs, {certificate['failed']} failed"
     yield f"{runs}, and {finer} on a finer mesh." if finer else f"{runs}."
@@ -112,91 +116,95 @@ def _judged(certificate: dict[str, Any]) -> Iterator[str]:
 
 
 def _day(path: Path) -> str:
-    """When a file was written; nothing where there is none."""
+    """Return the day on which a file was written; an empty text where there is no file."""
     if not path.is_file():
         return ""
     return f"{datetime.fromtimestamp(path.stat().st_mtime).date()}."
 
 
-def _data(posterior: Posterior) -> str:
-    found = [parts.chart(figure) for _, figure in charts.against_data(posterior)]
-    return "".join(found) or parts.note("The run kept no predictions.")
+def _data(posterior: Posterior) -> list[Block]:
+    blocks: list[Block] = [parts.chart(figure) for _, figure in charts.against_data(posterior)]
+    return blocks or [parts.note("The run kept no predictions.")]
 
 
-def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | None) -> str:
+def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | None) -> list[Block]:
     labels, cut = charts.names_with_units(posterior), posterior.model.prior_cut
-    head = ["", *parts.SUMMARY, "prior"]
     truth = run.truth if run.data == "synthetic" else {}
     priors = posterior.model.sampled_priors
-    head += ["truth"] if truth else []
-    moved = shifts(certificate or {})
-    head += [_MOVED[what] for what in moved]
+    shifts_by_judge = shifts(certificate or {})
+    head = ["", *parts.SUMMARY, "prior", *(["truth"] if truth else [])]
+    head += [_SHIFTS[judge] for judge in shifts_by_judge]
     rows = []
     for name, row in posterior.summary().items():
-        numbers = parts.summary_cells(row)
-        numbers.append(_in_words(priors[name]) if name in priors else "")
-        numbers += [f"{truth[name]:.4g}" if name in truth else ""] if truth else []
-        numbers += [f"{shift[name]:+.2f}" if name in shift else "" for shift in moved.values()]
-        rows.append((labels[name], *numbers))
-    lost = "".join(
+        cells = parts.summary_cells(row)
+        cells.append(_in_words(priors[name]) if name in priors else "")
+        cells += [f"{truth[name]:.4g}" if name in truth else ""] if truth else []
+        cells += [f"{s[name]:+.2f}" if name in s else "" for s in shifts_by_judge.values()]
+        rows.append((labels[name], *cells))
+    notes = [
         parts.note(
-            f"{n}: {100 * share:.2g} % of the prior lies where the map has no answer and was left "
-            "out."
+            f"{name}: {100 * share:.2g} % of the prior lies where the map has no answer and was "
+            "left out."
         )
-        for n, share in cut.items() if share
-    )  # fmt: skip
-    return parts.table(head, rows) + lost
+        for name, share in cut.items()
+        if share
+    ]
+    return [Table(head, rows), *notes]
 
 
-def _body(posterior: Posterior, simulator: Any) -> str:
+def _body(posterior: Posterior, simulator: Any) -> list[Block]:
     note = parts.note(
         "Drag to turn. The slider goes through draws of the posterior; the menu changes the "
         "colour; fibres and the body at rest are in the legend."
     )
-    return note + parts.chart(body_figure(posterior, simulator))
+    return [note, parts.chart(body_figure(posterior, simulator))]
 
 
-def _known(posterior: Posterior) -> str:
-    words = escape(in_words(identify(posterior))).replace("\n", "<br>")
-    found = f"<p>{words}</p>{parts.chart(charts.stress(posterior))}"
-    curve = charts.volume_band(posterior)
-    found += parts.chart(curve) if curve is not None else ""
-    return found + _ejection(charts.state_volumes(posterior))
+def _known(posterior: Posterior) -> list[Block]:
+    words = Paragraph(in_words(identify(posterior)), "lines")
+    blocks: list[Block] = [words, parts.chart(charts.stress(posterior))]
+    if (curve := charts.volume_band(posterior)) is not None:
+        blocks.append(parts.chart(curve))
+    return blocks + _ejection(charts.state_volumes(posterior))
 
 
-def _ejection(volumes: Mapping[str, np.ndarray]) -> str:
-    """Volumes by load state, and what of the largest the smallest leaves out; nothing of none."""
+def _ejection(volumes: Mapping[str, np.ndarray]) -> list[Block]:
+    """Return the volumes by load state, and the share of the largest that is ejected."""
     if not volumes:
-        return ""
+        return []
     rows = [(state, parts.median_and_range(values)) for state, values in volumes.items()]
     medians = {state: float(np.median(values)) for state, values in volumes.items()}
     full, empty = (pick(medians, key=medians.__getitem__) for pick in (max, min))
     ejected = 100.0 * (1.0 - volumes[empty] / volumes[full])
-    return (
-        f"{parts.table(('load state', 'cavity volume (mL), median and 90 %'), rows)}"
-        f"<p>Ejection fraction from {escape(full)} to {escape(empty)}: "
-        f"{parts.median_and_range(ejected)} %.</p>"
-    )
+    return [
+        Table(("load state", "cavity volume (mL), median and 90 %"), rows),
+        Paragraph(
+            f"Ejection fraction from {full} to {empty}: {parts.median_and_range(ejected)} %."
+        ),
+    ]
 
 
-def _draws(posterior: Posterior) -> str:
-    found = parts.chart(charts.traces(posterior))
-    return found + (parts.chart(charts.pairs(posterior)) if len(posterior.model.names) > 1 else "")
+def _draws(posterior: Posterior) -> list[Block]:
+    blocks: list[Block] = [parts.chart(charts.traces(posterior))]
+    if len(posterior.model.names) > 1:
+        blocks.append(parts.chart(charts.pairs(posterior)))
+    return blocks
 
 
-def _provenance(run: Run, posterior: Posterior) -> str:
-    again = (
+def _provenance(run: Run, posterior: Posterior) -> list[Block]:
+    program = (
         "from calibrate.project import infer, read_posterior\n\n"
         'run, _ = read_posterior("THIS FOLDER")\n'
         'infer(run, "ANOTHER FOLDER")  # the same draws'
     )
-    return parts.attributes(posterior.tree.attrs, ("run", "observe")) + parts.how_to_repeat(
-        parts.not_as_usual(run), "The run", again
-    )
+    return [
+        parts.attributes(posterior.tree.attrs, ("run", "observe")),
+        *parts.how_to_repeat(parts.changed_settings(run), "The run", program),
+    ]
 
 
 def _in_words(prior: dist.Distribution) -> str:
-    """A prior as its distribution's name and its range."""
+    """Return a prior as its distribution's name and its range."""
     if not isinstance(prior, dist.LogUniform | dist.Uniform):
         return describe_distribution(prior)
     log = "log-" if isinstance(prior, dist.LogUniform) else ""

@@ -1,4 +1,4 @@
-"""What pages are made of: the frame, the verdict's box, tables, charts, and values in words."""
+"""The blocks that pages are made of, and the template that renders them (``page.html.j2``)."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
-from html import escape
-from typing import Any
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import plotly.graph_objects as go
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
 
@@ -26,125 +27,154 @@ SUMMARY = ("mean", "sd", "5 %", "95 %", "R-hat", "ESS bulk", "ESS tail")
 _COLOURS = {
     "accepted": GOOD, "decided by FEM": GOOD, "reweight": UNSURE, "undecided": UNSURE,
 }  # fmt: skip
-_STYLE = f"""
-body {{ font: 16px/1.5 system-ui, sans-serif; color: #1c1c1c; margin: 0 auto; max-width: 1060px;
-  padding: 0 20px 60px; }}
-h1 {{ margin: 28px 0 4px; }} h2 {{ margin: 40px 0 8px; border-bottom: 1px solid #ccc; }}
-.verdict {{ color: white; padding: 14px 18px; border-radius: 6px; margin: 18px 0; }}
-.verdict b {{ font-size: 1.25em; }} .note {{ color: #555; }} .warning {{ color: {BAD}; }}
-table {{ border-collapse: collapse; }} td, th {{ padding: 4px 14px 4px 0; text-align: right; }}
-td:first-child, th:first-child {{ text-align: left; }}
-tr + tr {{ border-top: 1px solid #e4e4e4; }}
-pre {{ background: #f5f5f5; padding: 12px; overflow-x: auto; font-size: 13px; }}
-"""
 
 
-class Markup(str):
-    """A cell of a table that is HTML already."""
+@dataclass(frozen=True)
+class Paragraph:
+    """A paragraph of plain text; ``style`` is ``note``, ``warning``, ``lines`` or empty."""
 
-    __slots__ = ()
+    text: str
+    style: str = ""
+    kind: ClassVar = "paragraph"
 
 
-def frame(title: str, heading: str, first: str, sections: Iterable[tuple[str, str]]) -> str:
-    """The whole page: ``heading``, ``first`` (HTML), then sections, each a title and HTML."""
-    body = "".join(f"<h2>{escape(name)}</h2>{content}" for name, content in sections)
-    return (
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f"<style>{_STYLE}</style><script>{get_plotlyjs()}</script></head><body>"
-        f"<h1>{escape(heading)}</h1>{first}{body}</body></html>"
+@dataclass(frozen=True)
+class Code:
+    """A program or a file's content."""
+
+    text: str
+    kind: ClassVar = "code"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; a cell is plain text, or markup (``markupsafe.Markup``)."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    kind: ClassVar = "table"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A Plotly chart as HTML that draws with the page's own library."""
+
+    html: str
+    kind: ClassVar = "chart"
+
+
+Block = Paragraph | Code | Table | Chart
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The box at the top of a page.
+
+    Parameters
+    ----------
+    text : the verdict in one or two words.
+    colour : one of :data:`GOOD`, :data:`UNSURE` and :data:`BAD`.
+    findings : the sentences below the verdict.
+    basis : the sentence that says what the verdict rests on.
+    warnings : the sentences about the run, shown below the box.
+    """
+
+    text: str
+    colour: str
+    findings: Sequence[str]
+    basis: str
+    warnings: Sequence[str]
+
+
+def render(
+    title: str, heading: str, verdict: Verdict, sections: Sequence[tuple[str, Sequence[Block]]]
+) -> str:
+    """Return the whole page as HTML; ``sections`` are titles with their blocks."""
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return templates.get_template("page.html.j2").render(
+        title=title,
+        heading=heading,
+        verdict=verdict,
+        sections=sections,
+        warning_colour=BAD,
+        drawing_library=get_plotlyjs(),
     )
 
 
 def colour_of(verdict: str) -> str:
-    """The colour of a verdict; of one that is not known, the worst."""
+    """Return the colour of a verdict; an unknown verdict has the worst."""
     return _COLOURS.get(verdict, BAD)
 
 
-def verdict_box(
-    verdict: str, colour: str, findings: Iterable[str], judged: str, warnings: Iterable[str]
-) -> str:
-    """A verdict with its findings and what it rests on, and below it what is wrong with the run."""
-    items = "".join(f"<li>{escape(each)}</li>" for each in findings)
-    return (
-        f'<div class="verdict" style="background:{colour}"><b>{escape(verdict)}</b>'
-        f"<ul>{items}</ul><small>{escape(judged)}</small></div>{as_warnings(warnings)}"
-    )
+def note(text: str) -> Paragraph:
+    """Return a paragraph that explains."""
+    return Paragraph(text, "note")
 
 
-def as_warnings(sentences: Iterable[str]) -> str:
-    """A paragraph for each sentence, in the colour of what is wrong."""
-    return "".join(f'<p class="warning">{escape(each)}</p>' for each in sentences)
+def warnings(sentences: Iterable[str]) -> list[Block]:
+    """Return a paragraph for each sentence, in the colour of warnings."""
+    return [Paragraph(sentence, "warning") for sentence in sentences]
 
 
-def note(text: str) -> str:
-    """A paragraph that explains."""
-    return f'<p class="note">{escape(text)}</p>'
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; cells are text, or :class:`Markup`."""
-    cells = ["".join(f"<th>{escape(each)}</th>" for each in head)]
-    cells += ["".join(f"<td>{_cell(each)}</td>" for each in row) for row in rows]
-    return f"<table>{''.join(f'<tr>{line}</tr>' for line in cells)}</table>"
-
-
-def _cell(value: str) -> str:
-    return value if isinstance(value, Markup) else escape(str(value))
+def chart(figure: go.Figure) -> Chart:
+    """Return a figure as a block, in the page's style."""
+    figure.update_layout(template="simple_white", margin={"t": 50, "b": 40}, font={"size": 13})
+    if figure.layout.height is None:
+        figure.update_layout(height=420)
+    config = {"displaylogo": False}
+    return Chart(to_html(figure, full_html=False, include_plotlyjs=False, config=config))
 
 
 def summary_cells(row: Mapping[str, float]) -> list[str]:
-    """A row of :func:`calibrate.posterior.diagnosis.summary_of` as text, titled by SUMMARY."""
+    """Return a row of :func:`calibrate.posterior.diagnosis.summary_of` as text, titled SUMMARY."""
     numbers = [f"{row[key]:.4g}" for key in ("mean", "sd", "low", "high")]
     return [*numbers, f"{row['r_hat']:.4f}", f"{row['ess_bulk']:.0f}", f"{row['ess_tail']:.0f}"]
 
 
 def median_and_range(values: np.ndarray, form: str = ".1f") -> str:
-    """Median and central 90 % of draws (s,), each number in the format ``form``."""
+    """Return median and central 90 % of draws (s,), each number in the format ``form``."""
     low, middle, high = (format(each, form) for each in np.quantile(values, [0.05, 0.5, 0.95]))
     return f"{middle} ({low} to {high})"
 
 
-def chart(figure: go.Figure) -> str:
-    """A chart as HTML that draws with the page's own library."""
-    figure.update_layout(template="simple_white", margin={"t": 50, "b": 40}, font={"size": 13})
-    if figure.layout.height is None:
-        figure.update_layout(height=420)
-    return to_html(figure, full_html=False, include_plotlyjs=False, config={"displaylogo": False})
-
-
-def attributes(found: Mapping[Any, Any], leave_out: Iterable[str]) -> str:
-    """A table of a posterior's attributes that say something."""
-    named = {str(key): value for key, value in found.items() if key not in leave_out}
-    return table(
-        ("", ""), [(key, told) for key, value in named.items() if (told := in_text(value))]
-    )
+def attributes(values: Mapping[Any, Any], omitted: Iterable[str]) -> Table:
+    """Return a table of a posterior's attributes that are not empty and not ``omitted``."""
+    texts = {str(key): in_text(value) for key, value in values.items() if key not in omitted}
+    return Table(("", ""), [(key, text) for key, text in texts.items() if text])
 
 
 def in_text(value: Any) -> str:
-    """An attribute in words; nothing where it says nothing."""
+    """Return an attribute in words; an empty text where the attribute has no content."""
     if isinstance(value, str) and value[:1] in ("{", "[", "n"):
         with suppress(ValueError):
             value = json.loads(value)
     if isinstance(value, float) and not math.isfinite(value):
         return ""
     if isinstance(value, Mapping):
-        parts = {str(k): told for k, v in value.items() if (told := in_text(v))}
-        return "; ".join(f"{name}: {told}" if name else told for name, told in parts.items())
+        texts = {str(key): text for key, v in value.items() if (text := in_text(v))}
+        return "; ".join(f"{key}: {text}" if key else text for key, text in texts.items())
     if isinstance(value, list):
         return ", ".join(map(in_text, value))
     return "" if value is None else str(value)
 
 
-def not_as_usual(run: Run) -> dict[str, Any]:
-    """Entries of a run that are not its defaults, and its scene."""
-    usual = asdict(Run(run.scene))
-    return {k: v for k, v in asdict(run).items() if k == "scene" or v != usual[k]}
+def changed_settings(run: Run) -> dict[str, Any]:
+    """Return the entries of a run that differ from its defaults, and its scene."""
+    defaults = asdict(Run(run.scene))
+    return {k: v for k, v in asdict(run).items() if k == "scene" or v != defaults[k]}
 
 
-def how_to_repeat(settings: Mapping[str, Any], kept: str, program: str) -> str:
-    """Settings as JSON, after the words ``kept``, and the program that repeats them."""
-    return (
-        f"<p>{kept}, where it is not as usual (all of it is in <code>run.json</code>):</p>"
-        f"<pre>{escape(json.dumps(settings, indent=2))}</pre>"
-        f"<p>To repeat it:</p><pre>{escape(program)}</pre>"
-    )
+def how_to_repeat(settings: Mapping[str, Any], subject: str, program: str) -> list[Block]:
+    """Return the settings of ``subject`` as JSON, and the program that repeats it."""
+    return [
+        Paragraph(f"{subject}, where it is not as usual (all of it is in run.json):"),
+        Code(json.dumps(settings, indent=2)),
+        Paragraph("To repeat it:"),
+        Code(program),
+    ]

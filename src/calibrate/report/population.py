@@ -9,13 +9,13 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
+from markupsafe import Markup
 from plotly.subplots import make_subplots
 
 from calibrate.figures.drawing import BLUE, VERMILION
@@ -30,6 +30,7 @@ from calibrate.project.experiment import POPULATION, Cohort, Shared
 from calibrate.project.workflow import MEMBERS, POSTERIOR, REPORT
 from calibrate.report import charts, parts
 from calibrate.report.charts import translucent
+from calibrate.report.parts import Block, Paragraph, Table, Verdict
 
 _GREY = "#8c8c8c"
 _COLUMNS = 3  # parameters beside each other, at most
@@ -98,113 +99,111 @@ def _interval_trace(
 
 
 _FORM = ".4g"
-_UNTOLD = ("members", "alone")  # fingerprints, and what a cohort always says
+_OMITTED = ("members", "alone")  # attributes: fingerprints, and what every population has
 
 
-def html_of(cohort: Cohort, found: Hierarchy, folder: Path, beside: Path) -> str:
-    """The page as text.
+def html_of(cohort: Cohort, population: Hierarchy, folder: Path, beside: Path) -> str:
+    """Return the page of a population as HTML.
 
     Parameters
     ----------
-    folder : of the cohort: certificates, posteriors and pages of its members are read there.
-    beside : the folder that the page is written to, which links start from.
+    cohort : the runs of the members.
+    population : the posterior of the population.
+    folder : the population's folder, where its members' certificates, posteriors and pages are.
+    beside : the folder that the page is written to, from which links start.
     """
-    verdicts = dict.fromkeys(found.members, NOT_CERTIFIED) | kept_verdicts(cohort, folder)
-    table, warnings = found.summary(), found.warnings()
+    verdicts = dict.fromkeys(population.members, NOT_CERTIFIED) | kept_verdicts(cohort, folder)
+    table, warnings = population.summary(), population.warnings()
     sections = [
-        ("The population", _population(found, table)),
-        ("Members beside the population", _members(found, folder, beside, verdicts)),
-        ("A member not seen", _new_member(found)),
-        ("How sampling went", _sampling(found, table, warnings)),
-        ("Where this comes from, and how to repeat it", _provenance(cohort, found)),
+        ("The population", _population(population, table)),
+        ("Members beside the population", _members(population, folder, beside, verdicts)),
+        ("A member not seen", _new_member(population)),
+        ("How sampling went", _sampling(population, table, warnings)),
+        ("Where this comes from, and how to repeat it", _provenance(cohort, population)),
     ]
-    title = f"Population of {len(found.members)} members"
-    first = _verdict(verdicts, warnings)
-    return parts.frame(f"{title}: {', '.join(found.shared)}", title, first, sections)
+    heading = f"Population of {len(population.members)} members"
+    title = f"{heading}: {', '.join(population.shared)}"
+    return parts.render(title, heading, _verdict(verdicts, warnings), sections)
 
 
-def _verdict(verdicts: Mapping[str, str], warnings: Sequence[str]) -> str:
-    """How many members FEM agrees with, which it does not, and what is wrong with the run."""
+def _verdict(verdicts: Mapping[str, str], warnings: Sequence[str]) -> Verdict:
+    """Return how many members FEM agrees with, the other members, and the run's warnings."""
     colours = [parts.colour_of(verdict) for verdict in verdicts.values()]
-    good = colours.count(parts.GOOD)
     worst = max(colours, key=(parts.GOOD, parts.UNSURE, parts.BAD).index)
-    said = list(dict.fromkeys(verdicts.values()))
-    verdict = f"{good} of {len(verdicts)} members accepted"
-    if len(said) == 1:
-        verdict = f"all members: {said[0]}"
+    distinct = list(dict.fromkeys(verdicts.values()))
+    text = f"{colours.count(parts.GOOD)} of {len(verdicts)} members accepted"
+    if len(distinct) == 1:
+        text = f"all members: {distinct[0]}"
     findings = [
-        f"{each}: {', '.join(name for name, own in verdicts.items() if own == each)}"
-        for each in said
-        if parts.colour_of(each) != parts.GOOD
+        f"{verdict}: {', '.join(name for name, own in verdicts.items() if own == verdict)}"
+        for verdict in distinct
+        if parts.colour_of(verdict) != parts.GOOD
     ]
     if NOT_CERTIFIED in verdicts.values():
         findings.append(f"for a certificate: calibrate certify on {MEMBERS}/NAME in this folder")
-    return parts.verdict_box(
-        verdict,
-        worst,
-        findings,
-        "A certificate is of a member by itself, not of the population.",
-        warnings,
-    )
+    basis = "A certificate is of a member by itself, not of the population."
+    return Verdict(text, worst, findings, basis, warnings)
 
 
-def _labels(found: Hierarchy) -> dict[str, str]:
-    """What the numbers of the population are called, by their names in :meth:`Hierarchy.draws`."""
+def _labels(population: Hierarchy) -> dict[str, str]:
+    """Return the labels of the population's numbers, by name in :meth:`Hierarchy.draws`."""
     medians, spreads, correlations = {}, {}, {}
-    for k, name in enumerate(found.shared):
-        label = label_of(found, name)
-        log = found.tree["posterior"][name].attrs.get("scale") == "log"
+    for k, name in enumerate(population.shared):
+        label = label_of(population, name)
+        log = population.tree["posterior"][name].attrs.get("scale") == "log"
         medians[f"{MEDIAN}[{name}]"] = f"median of {label}"
         spreads[f"{SD}[{name}]"] = f"spread of {f'ln {name}' if log else label}"
-        for earlier in found.shared[:k]:
+        for earlier in population.shared[:k]:
             correlations[f"{CORRELATION}[{earlier}, {name}]"] = f"correlation of {earlier}, {name}"
     return medians | spreads | correlations
 
 
-def _population(found: Hierarchy, table: Mapping[str, Mapping[str, float]]) -> str:
-    labels = _labels(found)
+def _population(population: Hierarchy, table: Mapping[str, Mapping[str, float]]) -> list[Block]:
+    labels = _labels(population)
     rows = [(label, *parts.summary_cells(table[name])) for name, label in labels.items()]
-    return parts.table(("", *parts.SUMMARY), rows) + parts.note(
+    note = parts.note(
         "Of the population before it is cut to the parameters' ranges. A spread is an sd; of a "
         "logarithm it is about a relative sd. Few members tell little of it: it is then what its "
         "prior says."
     )
+    return [Table(("", *parts.SUMMARY), rows), note]
 
 
-def _members(found: Hierarchy, folder: Path, beside: Path, verdicts: Mapping[str, str]) -> str:
-    """The chart, its numbers, checks of each member, and what its own posterior does not fit."""
-    draws, numbers, checks, wrong = found.draws(), [], [], []
-    for member in found.members:
+def _members(
+    population: Hierarchy, folder: Path, beside: Path, verdicts: Mapping[str, str]
+) -> list[Block]:
+    """Return the chart of the members, its numbers, each member's checks and its misfits."""
+    draws = population.draws()
+    numbers, checks, misfit_sentences = [], [], []
+    for member in population.members:
         own = folder / MEMBERS / member
         tree = read_tree(own / POSTERIOR) if (own / POSTERIOR).exists() else xr.DataTree()
-        values = [draws[f"{name}[{member}]"] for name in found.shared]
+        values = [draws[f"{name}[{member}]"] for name in population.shared]
         numbers.append((member, *(parts.median_and_range(v, _FORM) for v in values)))
         checks.append((member, verdicts[member], _share(tree), _page(own / REPORT, beside)))
-        wrong += [f"{member}: {sentence}" for sentence in misfits(tree)]
-    labels = [label_of(found, name) for name in found.shared]
-    return "".join(
-        [
-            parts.chart(shrinkage(found)),
-            parts.note("Medians and 90 % of each member with the others, the chart's blue:"),
-            parts.table(("", *labels), numbers),
-            parts.note(
-                "Each member by itself, the chart's grey: FEM's verdict, and how much of its data "
-                "lies within 90 % of what its posterior predicts, noise included. For a page: "
-                f"calibrate report on {MEMBERS}/NAME in this folder, then on the folder again."
-            ),
-            parts.table(("", "FEM says", "data within 90 %", "page"), checks),
-            parts.as_warnings(wrong),
-        ]
-    )
+        misfit_sentences += [f"{member}: {sentence}" for sentence in misfits(tree)]
+    labels = [label_of(population, name) for name in population.shared]
+    return [
+        parts.chart(shrinkage(population)),
+        parts.note("Medians and 90 % of each member with the others, the chart's blue:"),
+        Table(("", *labels), numbers),
+        parts.note(
+            "Each member by itself, the chart's grey: FEM's verdict, and how much of its data "
+            "lies within 90 % of what its posterior predicts, noise included. For a page: "
+            f"calibrate report on {MEMBERS}/NAME in this folder, then on the folder again."
+        ),
+        Table(("", "FEM says", "data within 90 %", "page"), checks),
+        *parts.warnings(misfit_sentences),
+    ]
 
 
 def _share(tree: xr.DataTree) -> str:
-    """How much of a member's data lies within 90 % of what its posterior predicts."""
+    """Return the share of a member's data within 90 % of its posterior's predictions."""
     if "posterior_predictive" not in tree.children:
         return "not kept"
     observed = tree["observed_data"].to_dataset()
     replicates = tree["posterior_predictive"].to_dataset()
-    there = np.concatenate(
+    inside = np.concatenate(
         [
             charts.inside(
                 replicates[name].values.reshape(-1, measured.size), measured.values.ravel()
@@ -212,63 +211,63 @@ def _share(tree: xr.DataTree) -> str:
             for name, measured in observed.data_vars.items()
         ]
     )
-    return f"{100.0 * there.mean():.0f} % of {len(there)}"
+    return f"{100.0 * inside.mean():.0f} % of {len(inside)}"
 
 
 def _page(path: Path, beside: Path) -> str:
-    """A link to a member's page from the folder ``beside``, where there is one."""
+    """Return a link to a member's page from the folder ``beside``, or an empty text."""
     if not path.is_file():
         return ""
-    there = Path(os.path.relpath(path.resolve(), beside.resolve())).as_posix()
-    return parts.Markup(f'<a href="{quote(there)}">open</a>')
+    relative = Path(os.path.relpath(path.resolve(), beside.resolve())).as_posix()
+    return Markup('<a href="{}">open</a>').format(quote(relative))
 
 
-def _new_member(found: Hierarchy) -> str:
-    new = found.new_member()
-    rows = [(label_of(found, n), parts.median_and_range(v, _FORM)) for n, v in new.items()]
-    told = parts.note(
+def _new_member(population: Hierarchy) -> list[Block]:
+    member = population.new_member()
+    labels = {name: label_of(population, name) for name in member}
+    rows = [(labels[name], parts.median_and_range(v, _FORM)) for name, v in member.items()]
+    note = parts.note(
         "What is not known of the population widens it. In Python, the hierarchy's predict(model) "
         "gives the data of such a member, and as_prior() the prior of the next."
     )
-    pairs = charts.pairs_of({n: label_of(found, n) for n in new}, new) if len(new) > 1 else None
-    shown = "" if pairs is None else parts.chart(pairs)
-    return parts.table(("", "median and 90 %"), rows) + told + shown
+    pairs = [parts.chart(charts.pairs_of(labels, member))] if len(member) > 1 else []
+    return [Table(("", "median and 90 %"), rows), note, *pairs]
 
 
 def _sampling(
-    found: Hierarchy, table: Mapping[str, Mapping[str, float]], warnings: Sequence[str]
-) -> str:
-    """Draws, the worst R-hat and the fewest effective draws in words, and traces."""
-    labels = _labels(found)
-    sizes, statistics = found.tree["posterior"].sizes, found.tree["sample_stats"]
+    population: Hierarchy, table: Mapping[str, Mapping[str, float]], warnings: Sequence[str]
+) -> list[Block]:
+    """Return draws, the worst R-hat and the fewest effective draws in words, and traces."""
+    labels = _labels(population)
+    sizes, statistics = population.tree["posterior"].sizes, population.tree["sample_stats"]
     worst = max(table, key=lambda name: np.nan_to_num(table[name]["r_hat"], nan=np.inf))
     fewest = {key: min(row[key] for row in table.values()) for key in ("ess_bulk", "ess_tail")}
     diverging = int(statistics["diverging"].sum()) if "diverging" in statistics else 0
-    said = (
+    text = (
         f"{sizes['chain']} chains of {sizes['draw']} draws, {diverging or 'no'} divergent "
         f"transitions. R-hat is at most {table[worst]['r_hat']:.4f}, of "
         f"{labels.get(worst, worst)}; effective draws are {fewest['ess_bulk']:.0f} or more in the "
-        f"bulk, {fewest['ess_tail']:.0f} or more in the tails, of population and members alike."
+        f"bulk, {fewest['ess_tail']:.0f} or more in the tails, of population and members alike. "
     )
-    told = "Warnings are at the top." if warnings else "Nothing is wrong with the run."
-    traces = parts.chart(charts.traces_of(labels, found.draws(), {}))
-    return f"<p>{escape(said)} {told}</p>{traces}"
+    text += "Warnings are at the top." if warnings else "Nothing is wrong with the run."
+    return [Paragraph(text), parts.chart(charts.traces_of(labels, population.draws(), {}))]
 
 
-def _provenance(cohort: Cohort, found: Hierarchy) -> str:
-    """Attributes, each member's scene and data, and settings as an experiment file has them."""
-    runs = {name: parts.not_as_usual(run) for name, run in cohort.members.items()}
+def _provenance(cohort: Cohort, population: Hierarchy) -> list[Block]:
+    """Return attributes, each member's scene and data, and settings as in an experiment file."""
+    runs = {name: parts.changed_settings(run) for name, run in cohort.members.items()}
     first = next(iter(runs.values()))
     common = {k: v for k, v in first.items() if all(run.get(k) == v for run in runs.values())}
     own = {name: {k: v for k, v in run.items() if k not in common} for name, run in runs.items()}
-    usual, chosen = asdict(Shared()), asdict(cohort.population)
-    shared = {k: v for k, v in chosen.items() if v != usual[k]}
-    again = (
+    defaults, chosen = asdict(Shared()), asdict(cohort.population)
+    shared = {k: v for k, v in chosen.items() if v != defaults[k]}
+    program = (
         "from calibrate.project.cohort import infer_cohort, read_cohort\n\n"
         'cohort, _ = read_cohort("THIS FOLDER")\n'
         'infer_cohort(cohort, "ANOTHER FOLDER")  # the same draws'
     )
     settings = common | {MEMBERS: own, POPULATION: shared}
-    return parts.attributes(found.tree.attrs, _UNTOLD) + parts.how_to_repeat(
-        settings, "The runs of the members and what these share", again
-    )
+    return [
+        parts.attributes(population.tree.attrs, _OMITTED),
+        *parts.how_to_repeat(settings, "The runs of the members and what these share", program),
+    ]
