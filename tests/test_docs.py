@@ -46,31 +46,50 @@ def test_the_site_builds_without_a_warning(tmp_path):
         assert f'id="calibrate.{name}"' in page
 
 
+def test_no_line_of_prose_is_wider_than_100_characters():
+    for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        if path.name == "experiments.md":  # the log of what was tried keeps its lines
+            continue
+        text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+        lines = text.splitlines()
+        wide = [line for line in lines if len(line) > 100 and not line.startswith("|")]
+        assert not wide, (path.name, wide[0])
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def run_examples(page):
+    """Run the Python examples of a page one after the other; return what they define."""
+    names = {}
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
+        exec(compile(code, page, "exec"), names)
+    return names
+
+
 @pytest.mark.slow
 def test_the_examples_of_the_readme_run(capsys):
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    names = {}
-    for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
-        exec(compile(code, "README.md", "exec"), names)
-    said = capsys.readouterr().out
-    assert "accepted" in said
-    assert 120.0 < float(said.split()[-1]) < 180.0  # mL
+    run_examples("README.md")
+    assert "accepted" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_example_of_several_observations_runs(capsys):
+    run_examples("docs/observations.md")
+    assert 120.0 < float(capsys.readouterr().out.split()[-1]) < 180.0  # mL
 
 
 @pytest.mark.slow
 def test_the_quick_start_runs(capsys):
-    text = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
-    exec(compile(code, "quickstart.md", "exec"), {})
+    run_examples("docs/quickstart.md")
     assert "accepted" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_the_examples_of_populations_run():
-    text = (ROOT / "docs" / "populations.md").read_text(encoding="utf-8")
-    names = {}
-    for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
-        exec(compile(code, "populations.md", "exec"), names)
+    names = run_examples("docs/populations.md")
     assert names["solution"].converged
     found = names["found"]
     assert abs(found.summary()["median[mu]"]["mean"] - 70.0) < 7.0
