@@ -14,8 +14,9 @@ import calibrate as cal
 import emulator as em
 from bad_words import COMMANDS, INFERENCES
 from calibrate.analysis.sbc import sbc
+from calibrate.cli import COMMANDS as COMMAND_NAMES
 from calibrate.cli import main
-from calibrate.cli.common import seconds
+from calibrate.cli.words import seconds
 from calibrate.measurements.data import read_data, write_data
 from calibrate.project import Run, make_data
 from cli_support import write_block
@@ -154,7 +155,7 @@ def emulators(folder):
 
 
 def posteriors(folder):
-    """Kept ones whose run.json was edited; tests/calibrate/project/test_restore.py has sampled ones."""
+    """Kept ones whose run.json was edited; tests/calibrate/project/test_results.py has sampled ones."""
     scene = em.scenes.once_clamped_beam()
     truth = {"mu": 73.0, "lam": 61.0}
     run = asdict(Run(scene.name, truth=truth, noise={"displacement": 0.2}))
@@ -199,10 +200,8 @@ def test_bad_input(capsys, monkeypatch, folder, bad, message):
 
 
 def test_all_commands_are_among_them():
-    from calibrate.cli import command_names
-
     assert len(CALLS) + len(PYTHON) >= 150
-    assert set(command_names()) - {"demo"} <= {words.split()[0] for words, _ in CALLS}
+    assert set(COMMAND_NAMES) - {"demo"} <= {words.split()[0] for words, _ in CALLS}
 
 
 def test_unusual_input_is_taken(folder, monkeypatch, tmp_path):

@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 
 from calibrate.cli import build_parser, main
-from calibrate.cli.model_words import model_of
-from calibrate.project import Run, observed
+from calibrate.cli.run_words import problem_of
 from calibrate.statistical_model.load_states import known_thetas
-from emulator.catalogue import find_scene
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "cases.md").read_text(encoding="utf-8")
 BLOCKS = [
@@ -41,13 +39,11 @@ def on_this_machine(words, request):
 def test_the_command_names_what_there_is(words, request):
     """Scene, parameters, observations and noises, without solving, sampling or reading data."""
     words = on_this_machine(words, request)
-    run = Run(**model_of(build_parser().parse_args(words)))
-    scene = find_scene(run.scene, run.root)
-    observe = observed(run, scene)
-    assert run.noises(observe)
-    assert known_thetas(scene, observe.states, {**run.known, **run.truth}).shape[1] == len(
-        scene.parameter_names
-    )
+    problem = problem_of(build_parser().parse_args(words))
+    run, scene, states = problem.run, problem.scene, problem.observe.states
+    assert run.noises(problem.observe)
+    thetas = known_thetas(scene, states, {**run.known, **run.truth})
+    assert thetas.shape[1] == len(scene.parameter_names)
 
 
 @pytest.mark.slow

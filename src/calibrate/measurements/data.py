@@ -48,21 +48,32 @@ Files = str | Path | Mapping[str, str]
 
 
 def read_data(scene: Scene, files: Files) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Observations of a file and their data, by the same names.
+    """Observations of a file and their data, by the same names (:func:`read_measurements`)."""
+    observe, data, _ = read_measurements(scene, files)
+    return observe, data
+
+
+def read_measurements(
+    scene: Scene, files: Files
+) -> tuple[Observations, dict[str, np.ndarray], dict[str, float]]:
+    """Observations of a file, their data by the same names, and its known parameters.
 
     Of several files, by load state, each has the data of its state; one with states of its own,
-    such as a loading curve ``pull``, those of ``pull.1``, ``pull.2`` and so on.
+    such as a loading curve ``pull``, those of ``pull.1``, ``pull.2`` and so on. Known parameters
+    are those of columns ``known:NAME``, by ``parameter@state``.
 
     Raises
     ------
     InputError
         Missing or malformed file, a place that is not finite, an infinite value, an unknown node, a
-        point outside, an unknown cavity.
+        point outside, an unknown cavity, a known value that differs within one load state.
     """
     parts: dict[str, Observation] = {}
     data: dict[str, np.ndarray] = {}
-    known: dict[str, Observation] = {}
+    known: dict[str, float] = {}
+    equal: dict[str, Observation] = {}
     for path, state, rows in _states(files):
+        known |= _known(state, rows)
         layouts = _found(path, rows)
         for base, (kind, fields) in layouts.items():
             others = _others_there(fields, [f for _, f in layouts.values()])
@@ -70,13 +81,13 @@ def read_data(scene: Scene, files: Files) -> tuple[Observations, dict[str, np.nd
             try:
                 part, data[name] = kind.from_arrays(scene, base, arrays)
                 # One object for all states in which the same was observed: one program for them.
-                parts[name] = known.setdefault(json.dumps(part.to_json()), part)
+                parts[name] = equal.setdefault(json.dumps(part.to_json()), part)
                 parts[name].check(name, data[name])
                 check_some(base, data[name])
             except InputError as error:
                 where = f", state '{state}'" if state else ""
                 raise InputError(f"data file {path}{where}: {error}") from error
-    return Observations(parts), data
+    return Observations(parts), data, known
 
 
 def read_known(files: Files) -> dict[str, float]:
@@ -87,11 +98,14 @@ def read_known(files: Files) -> dict[str, float]:
     InputError
         A value that is no number, or differs within one load state.
     """
-    return {
-        in_state(parameter, state): value
-        for _, state, rows in _states(files)
-        for parameter, value in rows.known().items()
-    }
+    known: dict[str, float] = {}
+    for _, state, rows in _states(files):
+        known |= _known(state, rows)
+    return known
+
+
+def _known(state: str, rows: DataFile) -> dict[str, float]:
+    return {in_state(parameter, state): value for parameter, value in rows.known().items()}
 
 
 def _states(files: Files) -> Iterator[tuple[Path, str, DataFile]]:

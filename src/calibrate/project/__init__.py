@@ -1,21 +1,19 @@
-"""From a scene to a report: what is run is a :class:`Run`, and kept beside its results."""
+"""From a run to its report: a :class:`Run` is read, modelled, sampled, saved and certified."""
 
-from calibrate.project.run import Run
-from calibrate.project.workflow import (
+from calibrate.project.calibration import certify_and_keep, infer, report
+from calibrate.project.problem import (
+    Problem,
     by_fem,
-    certify_and_keep,
-    holds_population,
-    infer,
-    load,
     make_data,
     model_before_data,
-    observed,
-    read_posterior,
-    report,
+    read_problem,
     simulator_of,
 )
+from calibrate.project.results import holds_population, load, read_posterior
+from calibrate.project.run import Run
 
 __all__ = [
+    "Problem",
     "Run",
     "by_fem",
     "certify_and_keep",
@@ -24,8 +22,8 @@ __all__ = [
     "load",
     "make_data",
     "model_before_data",
-    "observed",
     "read_posterior",
+    "read_problem",
     "report",
     "simulator_of",
 ]

@@ -14,8 +14,9 @@ from typing import Any
 from calibrate.analysis.identifiability import identify
 from calibrate.figures.demo import beam_figure, ventricle_figure
 from calibrate.figures.drawing import pyplot
+from calibrate.project.calibration import certify_and_keep, infer, report
+from calibrate.project.problem import simulator_of
 from calibrate.project.run import Run
-from calibrate.project.workflow import certify_and_keep, infer, report, simulator_of
 from emulator.core.store import check_folder
 
 # Neither a theta of the training runs nor the centre of the Taylor series.

@@ -14,7 +14,8 @@ from pydantic import Field, create_model
 from calibrate.noise import NOISES, DiscrepancyNoise
 from calibrate.noise.spatial import KERNELS
 from calibrate.priors.population import BOX, POPULATIONS, Population
-from calibrate.project.experiment import MEMBERS, POPULATION, Cohort, Shared
+from calibrate.project.members import POPULATION, Members, Shared
+from calibrate.project.results import MEMBERS
 from calibrate.project.run import Run
 from calibrate.samplers import SAMPLERS
 from calibrate.statistical_model.shared_errors import SHARED_ERRORS
@@ -24,31 +25,31 @@ from emulator.surrogates.registry import FORWARD_MAPS, known_options
 
 
 def experiment_schema() -> dict[str, Any]:
-    """Draft 2020-12. It admits what the reader admits, and knows neither the scene nor its data."""
+    """Return the schema (draft 2020-12). It admits what the reader admits of any scene and data."""
     run: Any = _entries()
-    about = documented(Cohort)
-    of_cohort: dict[str, Any] = {
+    about = documented(Members)
+    tables: dict[str, Any] = {
         MEMBERS: (dict[str, run], Field(None, description=about[MEMBERS])),
         POPULATION: (table_of(Shared), Field(None, description=about[POPULATION])),
     }
-    schema = json_schema(create_model("ExperimentFile", __base__=run, **of_cohort))
+    schema = json_schema(create_model("ExperimentFile", __base__=run, **tables))
     schema["description"] = "What was measured on which body, and what is not known of it."
     for table in schema["$defs"].values():
         if "kernel" in table["properties"]:
             table["properties"]["kernel"]["enum"] = list(KERNELS)
-    # What the file does not say for all members, each has to say for itself.
+    # An entry that the file lacks for all members is required of each member.
     schema["$defs"][Run.__name__].pop("required")
-    whole = [_said(key) for key in schema.pop("required")]
+    whole = [_required(key) for key in schema.pop("required")]
     whole.append({"dependentRequired": {POPULATION: [MEMBERS]}})
     return {"title": "Experiment file", **schema, "allOf": whole}
 
 
 def _entries() -> type[Table]:
-    """The table of a run, with a closer type for each entry that a run keeps as it was written."""
+    """The table of a run, with the exact type of each entry that a run holds as plain data."""
     noise = Annotated[Any, OneOf("kind", NOISES)]
     named, in_file = Literal[BOX, *POPULATIONS], Annotated[str, Field(pattern=r"\.json$")]
     discrepancy: Any = create_model("Discrepancy", __base__=table_of(DiscrepancyNoise))
-    closer: dict[str, Any] = {
+    exact: dict[str, Any] = {
         "prior": Union[named, in_file, table_of(Population)],  # noqa: UP007
         "noise": Mapping[str, float | noise] | float,
         "discrepancy": dict[str, discrepancy],
@@ -59,12 +60,12 @@ def _entries() -> type[Table]:
         "sampler_options": Union[tuple(table_of(s.options) for s in SAMPLERS.values())],  # noqa: UP007
     }
     table = table_of(Run)
-    entries: dict[str, Any] = {k: (hint, table.model_fields[k]) for k, hint in closer.items()}
+    entries: dict[str, Any] = {k: (hint, table.model_fields[k]) for k, hint in exact.items()}
     return create_model(Run.__name__, __base__=table, __doc__=table.__doc__, **entries)
 
 
 def _forward_options() -> type[Table]:
-    """Options of all forward maps: which of them is meant, a member may say for itself."""
+    """The options of all forward maps: each member may choose a map of its own."""
     entries: dict[str, Any] = {}
     for name, (option, _) in known_options().items():
         shown: dict[str, Any] = {"default": option.default}
@@ -73,7 +74,7 @@ def _forward_options() -> type[Table]:
     return create_model("ForwardOptions", __base__=Table, **entries)
 
 
-def _said(key: str) -> dict[str, Any]:
-    """The entry is given, or each member gives it."""
+def _required(key: str) -> dict[str, Any]:
+    """The schema of a file that has the entry for all members, or in each member's table."""
     each = {MEMBERS: {"additionalProperties": {"required": [key]}}}
     return {"anyOf": [{"required": [key]}, {"required": [MEMBERS], "properties": each}]}

@@ -1,18 +1,29 @@
-"""What to calibrate and how: a :class:`Run` is plain JSON."""
+"""The one description of a calibration: what to calibrate, and how.
+
+A :class:`Run` is an experiment file, ``run.json``, and what the command line's options say. Its
+fields are the keys of both files and the names of the options; its docstring describes the keys in
+the JSON Schema (:mod:`calibrate.project.experiment_schema`) and the options in the help
+(:mod:`calibrate.cli.run_words`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from calibrate.measurements import DISPLACEMENT, Observations
 from calibrate.noise import Noise, noise_of, with_discrepancy
+from calibrate.samplers import Sampler, find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
 from calibrate.statistical_model.shared_errors import shared_error
 from emulator.core.errors import InputError
 from emulator.surrogates import registry
+
+SYNTHETIC = "synthetic"
+"""The word for data that FEM makes."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +36,8 @@ class Run:
         ``synthetic``: FEM at ``truth`` plus noise.
     truth : parameters of synthetic data by name, ``parameter@state`` in one of several load states
         (:mod:`calibrate.state_names`).
-    known : parameters that are not inferred, by the same names; what the data's files know comes to
-        them. They are those of synthetic data too, unless ``truth`` says otherwise.
+    known : parameters that are not inferred, by the same names; the parameters that the data's
+        files know are added. Synthetic data has them too, unless ``truth`` says otherwise.
     observe : observations of synthetic data, joined by ``+``, e.g. ``landmarks:24+volume``; each
         kind of ``calibrate.measurements.OBSERVATIONS`` says which words ask for it. They are made
         in every load state that ``truth`` and ``known`` name; ``volume@diastole`` in one.
@@ -34,10 +45,10 @@ class Run:
         fields of a :class:`calibrate.priors.Population`.
     noise : standard deviation by the observation's name, in its unit, or a kind of
         :data:`calibrate.noise.NOISES` with its options, ``{"kind": "student_t", "dof": 4, "scale":
-        0.2}``. A bare number belongs to a single observation, or to the displacements. What is not
-        named has its kind's default.
-    noise_scale : the same for the scale of the prior of a standard deviation that is to be
-        inferred; synthetic data then still has the one of ``noise``.
+        0.2}``. A bare number belongs to a single observation, or to the displacements. An
+        observation that is not named has its kind's default.
+    noise_scale : scale of the half-normal prior of a standard deviation that is inferred, by the
+        same names; synthetic data then still has the standard deviation of ``noise``.
     discrepancy : discrepancy of the model (:mod:`calibrate.noise.discrepancy`) by the
         observation's name, e.g. ``{"scale": 0.5, "length": 20.0}``; synthetic data has none.
     systematic : errors that several numbers share, by a name of their own, each a kind of
@@ -45,26 +56,28 @@ class Run:
         ``{"camera": {"kind": "rigid_motion", "of": "displacement", "shift": 2.0, "turn": 1.0}}``;
         synthetic data has none.
     check_scale : refuse data that is far from every prediction
-    (:mod:`calibrate.measurements.magnitude`).
+        (:mod:`calibrate.measurements.magnitude`).
     forward : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`.
     emulator : shipped name or folder of the emulator that the map is built from; by default the
         one shipped for the scene.
     forward_options : the map's options by name, e.g. ``{"fem_runs": 60}``.
-    error_runs : FEM runs from which the forward map's own error is learned, so that the likelihood
-        allows for it (``statistical_model/approximation_error``); 0 takes the map as exact.
-    mesh_error_runs : the same on the next finer mesh, so that the mesh's error is allowed for, too.
-    load_steps : in which every FEM solve follows the loading path from rest; 1 looks for its end.
+    error_runs : FEM runs (8 or more) from which the forward map's own error is learned, so that a
+        poor map widens the posterior instead of moving it; 0 takes the map as exact.
+    mesh_error_runs : the same with solves on the next finer mesh, so that the error of the mesh
+        widens the posterior, too.
+    load_steps : load steps in which every FEM solve follows the loading path from rest; 1 solves
+        at the full load.
     sampler : a name of :data:`calibrate.samplers.SAMPLERS`.
-    sampler_options : its options by name, e.g. ``{"target_accept": 0.95}``.
-    warmup : adapting iterations, not kept.
-    draws : kept iterations of a round, in each chain.
-    chains : independent chains.
-    seed : of synthetic data, of the design of FEM runs and of the sampler.
+    sampler_options : the sampler's options by name, e.g. ``{"target_accept": 0.95}``.
+    warmup : iterations of each chain that adapt the sampler and are not kept.
+    draws : iterations of each chain and round that are kept.
+    chains : number of independent chains.
+    seed : seed of synthetic data, of the design of FEM runs and of the sampler.
     """
 
     scene: str
     root: str | None = None
-    data: str | dict[str, str] = "synthetic"
+    data: str | dict[str, str] = SYNTHETIC
     truth: dict[str, float] = field(default_factory=dict)
     known: dict[str, float] = field(default_factory=dict)
     observe: str = "nodes:20"
@@ -91,13 +104,11 @@ class Run:
         registry.full_options(self.forward, self.forward_options)
         registry.check_emulator(self.forward, self.emulator)
         for name in ("warmup", "draws", "chains", "load_steps"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be 1 or more")
-        if self.truth and self.data != "synthetic":
+            self._check_at_least(name, 1)
+        if self.truth and self.data != SYNTHETIC:
             raise InputError(f"truth has no effect beside data file {self.data}; leave one out")
         for name in ("error_runs", "mesh_error_runs"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be 0 or more")
+            self._check_at_least(name, 0)
         if self.error_runs and self.mesh_error_runs:
             raise InputError(
                 "error_runs and mesh_error_runs are both given; the latter see the map's error, too"
@@ -108,70 +119,141 @@ class Run:
             raise InputError(
                 "systematic and error_runs are both given; a likelihood allows for one of them"
             )
-        if self.seed < 0:
-            raise InputError(f"seed is {self.seed}; it must be 0 or more")
+        self._check_at_least("seed", 0)
+
+    def _check_at_least(self, name: str, least: int) -> None:
+        if getattr(self, name) < least:
+            raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
+
+    @property
+    def is_synthetic(self) -> bool:
+        """Whether FEM makes the data."""
+        return self.data == SYNTHETIC
+
+    def sampling(self) -> tuple[Sampler, Any]:
+        """The sampler and its options.
+
+        Raises
+        ------
+        InputError
+            The sampler is unknown, or it has no such option.
+        """
+        sampler = find_sampler(self.sampler)
+        length = {"warmup": self.warmup, "draws": self.draws, "chains": self.chains}
+        return sampler, options_from(sampler, self.sampler_options, **length)
 
     def named(self, observe: Observations) -> Run:
-        """The run with every noise by name, the defaults filled in."""
+        """The run with every noise by the observation's name, the defaults filled in."""
         scales = _by_name(self.noise_scale, observe, "noise-scale")
-        given = _by_name(self.noise, observe, "noise")
-        full = observe.expand(given, "noise")
+        noise = _by_name(self.noise, observe, "noise")
+        expanded = observe.expand(noise, "noise")
         defaults = {
             split(name)[0]: part.default_noise.upper_sd
             for name, part in observe.parts.items()
-            if name not in full
+            if name not in expanded
         }
-        return replace(self, noise={**defaults, **given}, noise_scale=scales)
+        return replace(self, noise={**defaults, **noise}, noise_scale=scales)
 
     def noises(self, observe: Observations) -> dict[str, Noise]:
-        """Noise of each observation in the likelihood."""
+        """The noise of each observation in the likelihood."""
         run = self.named(observe)
         assert isinstance(run.noise, Mapping)
         assert isinstance(run.noise_scale, Mapping)
-        inferred = observe.expand(run.noise_scale, "noise-scale")
-        wrong = observe.expand(run.discrepancy, "discrepancy")
-        found: dict[str, Noise] = {}
-        for name, (source, given) in observe.expand(run.noise, "noise").items():
-            scale_source, scale = inferred.get(name, (source, None))
-            wrong_source, discrepancy = wrong.get(name, (source, None))
-            # What is said about one load state only makes its noise one of its own.
-            own = name in (source, scale_source, wrong_source)
-            found[name if own else source] = _noise(name, observe, given, scale, discrepancy)
-        return found
+        scales = observe.expand(run.noise_scale, "noise-scale")
+        discrepancies = observe.expand(run.discrepancy, "discrepancy")
+        noises: dict[str, Noise] = {}
+        for name, (source, description) in observe.expand(run.noise, "noise").items():
+            scale_source, scale = scales.get(name, (source, None))
+            discrepancy_source, discrepancy = discrepancies.get(name, (source, None))
+            # An entry that names one load state gives that state a noise of its own.
+            own = name in (source, scale_source, discrepancy_source)
+            noise = _noise(name, observe, description, scale, discrepancy)
+            noises[name if own else source] = noise
+        return noises
 
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
-        """Noise of each observation of synthetic data."""
+        """The noise of each observation of synthetic data."""
         named = replace(self, noise_scale={}, discrepancy={}).noises(observe)
         each = {name: noise for name, (_, noise) in observe.expand(named, "noise").items()}
         return at_sites(each, observe)
 
 
 def _by_name[T](
-    given: Mapping[str, T] | float, observe: Observations, what: str
+    values: Mapping[str, T] | float, observe: Observations, what: str
 ) -> dict[str, T | float]:
     """Values by the observation's name; a bare one is a single observation's or displacements'.
 
     A name without its load state stands for every state.
     """
-    if not isinstance(given, Mapping):
+    if not isinstance(values, Mapping):
         bases = observe.bases
         if len(bases) > 1 and DISPLACEMENT not in bases:
             raise InputError(f"{what}: give one for each of {', '.join(bases)}, by name")
-        return {DISPLACEMENT if len(bases) > 1 else bases[0]: given}
-    observe.expand(given, what)
-    return dict(given)
+        return {DISPLACEMENT if len(bases) > 1 else bases[0]: values}
+    observe.expand(values, what)
+    return dict(values)
 
 
 def _noise(
     name: str,
     observe: Observations,
-    given: float | Mapping[str, Any],
+    description: float | Mapping[str, Any],
     scale: float | None,
     discrepancy: Mapping[str, Any] | None,
 ) -> Noise:
     try:
-        noise = noise_of(given)
+        noise = noise_of(description)
         noise = noise if scale is None else noise.inferred(scale)
         return noise if discrepancy is None else with_discrepancy(noise, discrepancy)
     except InputError as error:
         raise InputError(f"{name} ({observe.parts[name].unit}): {error}") from error
+
+
+def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> dict[str, Any]:
+    """Return entries of a run that mean the same in every folder.
+
+    Files and folders become absolute; names of built-in scenes and shipped emulators stay. A file
+    of a prior becomes its content: a run must not change with the file.
+
+    Parameters
+    ----------
+    entries : some fields of a run by name.
+    folder : the folder that relative paths start from.
+    """
+    absolute = {"scene": _scene, "root": _path, "data": _data, "emulator": _emulator}
+    resolve = {**absolute, "prior": _prior}
+    return {
+        name: resolve[name](value, folder) if name in resolve and value is not None else value
+        for name, value in entries.items()
+    }
+
+
+def _path(word: str, folder: Path) -> str:
+    return str((folder / word).resolve())
+
+
+def _scene(word: str, folder: Path) -> str:
+    """Keep a name, make a file absolute; ``finer:`` stays before either."""
+    if word.startswith("finer:"):
+        return "finer:" + _scene(word.removeprefix("finer:"), folder)
+    return _path(word, folder) if word.endswith(".toml") else word
+
+
+def _data(word: str | dict[str, str], folder: Path) -> str | dict[str, str]:
+    if isinstance(word, dict):
+        return {state: _path(file, folder) for state, file in word.items()}
+    return word if word == SYNTHETIC else _path(word, folder)
+
+
+def _emulator(word: str, folder: Path) -> str:
+    from emulator.surrogates import shipped
+
+    return word if word in shipped() else _path(word, folder)
+
+
+def _prior(word: str | dict[str, Any], folder: Path) -> str | dict[str, Any]:
+    from calibrate.priors.population import read_population
+
+    if isinstance(word, str) and word.endswith(".json"):
+        return asdict(read_population(folder / word))
+    return word

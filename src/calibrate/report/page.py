@@ -16,8 +16,8 @@ from calibrate.certificate.verdict import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LA
 from calibrate.posterior import Posterior
 from calibrate.posterior.posterior import describe_distribution
 from calibrate.project import Run, holds_population, read_posterior, simulator_of
-from calibrate.project.cohort import read_cohort
-from calibrate.project.workflow import CERTIFICATE, REPORT
+from calibrate.project.members import read_members
+from calibrate.project.results import CERTIFICATE, REPORT
 from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
 from calibrate.report.parts import Block, Paragraph, Table, Verdict
@@ -32,7 +32,7 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, fem: bool
     Parameters
     ----------
     folder : the folder that :func:`calibrate.project.infer` wrote, or that of a population
-        (:func:`calibrate.project.cohort.infer_cohort`).
+        (:func:`calibrate.project.members.infer_members`).
     out : the file to write, ``folder/report.html`` by default.
     fem : whether to solve once at the posterior's mean, to show the map's error on the body;
         nothing is solved for a population.
@@ -46,7 +46,7 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, fem: bool
     folder = Path(folder)
     target = folder / REPORT if out is None else Path(out)
     if holds_population(folder):
-        page = population.html_of(*read_cohort(folder), folder, target.parent)
+        page = population.html_of(*read_members(folder), folder, target.parent)
     else:
         page = _page_of_posterior(folder, fem=fem)
     with replacing(target) as temporary:
@@ -71,7 +71,7 @@ def html_of(
 ) -> str:
     """Return the page of a posterior as HTML; ``made`` is the day of the certificate."""
     scene = posterior.model.forward.scene
-    simulator = simulator_of(scene) if fem else None
+    simulator = simulator_of(scene, run.load_steps) if fem else None
     sections = [
         ("Data against prediction", _data(posterior)),
         ("Parameters", _parameters(run, posterior, certificate)),

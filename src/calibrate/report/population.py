@@ -25,9 +25,9 @@ from calibrate.population.model import MEDIAN, SD
 from calibrate.population.posterior import CORRELATION
 from calibrate.posterior import read_tree
 from calibrate.posterior.fit import misfits
-from calibrate.project.cohort import NOT_CERTIFIED, kept_verdicts
-from calibrate.project.experiment import POPULATION, Cohort, Shared
-from calibrate.project.workflow import MEMBERS, POSTERIOR, REPORT
+from calibrate.project.calibration import NOT_CERTIFIED
+from calibrate.project.members import POPULATION, Members, Shared, verdicts_in
+from calibrate.project.results import MEMBERS, POSTERIOR, REPORT
 from calibrate.report import charts, parts
 from calibrate.report.charts import translucent
 from calibrate.report.parts import Block, Paragraph, Table, Verdict
@@ -102,24 +102,24 @@ _FORM = ".4g"
 _OMITTED = ("members", "alone")  # attributes: fingerprints, and what every population has
 
 
-def html_of(cohort: Cohort, population: Hierarchy, folder: Path, beside: Path) -> str:
+def html_of(plan: Members, population: Hierarchy, folder: Path, beside: Path) -> str:
     """Return the page of a population as HTML.
 
     Parameters
     ----------
-    cohort : the runs of the members.
+    plan : the runs of the members.
     population : the posterior of the population.
     folder : the population's folder, where its members' certificates, posteriors and pages are.
     beside : the folder that the page is written to, from which links start.
     """
-    verdicts = dict.fromkeys(population.members, NOT_CERTIFIED) | kept_verdicts(cohort, folder)
+    verdicts = dict.fromkeys(population.members, NOT_CERTIFIED) | verdicts_in(plan, folder)
     table, warnings = population.summary(), population.warnings()
     sections = [
         ("The population", _population(population, table)),
         ("Members beside the population", _members(population, folder, beside, verdicts)),
         ("A member not seen", _new_member(population)),
         ("How sampling went", _sampling(population, table, warnings)),
-        ("Where this comes from, and how to repeat it", _provenance(cohort, population)),
+        ("Where this comes from, and how to repeat it", _provenance(plan, population)),
     ]
     heading = f"Population of {len(population.members)} members"
     title = f"{heading}: {', '.join(population.shared)}"
@@ -253,18 +253,18 @@ def _sampling(
     return [Paragraph(text), parts.chart(charts.traces_of(labels, population.draws(), {}))]
 
 
-def _provenance(cohort: Cohort, population: Hierarchy) -> list[Block]:
+def _provenance(plan: Members, population: Hierarchy) -> list[Block]:
     """Return attributes, each member's scene and data, and settings as in an experiment file."""
-    runs = {name: parts.changed_settings(run) for name, run in cohort.members.items()}
+    runs = {name: parts.changed_settings(run) for name, run in plan.members.items()}
     first = next(iter(runs.values()))
     common = {k: v for k, v in first.items() if all(run.get(k) == v for run in runs.values())}
     own = {name: {k: v for k, v in run.items() if k not in common} for name, run in runs.items()}
-    defaults, chosen = asdict(Shared()), asdict(cohort.population)
+    defaults, chosen = asdict(Shared()), asdict(plan.population)
     shared = {k: v for k, v in chosen.items() if v != defaults[k]}
     program = (
-        "from calibrate.project.cohort import infer_cohort, read_cohort\n\n"
-        'cohort, _ = read_cohort("THIS FOLDER")\n'
-        'infer_cohort(cohort, "ANOTHER FOLDER")  # the same draws'
+        "from calibrate.project.members import infer_members, read_members\n\n"
+        'members, _ = read_members("THIS FOLDER")\n'
+        'infer_members(members, "ANOTHER FOLDER")  # the same draws'
     )
     settings = common | {MEMBERS: own, POPULATION: shared}
     return [

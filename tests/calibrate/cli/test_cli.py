@@ -6,8 +6,8 @@ import meshio
 import numpy as np
 import pytest
 
-from calibrate.cli import command_names, main
-from calibrate.cli.common import seconds
+from calibrate.cli import COMMANDS, main
+from calibrate.cli.words import seconds
 from cli_support import SCENE, answer, complaint, write_block
 from emulator.surrogates.files import load
 
@@ -101,7 +101,7 @@ def test_help_names_every_command(capsys, words):
     with pytest.raises(SystemExit):
         main(words)
     said = capsys.readouterr().out
-    assert all(f"    {name} " in said or f"    {name}\n" in said for name in command_names())
+    assert all(f"    {name} " in said or f"    {name}\n" in said for name in COMMANDS)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from calibrate.cli import command_names
+from calibrate.cli import COMMANDS
 from calibrate.cli.commands.completion import completion
 
 ASK = """
@@ -36,7 +36,7 @@ def ask(tmp_path_factory):
 
 
 def test_commands(ask):
-    assert ask("") == set(command_names())
+    assert ask("") == set(COMMANDS)
     assert ask("si") == {"simulate"}
     assert ask("check", "") == {"sbc", "prior", "mesh"}
 
@@ -58,7 +58,7 @@ def test_emulators_samplers_recipes_and_options(ask):
 def test_other_shells(shell, tmp_path):
     """Each has every command, and is a script that the shell itself can read, where it is there."""
     script = completion(shell)
-    assert all(name in script for name in command_names())
+    assert all(name in script for name in COMMANDS)
     assert "delayed_acceptance" in script
     assert "twice_clamped_beam" in script
     if found := shutil.which(shell):

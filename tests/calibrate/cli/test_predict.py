@@ -8,8 +8,8 @@ import pytest
 
 import emulator as em
 from calibrate.cli import main
-from calibrate.cli.commands.predict import summary
-from calibrate.cli.volumes import volume_lines, volumes
+from calibrate.cli.commands.emulators import prediction_summary
+from calibrate.cli.output import volume_lines, volumes
 from emulator.geometry.facets import Cavity
 
 CENTRE = ("mu=75", "lam=60")
@@ -42,7 +42,7 @@ def test_error_bar_against_fem(capsys):
     assert result["error"]["median_mm"] == pytest.approx(np.median(true), rel=0.1)
     assert result["error"]["max_mm"] == pytest.approx(true.max(), rel=0.1)
     assert 0.0 < result["error"]["energy_gap_percent"] < 1.0
-    said = summary(result)
+    said = prediction_summary(result)
     assert "estimated error: median " in said
     assert "not to be trusted" not in said
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
-from calibrate.cli.commands.infer import sampler_options
+from calibrate.cli.run_words import sampler_options
 from calibrate.posterior import read_tree
-from calibrate.project.workflow import SAMPLING
+from calibrate.project.results import SAMPLING
 from calibrate.samplers.checkpoint import Checkpoint
 
 

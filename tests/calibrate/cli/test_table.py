@@ -2,9 +2,9 @@
 
 import pytest
 
-from calibrate.cli.commands import compare, evaluate
-from calibrate.cli.common import table
-from calibrate.cli.posterior_table import summary
+from calibrate.cli.commands.emulators import evaluation_summary
+from calibrate.cli.commands.posteriors import comparison_summary
+from calibrate.cli.output import posterior_summary, table
 from calibrate.posterior.comparison import Compared, Comparison
 
 PARAMETERS = {
@@ -45,7 +45,7 @@ def evaluated():
     units = {"err_u": "mm", "err_V:right_ventricle": "% of the volume"}
     errors = {name: dict.fromkeys(("median", "mean", "q97_5", "max"), 1.234e-12) for name in units}
     about = {"units": units, "label": "emulator", "reference": "fem", "invalid": 0}
-    return evaluate.summary({"cases": 12345, **about, **errors})
+    return evaluation_summary({"cases": 12345, **about, **errors})
 
 
 def compared():
@@ -53,13 +53,13 @@ def compared():
         Compared(f"runs/{name}_of_the_ventricle", *[-1234.5] * 6, 3, -1234.5, 0.5)
         for name in ("holzapfel_ogden", "neo_hookean")
     )
-    return compare.summary(Comparison(models, 73)).split("leave-one-out")[0]
+    return comparison_summary(Comparison(models, 73)).split("leave-one-out")[0]
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        pytest.param(lambda: summary(POSTERIOR), id="infer"),
+        pytest.param(lambda: posterior_summary(POSTERIOR), id="infer"),
         pytest.param(
             lambda: table(
                 (

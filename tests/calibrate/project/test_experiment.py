@@ -8,7 +8,8 @@ import pytest
 import emulator as em
 from calibrate.cli import main
 from calibrate.project import Run, read_posterior
-from calibrate.project.experiment import Cohort, read_experiment
+from calibrate.project.experiment import read_experiment
+from calibrate.project.members import Members
 from cli_support import complaint, write_block
 from emulator.core.errors import InputError
 from emulator.core.store import read_arrays, save_arrays
@@ -58,7 +59,7 @@ def file(tmp_path):
 
 
 def test_entries_are_those_of_a_run_and_places_are_beside_the_file(file, tmp_path):
-    run = read_experiment(file())
+    run = read_experiment(file()).run
     assert run == Run(
         BEAM,
         data=str(tmp_path / "nodes.csv"),
@@ -78,14 +79,14 @@ def test_scene_files_and_files_of_load_states_are_beside_it_too(file, tmp_path):
     write_block(tmp_path)
     (tmp_path / "b.csv").write_text(NODES.replace("19,", "2,"))
     text = 'scene = "scene.toml"\n[data]\na = "b.csv"\nb = "b.csv"\n'
-    run = read_experiment(file(text))
+    run = read_experiment(file(text)).run
     assert run.scene == str(tmp_path / "scene.toml")
     assert run.data == {"a": str(tmp_path / "b.csv"), "b": str(tmp_path / "b.csv")}
 
 
 def test_what_is_given_replaces_entries(file, tmp_path):
     given = {"draws": 9, "noise": {"displacement": 0.5}, "forward": "fem"}
-    run = read_experiment(file(), given)
+    run = read_experiment(file(), given).run
     assert (run.draws, run.noise, run.warmup) == (9, {"displacement": 0.5}, 40)
     assert (run.forward, run.forward_options) == ("fem", {})  # not those of another map
 
@@ -146,13 +147,15 @@ MEMBERS = ONE.replace('data = "nodes.csv"\n', "") + (
 
 
 def test_members_have_what_is_common_and_what_is_their_own(file):
-    cohort = read_experiment(file(MEMBERS + "[population]\nshared = ['mu']\nspread = {mu = 0.2}\n"))
-    assert isinstance(cohort, Cohort)
-    first, second = cohort.members["first"], cohort.members["second"]
+    members = read_experiment(
+        file(MEMBERS + "[population]\nshared = ['mu']\nspread = {mu = 0.2}\n")
+    )
+    assert isinstance(members, Members)
+    first, second = members.members["first"], members.members["second"]
     assert (first.noise, second.noise) == ({"displacement": 0.2}, {"displacement": 0.4})
     assert (first.seed, second.seed, second.warmup) == (0, 3, 40)
-    assert cohort.population.shared == ("mu",)
-    assert cohort.population.spread == {"mu": 0.2}
+    assert members.population.shared == ("mu",)
+    assert members.population.spread == {"mu": 0.2}
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ from calibrate.cli import main
 from calibrate.noise import NOISES
 from calibrate.priors import Population
 from calibrate.project import Run
-from calibrate.project.experiment import Shared, read_experiment
+from calibrate.project.experiment import read_experiment
 from calibrate.project.experiment_schema import experiment_schema
+from calibrate.project.members import Shared
 from calibrate.samplers import SAMPLERS
 from calibrate.statistical_model.shared_errors import SHARED_ERRORS
 from emulator.core.errors import InputError

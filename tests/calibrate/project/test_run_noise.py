@@ -8,8 +8,8 @@ import pytest
 
 import calibrate as cal
 import emulator as em
-from calibrate.cli.noise_words import discrepancy_words, noise_scale_words, noise_words
-from calibrate.cli.posterior_table import summary
+from calibrate.cli.output import posterior_summary
+from calibrate.cli.run_words import discrepancy_words, noise_scale_words, noise_words
 from calibrate.measurements import parse_observation
 from calibrate.measurements.data import write_data
 from calibrate.noise import DiscrepancyNoise, StudentTNoise
@@ -76,7 +76,7 @@ def test_a_discrepancy_is_switched_on_by_name(beam):
 
 def test_synthetic_data_has_the_noise_of_the_run(beam, monkeypatch):
     monkeypatch.setattr(
-        "calibrate.project.workflow.simulator_of", lambda scene, load_steps: linear_forward(scene)
+        "calibrate.project.problem.simulator_of", lambda scene, load_steps: linear_forward(scene)
     )
     word = {"kind": "correlated", "length": 500.0, "sd": 1e-9, "spatial_sd": 1.0}
     observe, noisy = make_data(run_of(noise={"displacement": word}), beam)
@@ -102,7 +102,9 @@ def test_a_posterior_with_gaps_and_a_discrepancy_is_kept_and_read(tmp_path):
     )  # fmt: skip
     posterior = infer(run, tmp_path / "out")
     assert report(run, posterior, None)["missing"] == {"displacement": 4}
-    assert "missing values of displacement left out: 4" in summary(report(run, posterior, None))
+    assert "missing values of displacement left out: 4" in posterior_summary(
+        report(run, posterior, None)
+    )
     again, back = read_posterior(tmp_path / "out")
     assert again.noise == {"displacement": 0.2}
     np.testing.assert_array_equal(back.data["displacement"], values[~np.isnan(values)])

@@ -227,7 +227,7 @@ def test_observations_of_a_run_are_made_in_every_state(ventricle, monkeypatch):
     spread = parse_observation(ventricle, "volume+nodes:3@low", 0, ("low", "high"))
     assert list(spread.parts) == ["volume@low", "volume@high", "displacement@low"]
     forward = linear_forward(ventricle, size=1.0)
-    monkeypatch.setattr("calibrate.project.workflow.simulator_of", lambda *_: forward)
+    monkeypatch.setattr("calibrate.project.problem.simulator_of", lambda *_: forward)
     run = Run(
         "left_ventricle",
         truth={**MATERIAL, "pressure@high": 1.1},

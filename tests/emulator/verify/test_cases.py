@@ -7,7 +7,7 @@ from scipy.integrate import quad
 
 import axisymmetric_support
 import emulator as em
-from calibrate.cli.commands.verify import CASE_NAMES
+from calibrate.cli.commands.check import CASE_NAMES
 from emulator.verify import CASES, Benchmark
 from emulator.verify.consistency import verify_barriers, verify_invariance, verify_patch
 from emulator.verify.cook import deflection, membrane

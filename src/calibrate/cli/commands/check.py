@@ -1,37 +1,37 @@
-"""``calibrate check``: whether a model and its mesh mean what they say, before any data."""
+"""``calibrate check`` and ``verify``: checks of a model, of its mesh, and of the mechanics."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import (
-    DONE,
-    FAILED,
+from calibrate.cli.output import DONE, FAILED, emit, show_progress, table
+from calibrate.cli.words import (
     add_scene,
     add_scheduler,
     add_theta,
     answer,
-    assignments,
-    emit,
-    scene_words,
+    scene_of,
     scheduler_word,
-    show_progress,
-    table,
+    theta_by_name,
+    theta_of,
 )
-from calibrate.cli.model_words import add_model, run_of
-from calibrate.cli.noise_words import noise_words
 from emulator.core.errors import InputError
+from emulator.core.store import check_folder, write_json
 
 if TYPE_CHECKING:
     from calibrate.posterior.klotz_band import KlotzBand
     from calibrate.statistical_model import Model
+    from emulator.verify import Benchmark
 
 
-def register(commands: Any) -> None:
+def add_check(commands: Any) -> None:
     """Add the command and its kinds of checks."""
+    from calibrate.cli.run_words import add_run
+
     parser = commands.add_parser("check", help="whether a model and its sampler can be trusted")
     kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
     sbc = kinds.add_parser(
@@ -39,8 +39,7 @@ def register(commands: Any) -> None:
     )
     prior = kinds.add_parser("prior", help="what the prior predicts: 500 data sets and a picture")
     for kind, run in ((sbc, run_sbc), (prior, run_prior)):
-        add_model(kind)
-        kind.add_argument("--seed", type=int)
+        add_run(kind, ("seed",))
         kind.add_argument("--out", required=True, metavar="DIR")
         answer(kind, run)
     sbc.add_argument("--replicates", type=int, default=200, metavar="N", help="data sets")
@@ -86,13 +85,11 @@ def run_mesh(arguments: argparse.Namespace) -> int:
 
     from calibrate.measurements.mesh_error import errors_of
     from emulator.accuracy.mesh_error import mesh_error
-    from emulator.catalogue import find_scene
-    from emulator.core.store import check_folder, write_json
     from emulator.geometry.quality import mesh_quality
 
     folder = None if arguments.out is None else check_folder(arguments.out)
-    scene = find_scene(*scene_words(arguments))
-    theta = scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
+    scene = scene_of(arguments)
+    theta = theta_of(arguments, scene)
     quality = mesh_quality(scene.mesh)
     found = mesh_error(scene)
     told = found(theta)
@@ -100,7 +97,7 @@ def run_mesh(arguments: argparse.Namespace) -> int:
     length = np.linalg.norm(told.coarse, axis=1)
     result: dict[str, Any] = {
         "scene": scene.name,
-        "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
+        "theta": theta_by_name(scene, theta),
         "nodes": len(scene.mesh.nodes),
         "quality": quality._asdict(),
         "finer_nodes": len(found.finer.scene.mesh.nodes),
@@ -130,29 +127,29 @@ def run_mesh(arguments: argparse.Namespace) -> int:
         error = np.asarray(told.err_u)
         save(surface_figure(scene.mesh, error, title, label), folder / "mesh_error.png")
         text += f"\nwritten to {folder}"
-    emit(result, as_json=arguments.json, text=text)
+    emit(arguments, result, text)
     return DONE
 
 
 def run_sbc(arguments: argparse.Namespace) -> int:
     """Simulation-based calibration of the model."""
     from calibrate.analysis.sbc import sbc
+    from calibrate.cli.run_words import noise_words, problem_of
     from calibrate.figures.sensitivity import draw_calibration
     from calibrate.project import by_fem, model_before_data
     from calibrate.samplers import NUTSOptions
-    from emulator.core.store import check_folder, write_json
 
     folder, progress = check_folder(arguments.out), show_progress(arguments)
     if arguments.scheduler is not None and not arguments.fem_data:
         raise InputError("--scheduler has no effect without --fem-data")
     scheduler = scheduler_word(arguments)
-    run = run_of(arguments, seed=arguments.seed)
-    model = model_before_data(run, progress=progress)
+    problem = problem_of(arguments, ("seed",))
+    run, model = problem.run, model_before_data(problem, progress=progress)
     truth = model
     if arguments.true_noise:
-        truth = model_before_data(replace(run, noise=noise_words(arguments.true_noise)))
+        truth = model_before_data(problem.change(noise=noise_words(arguments.true_noise)))
     if arguments.fem_data:
-        truth = by_fem(truth)
+        truth = by_fem(truth, run.load_steps)
     options = NUTSOptions(arguments.warmup, arguments.draws, arguments.chains, rounds=1)
     found = sbc(
         model,
@@ -173,7 +170,7 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     header = ("quantity", "50 %", "80 %", "90 %", "95 %", "outside band")
     verdict = "calibrated" if found.passed else "NOT calibrated"
     text = f"{table(header, rows)}\n{found.replicates} data sets: {verdict}\nwritten to {folder}"
-    emit(result, as_json=arguments.json, text=text)
+    emit(arguments, result, text)
     return DONE if found.passed else FAILED
 
 
@@ -182,15 +179,16 @@ def run_prior(arguments: argparse.Namespace) -> int:
     import jax
     import numpy as np
 
+    from calibrate.cli.run_words import problem_of
     from calibrate.figures.sensitivity import draw_prior_predictive
     from calibrate.measurements.pressure_volume import in_mmhg
     from calibrate.posterior.predictions import prior_replicates
     from calibrate.project import model_before_data
-    from emulator.core.store import check_folder, save_arrays
+    from emulator.core.store import save_arrays
 
     folder: Path = check_folder(arguments.out)
-    run = run_of(arguments, seed=arguments.seed)
-    model = model_before_data(run, progress=show_progress(arguments))
+    problem = problem_of(arguments, ("seed",))
+    run, model = problem.run, model_before_data(problem, progress=show_progress(arguments))
     found = prior_replicates(model, jax.random.key(run.seed))
     units = {name: part.unit for name, part in model.observe.parts.items()}
     save_arrays(folder / "prior_predictive.safetensors", {**found.draws, **found.data})
@@ -209,7 +207,7 @@ def run_prior(arguments: argparse.Namespace) -> int:
             f"within {in_mmhg(band.band)} of Klotz's relation through their own last point"
         )
     text += f"\nwritten to {folder}"
-    emit(result, as_json=arguments.json, text=text)
+    emit(arguments, result, text)
     return DONE
 
 
@@ -228,3 +226,72 @@ def _klotz(model: Model, seed: int) -> KlotzBand | None:
     if klotz_of(model.forward.scene, curve.rest, curve.pressures[-1]) is None:
         return None
     return klotz_band(model, seed=seed)
+
+
+# Listed here too, so that --help needs no imports; a test compares them with verify.CASES.
+CASE_NAMES = (
+    "patch",
+    "invariance",
+    "derivatives",
+    "barriers",
+    "homogeneous",
+    "sphere",
+    "cook",
+    "land_beam",
+    "land_ventricle",
+    "land_contraction",
+)
+
+
+def add_verify(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "verify",
+        help="measured / reference / tolerance tables",
+        description="Check the mechanics against closed forms, benchmarks and released solutions.",
+        epilog=f"Cases: {', '.join(CASE_NAMES)} (all of them by default); or 'published DIR', FEM "
+        "against the released FEniCS solutions in DIR.",
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="cases; 'published DIR'")
+    answer(parser, run_verify)
+
+
+def run_verify(arguments: argparse.Namespace) -> int:
+    """Print the table; the exit code says whether every row is inside its tolerance."""
+    rows = _rows(arguments.names)
+    text = table(
+        ("name", "measured", "reference", "tolerance", "passed"),
+        [(r.name, r.measured, r.reference, r.tolerance, "yes" if r.passed else "NO") for r in rows],
+    )
+    failed = sum(not row.passed for row in rows)
+    text += f"\n{len(rows)} rows, {failed or 'none'} outside the tolerance"
+    emit(arguments, [row.to_json() for row in rows], text)
+    return FAILED if failed else DONE
+
+
+def _rows(names: list[str]) -> list[Benchmark]:
+    if names and names[0] == "published":
+        if len(names) != 2:
+            raise InputError("verify published: give the folder of the released data, and only it")
+        from emulator.released.files import models_in
+        from emulator.released.scenes import MODELS
+        from emulator.verify import verify_published
+
+        rows = verify_published(names[1])
+        absent = sorted(set(MODELS) - set(models_in(names[1])))
+        if absent:
+            print(f"not in {names[1]}: {', '.join(absent)}", file=sys.stderr, flush=True)
+        return rows
+    for name in names:
+        if name not in CASE_NAMES:
+            raise InputError(
+                f"verify: case '{name}' is unknown; known: {', '.join(CASE_NAMES)}, published DIR"
+            )
+    from emulator.verify import CASES
+
+    rows = []
+    for name in names or CASE_NAMES:
+        begin = time.perf_counter()
+        rows += CASES[name]()
+        print(f"{name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
+    return rows

@@ -1,4 +1,4 @@
-"""``calibrate completion``: what the Tab key completes."""
+"""``calibrate completion``: the words that the Tab key completes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from calibrate.cli.common import DONE, emit
+from calibrate.cli.output import DONE, emit
+from calibrate.cli.words import answer
 
 _SHELLS = ("bash", "zsh", "fish")
 
 
-def register(commands: Any) -> None:
+def add_completion(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "completion",
@@ -23,12 +24,13 @@ def register(commands: Any) -> None:
         "~/.config/fish/completions/calibrate.fish",
     )
     parser.add_argument("shell", choices=_SHELLS)
+    answer(parser, run_completion)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_completion(arguments: argparse.Namespace) -> int:
     """Print the script."""
     script = completion(arguments.shell)
-    emit({"script": script}, as_json=arguments.json, text=script)
+    emit(arguments, {"script": script}, script)
     return DONE
 
 

@@ -6,22 +6,25 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import (
-    DONE,
+from calibrate.cli.output import DONE, emit, table
+from calibrate.cli.words import (
+    add_forward,
     add_scene,
     add_scheduler,
-    emit,
-    scene_words,
+    add_seed,
+    answer,
+    checked_forward_options,
+    scene_of,
     scheduler_word,
-    table,
 )
-from calibrate.cli.forward import add_forward, forward_options
 from emulator.core.errors import InputError, check_seed
+from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from emulator.scenes.scene import Scene
+
 
 _METHODS = ("sobol", "morris", "derivatives")
 # By method: the heads of a table's columns, and what is in them; blanks keep heads apart.
@@ -38,7 +41,7 @@ _COLUMNS = {
 _SAMPLES = {"sobol": 512, "morris": 64, "derivatives": 256}
 
 
-def register(commands: Any) -> None:
+def add_sensitivity(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "sensitivity",
@@ -85,41 +88,40 @@ def register(commands: Any) -> None:
     add_forward(parser)
     parser.add_argument("--emulator", metavar="NAME|DIR", help="default: the one shipped")
     add_scheduler(parser, "with --forward fem, the FEM runs")
-    parser.add_argument("--seed", type=int, default=0)
+    add_seed(parser, "the design, of random landmarks and of FEM runs")
     parser.add_argument(
         "--out", metavar="DIR", help="write sensitivity.nc, figures, and the map as VTU"
     )
+    answer(parser, run_sensitivity)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Analyse a scene's forward map."""
+def run_sensitivity(arguments: argparse.Namespace) -> int:
+    """Analyse a scene's forward map, print the indices and write them."""
     from calibrate.analysis.sensitivity import sensitivity
     from calibrate.measurements import parse_observation
-    from calibrate.places import emulator_place, prior_place
     from calibrate.priors import prior_of
+    from calibrate.project.run import with_absolute_paths
     from emulator import Simulator
-    from emulator.catalogue import find_scene
-    from emulator.core.store import check_folder
     from emulator.surrogates.kind import Ingredients
     from emulator.surrogates.registry import build_forward, check_scheduler
 
     check_seed(arguments.seed, "sensitivity")
     check_scheduler(arguments.forward, arguments.scheduler)
     scheduler = scheduler_word(arguments)
-    scene = find_scene(*scene_words(arguments))
+    scene = scene_of(arguments)
     if arguments.out:
         check_folder(arguments.out)
     observe = arguments.observe and parse_observation(scene, arguments.observe, arguments.seed)
-    options = forward_options(arguments)
+    options = checked_forward_options(arguments)
     groups = _groups(arguments.group)
-    made_of = Ingredients(
-        scene, Simulator(scene), emulator_place(arguments.emulator), arguments.seed, progress=False
-    )
-    forward = build_forward(arguments.forward, made_of, options)
-    found = sensitivity(
+    entries = {"emulator": arguments.emulator, "prior": arguments.prior}
+    emulator, prior = with_absolute_paths(entries).values()
+    ingredients = Ingredients(scene, Simulator(scene), emulator, arguments.seed, progress=False)
+    forward = build_forward(arguments.forward, ingredients, options)
+    indices = sensitivity(
         forward,
         observe or None,
-        prior=prior_of(prior_place(arguments.prior), scene),
+        prior=prior_of(prior, scene),
         method=arguments.method,
         samples=_SAMPLES[arguments.method] if arguments.samples is None else arguments.samples,
         groups=groups,
@@ -128,15 +130,15 @@ def run(arguments: argparse.Namespace) -> int:
         scheduler=scheduler,
     )
     if arguments.out:
-        write(found, scene, Path(arguments.out))
-    report: dict[str, Any] = {str(name): value for name, value in found.attrs.items()}
-    report |= {name: _plain(node.to_dataset()) for name, node in found.children.items()}
-    emit(report, as_json=arguments.json, text=summary(found))
+        write(indices, scene, Path(arguments.out))
+    report: dict[str, Any] = {str(name): value for name, value in indices.attrs.items()}
+    report |= {name: _plain(node.to_dataset()) for name, node in indices.children.items()}
+    emit(arguments, report, sensitivity_summary(indices))
     return DONE
 
 
-def write(found: xr.DataTree, scene: Scene, folder: Path) -> None:
-    """The indices as netCDF, figures of them, and nodal ones as VTU."""
+def write(indices: xr.DataTree, scene: Scene, folder: Path) -> None:
+    """Write the indices as netCDF, their figures, and indices of the nodes as VTU."""
     import numpy as np
 
     from calibrate.analysis.sensitivity import FIELD
@@ -144,10 +146,10 @@ def write(found: xr.DataTree, scene: Scene, folder: Path) -> None:
     from emulator.core.store import write_netcdf
     from emulator.geometry.io import write_nodal
 
-    write_netcdf(folder / "sensitivity.nc", found)
-    draw(found, scene, folder)
-    if FIELD in found.children:
-        data = found[FIELD].to_dataset()
+    write_netcdf(folder / "sensitivity.nc", indices)
+    draw(indices, scene, folder)
+    if FIELD in indices.children:
+        data = indices[FIELD].to_dataset()
         nodal: dict[str, np.ndarray] = {}
         for name in {"first", "total", "mu_star", "bound_on_total"} & set(map(str, data)):
             for label, values in zip(
@@ -157,15 +159,15 @@ def write(found: xr.DataTree, scene: Scene, folder: Path) -> None:
         write_nodal(folder / "sensitivity.vtu", scene.mesh, nodal)
 
 
-def summary(found: xr.DataTree) -> str:
+def sensitivity_summary(indices: xr.DataTree) -> str:
     """A table for each observation."""
     lines = []
-    for name, node in found.children.items():
+    for name, node in indices.children.items():
         data = node.to_dataset()
         count = data.sizes["output"]
         numbers = f"{count} numbers, " if count > 1 else ""
         lines.append(f"{name} ({numbers}{data.attrs['unit']})")
-        columns = _COLUMNS[found.attrs["method"]]
+        columns = _COLUMNS[indices.attrs["method"]]
         names = list(columns.values())
         header = [str(data[names[0]].dims[0]), *(head.rstrip() for head in columns)]
         rows = [
@@ -173,13 +175,13 @@ def summary(found: xr.DataTree) -> str:
             for k, label in enumerate(data[data[names[0]].dims[0]].values)
         ]
         lines.append(table(header, rows))
-        if found.attrs["method"] == "derivatives":
+        if indices.attrs["method"] == "derivatives":
             lines.append(_active(data))
     return "\n".join(lines)
 
 
 def _active(data: xr.Dataset) -> str:
-    """The leading direction in words."""
+    """The direction of theta along which the observation changes most, in words."""
     values, vectors = data["active_value"].values, data["active_direction"].values
     if not values.sum() > 0.0:
         return "nothing changes along any direction"
@@ -202,7 +204,7 @@ def _plain(data: xr.Dataset) -> dict[str, Any]:
 
 
 def _groups(words: list[str]) -> dict[str, list[str]]:
-    """``NAME=A,B`` by name."""
+    """Read words ``NAME=A,B``: the parameters of each group by its name."""
     found = {}
     for word in words:
         name, mark, members = word.partition("=")

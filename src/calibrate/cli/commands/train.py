@@ -1,26 +1,25 @@
-"""``calibrate train``."""
+"""``calibrate train`` and ``released``: commands that make an emulator."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import (
-    DONE,
-    add_scene,
-    emit,
-    scene_words,
-    seconds,
-    show_progress,
-)
+from calibrate.cli.output import DONE, emit, show_progress
+from calibrate.cli.words import add_scene, answer, scene_of, seconds
 from emulator.core.errors import InputError
-from emulator.training.plan import OBJECTIVES, RECIPES, Plan
+from emulator.core.store import check_folder
+
+if TYPE_CHECKING:
+    from emulator.training.plan import Plan
 
 
-def register(commands: Any) -> None:
+def add_train(commands: Any) -> None:
     """Add the command."""
+    from emulator.training.plan import OBJECTIVES, RECIPES
+
     parser = commands.add_parser("train", help="train an emulator")
     add_scene(parser)
     parser.add_argument(
@@ -68,20 +67,19 @@ def register(commands: Any) -> None:
         "--resume", action="store_true", help="continue from the checkpoint in --out"
     )
     parser.add_argument("--out", required=True, metavar="DIR")
+    answer(parser, run_train)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_train(arguments: argparse.Namespace) -> int:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
-    from emulator.catalogue import find_scene
-    from emulator.core.store import check_folder
     from emulator.surrogates import load, save_emulator
     from emulator.training import recipe, remove_checkpoint
     from emulator.training import train as train_emulator
 
-    scene = find_scene(*scene_words(arguments))
+    scene = scene_of(arguments)
     check_folder(arguments.out)
-    given = _given(arguments)
+    given = _plan_entries(arguments)
     start = load(arguments.start) if arguments.start else None
     plan = replace(recipe(arguments.recipe or _default_recipe(start)), **given)
     if not arguments.resume:
@@ -118,16 +116,16 @@ def run(arguments: argparse.Namespace) -> int:
     save_emulator(result, arguments.out)
     remove_checkpoint(arguments.out)
     runs = record["plan"]["simulations"]
-    text = _told(arguments.out, scene.name, record)
+    text = _training_summary(arguments.out, scene.name, record)
     if not fixed and plan.runs > runs:
         text += f"\n{runs} of {plan.runs} FEM runs fit into the budget: more time, smaller errors"
     text += f"\nwritten to {arguments.out}; next: calibrate infer {arguments.scene} "
     text += f"--emulator {arguments.out} --data measured.csv --out RUN"
-    emit({"out": arguments.out, **record}, as_json=arguments.json, text=text)
+    emit(arguments, {"out": arguments.out, **record}, text)
     return DONE
 
 
-def _told(folder: str, scene: str, record: Mapping[str, Any]) -> str:
+def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str:
     """What was done, and how far the emulator is from FEM runs that it did not see."""
     plan = record["plan"]
     counts = [f"{plan['simulations']} FEM runs"] if plan["simulations"] else []
@@ -152,7 +150,7 @@ def _default_recipe(start: Any) -> str:
     return "network" if start.family is None else "family"
 
 
-def _given(arguments: argparse.Namespace) -> dict[str, Any]:
+def _plan_entries(arguments: argparse.Namespace) -> dict[str, Any]:
     """Fields of the plan given on the command line; with ``--resume`` there may be none."""
     names = ("objective", "steps", "simulations", "sweeps", "batch", "seed")
     given = {name: getattr(arguments, name) for name in names}
@@ -176,6 +174,8 @@ def _refuse_idle(plan: Plan, given: Mapping[str, Any], budget: str | None) -> No
 
 def command_line(scene: str, record: Mapping[str, Any]) -> str:
     """The command that repeats a training exactly, with the steps and runs it really took."""
+    from emulator.training.plan import Plan
+
     names = ("recipe", "objective", "steps", "simulations", "sweeps", "batch", "seed")
     plan = Plan(**record["plan"])
     options = " ".join(f"--{name} {getattr(plan, name)}" for name in names if name not in plan.idle)
@@ -183,3 +183,41 @@ def command_line(scene: str, record: Mapping[str, Any]) -> str:
     start = " --start EMULATOR" if "start" in record else ""
     campaign = " --campaign STORE.zarr" if record["plan"]["campaign"] else ""
     return f"calibrate train {scene} {options}{start}{campaign} --out DIR"
+
+
+def add_released(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "released",
+        help="make an emulator of a network released with Dalton et al. (2023)",
+        description="Read a released network and write it as an emulator, which evaluate, predict, "
+        "infer and certify take like any other.",
+    )
+    parser.add_argument("model", metavar="MODEL", help="TwistingBeam, Liver or LeftVentricle")
+    parser.add_argument(
+        "--root", required=True, metavar="DIR", help="a clone of the release, or its folder data"
+    )
+    parser.add_argument("--out", required=True, metavar="DIR")
+    answer(parser, run_released)
+
+
+def run_released(arguments: argparse.Namespace) -> int:
+    """Read, check and write the network."""
+    from emulator.surrogates import save_emulator
+    from emulator.surrogates.released_network import released_network
+
+    check_folder(arguments.out)
+    emulator = released_network(arguments.model, arguments.root)
+    save_emulator(emulator, arguments.out)
+    result = {
+        "scene": emulator.scene.name,
+        "parameters": list(emulator.scene.parameter_names),
+        "fingerprint": emulator.fingerprint,
+        "out": arguments.out,
+    }
+    text = (
+        f"{emulator.scene.name}: the released network, theta is "
+        f"{', '.join(emulator.scene.parameter_names)}\nwritten: {arguments.out}"
+    )
+    emit(arguments, result, text)
+    return DONE

@@ -1,18 +1,17 @@
-"""``calibrate serve``: a forward map for other programs."""
+"""``calibrate serve`` and ``explore``: servers of a forward map, for programs and for people."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
-from calibrate.cli.common import DONE, emit
-from calibrate.cli.model_words import emulator_of
+from calibrate.cli.output import needing_plotly, serve_until_interrupted
+from calibrate.cli.words import add_body, answer, emulator_of
 from calibrate.local_server import LOOPBACK
 from emulator.core.errors import InputError
 
 
-def register(commands: Any) -> None:
+def add_serve(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "serve",
@@ -21,10 +20,7 @@ def register(commands: Any) -> None:
         "tinyDA, PyMC and whatever else speaks UM-Bridge. End with Ctrl-C.",
         epilog="example: calibrate serve left_ventricle --observe landmarks:24+volume",
     )
-    parser.add_argument(
-        "body", metavar="EMULATOR|SCENE", help="an emulator's shipped name or folder, or a scene"
-    )
-    parser.add_argument("--emulator", metavar="E", help="of the scene: shipped name or folder")
+    add_body(parser)
     parser.add_argument("--fem", action="store_true", help="FEM of the scene instead")
     parser.add_argument(
         "--observe",
@@ -37,9 +33,10 @@ def register(commands: Any) -> None:
         default=LOOPBACK,
         help="default: this machine alone; 0.0.0.0 for all that reach it, without a password",
     )
+    answer(parser, run_serve)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_serve(arguments: argparse.Namespace) -> int:
     """Serve until interrupted."""
     from calibrate.measurements import parse_observation
     from calibrate.um_bridge import NAME, serve
@@ -55,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.fem:
         forward = fem_forward(Simulator(find_scene(arguments.body)))
     else:
-        forward = emulator_of(arguments.body, arguments.emulator).cache()
+        forward = emulator_of(arguments).cache()
     scene = forward.scene
     default = "volume" if cavity_sets(scene) else "landmarks:24"
     observe = parse_observation(scene, arguments.observe or default)
@@ -67,16 +64,40 @@ def run(arguments: argparse.Namespace) -> int:
             for name, size in zip(model.units, model.output_sizes, strict=True)
         ]
         names = list(scene.parameter_names)
-        told = {"address": address, "name": NAME, "input": names, "output": outputs}
+        result = {"address": address, "name": NAME, "input": names, "output": outputs}
         numbers = ", ".join("{name} ({numbers}, {unit})".format_map(each) for each in outputs)
         text = (
             f"{address}, model '{NAME}': {model.label} of {scene.name}\n"
             f"input: {', '.join(names)}\noutput: {numbers}\nCtrl-C ends it"
         )
-        emit(told, as_json=arguments.json, text=text)
-        sys.stdout.flush()
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            print("ended", file=sys.stderr)
-    return DONE
+        return serve_until_interrupted(arguments, server, result, text)
+
+
+def add_explore(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "explore",
+        help="a local page with a slider for every parameter",
+        description="The body deforms live, by the cached emulator; cavity volume, pressure-volume "
+        "curve and error bar beside it, and FEM on request. The page is served to this machine "
+        "only; end with Ctrl-C.",
+        epilog="example: calibrate explore left_ventricle",
+    )
+    add_body(parser)
+    parser.add_argument("--port", type=int, default=0, help="default: a free one")
+    parser.add_argument("--no-browser", action="store_true", help="print the address alone")
+    answer(parser, run_explore)
+
+
+def run_explore(arguments: argparse.Namespace) -> int:
+    """Serve until interrupted."""
+    with needing_plotly("exploring needs"):
+        from calibrate.explorer import Explorer, serve
+
+    explorer = Explorer(emulator_of(arguments))
+    with serve(explorer, arguments.port) as server:
+        address = f"http://{LOOPBACK}:{server.server_address[1]}/"
+        result = {"scene": explorer.scene.name, "address": address}
+        text = f"{explorer.scene.name}: {address} (Ctrl-C ends it)"
+        page = "" if arguments.no_browser else address
+        return serve_until_interrupted(arguments, server, result, text, page)

@@ -1,23 +1,36 @@
-"""``calibrate predict``."""
+"""``calibrate predict`` and ``evaluate``: an emulator at one theta, and its errors at many."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.common import DONE, FAILED, add_theta, assignments, check_vtu, emit
-from calibrate.cli.volumes import volume_lines, volumes
+from calibrate.cli.output import DONE, FAILED, emit, show_progress, table, volume_lines, volumes
+from calibrate.cli.words import (
+    add_forward,
+    add_theta,
+    answer,
+    assignments,
+    check_vtu,
+    checked_forward_options,
+    theta_by_name,
+)
 from emulator.core.errors import InputError
+from emulator.core.store import write_json
 
 if TYPE_CHECKING:
     import jax
 
+    from calibrate.analysis.evaluation import Evaluated
     from emulator.accuracy.estimate import ErrorEstimate
     from emulator.scenes import Scene
 
 
-def register(commands: Any) -> None:
+def add_predict(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "predict",
@@ -31,12 +44,11 @@ def register(commands: Any) -> None:
         "--error-bar", action="store_true", help="estimate the error from the residual forces"
     )
     parser.add_argument("--out", metavar="FILE.vtu", help="write displacement, stress and strain")
+    answer(parser, run_predict)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_predict(arguments: argparse.Namespace) -> int:
     """Predict at one theta and report the guard's verdict."""
-    from functools import partial
-
     import jax
     import numpy as np
 
@@ -63,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     result: dict[str, Any] = {
         "emulator": arguments.emulator,
         "scene": scene.name,
-        "theta": dict(zip(scene.parameter_names, map(float, theta), strict=True)),
+        "theta": theta_by_name(scene, theta),
         "trusted": bool(against.trusted),
         "guard": against.sentence(scene),
         "max_displacement": float(np.linalg.norm(u, axis=1).max()) if finite else None,
@@ -74,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out and finite and against.least_J > 0.0:
         write_solution(arguments.out, scene.mesh, np.asarray(u), element_fields(scene, u, theta))
         result["out"] = arguments.out
-    emit(result, as_json=arguments.json, text=summary(result))
+    emit(arguments, result, prediction_summary(result))
     return DONE if result["trusted"] else FAILED
 
 
@@ -111,7 +123,7 @@ def error_of(estimate: ErrorEstimate) -> dict[str, Any]:
     }
 
 
-def summary(result: dict[str, Any]) -> str:
+def prediction_summary(result: dict[str, Any]) -> str:
     """The result as text."""
     largest = result["max_displacement"]
     lines = [
@@ -133,3 +145,81 @@ def summary(result: dict[str, Any]) -> str:
     if not result["trusted"]:
         lines.append(f"not to be trusted: {result['guard']}")
     return "\n".join(lines)
+
+
+def add_evaluate(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser("evaluate", help="errors of an emulator against FEM")
+    parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
+    parser.add_argument(
+        "--against", required=True, metavar="DIR|fem", help="a published model's folder, or our FEM"
+    )
+    parser.add_argument("--cases", type=int, help="FEM runs when against fem (default 50)")
+    parser.add_argument(
+        "--outside",
+        type=float,
+        metavar="FRACTION",
+        help="evaluate at as many theta again outside the box, each side widened by this fraction",
+    )
+    add_forward(parser)
+    parser.add_argument("--out", metavar="DIR", help="write evaluation.json and figures")
+    answer(parser, run_evaluate)
+
+
+def run_evaluate(arguments: argparse.Namespace) -> int:
+    """Compare a forward map with stored or fresh FEM solutions."""
+    from calibrate.analysis.evaluation import Evaluation, run_evaluation
+
+    names = ("emulator", "against", "cases", "outside", "forward")
+    plan = Evaluation(
+        **{name: getattr(arguments, name) for name in names},
+        forward_options=checked_forward_options(arguments),
+    )
+    if arguments.out:
+        from calibrate.figures.drawing import pyplot
+        from emulator.core.store import check_folder
+
+        check_folder(arguments.out)
+        pyplot()  # a missing plotting package is reported before minutes of FEM
+    evaluated = run_evaluation(plan, progress=show_progress(arguments))
+    files = (
+        [str(path) for path in save_evaluation(evaluated, arguments.out)] if arguments.out else []
+    )
+    report = {**evaluated.report, **({"files": files} if files else {})}
+    text = evaluation_summary(report) + (f"\nwritten: {', '.join(files)}" if files else "")
+    emit(arguments, report, text)
+    return DONE
+
+
+def save_evaluation(evaluated: Evaluated, folder: str | Path) -> list[Path]:
+    """Write evaluation.json and the figures to ``folder``; the files written."""
+    from calibrate.figures.evaluation import draw
+
+    path = Path(folder) / "evaluation.json"
+    write_json(path, evaluated.report)
+    return [path, *draw(evaluated, folder)]
+
+
+def evaluation_summary(report: Mapping[str, Any]) -> str:
+    """The tables of errors as text."""
+    lines = [_table(report, f"{report['cases']} cases")]
+    lines.append(f"forward map: {report['label']}, reference: {report['reference']}")
+    if report["invalid"]:
+        lines.append(f"{report['invalid']} further cases without a valid prediction")
+    if outside := report.get("outside"):
+        title = f"{outside['cases']} cases outside"
+        lines += ["", _table({**outside, "units": report["units"]}, title)]
+        lines.append(
+            f"box widened by {outside['fraction']:g} of each side; further cases: FEM failed at "
+            f"{outside['failed']}, the map had no valid prediction at {outside['invalid']}"
+        )
+    return "\n".join(lines)
+
+
+def _table(report: Mapping[str, Any], title: str) -> str:
+    rows = [
+        (name, *(report[name][q] for q in ("median", "mean", "q97_5", "max")), unit)
+        for name, unit in report["units"].items()
+        if name in report
+    ]
+    return table((title, "median", "mean", "97.5 %", "max", "unit"), rows)

@@ -13,7 +13,7 @@ from calibrate.cli import main
 from calibrate.measurements.data import write_data
 from calibrate.posterior import read_tree
 from calibrate.project import holds_population
-from calibrate.project.cohort import read_cohort
+from calibrate.project.members import read_members
 from calibrate.report.population import shrinkage
 from cli_support import answer, complaint
 from emulator.scenes import registry
@@ -73,7 +73,7 @@ def result(folder, tmp_path_factory):
         def killed(*_, **__):
             raise Killed
 
-        patch.setattr("calibrate.project.cohort.sample_population", killed)
+        patch.setattr("calibrate.project.members.sample_population", killed)
         with pytest.raises(Killed):
             infer(folder)
     members = {name: folder / "r" / "members" / name / "posterior.nc" for name in TRUTHS}
@@ -130,7 +130,7 @@ def test_results_are_not_replaced_and_members_not_mixed(result, folder, capsys):
 def test_a_cohort_is_restored(result):
     assert holds_population(result)
     assert not holds_population(result / "members" / "soft")
-    cohort, found = read_cohort(result)
+    cohort, found = read_members(result)
     kept = json.loads((result / "run.json").read_text())
     assert {name: run.data for name, run in cohort.members.items()} == {
         name: kept["members"][name]["data"] for name in TRUTHS
@@ -170,7 +170,7 @@ def test_the_page_of_a_population(copy, capsys):
     ]
     places = [body.index(word) for word in order]
     assert places == sorted(places)
-    _, found = read_cohort(copy)
+    _, found = read_members(copy)
     for warning in found.warnings():
         assert warning in body
     for name, label in (("median", "median of mu (kPa)"), ("sd", "spread of ln mu")):
@@ -186,7 +186,7 @@ def test_the_page_of_a_population(copy, capsys):
     share = 100.0 * np.mean((measured >= ends[0]) & (measured <= ends[1]))
     assert f"<td>stiff</td><td>not certified</td><td>{share:.0f} % of 12</td><td></td>" in body
     assert re.findall('href="([^"]*)"', body) == ["members/soft/report.html"]
-    assert "infer_cohort(cohort, " in body
+    assert "infer_members(members, " in body
     assert str(copy) not in body
 
 
@@ -203,7 +203,7 @@ def test_the_page_elsewhere_links_back(copy, tmp_path):
 
 
 def test_the_chart_shows_members_and_one_not_seen(result):
-    _, found = read_cohort(result)
+    _, found = read_members(result)
     band, middle, alone, together = shrinkage(found).data
     low, median, high = np.quantile(found.new_member()["mu"], [0.05, 0.5, 0.95])
     np.testing.assert_allclose(band.x, [low, high, high, low])

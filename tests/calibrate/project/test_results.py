@@ -136,7 +136,7 @@ def test_a_result_is_replaced_at_once_or_not_at_all(infer_once, folder, monkeypa
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     (folder / "certificate.json").touch()
     (folder / "error.safetensors").touch()
-    monkeypatch.setattr("calibrate.project.workflow.sample", lambda *_, **__: infer_once[1])
+    monkeypatch.setattr("calibrate.project.calibration.sample", lambda *_, **__: infer_once[1])
     with monkeypatch.context() as patch:
         full = OSError(errno.ENOSPC, "No space left on device")
         patch.setattr("emulator.core.store.os.fsync", Mock(side_effect=[None, full]))

@@ -1,0 +1,144 @@
+"""One calibration from start to end: read, model, sample, save; then certify and report."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+from calibrate.certificate import Certificate, examine
+from calibrate.certificate.check import can_reweight, reweighted
+from calibrate.measurements.present import missing_values
+from calibrate.posterior import Posterior, sample
+from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
+from calibrate.project.results import (
+    CERTIFICATE,
+    SAMPLING,
+    remove_pages,
+    reserved,
+    save_results,
+    save_reweighted,
+)
+from calibrate.project.run import Run
+from calibrate.state_names import split
+from emulator.core.store import write_json
+
+NOT_CERTIFIED = "not certified"
+DECIDED_BY_FEM = "decided by FEM"
+
+
+def infer(
+    run: Run | Problem,
+    folder: str | Path | None = None,
+    *,
+    force: bool = False,
+    progress: bool = False,
+) -> Posterior:
+    """Sample the posterior of a run.
+
+    Parameters
+    ----------
+    run : the run, or the problem that it was read as.
+    folder : the folder to write run, data and posterior to (:mod:`calibrate.project.results`). A
+        run into a folder that was killed while sampling continues there.
+    force : replace the results of an earlier run in ``folder``.
+
+    Raises
+    ------
+    InputError
+        ``folder`` has the results of an earlier run, or another process is writing to it; the run
+        does not fit its scene or its data.
+    """
+    target = None if folder is None else Path(folder)
+    with nullcontext() if target is None else reserved(target, force=force):
+        problem = with_data(read_problem(run))
+        model, data = build_model(problem, progress=progress)
+        sampler, options = problem.run.sampling()
+        posterior = sample(
+            model,
+            data,
+            sampler=sampler.name,
+            options=options,
+            seed=problem.run.seed,
+            progress=progress,
+            simulator=problem.simulator if sampler.solves_fem else None,
+            checkpoint=None if target is None else target / SAMPLING,
+        )
+        if target is not None:
+            save_results(target, problem, posterior)
+    return posterior
+
+
+def certify_and_keep(
+    posterior: Posterior,
+    folder: str | Path,
+    *,
+    draws: int | None = None,
+    at_most: int | None = None,
+    mesh: int | None = None,
+    load_steps: int = 1,
+    reweight_to: str | Path | None = None,
+    scheduler: str | None = None,
+    progress: bool = False,
+) -> Certificate:
+    """Check a posterior against FEM and write ``certificate.json``.
+
+    Parameters
+    ----------
+    folder : the folder of the posterior.
+    draws, at_most, mesh : the numbers of FEM runs, as of :func:`calibrate.certify`.
+    load_steps : load steps of every solve.
+    reweight_to : the folder that the reweighted posterior is written to, ready to be certified in
+        its turn, where the verdict allows it (:func:`calibrate.certificate.check.can_reweight`).
+    scheduler : the address of a Dask scheduler whose workers solve.
+
+    Raises
+    ------
+    InputError
+        FEM has decided on the draws already.
+    """
+    check = examine(
+        posterior,
+        simulator_of(posterior.model.forward.scene, load_steps),
+        draws=draws,
+        at_most=at_most,
+        mesh=mesh,
+        scheduler=scheduler,
+        progress=progress,
+    )
+    write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
+    remove_pages(Path(folder).resolve())
+    if reweight_to is not None and can_reweight(check.certificate):
+        save_reweighted(reweighted(check), Path(folder), Path(reweight_to))
+    return check.certificate
+
+
+def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> dict[str, Any]:
+    """The result as plain JSON: parameter table, diagnostics, verdict."""
+    table = posterior.summary()
+    for name, row in table.items() if run.is_synthetic else ():
+        if (value := run.truth.get(name, run.truth.get(split(name)[0]))) is not None:
+            row["truth"] = value
+    result: dict[str, Any] = {
+        "scene": run.scene,
+        "forward": run.forward,
+        "parameters": table,
+        "divergences": posterior.divergences,
+        "verdict": NOT_CERTIFIED,
+        "k_hat": None,
+        "prior_cut": dict(posterior.model.prior_cut),
+        "missing": missing_values(posterior.model.observe),
+        "draws": int(posterior.tree["posterior"].sizes["draw"]),
+        "chains": int(posterior.tree["posterior"].sizes["chain"]),
+        "warnings": posterior.warnings(),
+    }
+    if "fem_solves" in posterior.tree.attrs:
+        result["fem_solves"] = int(posterior.tree.attrs["fem_solves"])
+        result["verdict"] = DECIDED_BY_FEM
+    if "log_evidence" in posterior.tree.attrs:
+        result["log_evidence"] = posterior.tree.attrs["log_evidence"]
+        result["log_evidence_error"] = posterior.tree.attrs.get("log_evidence_error")
+    if certificate is not None:
+        result.update(verdict=certificate.verdict, k_hat=certificate.k_hat)
+        result["certificate"] = certificate.to_json()
+    return result

@@ -1,0 +1,292 @@
+"""Members of one population: each calibrated by itself and certified, then all together.
+
+The folder of a population has ``members/NAME``, the folder of a run, for each member
+(:mod:`calibrate.project.results`); ``run.json``, the :class:`Members`; and ``posterior.nc``, the
+hierarchy of them all (:func:`calibrate.read_hierarchy`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpyro.distributions as dist
+
+from calibrate.figures import shrinkage
+from calibrate.population import Hierarchy, read_hierarchy
+from calibrate.population.sample import TARGET_ACCEPT
+from calibrate.posterior import Posterior
+from calibrate.priors import log_normal
+from calibrate.project.calibration import DECIDED_BY_FEM, NOT_CERTIFIED, certify_and_keep, infer
+from calibrate.project.problem import Problem, read_problem, with_data
+from calibrate.project.results import (
+    CERTIFICATE,
+    MEMBERS,
+    POSTERIOR,
+    REPORT,
+    RUN,
+    SAMPLING,
+    holds_population,
+    is_of,
+    read_posterior,
+    reserved,
+)
+from calibrate.project.run import Run
+from calibrate.samplers import find_sampler, options_from
+from calibrate.samplers.nuts import NUTS
+from calibrate.statistical_model import Model
+from emulator.core import schema
+from emulator.core.errors import InputError
+from emulator.core.store import read_json, write_json
+
+POPULATION = "population"
+SHRINKAGE = "shrinkage.png"
+_SAME_MODEL = (
+    "scene_fingerprint", "forward_fingerprint", "forward_error", "observe", "noise", "prior",
+    "prior_dependence", "load_states",
+)  # fmt: skip
+"""Attributes of posteriors that agree where members may share one model, which is faster."""
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What members of a population have in common, as of :func:`calibrate.hierarchy`.
+
+    shared : unknowns that follow the population; by default all that every member has.
+    median : median and relative sd of a log-normal prior of the population's median, by name.
+    spread : scale of the half-normal prior of the population's sd, by name.
+    eta : concentration of the prior of correlations; 1 is uniform, more prefers none.
+    """
+
+    shared: tuple[str, ...] | None = None
+    median: dict[str, list[float]] = field(default_factory=dict)
+    spread: dict[str, float] = field(default_factory=dict)
+    eta: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name, numbers in self.median.items():
+            if len(numbers) != 2:
+                raise InputError(f"median of '{name}' is {numbers}; give median and relative sd")
+
+    @property
+    def medians(self) -> dict[str, dist.Distribution]:
+        """The log-normal priors of the population's medians, by name."""
+        return {name: log_normal(median, sd) for name, (median, sd) in self.median.items()}
+
+
+@dataclass(frozen=True)
+class Members:
+    """Members of one population.
+
+    members : the run of each by itself, by name.
+    population : what they share.
+    problems : the members' problems, where their scenes and data have been read.
+    """
+
+    members: Mapping[str, Run]
+    population: Shared = Shared()
+    problems: Mapping[str, Problem] = field(default_factory=dict, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if len(self.members) < 2:
+            raise InputError(
+                "members: one is no population; give two tables [members.NAME] or more"
+            )
+        for name in self.members:
+            if not name or set("/@[]") & set(name):
+                raise InputError(f"members: '{name}' is no name; leave out /, @ and brackets")
+
+    @property
+    def first(self) -> Run:
+        """The first member's run: sampler, length and seed are those of all members together."""
+        return next(iter(self.members.values()))
+
+    def problem(self, name: str) -> Problem:
+        """The problem of one member."""
+        return self.problems[name] if name in self.problems else read_problem(self.members[name])
+
+
+def infer_members(
+    plan: Members,
+    folder: str | Path,
+    *,
+    certify: bool = True,
+    force: bool = False,
+    progress: bool = False,
+) -> tuple[Hierarchy, dict[str, str]]:
+    """Calibrate all members, write everything to ``folder``, and return verdicts by member.
+
+    A calibration that was killed continues where it was: members that are done are not sampled
+    again.
+
+    Parameters
+    ----------
+    plan : the members and what they share.
+    certify : check each member's posterior against FEM.
+    force : replace the results of an earlier calibration.
+
+    Raises
+    ------
+    InputError
+        ``folder`` has the results of an earlier run and there is no ``force``, or a member's data
+        or model does not fit.
+    """
+    folder = Path(folder)
+    with reserved(folder, (POSTERIOR,), force=force):
+        for name in (REPORT, POSTERIOR):
+            (folder / name).unlink(missing_ok=True)
+        runs = {name: asdict(run) for name, run in plan.members.items()}
+        write_json(folder / RUN, {MEMBERS: runs, POPULATION: asdict(plan.population)})
+        alone: dict[str, Posterior] = {}
+        verdicts: dict[str, str] = {}
+        for name, run in plan.members.items():
+            own = folder / MEMBERS / name
+            alone[name] = _posterior_of(plan.problem(name), own, force=force, progress=progress)
+            if certify:
+                verdicts[name] = _verdict(alone[name], own, run, progress=progress)
+        hierarchy = _sample_together(plan, alone, folder / SAMPLING, progress=progress)
+        shrinkage.draw(hierarchy, folder / SHRINKAGE)
+        hierarchy.save(folder / POSTERIOR)
+    return hierarchy, verdicts
+
+
+def read_members(folder: str | Path) -> tuple[Members, Hierarchy]:
+    """Read the members in ``folder``, and their hierarchy.
+
+    Raises
+    ------
+    InputError
+        The folder holds no population, one that is not sampled to its end, or one of other members.
+    """
+    folder = Path(folder)
+    if not holds_population(folder):
+        raise InputError(f"{folder} holds a single run; calibrate.load reads it")
+    plan, path = _read_plan(folder / RUN), folder / POSTERIOR
+    if not path.exists():
+        ready = [name for name in plan.members if (folder / MEMBERS / name / POSTERIOR).exists()]
+        raise InputError(
+            f"{folder} holds a population without {POSTERIOR}: {len(ready)} of its "
+            f"{len(plan.members)} members are sampled; repeat calibrate infer, which goes on"
+        )
+    hierarchy = read_hierarchy(path)
+    if hierarchy.members != tuple(plan.members):
+        raise InputError(
+            f"{path} is of members {', '.join(hierarchy.members)}, but {RUN} names "
+            f"{', '.join(plan.members)}; infer again"
+        )
+    return plan, hierarchy
+
+
+def _read_plan(path: Path) -> Members:
+    entries = read_json(path)
+    runs = {
+        name: schema.read_as(Run, run, f"{path}, member '{name}'")
+        for name, run in entries[MEMBERS].items()
+    }
+    shared = schema.read_as(Shared, entries.get(POPULATION, {}), f"{path}, {POPULATION}")
+    return Members(runs, shared)
+
+
+def verdicts_in(plan: Members, folder: str | Path) -> dict[str, str]:
+    """What FEM says of members in ``folder``, by name; those without a certificate are missing."""
+    verdicts = {
+        name: _written_verdict(run, Path(folder) / MEMBERS / name)
+        for name, run in plan.members.items()
+    }
+    return {name: verdict for name, verdict in verdicts.items() if verdict is not None}
+
+
+def _posterior_of(problem: Problem, folder: Path, *, force: bool, progress: bool) -> Posterior:
+    """The posterior of a member by itself: the one in ``folder`` if it is of this problem."""
+    if (folder / POSTERIOR).exists() and not force:
+        run, posterior = read_posterior(folder)
+        if run == problem.run and is_of(posterior, with_data(problem)):
+            return posterior
+        raise InputError(
+            f"{folder} is of another run or other data than the experiment's member; replace it "
+            "with --force, or name another folder"
+        )
+    return infer(problem, folder, force=force, progress=progress)
+
+
+def _verdict(posterior: Posterior, folder: Path, run: Run, *, progress: bool) -> str:
+    """What FEM says of a member, from its certificate if there is one."""
+    if (verdict := _written_verdict(run, folder)) is not None:
+        return verdict
+    certificate = certify_and_keep(posterior, folder, load_steps=run.load_steps, progress=progress)
+    return certificate.verdict
+
+
+def _written_verdict(run: Run, folder: Path) -> str | None:
+    if find_sampler(run.sampler).solves_fem:
+        return DECIDED_BY_FEM
+    path = folder / CERTIFICATE
+    return str(read_json(path)["verdict"]) if path.exists() else None
+
+
+def _sample_together(
+    plan: Members, alone: Mapping[str, Posterior], checkpoint: Path, *, progress: bool
+) -> Hierarchy:
+    run, population = plan.first, plan.population
+    own = run.sampler_options if run.sampler == NUTS.name else {}
+    options = options_from(
+        NUTS,
+        {"target_accept": TARGET_ACCEPT, **own},
+        warmup=run.warmup,
+        draws=run.draws,
+        chains=run.chains,
+    )
+    model = population_model(
+        _models(alone),
+        shared=population.shared,
+        median=population.medians,
+        spread=population.spread,
+        eta=population.eta,
+    )
+    return sample_population(
+        model,
+        {name: posterior.data for name, posterior in alone.items()},
+        options=options,
+        alone={name: posterior.draws() for name, posterior in alone.items()},
+        seed=run.seed,
+        progress=progress,
+        checkpoint=checkpoint,
+    )
+
+
+def _models(alone: Mapping[str, Posterior]) -> dict[str, Model]:
+    """Each member's model; one object for all that differ in their data only."""
+    models: dict[tuple[Any, ...], Model] = {}
+    return {
+        name: models.setdefault(
+            tuple(posterior.tree.attrs.get(key) for key in _SAME_MODEL), posterior.model
+        )
+        for name, posterior in alone.items()
+    }
+
+
+def members_report(hierarchy: Hierarchy, verdicts: Mapping[str, str]) -> dict[str, Any]:
+    """The result as plain JSON: the population, each member alone and together with the others."""
+    shrinkages = hierarchy.shrinkage()
+    return {
+        "population": hierarchy.summary(),
+        "members": {
+            member: {
+                "verdict": verdicts.get(member, NOT_CERTIFIED),
+                **{name: by_member[member]._asdict() for name, by_member in shrinkages.items()},
+            }
+            for member in hierarchy.members
+        },
+        "new_member": {
+            name: dict(zip(("low", "median", "high"), _quantiles(draws), strict=True))
+            for name, draws in hierarchy.new_member().items()
+        },
+        "warnings": hierarchy.warnings(),
+    }
+
+
+def _quantiles(draws: np.ndarray) -> list[float]:
+    return [float(value) for value in np.quantile(draws, (0.05, 0.5, 0.95))]

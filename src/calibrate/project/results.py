@@ -1,0 +1,264 @@
+"""The folder that a run leaves: how it is written, and read again.
+
+=======================  ===========================================================================
+``run.json``             the :class:`~calibrate.project.run.Run`
+``data.csv``             its data
+``forward.safetensors``  the forward map, where it was fitted for this run
+``error.safetensors``    the errors besides noise that the likelihood allows for, if any
+``posterior.nc``         the posterior, as ArviZ reads it
+``certificate.json``     what FEM says of the posterior, once it is certified
+``report.html``          the page, once it is written
+=======================  ===========================================================================
+
+``posterior.nc`` carries the run it was sampled for and the fingerprint of its forward map. A
+certificate speaks about that run and that map, so any difference is refused.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from shutil import copyfile
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from calibrate.measurements import Observations, observations_from_json
+from calibrate.measurements.data import write_data
+from calibrate.measurements.present import leave_out_missing
+from calibrate.posterior import Posterior, read_tree
+from calibrate.project.problem import Problem, model_of, restore_forward
+from calibrate.project.run import Run
+from calibrate.statistical_model.approximation_error import ApproximationError
+from calibrate.statistical_model.error_modes import ErrorModes
+from calibrate.statistical_model.systematic import SystematicError
+from emulator.catalogue import find_scene
+from emulator.core import schema
+from emulator.core.errors import InputError
+from emulator.core.store import exclusive, read_arrays, read_json, save_arrays, write_json
+from emulator.surrogates import registry
+from emulator.surrogates.protocol import ForwardMap
+
+RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
+FORWARD, ERROR = "forward.safetensors", "error.safetensors"
+REPORT = "report.html"
+SAMPLING = "sampling.safetensors"  # of a run under way, or killed
+MEMBERS = "members"  # of a population: their entry in run.json, and the folder of their runs
+
+_RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # of a run that has ended
+_PLACES = ("scene", "root", "emulator")  # paths may change; fingerprints tell what they name
+_DESCRIPTION = "systematic"  # metadata of a file of systematic errors
+_SHOWN = 4  # files of a folder that an error names
+
+
+@contextmanager
+def reserved(folder: Path, results: tuple[str, ...] = _RESULTS, *, force: bool) -> Iterator[None]:
+    """Reserve ``folder`` for one run of one process.
+
+    Raises
+    ------
+    InputError
+        The folder has results of an earlier run and there is no ``force``, or another process is
+        writing to it.
+    """
+    with exclusive(folder / RUN, "run"):
+        present = [name for name in results if (folder / name).exists()]
+        if present and not force:
+            raise InputError(
+                f"{folder} has results of an earlier run ({', '.join(present)}); replace them with "
+                "--force (in Python: force=True), or name another folder"
+            )
+        yield
+
+
+def save_results(folder: Path, problem: Problem, posterior: Posterior) -> None:
+    """Write run, data, forward map, errors and posterior in place of earlier results."""
+    assert problem.data is not None, "the posterior has been sampled with data"
+    run = asdict(problem.run)
+    with TemporaryDirectory(dir=folder, prefix=".new.") as name:
+        new = Path(name)
+        write_data(new / DATA, problem.observe, problem.data)
+        write_json(new / RUN, run)
+        registry.keep_forward(posterior.model.full, new / FORWARD)
+        if posterior.model.error is not None:
+            _save_error(new / ERROR, posterior.model.error)
+        posterior.tree.attrs["run"] = json.dumps(run)
+        posterior.save(new / POSTERIOR)
+        # Earlier results go first and the posterior comes last: a run that is killed leaves no
+        # posterior, rather than one beside the certificate of another.
+        _remove(folder, _RESULTS)
+        for path in sorted(new.iterdir(), key=lambda path: path.name == POSTERIOR):
+            path.replace(folder / path.name)
+
+
+def save_reweighted(posterior: Posterior, source: Path, target: Path) -> None:
+    """Write a reweighted posterior beside copies of the run, the data and the map in ``source``."""
+    target.mkdir(parents=True, exist_ok=True)
+    _remove(target, _RESULTS)
+    for name in (RUN, DATA, FORWARD, ERROR):
+        if (source / name).exists():
+            copyfile(source / name, target / name)
+    posterior.save(target / POSTERIOR)
+
+
+def remove_pages(folder: Path) -> None:
+    """Remove the pages with an earlier verdict: the run's, and its population's."""
+    _remove(folder, (REPORT,))
+    above = folder.parent.parent
+    if folder.parent.name == MEMBERS and (above / RUN).is_file() and holds_population(above):
+        _remove(above, (REPORT,))
+
+
+def _remove(folder: Path, names: tuple[str, ...]) -> None:
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+
+
+def load(folder: str | Path) -> Posterior:
+    """Read the posterior that :func:`calibrate.project.infer`, or ``calibrate infer``, wrote.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_posterior`.
+    """
+    return read_posterior(folder)[1]
+
+
+def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
+    """Read the run in ``folder`` and its posterior, ready to be certified.
+
+    Raises
+    ------
+    InputError
+        A file is missing or damaged, or the posterior was not made with this run, its scene or its
+        forward map.
+    """
+    folder = Path(folder)
+    path = folder / POSTERIOR
+    if holds_population(folder):
+        raise InputError(
+            f"{folder} holds a population; name one of its members, {folder / MEMBERS}/NAME"
+        )
+    run = schema.read_json_as(Run, folder / RUN)
+    scene = find_scene(run.scene, run.root)
+    tree = read_tree(path)
+    if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
+        raise InputError(f"{path} was made for another scene than '{run.scene}'")
+    _check_run(path, tree, read_json(folder / RUN))
+    forward = restore_forward(run, scene, folder / FORWARD)
+    _check_forward(path, tree, forward)
+    observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
+    # The data was checked when it was sampled, or the check was overruled.
+    built = model_of(run, forward, observe, check_scale=False)
+    if run.error_runs or run.mesh_error_runs or run.systematic:
+        built = replace(built, error=_read_error(folder / ERROR, path, tree))
+    observed = tree["observed_data"]
+    data = built.check_data(
+        {n: np.asarray(observed[n]).reshape(part.shape) for n, part in observe.parts.items()}
+    )
+    return run, Posterior(tree, built, data)
+
+
+def holds_population(folder: str | Path) -> bool:
+    """Whether ``folder`` has the results of a population instead of one run's.
+
+    Raises
+    ------
+    InputError
+        It has neither.
+    """
+    path = Path(folder) / RUN
+    if not path.is_file():
+        raise InputError(
+            f"{path} does not exist: {_content(path.parent)}; give a folder that calibrate infer "
+            "wrote, of a posterior or of a population"
+        )
+    entries = read_json(path)
+    return isinstance(entries, dict) and isinstance(entries.get(MEMBERS), dict)
+
+
+def _content(folder: Path) -> str:
+    """What stands in place of a folder of results, in a few words."""
+    if not folder.is_dir():
+        return f"{folder} is a file" if folder.exists() else "there is no such folder"
+    names = sorted(path.name for path in folder.iterdir())
+    more = ", ..." if len(names) > _SHOWN else ""
+    return f"the folder holds {', '.join(names[:_SHOWN]) or 'nothing'}{more}"
+
+
+def is_of(posterior: Posterior, problem: Problem) -> bool:
+    """Whether a posterior was sampled with the observations and the data of ``problem``."""
+    assert problem.data is not None
+    reduced, present = leave_out_missing(problem.observe, problem.data)
+    return _same_observations(posterior, reduced) and all(
+        np.array_equal(np.ravel(present[name]), np.ravel(values))
+        for name, values in posterior.data.items()
+    )
+
+
+def _same_observations(posterior: Posterior, observe: Observations) -> bool:
+    described = json.loads(json.dumps(observe.to_json()))
+    return described == json.loads(posterior.tree.attrs["observe"])
+
+
+def _check_run(path: Path, tree: xr.DataTree, run: Mapping[str, Any]) -> None:
+    """Refuse the first entry of ``run.json`` that the posterior in ``path`` was not made with."""
+    try:
+        sampled: dict[str, Any] = json.loads(tree.attrs["run"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} does not name the run it was sampled for; infer again") from error
+    for name in sorted({*sampled, *run} - set(_PLACES)):
+        if name not in run:
+            raise InputError(
+                f"{path} was sampled with {name} = {json.dumps(sampled[name])}, which run.json "
+                "lacks; restore it, or infer again"
+            )
+        if sampled.get(name) != run.get(name):
+            raise InputError(
+                f"{path} was sampled with {name} = {json.dumps(sampled.get(name))}, but run.json "
+                f"says {json.dumps(run.get(name))}; infer again"
+            )
+
+
+def _check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
+    sampled_with = tree.attrs.get("forward_fingerprint")
+    if sampled_with != forward.fingerprint:
+        raise InputError(
+            f"{path} was made with another {forward.kind} map (fingerprint {sampled_with}; it is "
+            f"{forward.fingerprint} now); infer again"
+        )
+
+
+def _save_error(path: Path, error: ErrorModes) -> None:
+    metadata = {}
+    if isinstance(error, SystematicError):
+        metadata[_DESCRIPTION] = json.dumps(error.words)
+    save_arrays(path, error.arrays(), metadata)
+
+
+def _read_error(path: Path, posterior: Path, tree: xr.DataTree) -> ErrorModes:
+    """The errors besides noise that the likelihood of a posterior allows for."""
+    if not path.is_file():
+        raise InputError(f"{path}, the error in the likelihood of the posterior, is missing")
+    arrays, metadata = read_arrays(path)
+    error: ErrorModes
+    try:
+        if _DESCRIPTION in metadata:
+            error = SystematicError.restore(arrays, json.loads(metadata[_DESCRIPTION]))
+        else:
+            error = ApproximationError.restore(arrays)
+    except KeyError as missing:
+        raise InputError(f"{path}: array {missing} is missing; infer again") from missing
+    except TypeError as wrong:
+        raise InputError(f"{path} holds other arrays than an error has; infer again") from wrong
+    if tree.attrs.get("forward_error") != error.fingerprint:
+        raise InputError(
+            f"{posterior} was sampled with another error than {path} holds; infer again"
+        )
+    return error
