@@ -16,7 +16,7 @@ import numpy as np
 import numpyro.distributions as dist
 
 from calibrate.figures import shrinkage
-from calibrate.population import Hierarchy, read_hierarchy
+from calibrate.population import Hierarchy, population_model, read_hierarchy, sample_population
 from calibrate.population.sample import TARGET_ACCEPT
 from calibrate.posterior import Posterior
 from calibrate.priors import log_normal
