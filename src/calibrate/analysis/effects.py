@@ -127,23 +127,23 @@ def recommend(
         trial = compared.without((*chosen, *each.left_out))
         if trial.within(limits) and trial.ratio < _SAVES * best.ratio:
             chosen, best = (*chosen, *each.left_out), trial
-    whole = found = compared.without(())
+    whole = judged = compared.without(())
     trials = 0
     while chosen:
         trials += 1
         judge = Comparison(
             scene, seen, samples, seed + trials * _HELD_OUT, say, compared.simulators
         )
-        found = judge.without(chosen)
-        if found.within(limits):
+        judged = judge.without(chosen)
+        if judged.within(limits):
             break
-        chosen, found = chosen[:-1], whole
+        chosen, judged = chosen[:-1], whole
     return Recommendation(
         limits,
         {name: part.unit for name, part in seen.parts.items()},
         whole,
         alone,
-        found,
+        judged,
         leave_out(scene, chosen),
         effects,
     )
@@ -153,14 +153,14 @@ def tolerances(words: Sequence[str], observe: Observations) -> dict[str, float]:
     """Tolerance of each observation from words such as ``0.5mm``, matched by their units."""
     by_unit: dict[str, float] = {}
     for word in words:
-        found = _WORD.fullmatch(word.strip())
+        match = _WORD.fullmatch(word.strip())
         try:
-            value = float(found[1]) if found else float("nan")
+            value = float(match[1]) if match else float("nan")
         except ValueError:
             value = float("nan")
-        if found is None or not np.isfinite(value):
+        if match is None or not np.isfinite(value):
             raise InputError(f"tolerance '{word}': write a number and its unit, e.g. 0.5mm")
-        unit = found[2] or "1"
+        unit = match[2] or "1"
         if unit in by_unit:
             raise InputError(f"tolerance: two are given in {unit}; give one for each unit")
         by_unit[unit] = value
@@ -222,10 +222,10 @@ class Comparison:
         values, times, ratios = [], [], []
         for own, theta in zip(thetas, self._thetas, strict=True):
             # Solvers keep factors of values they have seen: not the theta of the comparison again.
-            beside = _clocked(whole, theta * (1.0 + _ASIDE))[0] if names else None
+            whole_seconds = _clocked(whole, theta * (1.0 + _ASIDE))[0] if names else None
             seconds, solution = _clocked(simulator, own)
             times.append(seconds)
-            ratios.append(1.0 if beside is None else seconds / beside)
+            ratios.append(1.0 if whole_seconds is None else seconds / whole_seconds)
             status = Status(int(solution.status))
             if status is not Status.CONVERGED:
                 if not names:
@@ -277,8 +277,8 @@ def operations(scene: Scene) -> float | None:
     if not all(load.has_potential for load in scene.loads):
         return None
     both = jax.jit(jax.value_and_grad(potential_energy(scene)))
-    told: Any = both.lower(np.zeros(scene.held.shape), scene.centre).compile().cost_analysis()
-    return float(told["flops"])
+    cost: Any = both.lower(np.zeros(scene.held.shape), scene.centre).compile().cost_analysis()
+    return float(cost["flops"])
 
 
 def _largest(change: np.ndarray) -> float:

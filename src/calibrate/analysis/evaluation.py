@@ -105,12 +105,12 @@ def _outside(
     forward: ForwardMap, beyond: Reference, fraction: float
 ) -> tuple[Errors | None, dict[str, Any]]:
     """Errors outside the box and their report; no errors where no case has a valid prediction."""
-    found: dict[str, Any] = {"fraction": fraction, "failed": beyond.failed}
+    report: dict[str, Any] = {"fraction": fraction, "failed": beyond.failed}
     solved = len(beyond.thetas)
     try:
         errors = case_errors(forward, beyond.thetas, beyond.displacement) if solved else None
     except SolverError:  # the map has no valid prediction at any of them
         errors = None
     if errors is None:
-        return None, {"cases": 0, "invalid": solved, **found}
-    return errors, {**errors.report(), **found}
+        return None, {"cases": 0, "invalid": solved, **report}
+    return errors, {**errors.report(), **report}

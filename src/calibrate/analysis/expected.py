@@ -99,8 +99,8 @@ def expected_precision(
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     ratio = sd / np.sqrt(np.diagonal(before))
     many = sum(int(np.prod(part.shape)) for part in model.observe.parts.values())
-    found = combinations(names, covariances.mean(axis=0), before)[:many] if log else []
-    return {"sd": dict(zip(names, ratio.tolist(), strict=True)), "combinations": found}
+    best = combinations(names, covariances.mean(axis=0), before)[:many] if log else []
+    return {"sd": dict(zip(names, ratio.tolist(), strict=True)), "combinations": best}
 
 
 class _Around(NamedTuple):
@@ -133,10 +133,10 @@ def _informations(model: Model, errors: Errors, theta: np.ndarray, *, log: bool)
     means, valid = model.predict(dict(zip(model.states.unknowns, theta, strict=True)))
     _some(valid)
     error = errors(means)
-    told = information_at(model, model.observe, model.noise, log=log)
+    information = information_at(model, model.observe, model.noise, log=log)
     x = jnp.asarray(np.log(theta) if log else theta)
-    found, _ = jax.jit(jax.vmap(lambda sizes: told(x, error, sizes)))(sizes_of(error))
-    return np.asarray(found)
+    matrices, _ = jax.jit(jax.vmap(lambda sizes: information(x, error, sizes)))(sizes_of(error))
+    return np.asarray(matrices)
 
 
 def _posterior_covariances(
@@ -159,8 +159,8 @@ def _posterior_covariances(
         return dict(zip(names, thetas(x), strict=True))
 
     def log_prior(x: jax.Array) -> jax.Array:
-        found = model.log_prior(values(x)) + (jnp.sum(x) if log else 0.0)
-        return jnp.where(jnp.isnan(found), -jnp.inf, found)
+        covariances = model.log_prior(values(x)) + (jnp.sum(x) if log else 0.0)
+        return jnp.where(jnp.isnan(covariances), -jnp.inf, covariances)
 
     def predicted(x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         return model.predict(values(x))
@@ -172,13 +172,13 @@ def _posterior_covariances(
         error: ErrorModes | None,
     ) -> jax.Array:
         means, valid = answer
-        found = model.log_density(means, model.noise_values({}), data)
+        covariances = model.log_density(means, model.noise_values({}), data)
         if error is not None:
             residual = {name: data[name] - mean for name, mean in means.items()}
-            found += log_ratio(error, thetas(x), residual, means)
-        return jnp.where(valid & jnp.isfinite(found), found, -jnp.inf)
+            covariances += log_ratio(error, thetas(x), residual, means)
+        return jnp.where(valid & jnp.isfinite(covariances), covariances, -jnp.inf)
 
-    told = information_at(model, model.observe, model.noise, log=log)
+    information = information_at(model, model.observe, model.noise, log=log)
     shared = jnp.asarray(np.log(prior[count:]) if log else prior[count:])[:_FROM_PRIOR]
     precision = jnp.asarray(np.linalg.inv(before))
     ask = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))
@@ -190,7 +190,7 @@ def _posterior_covariances(
         x: jax.Array, sizes: jax.Array, data: dict[str, jax.Array], error: ErrorModes | None
     ) -> _Around:
         """A Newton step from where the data was made, in the linear map with a normal prior."""
-        Q = _inverse(told(x, error, sizes)[0] + precision)
+        Q = _inverse(information(x, error, sizes)[0] + precision)
         score = jax.grad(lambda x: log_likelihood(x, predicted(x), data, error))(x)
         score -= precision @ (x - shared.mean(axis=0))
         step = jnp.where(jnp.isfinite(score), score, 0.0)
@@ -238,14 +238,14 @@ def _posterior_covariances(
 
     truths = jnp.asarray(np.log(prior[:count]) if log else prior[:count])
     means, valid = ask(truths)
-    kept = _some(valid)
-    truths, means = truths[kept], {name: mean[kept] for name, mean in means.items()}
-    keys = jax.random.split(jax.random.key(seed), count)[kept]
+    rows = _some(valid)
+    truths, means = truths[rows], {name: mean[rows] for name, mean in means.items()}
+    keys = jax.random.split(jax.random.key(seed), count)[rows]
     keys = jax.vmap(lambda key: jax.random.split(key, 2 + _ROUNDS))(keys)
-    made = of_each(errors, means)
-    sets = truths, sizes_of(made, count)[kept], keys, means, made
-    found = np.asarray(jax.jit(partial(jax.lax.map, lambda each: covariance(*each)))(sets))
-    return found[_some(np.isfinite(found).all(axis=(1, 2)))]
+    set_errors = of_each(errors, means)
+    sets = truths, sizes_of(set_errors, count)[rows], keys, means, set_errors
+    covariances = np.asarray(jax.jit(partial(jax.lax.map, lambda each: covariance(*each)))(sets))
+    return covariances[_some(np.isfinite(covariances).all(axis=(1, 2)))]
 
 
 def _some(valid: Any) -> np.ndarray:

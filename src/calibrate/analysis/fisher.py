@@ -70,8 +70,8 @@ def information_at(
     names, known = model.states.unknowns, model.states.states
     for state in observe.states:
         if state not in known:
-            given = f"load state '{state}' is unknown" if state else "no load state is named"
-            raise InputError(f"{given}; known: {', '.join(filter(None, known)) or 'none'}")
+            problem = f"load state '{state}' is unknown" if state else "no load state is named"
+            raise InputError(f"{problem}; known: {', '.join(filter(None, known)) or 'none'}")
     rows = np.array([known.index(state) for state in observe.states])
     forward = model.full.at(observe.nodes)
 
@@ -112,11 +112,11 @@ def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ErrorModes | None
 def _stacked(arrays: Sequence[Any]) -> np.ndarray:
     """One array of several, with zeros where one has fewer rows: such a mode changes nothing."""
     shape = np.max([np.shape(array) for array in arrays], axis=0).astype(int)
-    found = np.zeros((len(arrays), *shape))
+    stack = np.zeros((len(arrays), *shape))
     for k, array in enumerate(arrays):
         corner: tuple[int | slice, ...] = (k, *(slice(size) for size in np.shape(array)))
-        found[corner] = array
-    return found
+        stack[corner] = array
+    return stack
 
 
 def sizes_of(error: ErrorModes | None, count: int = _SIZES) -> jax.Array:

@@ -111,7 +111,7 @@ def combinations(
     """
     _, directions = eigh(after, before)  # eigenvalues ascend
     prior_sd = np.sqrt(np.diagonal(before))
-    found = []
+    products = []
     for w in directions.T:
         # The parameter that contributes most to its variance under the prior has exponent 1.
         leading = int(np.argmax(np.abs(w) * prior_sd))
@@ -120,24 +120,24 @@ def combinations(
         if sds[0] > _LEARNED * sds[1]:
             continue
         rounded = np.round(exponents, _DIGITS) + 0.0
-        kept = {n: float(e) for n, e in zip(names, rounded, strict=True) if e}
-        found.append({"exponents": kept, "known_to": sds[0], "prior": sds[1]})
-    return sorted(found, key=lambda entry: entry["known_to"] / entry["prior"])
+        nonzero = {n: float(e) for n, e in zip(names, rounded, strict=True) if e}
+        products.append({"exponents": nonzero, "known_to": sds[0], "prior": sds[1]})
+    return sorted(products, key=lambda entry: entry["known_to"] / entry["prior"])
 
 
-def in_words(found: dict[str, Any]) -> str:
+def in_words(result: dict[str, Any]) -> str:
     """The result in words: contractions, correlated pairs, the best combinations."""
-    learned = ", ".join(f"{name} {100 * c:.0f} %" for name, c in found["contraction"].items())
+    learned = ", ".join(f"{name} {100 * c:.0f} %" for name, c in result["contraction"].items())
     lines = [f"learned from the data (1 - sd / prior sd): {learned}"]
-    names = list(found["correlation"])
+    names = list(result["correlation"])
     together = [
-        f"{first} and {second} ({found['correlation'][first][second]:+.2f})"
+        f"{first} and {second} ({result['correlation'][first][second]:+.2f})"
         for k, first in enumerate(names)
         for second in names[k + 1 :]
-        if abs(found["correlation"][first][second]) >= _TOGETHER
+        if abs(result["correlation"][first][second]) >= _TOGETHER
     ]
     lines.append(f"only known together: {', '.join(together) or 'none'}")
-    return "\n".join([*lines, *products_in_words(found["combinations"], _BEST)])
+    return "\n".join([*lines, *products_in_words(result["combinations"], _BEST)])
 
 
 def products_in_words(combinations: list[dict[str, Any]], best: int) -> list[str]:
@@ -196,26 +196,28 @@ def next_measurement(
     x = np.log(table) if log else table
     covariance = np.atleast_2d(np.cov(x, rowvar=False))
     rows = np.linspace(0, len(x) - 1, min(_DRAWS, len(x))).astype(int)
-    found = {}
+    gains_by_name = {}
     for name, (part, noise) in candidates.items():
-        told = jax.jit(information_at(model, Observations({name: part}), {name: noise}, log=log))
+        information_of = jax.jit(
+            information_at(model, Observations({name: part}), {name: noise}, log=log)
+        )
         gains, ratios = [], []
         for k in rows:
-            information, _ = told(jnp.asarray(x[k]), None, jnp.zeros(0))
+            information, _ = information_of(jnp.asarray(x[k]), None, jnp.zeros(0))
             gain, ratio = _gain(covariance, np.asarray(information))
             gains.append(gain)
             ratios.append(ratio)
         sd = dict(zip(model.states.unknowns, np.mean(ratios, axis=0).tolist(), strict=True))
-        found[name] = Candidate(float(np.mean(gains)), sd)
-    return dict(sorted(found.items(), key=lambda item: -item[1].bits))
+        gains_by_name[name] = Candidate(float(np.mean(gains)), sd)
+    return dict(sorted(gains_by_name.items(), key=lambda item: -item[1].bits))
 
 
 def _gain(C: np.ndarray, information: np.ndarray) -> tuple[float, np.ndarray]:
     """Bits, and sd afterwards relative to now (q,)."""
     root = np.linalg.cholesky(C)
-    told = np.eye(len(C)) + root.T @ information @ root
-    after = root @ np.linalg.solve(told, root.T)
-    bits = 0.5 * np.linalg.slogdet(told)[1] / np.log(2.0)
+    precision = np.eye(len(C)) + root.T @ information @ root
+    after = root @ np.linalg.solve(precision, root.T)
+    bits = 0.5 * np.linalg.slogdet(precision)[1] / np.log(2.0)
     return float(bits), np.sqrt(np.diagonal(after) / np.diagonal(C))
 
 
@@ -265,8 +267,8 @@ def stress_band(
     rows = np.linspace(0, len(thetas) - 1, min(_STRESS_DRAWS, len(thetas))).astype(int)
     curve = jax.jit(jax.vmap(lambda t: stresses(model.forward.scene, t, axis, stretch)))
     edge = 0.5 * (1.0 - probability)
-    found = np.quantile(np.asarray(curve(thetas[rows])), [edge, 0.5, 1.0 - edge], axis=0)
-    return StressBand(direction, stretch, *found)
+    quantiles = np.quantile(np.asarray(curve(thetas[rows])), [edge, 0.5, 1.0 - edge], axis=0)
+    return StressBand(direction, stretch, *quantiles)
 
 
 def stresses(scene: Scene, theta: jax.Array, axis: jax.Array, stretch: np.ndarray) -> jax.Array:

@@ -88,12 +88,12 @@ class Factors:
     @property
     def problem(self) -> dict[str, Any]:
         """SALib's description of the unit cube."""
-        told: dict[str, Any] = {
+        problem: dict[str, Any] = {
             "num_vars": len(self.names),
             "names": list(self.names),
             "bounds": [[0.0, 1.0]] * len(self.names),
         }
-        return told | {"groups": list(self.group_of)} if self.groups else told
+        return problem | {"groups": list(self.group_of)} if self.groups else problem
 
 
 def quantiles(prior: Prior, names: Sequence[str], points: jax.Array) -> jax.Array:
@@ -191,27 +191,29 @@ def _by_variance(factors: Factors, function: Function, samples: int, seed: int) 
     points = sobol_design.sample(factors.problem, samples, calc_second_order=False, seed=seed)
     outputs = _evaluated(function, points)
     shape = len(factors.labels), outputs.shape[1]
-    found = {name: np.full(shape, np.nan) for name in ("first", "total")}
-    half = {name: np.full(shape, np.nan) for name in found}
-    resampled = {name: np.zeros((_RESAMPLES, shape[0])) for name in found}
+    indices = {name: np.full(shape, np.nan) for name in ("first", "total")}
+    half = {name: np.full(shape, np.nan) for name in indices}
+    resampled = {name: np.zeros((_RESAMPLES, shape[0])) for name in indices}
     variance = _base(outputs, len(factors.labels)).var(axis=0)
     for k in np.flatnonzero(_varies(outputs)):
         # SALib takes the seed 0 for none.
-        told = sobol_analysis.analyze(
+        result = sobol_analysis.analyze(
             factors.problem, outputs[:, k], calc_second_order=False, num_resamples=_RESAMPLES,
             conf_level=CONFIDENCE, keep_resamples=True, seed=seed + 1,
         )  # fmt: skip
         for name, key in (("first", "S1"), ("total", "ST")):
-            found[name][:, k], half[name][:, k] = told[key], told[f"{key}_conf"]
-            resampled[name] += variance[k] * told[f"{key}_conf_all"]
-    kept = variance * _varies(outputs)
+            indices[name][:, k], half[name][:, k] = result[key], result[f"{key}_conf"]
+            resampled[name] += variance[k] * result[f"{key}_conf_all"]
+    weights = variance * _varies(outputs)
     dims = ("factor", "output")
-    data: dict[str, Any] = {name: (dims, values) for name, values in found.items()}
+    data: dict[str, Any] = {name: (dims, values) for name, values in indices.items()}
     data |= {f"{name}_half_width": (dims, values) for name, values in half.items()}
-    for name, values in found.items():
-        total = np.nansum(values * kept, axis=1) / kept.sum() if kept.any() else values[:, 0]
+    for name, values in indices.items():
+        total = (
+            np.nansum(values * weights, axis=1) / weights.sum() if weights.any() else values[:, 0]
+        )
         data[f"{name}_together"] = ("factor", total)
-        spread = resampled[name].std(axis=0, ddof=1) / max(kept.sum(), np.finfo(float).tiny)
+        spread = resampled[name].std(axis=0, ddof=1) / max(weights.sum(), np.finfo(float).tiny)
         data[f"{name}_together_half_width"] = ("factor", _DEVIATIONS * spread)
     data["variance"] = ("output", variance)
     return _dataset(data, factors, evaluations=len(points), method="sobol")
@@ -221,18 +223,20 @@ def _by_screening(factors: Factors, function: Function, samples: int, seed: int)
     points = morris_design.sample(factors.problem, samples, num_levels=_LEVELS, seed=seed)
     outputs = _evaluated(function, points)
     shape = len(factors.labels), outputs.shape[1]
-    found = {name: np.full(shape, np.nan) for name in ("mu_star", "sigma", "mu_star_half_width")}
+    effects = {name: np.full(shape, np.nan) for name in ("mu_star", "sigma", "mu_star_half_width")}
     for k in range(shape[1]):
-        told = morris_analysis.analyze(
+        result = morris_analysis.analyze(
             factors.problem, points, outputs[:, k], num_resamples=_RESAMPLES,
             conf_level=CONFIDENCE, num_levels=_LEVELS, seed=seed + 1,
         )  # fmt: skip
         for name, key in (
             ("mu_star", "mu_star"), ("sigma", "sigma"), ("mu_star_half_width", "mu_star_conf"),
         ):  # fmt: skip
-            found[name][:, k] = np.ma.filled(np.ma.asarray(told[key], dtype=float), np.nan)
-    data: dict[str, Any] = {name: (("factor", "output"), values) for name, values in found.items()}
-    together = np.sqrt(np.mean(found["mu_star"] ** 2, axis=1))
+            effects[name][:, k] = np.ma.filled(np.ma.asarray(result[key], dtype=float), np.nan)
+    data: dict[str, Any] = {
+        name: (("factor", "output"), values) for name, values in effects.items()
+    }
+    together = np.sqrt(np.mean(effects["mu_star"] ** 2, axis=1))
     data["mu_star_together"] = ("factor", together)
     return _dataset(data, factors, evaluations=len(points), method="morris")
 
@@ -271,8 +275,8 @@ def _by_derivatives(
         "active_direction": (("parameter", "direction"), vectors),
         "variance": ("output", variance),
     }
-    found = _dataset(data, factors, evaluations=samples, method="derivatives")
-    return found.assign_coords(parameter=list(factors.names))
+    dataset = _dataset(data, factors, evaluations=samples, method="derivatives")
+    return dataset.assign_coords(parameter=list(factors.names))
 
 
 def _evaluated(function: Function, points: np.ndarray) -> np.ndarray:

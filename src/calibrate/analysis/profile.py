@@ -93,9 +93,9 @@ def _profile(
         return -log_likelihood(jnp.zeros(z.shape[1]).at[k].set(value).at[others].set(rest))
 
     def safe(rest: np.ndarray, value: float) -> tuple[float, np.ndarray]:
-        found, gradient = (np.asarray(part) for part in objective(jnp.asarray(rest), value))
-        fine = np.isfinite(found) and np.isfinite(gradient).all()
-        return (float(found), gradient) if fine else (1e10, np.zeros_like(rest))
+        optima, gradient = (np.asarray(part) for part in objective(jnp.asarray(rest), value))
+        fine = np.isfinite(optima) and np.isfinite(gradient).all()
+        return (float(optima), gradient) if fine else (1e10, np.zeros_like(rest))
 
     best, last = [], None
     for value in grid:
@@ -103,13 +103,13 @@ def _profile(
         starts += [] if last is None else [last]
         low, high = -limits[others], limits[others]
         box = list(zip(low, high, strict=True))
-        found = [
+        optima = [
             minimize(safe, np.clip(s, low, high), (value,), jac=True, bounds=box)
             if len(others)
             else _nothing_to_fit(safe, value)
             for s in starts
         ]
-        lowest = min(found, key=lambda result: result.fun)
+        lowest = min(optima, key=lambda result: result.fun)
         best.append(-lowest.fun)
         last = lowest.x
     return np.array(best)

@@ -164,18 +164,18 @@ def calibration_of(replicates: Iterator[Replicate], seed: int = 0) -> Calibratio
         Fewer than 20 replicates, draws that are missing or not finite.
     """
     rng = np.random.default_rng(seed)
-    found: dict[str, list[float]] = {}
+    ranks: dict[str, list[float]] = {}
     for replicate in replicates:
         for name, draws in replicate.draws.items():
             values, truth = np.asarray(draws), float(replicate.truth[name])
             if not (values.size and np.isfinite(values).all() and np.isfinite(truth)):
                 raise InputError(f"calibration: a draw or truth of {name} is not finite")
             below, ties = int(np.sum(values < truth)), int(np.sum(values == truth))
-            found.setdefault(name, []).append(
+            ranks.setdefault(name, []).append(
                 (below + rng.random() * (1 + ties)) / (len(values) + 1)
             )
-    _check_count(min(map(len, found.values()), default=0))
-    return Calibration({name: np.array(u) for name, u in found.items()})
+    _check_count(min(map(len, ranks.values()), default=0))
+    return Calibration({name: np.array(u) for name, u in ranks.items()})
 
 
 def _check_count(replicates: int) -> None:
@@ -235,8 +235,10 @@ def sbc(
         rows = np.linspace(0, len(every[model.names[0]]) - 1, draws).astype(int)
         return {name: values[rows] for name, values in every.items()}
 
-    made = _data_sets(truth, replicates, seed, scheduler)
-    return calibration_of(_replicates(model, made, draw or sampled, seed, progress=progress), seed)
+    data_sets = _data_sets(truth, replicates, seed, scheduler)
+    return calibration_of(
+        _replicates(model, data_sets, draw or sampled, seed, progress=progress), seed
+    )
 
 
 def _data_sets(truth: Model, count: int, seed: int, scheduler: str | None) -> predictions.Prior:
@@ -246,21 +248,21 @@ def _data_sets(truth: Model, count: int, seed: int, scheduler: str | None) -> pr
         return predictions.prior_replicates(truth, rng_key, count)
     solved_by(truth.forward, in_process)  # a map that solves nothing is refused before connecting
     with executor(scheduler) as execute:
-        there = replace(truth, forward=solved_by(truth.forward, execute))
-        return predictions.prior_replicates(there, rng_key, count)
+        on_workers = replace(truth, forward=solved_by(truth.forward, execute))
+        return predictions.prior_replicates(on_workers, rng_key, count)
 
 
 def _replicates(
-    model: Model, made: predictions.Prior, draw: Sample, seed: int, *, progress: bool
+    model: Model, data_sets: predictions.Prior, draw: Sample, seed: int, *, progress: bool
 ) -> Iterator[Replicate]:
-    rows = range(len(next(iter(made.draws.values()))))
+    rows = range(len(next(iter(data_sets.draws.values()))))
     for r in counting(rows, "calibration", disable=not progress, unit="data set"):
-        data = {name: values[r] for name, values in made.data.items()}
-        true = {name: values[r] for name, values in made.draws.items()}
-        found = draw(data, seed + r)
+        data = {name: values[r] for name, values in data_sets.data.items()}
+        true = {name: values[r] for name, values in data_sets.draws.items()}
+        draws = draw(data, seed + r)
         yield Replicate(
             {**true, LOG_LIKELIHOOD: _log_likelihoods(model, true, data)},
-            {**found, LOG_LIKELIHOOD: _log_likelihoods(model, found, data)},
+            {**draws, LOG_LIKELIHOOD: _log_likelihoods(model, draws, data)},
         )
 
 

@@ -74,7 +74,7 @@ def sensitivity(
     check_independent(prior)
     prior, _ = fit_to(forward, prior)
     factors = Factors(scene.parameter_names, dict(groups or {}))
-    found = {}
+    datasets = {}
     with executor(scheduler) as execute:
         solving = forward if scheduler is None else solved_by(forward, execute)
         outputs = Outputs(solving, parts, field=field, what="sensitivity")
@@ -89,11 +89,11 @@ def sensitivity(
                 seed=seed,
             )
             unit = "mm" if name == FIELD else parts[name].unit
-            found[name] = data.assign_attrs(unit=unit)
+            datasets[name] = data.assign_attrs(unit=unit)
             if name == FIELD:  # its output is the node of that number
-                found[name] = found[name].assign_coords(output=outputs.nodes)
+                datasets[name] = datasets[name].assign_coords(output=outputs.nodes)
     about = {"forward": forward.label, "scene": scene.name, "method": method, "seed": seed}
-    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=about), **found})
+    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=about), **datasets})
 
 
 def _over_unit_cube(outputs: Outputs, prior: Prior, factors: Factors) -> tuple[Function, Function]:

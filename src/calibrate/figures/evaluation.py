@@ -73,12 +73,12 @@ def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
 
 
 def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> None:
-    found = quantiles(values)
+    marks = quantiles(values)
     head = f"{label}: " if label else ""
     for name, style, text in (("median", "-", "median"), ("q97_5", "--", "97.5 %")):
-        if found[name] > 0.0:
-            line = f"{head}{text} {found[name]:.3g}"
-            axes.axvline(found[name], color=colour, ls=style, lw=1.2, label=line)
+        if marks[name] > 0.0:
+            line = f"{head}{text} {marks[name]:.3g}"
+            axes.axvline(marks[name], color=colour, ls=style, lw=1.2, label=line)
     curve = log_density(values)
     if curve is None:
         return  # all values are alike: no density to draw

@@ -17,14 +17,14 @@ from emulator.scenes.scene import Scene
 _INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ for all readers
 
 
-def draw_calibration(found: Calibration, title: str, path: str | Path) -> None:
+def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> None:
     """Distribution function of each quantity's ranks less the uniform one, with its band.
 
     A hump above zero: truths lie low among the draws. Steep ends, flat middle: the posterior is too
     narrow. Flat ends, steep middle: it is too wide.
     """
     plt = pyplot()
-    names, outside = list(found.ranks), found.outside()
+    names, outside = list(calibration.ranks), calibration.outside()
     columns = min(len(names), 3)
     rows = -(-len(names) // columns)
     figure, grid = plt.subplots(
@@ -33,12 +33,12 @@ def draw_calibration(found: Calibration, title: str, path: str | Path) -> None:
     )  # fmt: skip
     each = 1.0 - 0.05 / len(names)
     for axes, name in zip(grid.flat, names, strict=False):
-        band = found.band(name, each)
+        band = calibration.band(name, each)
         axes.fill_between(band.x, band.low - band.x, band.high - band.x, color=_BAND, lw=0)
         color = _OUTSIDE if outside[name] else _INSIDE
         axes.step(band.x, band.ecdf - band.x, where="post", color=color, lw=1.4)
         axes.axhline(0.0, color="0.4", lw=0.6)
-        covered = found.coverage()[name]
+        covered = calibration.coverage()[name]
         text = ", ".join(f"{100 * covered[c][0]:.0f}" for c in LEVELS)
         wanted = "/".join(f"{100 * c:g}" for c in LEVELS)
         axes.set_title(f"{name}\ncoverage {text} % ({wanted} %)", fontsize=9)
@@ -48,8 +48,8 @@ def draw_calibration(found: Calibration, title: str, path: str | Path) -> None:
         axes.set_xlabel("rank of the truth among the draws")
     for axes in grid[:, 0]:
         axes.set_ylabel("distribution less uniform")
-    verdict = "inside the 95 % band" if found.passed else "outside the 95 % band"
-    figure.suptitle(f"{title}: {found.replicates} data sets, {verdict}")
+    verdict = "inside the 95 % band" if calibration.passed else "outside the 95 % band"
+    figure.suptitle(f"{title}: {calibration.replicates} data sets, {verdict}")
     save(figure, path)
 
 
@@ -94,29 +94,29 @@ _MAPPED = {"sobol": "total", "morris": "mu_star", "derivatives": "bound_on_total
 _MOST_MAPS = 9  # more would be too small to see
 
 
-def draw(found: xr.DataTree, scene: Scene, folder: str | Path) -> list[Path]:
+def draw(study: xr.DataTree, scene: Scene, folder: str | Path) -> list[Path]:
     """Draw the indices, and maps where the field was analysed, into ``folder``; the files."""
-    figures = {"sensitivity.png": index_figure(found)}
-    if FIELD in found.children:
-        figures["sensitivity_on_body.png"] = body_figure(found, scene)
+    figures = {"sensitivity.png": index_figure(study)}
+    if FIELD in study.children:
+        figures["sensitivity_on_body.png"] = body_figure(study, scene)
     for name, figure in figures.items():
         save(figure, Path(folder) / name)
     return [Path(folder) / name for name in figures]
 
 
-def index_figure(found: xr.DataTree) -> Any:
+def index_figure(study: xr.DataTree) -> Any:
     """Bars of every factor, one panel for each observation, with 95 % intervals."""
     plt = pyplot()
-    names, bars = list(found.children), _BARS[found.attrs["method"]]
+    names, bars = list(study.children), _BARS[study.attrs["method"]]
     figure, panels = plt.subplots(
         1, len(names), figsize=(1.5 + 3.4 * len(names), 3.8), layout="constrained", squeeze=False
     )
     for axes, name in zip(panels[0], names, strict=True):
-        _draw_bars(axes, found[name].to_dataset(), bars)
+        _draw_bars(axes, study[name].to_dataset(), bars)
         title = name if name != FIELD else "displacement of all nodes"
-        axes.set_title(f"{title}, sd {_sd(found[name].to_dataset())}", fontsize="medium")
+        axes.set_title(f"{title}, sd {_sd(study[name].to_dataset())}", fontsize="medium")
     panels[0, 0].legend(frameon=False)
-    figure.suptitle(f"{found.attrs['scene']} by {found.attrs['forward']}: what moves what")
+    figure.suptitle(f"{study.attrs['scene']} by {study.attrs['forward']}: what moves what")
     return figure
 
 
@@ -144,15 +144,15 @@ def _sd(data: xr.Dataset) -> str:
     return f"{float(np.sqrt(data['variance'].mean())):.3g}{unit}"
 
 
-def body_figure(found: xr.DataTree, scene: Scene) -> Any:
+def body_figure(study: xr.DataTree, scene: Scene) -> Any:
     """The body at rest, once for each factor, coloured by the factor's index at the nodes."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     plt = pyplot()
-    name = _MAPPED[found.attrs["method"]]
-    values = found[FIELD].to_dataset()[name]
+    name = _MAPPED[study.attrs["method"]]
+    values = study[FIELD].to_dataset()[name]
     labels = [str(label) for label in values[values.dims[0]].values][:_MOST_MAPS]
     nodes, triangles = scene.mesh.nodes, flat_triangles(scene.mesh.surface)
     known = np.asarray(values)[:, triangles]

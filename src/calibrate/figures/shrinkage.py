@@ -27,42 +27,42 @@ class Intervals(NamedTuple):
     new: np.ndarray
 
 
-def intervals_of(found: Hierarchy, name: str, probability: float = 0.9) -> Intervals:
+def intervals_of(population: Hierarchy, name: str, probability: float = 0.9) -> Intervals:
     """Central intervals of ``probability`` of the shared unknown ``name``, in its unit."""
-    together = np.moveaxis(np.asarray(found.tree["posterior"][name]), -1, 0)
-    rows = together.reshape(len(found.members), -1)
-    alone, new = np.asarray(found.tree[ALONE][name]), found.new_member()[name]
+    together = np.moveaxis(np.asarray(population.tree["posterior"][name]), -1, 0)
+    rows = together.reshape(len(population.members), -1)
+    alone, new = np.asarray(population.tree[ALONE][name]), population.new_member()[name]
     edge = 0.5 * (1.0 - probability)
     ends = [edge, 0.5, 1.0 - edge]
     return Intervals(*(np.quantile(draws, ends, axis=-1) for draws in (alone, rows, new)))
 
 
-def label_of(found: Hierarchy, name: str) -> str:
+def label_of(population: Hierarchy, name: str) -> str:
     """A shared unknown with its unit."""
-    unit = str(found.tree["posterior"][name].attrs.get("units", "1"))
+    unit = str(population.tree["posterior"][name].attrs.get("units", "1"))
     return name if unit == "1" else f"{name} ({unit})"
 
 
-def draw(found: Hierarchy, path: str | Path, probability: float = 0.9) -> None:
+def draw(population: Hierarchy, path: str | Path, probability: float = 0.9) -> None:
     """Central intervals of ``probability`` and medians of each shared unknown, a row a member.
 
     Grey: the member's own data. Blue: with the population. The band is where a member not seen is
     expected, the line its median.
     """
     plt = pyplot()
-    names, members = found.shared, found.members
+    names, members = population.shared, population.members
     figure, grid = plt.subplots(
         1, len(names), figsize=(1.2 + 3.6 * len(names), 1.6 + 0.34 * len(members)), sharey=True,
         layout="constrained", squeeze=False,
     )  # fmt: skip
     rows = np.arange(len(members))
     for axes, name in zip(grid.flat, names, strict=True):
-        alone, together, (low, middle, high) = intervals_of(found, name, probability)
+        alone, together, (low, middle, high) = intervals_of(population, name, probability)
         axes.axvspan(low, high, color=_POPULATION, alpha=0.14, lw=0, label="a member not seen")
         axes.axvline(middle, color=_POPULATION, lw=1.2)
         _intervals(axes, alone, rows - APART, _ALONE, "alone")
         _intervals(axes, together, rows + APART, _TOGETHER, "with the others")
-        axes.set_xlabel(label_of(found, name))
+        axes.set_xlabel(label_of(population, name))
         axes.spines[["top", "right"]].set_visible(False)
     grid[0, 0].set_yticks(rows, members)
     grid[0, 0].invert_yaxis()

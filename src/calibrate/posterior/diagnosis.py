@@ -17,10 +17,10 @@ def summary_of(
     draws: Mapping[str, np.ndarray], probability: float = 0.9
 ) -> dict[str, dict[str, float]]:
     """Of draws (chains, draws): mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
-    found = base.dict_to_dataset(dict(draws))
+    dataset = base.dict_to_dataset(dict(draws))
     # By default ArviZ takes the tails of its own interval, which a user may have set.
-    bulk = stats.ess(found, method="bulk")
-    tail = stats.ess(found, method="tail", prob=(0.05, 0.95))
+    bulk = stats.ess(dataset, method="bulk")
+    tail = stats.ess(dataset, method="tail", prob=(0.05, 0.95))
     edge = 0.5 * (1.0 - probability)
     table = {}
     for name, values in draws.items():
@@ -59,7 +59,7 @@ def diagnose(
     summary : of each parameter, with ``r_hat``, ``ess_bulk`` and ``ess_tail``.
     attributes : of the run, e.g. ``pareto_k``.
     """
-    found = [
+    sentences = [
         _divergences(draws, statistics.get("diverging")),
         _disagreement(summary),
         _too_few(summary),
@@ -67,7 +67,7 @@ def diagnose(
         _approximation(attributes.get("pareto_k"), attributes.get("importance_efficiency")),
         _missed(attributes.get(MISSED_AT), attributes.get(MISSED_BY)),
     ]
-    return [sentence for sentence in found if sentence]
+    return [sentence for sentence in sentences if sentence]
 
 
 def _divergences(draws: Mapping[str, np.ndarray], diverging: np.ndarray | None) -> str:
@@ -75,8 +75,8 @@ def _divergences(draws: Mapping[str, np.ndarray], diverging: np.ndarray | None) 
         return ""
     diverging = np.asarray(diverging, bool)
     count, share = int(diverging.sum()), 100.0 * diverging.mean()
-    found = [place for name, v in draws.items() if (place := _where(name, v, diverging))]
-    places = [words for _, words in sorted(found, reverse=True)[:_NAMED]]
+    clusters = [place for name, v in draws.items() if (place := _where(name, v, diverging))]
+    places = [words for _, words in sorted(clusters, reverse=True)[:_NAMED]]
     return (
         f"{count} divergent transitions of {diverging.size} ({share:.2g} %)"
         + (f", mostly at {' and '.join(places)}" if places else ", spread over the whole posterior")

@@ -91,11 +91,11 @@ def _sentence(name: str, replicates: np.ndarray, data: np.ndarray) -> str:
     y = replicates.reshape(-1, data.size)
     if len(y) < _FEWEST or not np.isfinite(y).all() or not (y.std(axis=0) > 0.0).all():
         return ""
-    found = misfit_of(name, replicates, data)
-    if found.p >= SMALLEST_P and found.p_worst > 0.0:
+    misfit = misfit_of(name, replicates, data)
+    if misfit.p >= SMALLEST_P and misfit.p_worst > 0.0:
         return ""
-    worst = "".join(f" ({place} is {d:.3g} sd off)" for place, d in [*found.outlying.items()][:1])
+    worst = "".join(f" ({place} is {d:.3g} sd off)" for place, d in [*misfit.outlying.items()][:1])
     return (
-        f"{name} does not fit the model, posterior predictive p {min(found.p, found.p_worst):.3f}"
+        f"{name} does not fit the model, posterior predictive p {min(misfit.p, misfit.p_worst):.3f}"
         f"{worst}: check outlying data, registration, units, law and noise sd"
     )

@@ -89,8 +89,8 @@ def klotz_band(
 
     row = _row(model.states.states, state)
     thetas = model.states.thetas(model.prior_draws(jax.random.key(seed), count))[:, row]
-    found = np.asarray(jax.jit(partial(jax.lax.map, apart))(thetas))
-    valid = found[np.isfinite(found)]
+    curves = np.asarray(jax.jit(partial(jax.lax.map, apart))(thetas))
+    valid = curves[np.isfinite(curves)]
     if not valid.size:
         raise InputError(f"klotz: the forward map has no answer at any of {count} draws")
     return KlotzBand(valid, band, count - valid.size)

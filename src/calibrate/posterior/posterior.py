@@ -223,21 +223,21 @@ def sample(
     options = check_options(chosen, options)
     model, checked = model.given(data)
     fem = _fem_likelihood(chosen, model, simulator)
-    made = provenance(model, seed, sampler, options)
-    state = Checkpoint(checkpoint, _identity(made, checked))
+    record = provenance(model, seed, sampler, options)
+    state = Checkpoint(checkpoint, _identity(record, checked))
     context = Context(progress, state, fem)
     density = density_of(model)
-    found = chosen.sample(density, checked, options, seed, context)
-    attributes = dict(found.attributes)
+    run = chosen.sample(density, checked, options, seed, context)
+    attributes = dict(run.attributes)
     if MISSED_BY not in attributes:
-        z = np.asarray(found.z).reshape(-1, density.dimension)
+        z = np.asarray(run.z).reshape(-1, density.dimension)
         key = jax.random.fold_in(jax.random.key(seed), _MODES)
         modes = find_modes(density, checked, key, draws=z)
         attributes |= missed_mode(density, checked, z, modes)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
-    draws = named_draws(model, found.z)
-    tree = make_tree(model, checked, draws, found.statistics, rng_key, found.means)
-    for name, value in {**made, **attributes}.items():
+    draws = named_draws(model, run.z)
+    tree = make_tree(model, checked, draws, run.statistics, rng_key, run.means)
+    for name, value in {**record, **attributes}.items():
         tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
     state.remove()
     return Posterior(tree, model, checked)
@@ -258,12 +258,12 @@ def _fem_likelihood(
     return None if simulator is None else FEMLikelihood(model, simulator)
 
 
-def _identity(made: Mapping[str, Any], data: Data) -> dict[str, str]:
+def _identity(record: Mapping[str, Any], data: Data) -> dict[str, str]:
     """What a run is of, by name: provenance without places, and a hash of the data."""
     digest = hashlib.sha256()
     for name in sorted(data):
         digest.update(name.encode() + np.asarray(data[name]).tobytes())
-    described = {name: json.dumps(value) for name, value in made.items() if name != "scene"}
+    described = {name: json.dumps(value) for name, value in record.items() if name != "scene"}
     # What a user changes most comes first: the first difference is named.
     first = {name: described.pop(name) for name in ("sampler", "seed", "sampler_options")}
     return {**first, **described, "data": digest.hexdigest()[:16]}

@@ -53,8 +53,8 @@ def log_likelihood(
     means : data without noise (chains, draws, *shape), where the draws are not of the model's own
         posterior; by its forward map otherwise.
     """
-    told = _programs(model).log_likelihood(_flat(draws), _flat_means(means), data)
-    return _unflat(told, draws)
+    terms = _programs(model).log_likelihood(_flat(draws), _flat_means(means), data)
+    return _unflat(terms, draws)
 
 
 def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> np.ndarray:
@@ -65,8 +65,8 @@ def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> n
     InputError
         ``forward`` has no answer at one of them.
     """
-    asked: Any = (forward, observe)
-    return _outputs(*asked).values(thetas).reshape(-1, *observe.shape)
+    key: Any = (forward, observe)
+    return _outputs(*key).values(thetas).reshape(-1, *observe.shape)
 
 
 @lru_cache(maxsize=4)
@@ -94,10 +94,10 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
     """
     keys = jax.random.split(rng_key, count + count // 10)
     if isinstance(model.forward, SolvingMap):
-        made = _solved_prior(model, keys)
+        prior = _solved_prior(model, keys)
     else:
-        made = _programs(model).prior(keys)
-    draws, data, valid = jax.tree.map(np.asarray, made)
+        prior = _programs(model).prior(keys)
+    draws, data, valid = jax.tree.map(np.asarray, prior)
     rows = np.flatnonzero(valid)[:count]
     return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))
 
@@ -116,11 +116,11 @@ def _solved_prior(model: Model, keys: jax.Array) -> Any:
     The theta of all draws first, then every solve, then the data: keys decide on all of them alike.
     """
     states = model.states
-    given = partial(_prior, model)
+    prior_of = partial(_prior, model)
     at_rest = Prediction(
         jnp.zeros((len(states.states), len(model.observe.nodes), 3)), jnp.array(True)
     )
-    draws = jax.jit(jax.vmap(lambda key: given(key, at_rest)[0]))(keys)
+    draws = jax.jit(jax.vmap(lambda key: prior_of(key, at_rest)[0]))(keys)
     thetas = jax.jit(jax.vmap(states.thetas))({name: draws[name] for name in states.unknowns})
     solved = evaluate_all(model.forward, thetas.reshape(-1, thetas.shape[-1]))
     shape = thetas.shape[:2]
@@ -128,7 +128,7 @@ def _solved_prior(model: Model, keys: jax.Array) -> Any:
         solved.displacement.reshape(*shape, *solved.displacement.shape[1:]),
         jnp.all(solved.valid.reshape(shape), axis=1),
     )
-    return jax.jit(jax.vmap(given))(keys, known)
+    return jax.jit(jax.vmap(prior_of))(keys, known)
 
 
 def _prior(model: Model, rng_key: jax.Array, prediction: Prediction | None = None) -> Any:
@@ -165,8 +165,8 @@ def _programs(model: Model) -> _Programs:
     ) -> dict[str, jax.Array]:
         if means is not None:
             own, *keys = jax.random.split(rng_key, len(means) + 1)
-            moved = model.fem_means(own, draw, means)
-            around = model.distributions(moved, model.noise_values(draw))
+            own_means = model.fem_means(own, draw, means)
+            around = model.distributions(own_means, model.noise_values(draw))
             return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
         seeded = handlers.substitute(handlers.seed(model, rng_key), data=draw)
         trace = handlers.trace(seeded).get_trace()

@@ -74,11 +74,13 @@ def _predictions(
     """The groups of predictions, and which draws of each chain data was replicated at."""
     posterior_key, prior_key = jax.random.split(rng_key)
     rows, some = predictions.spread(draws)
-    there = None if means is None else {name: np.asarray(m)[:, rows] for name, m in means.items()}
+    own_means = (
+        None if means is None else {name: np.asarray(m)[:, rows] for name, m in means.items()}
+    )
     prior = predictions.prior_replicates(model, prior_key)
     groups = {
         "log_likelihood": predictions.log_likelihood(model, draws, data, means),
-        "posterior_predictive": predictions.replicates(model, some, posterior_key, there),
+        "posterior_predictive": predictions.replicates(model, some, posterior_key, own_means),
         "prior": {name: values[None] for name, values in prior.draws.items()},
         "prior_predictive": {name: values[None] for name, values in prior.data.items()},
     }

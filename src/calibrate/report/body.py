@@ -70,16 +70,16 @@ def _colours(
     theta: jax.Array,
 ) -> dict[str, np.ndarray]:
     """Values (n,) at the nodes, by what they are."""
-    found = {
+    colours = {
         "mean displacement (mm)": np.linalg.norm(mean, axis=1),
         "sd of displacement (mm)": np.sqrt(fields.var(axis=0).sum(axis=1)),
     }
-    told = element_fields(scene, jnp.asarray(mean), theta)
-    largest = np.linalg.eigvalsh(told["green_lagrange"])[:, -1]
-    found["largest principal strain"] = _nodal(scene, largest)
-    if "fibre_stretch" in told:
-        found["fibre stretch"] = _nodal(scene, told["fibre_stretch"])
-    return found
+    element_values = element_fields(scene, jnp.asarray(mean), theta)
+    largest = np.linalg.eigvalsh(element_values["green_lagrange"])[:, -1]
+    colours["largest principal strain"] = _nodal(scene, largest)
+    if "fibre_stretch" in element_values:
+        colours["fibre stretch"] = _nodal(scene, element_values["fibre_stretch"])
+    return colours
 
 
 def _error(posterior: Posterior, theta: jax.Array, simulator: Simulator) -> dict[str, np.ndarray]:
@@ -114,10 +114,10 @@ def _coloured(values: np.ndarray, title: str) -> dict[str, Any]:
 
 def _fibres(scene: Scene, mean: np.ndarray, theta: jax.Array) -> go.Scatter3d:
     """Short lines along the deformed fibres of some elements."""
-    told = element_fields(scene, jnp.asarray(mean), theta)["deformed_fibres"]
-    some = np.linspace(0, len(told) - 1, min(len(told), _FIBRES)).astype(int)
+    directions = element_fields(scene, jnp.asarray(mean), theta)["deformed_fibres"]
+    some = np.linspace(0, len(directions) - 1, min(len(directions), _FIBRES)).astype(int)
     middle = (scene.mesh.nodes + mean)[scene.mesh.elements[some, :4]].mean(axis=1)
-    half = 0.5 * np.cbrt(scene.discretisation.weights.sum(axis=1)[some])[:, None] * told[some]
+    half = 0.5 * np.cbrt(scene.discretisation.weights.sum(axis=1)[some])[:, None] * directions[some]
     ends = np.stack([middle - half, middle + half, np.full_like(middle, np.nan)], axis=1)
     lines = {name: [None if np.isnan(v) else round(float(v), _DIGITS) for v in ends[..., k].ravel()]
              for k, name in enumerate("xyz")}  # fmt: skip
@@ -134,8 +134,8 @@ def _add_controls(figure: go.Figure, names: list[str], colours: dict[str, np.nda
     steps = [{"label": n, "method": "animate", "args": [[n], at_once]} for n in names]
     buttons = []
     for title, values in colours.items():
-        made = _coloured(values, title)
-        restyle = {"intensity": [made["intensity"]], "colorbar.title.text": [title]}
+        style = _coloured(values, title)
+        restyle = {"intensity": [style["intensity"]], "colorbar.title.text": [title]}
         buttons.append({"label": title, "method": "restyle", "args": [restyle, [0]]})
     figure.update_layout(
         sliders=[{"steps": steps, "currentvalue": {"prefix": "shape: "}, "pad": {"t": 10}}],

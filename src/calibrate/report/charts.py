@@ -48,11 +48,11 @@ def inside(values: np.ndarray, measured: np.ndarray) -> np.ndarray:
 def names_with_units(posterior: Posterior) -> dict[str, str]:
     """Label of each unknown, its unit included."""
     units = {p.name: p.unit for p in posterior.model.forward.scene.parameters}
-    found = {}
+    labels = {}
     for name in posterior.model.names:
         unit = units.get(split(name)[0], "")
-        found[name] = f"{name} ({unit})" if unit else name
-    return found
+        labels[name] = f"{name} ({unit})" if unit else name
+    return labels
 
 
 def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
@@ -88,7 +88,7 @@ def _many_numbers(
     name: str, part: Observation, values: np.ndarray, measured: np.ndarray
 ) -> go.Figure:
     low, middle, high = np.nanquantile(values, [0.05, 0.5, 0.95], axis=0)
-    there = np.isfinite(measured)
+    present = np.isfinite(measured)
     share = 100.0 * inside(values, measured).mean()
     ends = [float(np.nanmin(measured)), float(np.nanmax(measured))]
     figure = go.Figure()
@@ -97,15 +97,15 @@ def _many_numbers(
         hoverinfo="skip",
     )  # fmt: skip
     figure.add_scatter(
-        x=measured[there],
-        y=middle[there],
+        x=measured[present],
+        y=middle[present],
         mode="markers",
         marker={"color": BLUE, "size": 6},
         error_y={
             "type": "data",
             "symmetric": False,
-            "array": (high - middle)[there],
-            "arrayminus": (middle - low)[there],
+            "array": (high - middle)[present],
+            "arrayminus": (middle - low)[present],
             "thickness": 1,
         },
         name=f"median and 90 %; {share:.0f} % of the data lie within",
@@ -282,13 +282,13 @@ def _measured_volumes(
     posterior: Posterior, curve: PressureVolume
 ) -> dict[str, tuple[float, np.ndarray]]:
     """By the observation's name, the cavity's measured volume in mL, and its pressure at draws."""
-    found, model = {}, posterior.model
+    volumes, model = {}, posterior.model
     column = model.forward.scene.parameter_names.index(curve.parameter.name)
     for seen, part in model.observe.parts.items():
         if part.to_json() == curve.volume.to_json():
             pressures = np.asarray(posterior.thetas(split(seen)[1])[:, column])
-            found[seen] = float(posterior.data[seen]), pressures
-    return found
+            volumes[seen] = float(posterior.data[seen]), pressures
+    return volumes
 
 
 def _add_measured(figure: go.Figure, seen: str, volume: float, pressures: np.ndarray) -> None:

@@ -85,14 +85,14 @@ def html_of(
 
 
 def _verdict(
-    run: Run, posterior: Posterior, certificate: dict[str, Any] | None, made: str
+    run: Run, posterior: Posterior, certificate: dict[str, Any] | None, day: str
 ) -> Verdict:
     """Return the certificate's verdict, findings and basis, with the run's warnings."""
     basis = f"Data: {run.data}."
     findings: Sequence[str] = ()
     if certificate is not None:
         text, findings = certificate["verdict"], certificate["findings"]
-        basis = " ".join([*_basis(certificate), basis, made])
+        basis = " ".join([*_basis(certificate), basis, day])
     elif "fem_solves" in posterior.tree.attrs:
         text = "decided by FEM"
     else:

@@ -37,12 +37,12 @@ _COLUMNS = 3  # parameters beside each other, at most
 _ROW, _MARGIN = 34, 110  # pixels: of a member, and around a row of parameters
 
 
-def shrinkage(found: Hierarchy) -> go.Figure:
+def shrinkage(population: Hierarchy) -> go.Figure:
     """Medians and central 90 % intervals of each shared unknown, a row a member.
 
     Grey: by the member's own data. Blue: with the others. The band is a member not seen.
     """
-    names, members = found.shared, found.members
+    names, members = population.shared, population.members
     lines = math.ceil(len(names) / _COLUMNS)
     columns = math.ceil(len(names) / lines)  # four are two by two
     height = _ROW * len(members) + _MARGIN
@@ -53,9 +53,9 @@ def shrinkage(found: Hierarchy) -> go.Figure:
     edges = (len(members) - 0.4, -0.6)  # the first member on top
     for k, name in enumerate(names):
         row, column = k // columns + 1, k % columns + 1
-        for trace in _traces(intervals_of(found, name), members, edges):
+        for trace in _traces(intervals_of(population, name), members, edges):
             figure.add_trace(trace if k == 0 else trace.update(showlegend=False), row, column)
-        figure.update_xaxes(title_text=label_of(found, name), row=row, col=column)
+        figure.update_xaxes(title_text=label_of(population, name), row=row, col=column)
         ticks = {"tickvals": list(range(len(members))), "ticktext": members}
         figure.update_yaxes(range=edges, **ticks, automargin=True, row=row, col=column)
     legend = {"orientation": "h", "x": 0.0, "y": 1.02, "yanchor": "bottom"}
@@ -87,14 +87,14 @@ def _interval_trace(
 ) -> go.Scatter:
     """A dot and a line for each of the intervals ``ends`` (3, n), at the heights ``rows`` (n,)."""
     low, middle, high = ends
-    told = [f"{m}, {name}: {b:.4g} ({a:.4g} to {c:.4g})" for m, (a, b, c) in zip(
+    texts = [f"{m}, {name}: {b:.4g} ({a:.4g} to {c:.4g})" for m, (a, b, c) in zip(
         members, ends.T, strict=True
     )]  # fmt: skip
     return go.Scatter(
         x=middle, y=rows, mode="markers", marker={"color": colour, "size": 7}, name=name,
         error_x={"type": "data", "symmetric": False, "array": high - middle,
                  "arrayminus": middle - low, "thickness": 2.5, "width": 0},
-        text=told, hovertemplate="%{text}<extra></extra>", legendgroup=name,
+        text=texts, hovertemplate="%{text}<extra></extra>", legendgroup=name,
     )  # fmt: skip
 
 

@@ -140,18 +140,18 @@ class OneOf:
         self, core: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
         """One of the tables; each but the default's needs its ``key``."""
-        found = handler(core)
-        for name, member in zip(self.choices, found["oneOf"], strict=True):
+        schema = handler(core)
+        for name, member in zip(self.choices, schema["oneOf"], strict=True):
             table = handler.resolve_ref_schema(member)
             table["properties"][self.key] = {"const": name, "description": table["description"]}
             if name != self.default:
                 # A table that stands in several places passes here as often.
                 table["required"] = list(dict.fromkeys([self.key, *table.get("required", ())]))
-        return found
+        return schema
 
     def _tag(self, data: Any) -> str | None:
-        found = data.get(self.key, self.default) if isinstance(data, dict) else None
-        return found if isinstance(found, str) else None
+        tag = data.get(self.key, self.default) if isinstance(data, dict) else None
+        return tag if isinstance(tag, str) else None
 
 
 @dataclass(frozen=True)
@@ -315,13 +315,13 @@ def _for_files(node: Any) -> Any:
     if not isinstance(node, dict):
         return node
     empty = {"default": None, "title": node.get("title")}
-    kept = {
+    entries = {
         key: _for_files(value)
         for key, value in node.items()
         if not (key in empty and value == empty[key] and not isinstance(value, dict))
     }
-    (only,) = kept["anyOf"] if len(kept.get("anyOf", ())) == 1 else (None,)
-    return {**only, **{k: v for k, v in kept.items() if k != "anyOf"}} if only else kept
+    (only,) = entries["anyOf"] if len(entries.get("anyOf", ())) == 1 else (None,)
+    return {**only, **{k: v for k, v in entries.items() if k != "anyOf"}} if only else entries
 
 
 def expectation(annotation: Any) -> str | None:
@@ -357,7 +357,7 @@ def _mistake(expected: str = "", *, problem: str = "", key: str = "") -> Pydanti
 
 def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
     """The line about one of pydantic's errors."""
-    path, found = _found(source.data, error["loc"])
+    path, value_found = _found(source.data, error["loc"])
     context: dict[str, Any] = error.get("ctx", {})
     if error["type"] == "value_error":  # the dataclass refused its values
         return source.error(str(context["error"]), path, path)
@@ -365,16 +365,16 @@ def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
         key = context["key"]
         return source.error(context["problem"], (*path, key) if key else path, path)
     expected = context.get("expected") or _EXPECTED.get(error["type"], "a table")
-    if error["type"] == "choice" and isinstance(found, dict):
+    if error["type"] == "choice" and isinstance(value_found, dict):
         choices, key = json.loads(context["choices"]), context["key"]
         expected = " or ".join(map(json.dumps, choices))
-        if key not in found:
+        if key not in value_found:
             return source.error(f"key '{key}' is missing; expected {expected}", path, path)
-        path, found = (*path, key), found[key]
-        expected += closest(found, choices)
+        path, value_found = (*path, key), value_found[key]
+        expected += closest(value_found, choices)
     if source.toml and expected == "a list":
         expected = f"tables [[{path[-1]}]]"
-    value = _shortened(json.dumps(found, default=str, ensure_ascii=False))
+    value = _shortened(json.dumps(value_found, default=str, ensure_ascii=False))
     if expected == "a table" and path:
         return source.error(f"{source.written(path)} is {value}; expected a table", path)
     table, key = path[:-1], path[-1] if path else "content"

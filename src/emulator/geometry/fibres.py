@@ -85,32 +85,32 @@ def from_nodes(mesh: Mesh, at_nodes: np.ndarray, order: int) -> np.ndarray:
     return unit(np.einsum("qa,ma,mai->mqi", values, side, local))
 
 
-def from_elements(mesh: Mesh, given: np.ndarray) -> np.ndarray:
+def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
     """Unit directions at the quadrature points of quadratic elements, (m, 4, 3), from (m, 3).
 
     ``mesh`` is quadratic, or linear and about to be.
     """
     corners = mesh.nodes[mesh.corners]
-    centre, count = corners.mean(axis=1), len(given)
+    centre, count = corners.mean(axis=1), len(directions)
     rows = np.repeat(np.arange(count), 4)
     touching = csr_matrix((np.ones(4 * count), (rows, mesh.corners.ravel())))
     one, other = (touching @ touching.T).nonzero()
-    cosine = np.sum(given[one] * given[other], axis=1)
-    kept = (one != other) & (np.abs(cosine) > _ALIKE)
-    one, other, side = one[kept], other[kept], np.sign(cosine[kept])
+    cosine = np.sum(directions[one] * directions[other], axis=1)
+    alike_pairs = (one != other) & (np.abs(cosine) > _ALIKE)
+    one, other, side = one[alike_pairs], other[alike_pairs], np.sign(cosine[alike_pairs])
     step = centre[other] - centre[one]
     weight = 1.0 / np.sum(step**2, axis=1)
-    change = side[:, None] * given[other] - given[one]
+    change = side[:, None] * directions[other] - directions[one]
     gram = _summed(one, weight[:, None, None] * step[:, :, None] * step[:, None, :], count)
     moment = _summed(one, weight[:, None, None] * step[:, :, None] * change[:, None, :], count)
     damping = _DAMPING * np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-300)
     gram = gram + damping[:, None, None] * np.eye(3)
     slope = np.linalg.solve(gram, moment)  # NumPy, no batched LAPACK of JAX's
     away = np.einsum("qa,mai->mqi", quadrature_points(2), corners) - centre[:, None]
-    found = unit(given[:, None] + np.einsum("mqj,mji->mqi", away, slope))
+    at_points = unit(directions[:, None] + np.einsum("mqj,mji->mqi", away, slope))
     # A slope that would turn a direction by more than its neighbours differ is not believed.
-    alike = np.einsum("mqi,mi->mq", found, given) > _ALIKE
-    return np.where(alike[:, :, None], found, given[:, None])
+    alike = np.einsum("mqi,mi->mq", at_points, directions) > _ALIKE
+    return np.where(alike[:, :, None], at_points, directions[:, None])
 
 
 def _summed(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

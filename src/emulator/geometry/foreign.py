@@ -89,7 +89,7 @@ _PLURAL = {0: "points", 1: "lines", 2: "triangles"}
 Sets = dict[str, np.ndarray]
 
 
-def read_sets(found: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> tuple[Sets, Sets]:
+def read_sets(source: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> tuple[Sets, Sets]:
     """Node sets and facet sets of a mesh file.
 
     Groups of triangles become facet sets, their normals turned out of the body, and node sets of
@@ -97,7 +97,7 @@ def read_sets(found: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> t
 
     Parameters
     ----------
-    found : the file as meshio reads it.
+    source : the file as meshio reads it.
     number : (n,) new number of each of its nodes, -1 for those that were dropped.
     elements : (m, 4 or 10) tetrahedra in the new numbers, positively oriented.
 
@@ -106,7 +106,7 @@ def read_sets(found: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> t
     InputError
         A group without a name, or a triangle of a group that is not on the surface.
     """
-    found_groups = _groups(found)
+    found_groups = _groups(source)
     facets = {name: rows for (name, dimension), rows in found_groups.items() if dimension == 2}
     facet_sets = _on_surface({name: number[rows] for name, rows in facets.items()}, elements)
     node_sets = {name: np.unique(rows) for name, rows in facet_sets.items()}
@@ -114,7 +114,7 @@ def read_sets(found: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> t
     for (name, dimension), rows in found_groups.items():
         if dimension < 2:
             points.setdefault(name, []).append(rows.ravel())
-    for name, nodes in _point_sets(found):
+    for name, nodes in _point_sets(source):
         points.setdefault(name, []).append(nodes)
     for name, parts in points.items():
         nodes = np.unique(number[np.concatenate(parts)])
@@ -132,33 +132,33 @@ def own_node_sets(mesh: Mesh) -> Sets:
     }
 
 
-def _groups(found: meshio.Mesh) -> dict[tuple[str, int], np.ndarray]:
+def _groups(source: meshio.Mesh) -> dict[tuple[str, int], np.ndarray]:
     """``(name, dimension)`` -> corner nodes (k, dimension + 1) of the group's cells."""
     parts: dict[tuple[str, int], list[np.ndarray]] = {}
-    for k, block in enumerate(found.cells):
+    for k, block in enumerate(source.cells):
         if block.dim < 3:
-            for name, cells in _named_cells(found, k):
+            for name, cells in _named_cells(source, k):
                 corners = np.asarray(block.data)[cells][:, : block.dim + 1]
                 if len(corners):
                     parts.setdefault((name, block.dim), []).append(corners)
     return {key: np.concatenate(rows) for key, rows in parts.items()}
 
 
-def _named_cells(found: meshio.Mesh, k: int) -> Iterator[tuple[str, np.ndarray]]:
+def _named_cells(source: meshio.Mesh, k: int) -> Iterator[tuple[str, np.ndarray]]:
     """Name and members of every group in cell block ``k``."""
-    for name, members in found.cell_sets.items():
+    for name, members in source.cell_sets.items():
         if name != "gmsh:bounding_entities" and members[k] is not None:
             yield name, np.asarray(members[k], dtype=np.int64)
-    for name, data in found.cell_data.items():
+    for name, data in source.cell_data.items():
         if name.startswith(MARK):
             yield name.removeprefix(MARK), np.flatnonzero(data[k])
-    if _TAG in found.cell_data:
-        yield from _tagged_cells(found, k)
+    if _TAG in source.cell_data:
+        yield from _tagged_cells(source, k)
 
 
-def _tagged_cells(found: meshio.Mesh, k: int) -> Iterator[tuple[str, np.ndarray]]:
-    dimension, tags = found.cells[k].dim, np.asarray(found.cell_data[_TAG][k])
-    names = {tuple(map(int, entry)): name for name, entry in found.field_data.items()}
+def _tagged_cells(source: meshio.Mesh, k: int) -> Iterator[tuple[str, np.ndarray]]:
+    dimension, tags = source.cells[k].dim, np.asarray(source.cell_data[_TAG][k])
+    names = {tuple(map(int, entry)): name for name, entry in source.field_data.items()}
     for tag in np.unique(tags[tags != 0]).tolist():
         if (tag, dimension) not in names:
             raise InputError(
@@ -168,10 +168,10 @@ def _tagged_cells(found: meshio.Mesh, k: int) -> Iterator[tuple[str, np.ndarray]
         yield names[tag, dimension], np.flatnonzero(tags == tag)
 
 
-def _point_sets(found: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
-    for name, nodes in found.point_sets.items():
+def _point_sets(source: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
+    for name, nodes in source.point_sets.items():
         yield name, np.asarray(nodes, dtype=np.int64)
-    for name, data in found.point_data.items():
+    for name, data in source.point_data.items():
         if name.startswith(MARK):
             yield name.removeprefix(MARK), np.flatnonzero(data)
 

@@ -196,8 +196,8 @@ def _sector(turn: np.ndarray, count: int) -> np.ndarray:
     return np.floor(np.round(turn * count + 0.5, _DIGITS)).astype(int) % count
 
 
-def _unit(vector: np.ndarray, name: str, given: Axis) -> np.ndarray:
+def _unit(vector: np.ndarray, name: str, original: Axis) -> np.ndarray:
     length = np.linalg.norm(vector)
     if vector.shape != (3,) or not np.isfinite(length) or not length > 1e-12:
-        raise InputError(f"segments: no {name}: {given}; expected three numbers, not all zero")
+        raise InputError(f"segments: no {name}: {original}; expected three numbers, not all zero")
     return vector / length

@@ -81,12 +81,12 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
 
 def read_regions(path: str | Path, name: str) -> np.ndarray:
     """Whole number (m,) of each element from cell data ``name``; :class:`InputError` if none."""
-    found = read_cells(Path(path))
-    if name not in found.cell_data:
-        there = ", ".join(f"'{key}'" for key in found.cell_data) or "none"
-        raise InputError(f"mesh file {path}: it has no cell data '{name}' for regions; has {there}")
-    kind = _tetrahedra(found)
-    blocks = zip(found.cells, found.cell_data[name], strict=True)
+    content = read_cells(Path(path))
+    if name not in content.cell_data:
+        names = ", ".join(f"'{key}'" for key in content.cell_data) or "none"
+        raise InputError(f"mesh file {path}: it has no cell data '{name}' for regions; has {names}")
+    kind = _tetrahedra(content)
+    blocks = zip(content.cells, content.cell_data[name], strict=True)
     values = np.concatenate([data for block, data in blocks if block.type == kind])
     if values.ndim != 1 or not (values == np.round(values)).all():
         raise InputError(f"mesh file {path}: '{name}' are not one whole number for each element")
@@ -169,28 +169,28 @@ def read_cells(path: Path) -> meshio.Mesh:
         raise InputError(f"mesh file {path} {what}")
     if not path.stat().st_size:
         raise InputError(f"mesh file {path} is empty")
-    said = io.StringIO()
+    output = io.StringIO()
     try:
         # meshio's readers raise exceptions of many types, or print a reason and exit.
         # In a text file of STL it takes letters for a number of triangles, which overflows.
-        with redirect_stdout(said), redirect_stderr(said), np.errstate(over="ignore"):
+        with redirect_stdout(output), redirect_stderr(output), np.errstate(over="ignore"):
             return meshio.read(path)
     except (Exception, SystemExit) as error:
-        reason = said.getvalue() if isinstance(error, SystemExit) else str(error)
+        reason = output.getvalue() if isinstance(error, SystemExit) else str(error)
         reason = " ".join(reason.split())[:160] or type(error).__name__
         raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
 
 
 def _convert(source: str | Path | Any, *, directions: bool, quadratic: bool = False) -> Body:
     is_file = isinstance(source, str | Path)
-    found = read_cells(Path(source)) if is_file else as_meshio(source)
+    content = read_cells(Path(source)) if is_file else as_meshio(source)
     try:
-        mesh, used = _mesh(found)
+        mesh, used = _mesh(content)
         if not directions:
             return Body(mesh)
         order = 2 if quadratic else mesh.order
         fibres, sheets = (
-            _directions(found, mesh, used, name, order) for name in ("fibres", "sheets")
+            _directions(content, mesh, used, name, order) for name in ("fibres", "sheets")
         )
         if fibres is not None and sheets is not None and fibres.ndim == 3:
             # What was orthogonal where it was given need not be where it was interpolated.
@@ -202,18 +202,18 @@ def _convert(source: str | Path | Any, *, directions: bool, quadratic: bool = Fa
         raise InputError(f"{name}: {str(error).removeprefix('mesh: ')}") from error
 
 
-def _mesh(found: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
+def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
     """The mesh, and the file's number (n,) of each of its nodes."""
-    kind = _tetrahedra(found)
-    elements = np.concatenate([block.data for block in found.cells if block.type == kind])
-    used, points = np.unique(elements), np.asarray(found.points, dtype=float)
+    kind = _tetrahedra(content)
+    elements = np.concatenate([block.data for block in content.cells if block.type == kind])
+    used, points = np.unique(elements), np.asarray(content.points, dtype=float)
     if used[0] < 0 or used[-1] >= len(points):
         return Mesh(points, elements), used  # raises InputError and names the range
     number = np.full(len(points), -1)
     number[used] = np.arange(len(used))
     nodes = points[used]
     elements = orient(nodes, number[elements])
-    mesh = Mesh(nodes, elements, *read_sets(found, number, elements))
+    mesh = Mesh(nodes, elements, *read_sets(content, number, elements))
     pairs = coincident(nodes)
     if len(pairs):
         one, other = np.sort(used[pairs[0]])
@@ -224,9 +224,9 @@ def _mesh(found: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
     return mesh, used
 
 
-def _tetrahedra(found: meshio.Mesh) -> str:
+def _tetrahedra(content: meshio.Mesh) -> str:
     """The one type of tetrahedra in the file; :class:`InputError` names any other cells."""
-    kinds = sorted({block.type for block in found.cells if len(block.data)})
+    kinds = sorted({block.type for block in content.cells if len(block.data)})
     solid = [kind for kind in kinds if kind in ("tetra", "tetra10")]
     other = [kind for kind in kinds if kind not in _LOWER | {"tetra", "tetra10"}]
     if other:
@@ -245,12 +245,12 @@ def _tetrahedra(found: meshio.Mesh) -> str:
 
 
 def _directions(
-    found: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str, order: int
+    content: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str, order: int
 ) -> np.ndarray | None:
     """Unit vectors at the points of elements of ``order`` from cell or point data ``name``."""
     kind = _CELLS[mesh.order][0]
-    if name in found.cell_data:
-        blocks = zip(found.cells, found.cell_data[name], strict=True)
+    if name in content.cell_data:
+        blocks = zip(content.cells, content.cell_data[name], strict=True)
         values = np.concatenate([data for block, data in blocks if block.type == kind])
         points = len(quadrature_points(order))
         if points > 1 and values.ndim == 2 and values.shape[1] == 3 * points:
@@ -258,8 +258,8 @@ def _directions(
             return at_points.reshape(-1, points, 3)
         of_elements = _checked(values, name, "element")
         return of_elements if order == 1 else from_elements(mesh, of_elements)
-    if name in found.point_data:
-        at_nodes = _checked(np.asarray(found.point_data[name])[used], name, "node")
+    if name in content.point_data:
+        at_nodes = _checked(np.asarray(content.point_data[name])[used], name, "node")
         at_points = from_nodes(mesh, at_nodes, order)
         return at_points[:, 0] if order == 1 else at_points
     return None

@@ -94,8 +94,8 @@ def parts(elements: np.ndarray, nodes: int) -> np.ndarray:
 
 def coincident(nodes: np.ndarray) -> np.ndarray:
     """Pairs (k, 2) of ``nodes`` at the same place: elements that touch there are not joined."""
-    near = _COINCIDENT * np.ptp(nodes, axis=0).max()
-    return cKDTree(nodes).query_pairs(near, output_type="ndarray")
+    tolerance = _COINCIDENT * np.ptp(nodes, axis=0).max()
+    return cKDTree(nodes).query_pairs(tolerance, output_type="ndarray")
 
 
 # A tetrahedron is taken for flat when its volume is below this fraction of its longest edge cubed;

@@ -85,8 +85,8 @@ def patches(mesh: Mesh, size: int = _SIZE) -> np.ndarray:
     """
     corners = np.sort(mesh.corners, axis=1)
     order = np.lexsort(corners.T)
-    beside = _neighbours(corners[order])
-    groups = _joined(_grown(corners[order].tolist(), beside, size), beside)
+    neighbours = _neighbours(corners[order])
+    groups = _joined(_grown(corners[order].tolist(), neighbours, size), neighbours)
     label = np.empty(len(order), dtype=int)
     for k, group in enumerate(groups):
         label[order[group]] = k
@@ -98,44 +98,46 @@ def _neighbours(corners: np.ndarray) -> list[list[int]]:
     faces = np.concatenate([np.sort(corners[:, face], axis=1) for face in FACES])
     order = np.lexsort(faces.T)
     same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
-    beside: list[list[int]] = [[] for _ in corners]
+    neighbours: list[list[int]] = [[] for _ in corners]
     ends = np.stack([order[same], order[same + 1]]) % len(corners)
     for one, other in ends.T.tolist():
-        beside[one].append(other)
-        beside[other].append(one)
-    return beside
+        neighbours[one].append(other)
+        neighbours[other].append(one)
+    return neighbours
 
 
-def _grown(corners: Sequence[list[int]], beside: Sequence[list[int]], size: int) -> list[list[int]]:
+def _grown(
+    corners: Sequence[list[int]], neighbours: Sequence[list[int]], size: int
+) -> list[list[int]]:
     """Elements of each patch, grown over faces to at most ``size``."""
-    taken, groups = [False] * len(corners), []
+    assigned, groups = [False] * len(corners), []
 
     def order(k: int, nodes: set[int]) -> tuple[int, int, int]:
         # Compact patches, and first what few neighbours are left to take.
-        return len(nodes.union(corners[k])), sum(not taken[j] for j in beside[k]), k
+        return len(nodes.union(corners[k])), sum(not assigned[j] for j in neighbours[k]), k
 
     for seed in range(len(corners)):
         group: list[int] = []
         nodes: set[int] = set()
-        edge = set() if taken[seed] else {seed}
+        edge = set() if assigned[seed] else {seed}
         while edge and len(group) < size:
             best = min(edge, key=lambda k: order(k, nodes))
             group.append(best)
-            taken[best] = True
+            assigned[best] = True
             nodes.update(corners[best])
-            edge = {k for k in edge.union(beside[best]) if not taken[k]}
+            edge = {k for k in edge.union(neighbours[best]) if not assigned[k]}
         if group:
             groups.append(group)
     return groups
 
 
-def _joined(groups: list[list[int]], beside: Sequence[list[int]]) -> list[list[int]]:
+def _joined(groups: list[list[int]], neighbours: Sequence[list[int]]) -> list[list[int]]:
     """The same with each patch of fewer than ``_LEAST`` elements in the smallest beside it."""
     owner = {k: patch for patch, group in enumerate(groups) for k in group}
     for patch, group in enumerate(groups):
-        near = {owner[j] for k in group for j in beside[k]} - {patch}
-        if len(group) < _LEAST and near:
-            chosen = min(near, key=lambda other: (len(groups[other]), other))
+        adjacent = {owner[j] for k in group for j in neighbours[k]} - {patch}
+        if len(group) < _LEAST and adjacent:
+            chosen = min(adjacent, key=lambda other: (len(groups[other]), other))
             groups[chosen] += group
             owner |= dict.fromkeys(group, chosen)
             groups[patch] = []

@@ -152,13 +152,13 @@ class Refinement:
         """A nodal field (n, 3) on the finer mesh, the same function of place."""
         return self.prolongation @ np.asarray(u)
 
-    def directions(self, given: np.ndarray) -> np.ndarray:
+    def directions(self, directions: np.ndarray) -> np.ndarray:
         """Unit directions (m, 3) or (m, q, 3) at the finer mesh's quadrature points.
 
         One direction an element is continued linearly first
         (:func:`~emulator.geometry.fibres.from_elements`).
         """
-        at_points = from_elements(self.coarse, given) if given.ndim == 2 else given
+        at_points = from_elements(self.coarse, directions) if directions.ndim == 2 else directions
         inside = np.einsum("qa,mcab->mcqb", quadrature_points(2), self.corners)
         weights = from_quadrature_points(2, inside.reshape(-1, 4))
         weights = weights.reshape(*inside.shape[:3], -1)
@@ -205,9 +205,9 @@ def _middle_of(
     size = len(mesh.nodes)
     pairs = np.sort(elements[:, :, EDGES], axis=-1).reshape(-1, 2)
     keys, first = np.unique(pairs[:, 0] * size + pairs[:, 1], return_index=True)
-    found = first[np.searchsorted(keys, edges[:, 0] * size + edges[:, 1])]
-    local = children[:, :, EDGES].reshape(-1, 2)[found]
+    places = first[np.searchsorted(keys, edges[:, 0] * size + edges[:, 1])]
+    local = children[:, :, EDGES].reshape(-1, 2)[places]
     values, _ = shapes_at(2, _NODES[local].mean(axis=1))
-    parents = mesh.elements[found // (children.shape[1] * len(EDGES))]
+    parents = mesh.elements[places // (children.shape[1] * len(EDGES))]
     rows = np.repeat(np.arange(len(edges)), values.shape[1])
     return csr_matrix((values.ravel(), (rows, parents.ravel())), (len(edges), size))

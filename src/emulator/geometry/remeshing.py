@@ -125,8 +125,8 @@ def _model() -> Iterator[Any]:
     except InputError:
         raise
     except Exception as error:  # Gmsh raises no other type
-        said = " ".join(str(error).split())[:160]
-        raise InputError(f"gmsh could not mesh it: {said}") from error
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(f"gmsh could not mesh it: {reason}") from error
     finally:
         if started:
             gmsh.finalize()
@@ -200,10 +200,10 @@ class Flattened:
 
     def at(self, places: np.ndarray) -> np.ndarray:
         """Points (k, 3) mm of the surface at ``places`` (k, 2) in the disc; off it, of the rim."""
-        found = self._inside(places)
-        off = np.isnan(found).any(axis=1)
-        found[off] = self.rim_at(np.arctan2(places[off, 1], places[off, 0]))
-        return found
+        points = self._inside(places)
+        off = np.isnan(points).any(axis=1)
+        points[off] = self.rim_at(np.arctan2(places[off, 1], places[off, 0]))
+        return points
 
     def remeshed(self, size: float) -> tuple[Surface, np.ndarray]:
         """Triangles with edges of about ``size`` mm, and the places (n, 2) of their points.
@@ -213,13 +213,15 @@ class Flattened:
         count = max(6, round(self.length / size))
         turn = 2.0 * np.pi * np.arange(count) / count
         polygon = np.column_stack([np.cos(turn), np.sin(turn)])
-        near, stretch = cKDTree(self.places, balanced_tree=False), self._stretch()
-        places, rows = triangulate([polygon], lambda x, y: size / stretch[near.query((x, y))[1]])
+        nearest, stretch = cKDTree(self.places, balanced_tree=False), self._stretch()
+        places, rows = triangulate([polygon], lambda x, y: size / stretch[nearest.query((x, y))[1]])
         points = self.at(places)
         points[:count] = self.rim_at(turn)
         facing = np.sign(np.sum(_signed(places[rows])))
-        kept = np.sign(np.sum(_signed(self._corners)))
-        return Surface(self.surface.name, points, rows if facing == kept else rows[:, ::-1]), places
+        original_facing = np.sign(np.sum(_signed(self._corners)))
+        return Surface(
+            self.surface.name, points, rows if facing == original_facing else rows[:, ::-1]
+        ), places
 
     def _stretch(self) -> np.ndarray:
         """Lengths on the surface over those in the disc, (n,), from areas around each point."""
@@ -244,16 +246,16 @@ class Flattened:
         """
         first, last = self.at(one), self.at(other)
         low, high = np.zeros(len(one)), np.ones(len(one))
-        found = first
+        points = first
         for _ in range(_HALVINGS):
             share = 0.5 * (low + high)
-            found = self.at(one + share[:, None] * (other - one))
-            nearer = np.sum((found - first) ** 2 - (found - last) ** 2, axis=1) < 0.0
+            points = self.at(one + share[:, None] * (other - one))
+            nearer = np.sum((points - first) ** 2 - (points - last) ** 2, axis=1) < 0.0
             low, high = np.where(nearer, share, low), np.where(nearer, high, share)
         on_rim = np.all([np.linalg.norm(p, axis=1) > 1.0 - 1e-9 for p in (one, other)], axis=0)
         x, y = (one + other)[on_rim].T
-        found[on_rim] = self.rim_at(np.arctan2(y, x))
-        return found
+        points[on_rim] = self.rim_at(np.arctan2(y, x))
+        return points
 
 
 def _mean_value_weights(surface: Surface) -> coo_array:

@@ -98,20 +98,20 @@ def side_by_side(meshes: Mapping[str, Mesh], *, gap: float | None = None) -> Bod
             )
     for name in meshes:
         check_name(name)
-    moved = list(meshes.values()) if gap is None else _apart(list(meshes.values()), gap)
+    placed = list(meshes.values()) if gap is None else _apart(list(meshes.values()), gap)
     names = tuple(meshes)
-    sizes = [len(mesh.nodes) for mesh in moved]
+    sizes = [len(mesh.nodes) for mesh in placed]
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    nodes = np.concatenate([mesh.nodes for mesh in moved])
+    nodes = np.concatenate([mesh.nodes for mesh in placed])
     _check_apart(names, nodes, np.repeat(np.arange(len(names)), sizes))
     node_sets: dict[str, np.ndarray] = {}
     facet_sets: dict[str, np.ndarray] = {}
-    for name, mesh, start in zip(names, moved, starts[:-1], strict=True):
+    for name, mesh, start in zip(names, placed, starts[:-1], strict=True):
         facet_sets[name] = mesh.surface + start
         node_sets[name] = np.unique(facet_sets[name])
         node_sets |= {f"{name}.{of}": rows + start for of, rows in mesh.node_sets.items()}
         facet_sets |= {f"{name}.{of}": rows + start for of, rows in mesh.facet_sets.items()}
-    elements = [mesh.elements + start for mesh, start in zip(moved, starts[:-1], strict=True)]
+    elements = [mesh.elements + start for mesh, start in zip(placed, starts[:-1], strict=True)]
     body = np.repeat(np.arange(len(names)), [len(part) for part in elements])
     mesh = Mesh(nodes, np.concatenate(elements), node_sets, facet_sets)
     return Bodies(mesh, names, frozen_array(body, np.int64))
@@ -132,11 +132,11 @@ def check_name(name: str) -> None:
 
 def _apart(meshes: list[Mesh], gap: float) -> list[Mesh]:
     """The first where it is, each next one ``gap`` beyond the one before along x."""
-    found = meshes[:1]
+    placed = meshes[:1]
     for mesh in meshes[1:]:
-        beyond = found[-1].nodes[:, 0].max() + gap - mesh.nodes[:, 0].min()
-        found.append(shifted(mesh, (beyond, 0.0, 0.0)))
-    return found
+        beyond = placed[-1].nodes[:, 0].max() + gap - mesh.nodes[:, 0].min()
+        placed.append(shifted(mesh, (beyond, 0.0, 0.0)))
+    return placed
 
 
 def _check_apart(names: tuple[str, ...], nodes: np.ndarray, owner: np.ndarray) -> None:

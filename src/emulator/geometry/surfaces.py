@@ -76,15 +76,15 @@ def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
     InputError
         As :func:`surface`; or a file that cannot be read or has other cells than triangles.
     """
-    found = read_cells(Path(path))
-    kinds = sorted({block.type for block in found.cells if len(block.data)})
+    content = read_cells(Path(path))
+    kinds = sorted({block.type for block in content.cells if len(block.data)})
     if "triangle" not in kinds or set(kinds) - {"triangle", "line", "vertex"}:
         raise InputError(
             f"{name} {path}: it has {', '.join(kinds) or 'no cells'}; expected triangles only, "
             "as in STL or PLY"
         )
-    rows = np.concatenate([block.data for block in found.cells if block.type == "triangle"])
-    return surface(name, scale * np.asarray(found.points, dtype=float), rows)
+    rows = np.concatenate([block.data for block in content.cells if block.type == "triangle"])
+    return surface(name, scale * np.asarray(content.points, dtype=float), rows)
 
 
 def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
@@ -107,17 +107,17 @@ def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
     if len(triangles) < 4:
         raise InputError(f"{name}: {len(triangles)} triangles with an area; expected a surface")
     triangles = _one_sided(name, points, triangles)
-    made = Surface(name, points, triangles)
-    volume = made.volume
-    if abs(volume) < 1e-6 * made.extent**3:
+    checked = Surface(name, points, triangles)
+    volume = checked.volume
+    if abs(volume) < 1e-6 * checked.extent**3:
         raise InputError(f"{name}: it encloses no volume; expected a closed or cup-like surface")
-    return made if volume > 0.0 else Surface(name, points, triangles[:, ::-1].copy())
+    return checked if volume > 0.0 else Surface(name, points, triangles[:, ::-1].copy())
 
 
 def _merged(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One point at each place that triangles use, and the triangles whose corners differ."""
-    near = _MERGE * np.linalg.norm(np.ptp(points, axis=0))
-    pairs = cKDTree(points, balanced_tree=False).query_pairs(near, output_type="ndarray")
+    tolerance = _MERGE * np.linalg.norm(np.ptp(points, axis=0))
+    pairs = cKDTree(points, balanced_tree=False).query_pairs(tolerance, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
     triangles = connected_components(graph, directed=False)[1][triangles]
     a, b, c = triangles.T
@@ -167,7 +167,7 @@ def place_of(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.4g}" for x in np.round(point, 6) + 0.0) + ")"
 
 
-def cut(given: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
+def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
     """What lies below the plane through ``point`` (3,) mm, on the side ``normal`` (3,) leaves.
 
     Raises
@@ -175,23 +175,23 @@ def cut(given: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
     InputError
         A plane that does not cut the surface, or leaves another number of openings than one.
     """
-    height = (given.points - point) @ normal
-    height[np.abs(height) < _SNAP * given.extent] = 0.0
+    height = (surface.points - point) @ normal
+    height[np.abs(height) < _SNAP * surface.extent] = 0.0
     if not (height.min() < 0.0 <= height.max()):
         where = "above" if height.min() >= 0.0 else "below"
         raise InputError(
-            f"{given.name}: all of it is {where} the base plane through {place_of(point)}, its "
+            f"{surface.name}: all of it is {where} the base plane through {place_of(point)}, its "
             f"heights {height.min():.4g} to {height.max():.4g} mm; expected a plane that cuts it"
         )
     points = np.where(
         (height == 0.0)[:, None],
-        given.points - np.outer((given.points - point) @ normal, normal),
-        given.points,
+        surface.points - np.outer((surface.points - point) @ normal, normal),
+        surface.points,
     )
-    sign = np.sign(height).astype(int)[given.triangles]
+    sign = np.sign(height).astype(int)[surface.triangles]
     below = (sign <= 0).all(axis=1) & (sign < 0).any(axis=1)
-    pieces = [given.triangles[below]]
-    made: list[np.ndarray] = []
+    pieces = [surface.triangles[below]]
+    new_points: list[np.ndarray] = []
     numbers: dict[tuple[int, int], int] = {}
 
     def between(a: int, b: int) -> int:
@@ -199,12 +199,12 @@ def cut(given: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
         if key not in numbers:
             low, high = key
             share = height[low] / (height[low] - height[high])
-            numbers[key] = len(points) + len(made)
-            made.append(points[low] + share * (points[high] - points[low]))
+            numbers[key] = len(points) + len(new_points)
+            new_points.append(points[low] + share * (points[high] - points[low]))
         return numbers[key]
 
     new: list[tuple[int, int, int]] = []
-    for row in given.triangles[(sign < 0).any(axis=1) & (sign > 0).any(axis=1)].tolist():
+    for row in surface.triangles[(sign < 0).any(axis=1) & (sign > 0).any(axis=1)].tolist():
         polygon: list[int] = []
         for a, b in zip(row, [*row[1:], row[0]], strict=True):
             if height[a] <= 0.0:
@@ -215,51 +215,51 @@ def cut(given: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
     pieces.append(np.array(new, dtype=np.int64).reshape(-1, 3))
     rows = np.concatenate(pieces)
     used, numbered = np.unique(rows, return_inverse=True)
-    places = np.concatenate([points, np.array(made).reshape(-1, 3)])[used]
-    below_it = Surface(given.name, places, numbered.reshape(-1, 3))
+    places = np.concatenate([points, np.array(new_points).reshape(-1, 3)])[used]
+    below_it = Surface(surface.name, places, numbered.reshape(-1, 3))
     one_rim(below_it)
     return below_it
 
 
-def one_rim(given: Surface) -> np.ndarray:
+def one_rim(surface: Surface) -> np.ndarray:
     """The edges (e, 2) of the only opening; :class:`InputError` names the others by place."""
-    rims = sorted(given.rims, key=len)
+    rims = sorted(surface.rims, key=len)
     if len(rims) == 1:
         return rims[0]
     if not rims:
         raise InputError(
-            f"{given.name}: it is closed; give the base plane, a height along the long axis or a "
+            f"{surface.name}: it is closed; give the base plane, a height along the long axis or a "
             "point and a normal"
         )
-    small = given.points[np.unique(rims[0])].mean(axis=0)
+    small = surface.points[np.unique(rims[0])].mean(axis=0)
     raise InputError(
-        f"{given.name}: it has {len(rims)} openings, the smallest of {len(rims[0])} edges at "
+        f"{surface.name}: it has {len(rims)} openings, the smallest of {len(rims[0])} edges at "
         f"{place_of(small)}; expected the base's alone: fill the others"
     )
 
 
-def smoothed(given: Surface, times: int) -> Surface:
+def smoothed(surface: Surface, times: int) -> Surface:
     """``given`` after ``times`` of Taubin's filter; a rim is smoothed along itself.
 
     A flat rim stays in its plane.
     """
-    count, rows = len(given.points), given.triangles
+    count, rows = len(surface.points), surface.triangles
     edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]], rows[:, [2, 0]]])
     on_rim = np.zeros(count, dtype=bool)
-    rims = given.rims
+    rims = surface.rims
     for rim in rims:
         on_rim[rim] = True
-    kept = edges[~on_rim[edges[:, 0]]], edges[~on_rim[edges[:, 1]]][:, ::-1], *rims
-    pairs = np.concatenate([*kept, *(rim[:, ::-1] for rim in rims)])
+    directed_edges = edges[~on_rim[edges[:, 0]]], edges[~on_rim[edges[:, 1]]][:, ::-1], *rims
+    pairs = np.concatenate([*directed_edges, *(rim[:, ::-1] for rim in rims)])
     graph = (coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)) > 0).astype(float)
     mean = diags_array(1.0 / graph.sum(axis=1)) @ graph
-    x = given.points
+    x = surface.points
     for factor in (_LAMBDA, _MU) * times:
         x = x + factor * (mean @ x - x)
-    return Surface(given.name, x, rows)
+    return Surface(surface.name, x, rows)
 
 
-def inside(given: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def inside(surface: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Which ``points`` (k, 3) mm are enclosed, (k,) bool, for a surface whose lid is above them.
 
     A ray from an enclosed point against ``axis`` (3,), away from the lid, crosses the surface an
@@ -271,13 +271,13 @@ def inside(given: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
     across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     across /= np.linalg.norm(across)
     frame = np.stack([across, np.cross(up, across), up], axis=1)
-    corners, at = given.points[given.triangles] @ frame, points @ frame
+    corners, at = surface.points[surface.triangles] @ frame, points @ frame
     flat = corners[..., :2]
     middle = flat.mean(axis=1)
     reach = np.linalg.norm(flat - middle[:, None], axis=-1).max()
-    found = cKDTree(middle, balanced_tree=False).query_ball_point(at[:, :2], 1.000001 * reach)
-    point = np.repeat(np.arange(len(at)), [len(near) for near in found])
-    row = np.concatenate([np.asarray(near, dtype=np.int64) for near in found])
+    neighbours = cKDTree(middle, balanced_tree=False).query_ball_point(at[:, :2], 1.000001 * reach)
+    point = np.repeat(np.arange(len(at)), [len(candidates) for candidates in neighbours])
+    row = np.concatenate([np.asarray(candidates, dtype=np.int64) for candidates in neighbours])
     a, b, c = (corners[row, k] for k in range(3))
     p = at[point]
 

@@ -141,8 +141,8 @@ def mesh_wall(
     if smooth < 0:
         raise InputError(f"smooth {smooth}: expected 0 times or more")
     whole = [
-        _surface(given, name, unit)
-        for given, name in ((endocardium, "endocardium"), (epicardium, "epicardium"))
+        _surface(source, name, unit)
+        for source, name in ((endocardium, "endocardium"), (epicardium, "epicardium"))
     ]
     normal, point = _plane(whole, axis, base_height, base_point)
     below = [cut(each, point, normal) for each in whole]
@@ -185,14 +185,14 @@ def mesh_wall(
     )
 
 
-def _surface(given: str | Path | Surface, name: str, unit: str) -> Surface:
-    found = given if isinstance(given, Surface) else read_surface(given, name, UNITS[unit])
-    if found.extent < _LEAST:
+def _surface(source: str | Path | Surface, name: str, unit: str) -> Surface:
+    surface = source if isinstance(source, Surface) else read_surface(source, name, UNITS[unit])
+    if surface.extent < _LEAST:
         raise InputError(
-            f"{name}: it is {found.extent:.3g} mm from corner to corner; lengths are taken as mm: "
-            "give the unit m or cm"
+            f"{name}: it is {surface.extent:.3g} mm from corner to corner; lengths are taken as "
+            "mm: give the unit m or cm"
         )
-    return found
+    return surface
 
 
 def _plane(
@@ -204,8 +204,8 @@ def _plane(
     """Normal (3,) and a point (3,) of the base plane."""
     if height is not None and point is not None:
         raise InputError("base plane: give a height or a point, not both")
-    given = height is not None or point is not None
-    rims = [(each, one_rim(each)) for each in surfaces if each.rims or not given]
+    has_plane = height is not None or point is not None
+    rims = [(each, one_rim(each)) for each in surfaces if each.rims or not has_plane]
     if axis is None:
         if len(rims) < len(surfaces):
             raise InputError(
@@ -266,8 +266,8 @@ def _thickness(endocardium: Surface, epicardium: Surface) -> Thickness:
     corners = epicardium.points[epicardium.triangles]
     middles = 0.5 * (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3)
     points = np.vstack([epicardium.points, corners.mean(axis=1), middles])
-    found = cKDTree(points, balanced_tree=False).query(endocardium.points)[0]
-    return Thickness(float(found.min()), float(np.median(found)), float(found.max()))
+    distances = cKDTree(points, balanced_tree=False).query(endocardium.points)[0]
+    return Thickness(float(distances.min()), float(np.median(distances)), float(distances.max()))
 
 
 def _mesh(

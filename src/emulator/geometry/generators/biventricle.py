@@ -61,19 +61,19 @@ def open_sheet(triangles: np.ndarray, inside: np.ndarray, strips: int) -> Footpr
 
     The new vertices are numbered after the old ones, line by line.
     """
-    near = inside[triangles].all(axis=1)
-    edges = np.intersect1d(_edge_keys(triangles[near]), _edge_keys(triangles[~near]))
+    within = inside[triangles].all(axis=1)
+    edges = np.intersect1d(_edge_keys(triangles[within]), _edge_keys(triangles[~within]))
     ends = np.column_stack(np.divmod(edges, _KEY))  # lower vertex first, as extrude sorts them
     line = np.unique(ends)
     levels = len(inside) + np.arange(len(line) * strips).reshape(strips, len(line)).T
     levels = np.column_stack([line, levels])
-    moved = np.arange(len(inside))
-    moved[line] = levels[:, -1]
+    renumbered = np.arange(len(inside))
+    renumbered[line] = levels[:, -1]
     a, b = levels[np.searchsorted(line, ends)].swapaxes(0, 1)
     a0, a1, b0, b1 = (part.ravel() for part in (a[:, :-1], a[:, 1:], b[:, :-1], b[:, 1:]))
     band = np.concatenate([np.column_stack([a0, b0, b1]), np.column_stack([a0, a1, b1])])
     origin = np.concatenate([np.arange(len(inside)), np.tile(line, strips)])
-    return Footprint(origin, line, levels, triangles[near], moved[triangles[~near]], band)
+    return Footprint(origin, line, levels, triangles[within], renumbered[triangles[~within]], band)
 
 
 _KEY = 1 << 31
@@ -301,8 +301,8 @@ def _made_room(
     """New ``r``, ``phi``: septum and band at their places, the other vertices moved smoothly."""
     points = _polar(r, phi)
     r, phi = r.copy(), phi.copy()
-    near, band = np.unique(opened.inner), opened.levels[:, 1:]
-    r[near], phi[near] = septum.foot(xi[near], eta[near], np.zeros(1))
+    septal, band = np.unique(opened.inner), opened.levels[:, 1:]
+    r[septal], phi[septal] = septum.foot(xi[septal], eta[septal], np.zeros(1))
     r[band], phi[band] = septum.foot(xi[band], eta[band], _depths(band.shape[1])[1:])
     share = (np.pi - np.abs(phi[rim])) / (np.pi - half_angle)
     phi[rim] = np.sign(phi[rim]) * (np.pi - share * (np.pi - septum.half_angle))
@@ -323,8 +323,8 @@ def _sheet(flat: _Flat, wall: np.ndarray, strips: int) -> tuple[np.ndarray, np.n
     sheet = np.full((len(flat.r), strips + 1), -1)
     sheet[opened.line] = wall[opened.levels, -1]
     sheet[free] = wall.size + np.arange(len(free) * (strips + 1)).reshape(-1, strips + 1)
-    near = np.unique(opened.inner)
-    return sheet, _in_columns(sheet[near], flat.xi[near], flat.eta[near])
+    septal = np.unique(opened.inner)
+    return sheet, _in_columns(sheet[septal], flat.xi[septal], flat.eta[septal])
 
 
 def _in_columns(columns: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

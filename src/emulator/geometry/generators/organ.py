@@ -100,8 +100,8 @@ def _clustered(points: np.ndarray, clustering: float) -> np.ndarray:
     """
     a = clustering * _LIGAMENT_DIRECTION
     along, square = 2.0 * (points @ a)[:, None], np.sum(points**2, axis=1)[:, None]
-    moved = (1.0 + along + square) * a + (1.0 - clustering**2) * points
-    return moved / (1.0 + along + clustering**2 * square)
+    numerator = (1.0 + along + square) * a + (1.0 - clustering**2) * points
+    return numerator / (1.0 + along + clustering**2 * square)
 
 
 def _shape(points: np.ndarray, half_axes: tuple[float, float, float]) -> np.ndarray:

@@ -73,11 +73,11 @@ def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     half = np.array([(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
     corners = unit(np.concatenate([np.roll(half, turn, axis=1) for turn in range(3)]))
-    near = corners @ corners.T > 0.4  # neighbours' directions have cosine 1 / sqrt(5)
+    adjacent = corners @ corners.T > 0.4  # neighbours' directions have cosine 1 / sqrt(5)
     faces = [
         (a, b, c)
         for a, b, c in combinations(range(12), 3)
-        if near[a, b] and near[b, c] and near[a, c]
+        if adjacent[a, b] and adjacent[b, c] and adjacent[a, c]
     ]
     return corners, np.array(faces)
 

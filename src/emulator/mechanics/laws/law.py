@@ -48,10 +48,10 @@ class Quantity:
         """Message if ``owner`` cannot take a value in ``unit``, else ``None``."""
         if unit == self.unit:
             return None
-        found = f"in {unit}" if unit else "given no unit"
+        given_unit = f"in {unit}" if unit else "given no unit"
         expected = self.unit or "it without a unit"
         hint = f" ({self.hint})" if self.hint else ""
-        return f"parameter '{self.name}' is {found}; {owner} takes {expected}{hint}"
+        return f"parameter '{self.name}' is {given_unit}; {owner} takes {expected}{hint}"
 
     def range_fault(self, low: float, high: float) -> str | None:
         """Message if the range from ``low`` to ``high`` is not admissible, else ``None``."""
