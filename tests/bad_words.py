@@ -270,7 +270,7 @@ INFERENCES = [
     ("--truth mu=73 lam=61 --noise much", "--noise: 'much' is not a number"),
     (
         "--truth mu=73 lam=61 --noise-scale displacement=0",
-        "displacement (mm): noise: standard deviation is 0.0",
+        "displacement (mm): noise 'gaussian': standard deviation is 0.0",
     ),
     (
         "--truth mu=73 lam=61 --noise student_t:dof=4",
@@ -282,7 +282,7 @@ INFERENCES = [
     ),
     (
         "--truth mu=73 lam=61 --noise displacement=student_t:dof=4",
-        "noise: give either scale (known) or prior_scale",
+        "noise 'student_t': give either scale (known) or prior_scale",
     ),
     (
         "--truth mu=73 lam=61 --noise displacement=correlated:length=0,sd=1,spatial_sd=1",
@@ -307,7 +307,10 @@ INFERENCES = [
     ("--truth mu=73 lam=61 --observe nodes:x", "'x' is not a number of nodes"),
     ("--truth mu=73 lam=61 --observe nodes:9+volume", "scene 'once_clamped_beam' has 0 cavities"),
     ("--truth mu=73 lam=61 --observe all+right", "displacement is given twice"),
-    ("--truth mu=73 lam=61 --noise -1", "displacement (mm): noise: standard deviation is -1.0"),
+    (
+        "--truth mu=73 lam=61 --noise -1",
+        "displacement (mm): noise 'gaussian': standard deviation is -1.0",
+    ),
     ("--truth mu=73 lam=61 --emulator broken", "is truncated or not a safetensors"),
     ("--truth mu=73 lam=61 --emulator other", "was trained for a scene"),
     (
@@ -335,7 +338,7 @@ INFERENCES = [
         "--truth mu=73 lam=61 --sampler laplace --draws 5 --chains 1",
         "Laplace: 5 draws of 1 chains; give 25 or more together",
     ),
-    ("--truth mu=73 lam=61 --noise nan", "noise: standard deviation is nan"),
+    ("--truth mu=73 lam=61 --noise nan", "noise 'gaussian': standard deviation is nan"),
     (
         "--truth mu=73 lam=61 --forward reduced --emulator liver",
         "--emulator has no effect without --forward",

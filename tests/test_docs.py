@@ -10,7 +10,7 @@ import pytest
 
 import calibrate
 import emulator
-from calibrate.statistical_model.shared_errors import SHARED_ERRORS
+from calibrate.model_error.kinds import SYSTEMATIC_ERRORS
 
 ROOT = Path(__file__).parents[1]
 
@@ -31,7 +31,7 @@ def test_pages_are_reached():
 def test_the_docs_have_every_kind_of_error_that_numbers_share():
     text = (ROOT / "docs" / "experiment_files.md").read_text(encoding="utf-8")
     kinds = set(re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE))
-    assert kinds == set(SHARED_ERRORS)
+    assert kinds == set(SYSTEMATIC_ERRORS)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from .measurements import (
     strains,
     surface_points,
 )
+from .model_error import placement, rigid_motion
 from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from .population import Hierarchy, hierarchy, read_hierarchy
 from .posterior import Posterior, sample
@@ -35,8 +36,8 @@ from .project import load
 from .project.campaigns import campaign
 from .samplers import Density, NUTSOptions, density_of
 from .statistical_model import Model
-from .statistical_model.build import model
-from .statistical_model.systematic import placement, rigid_motion, with_systematic
+from .statistical_model.errors import with_systematic
+from .statistical_model.model import model
 from .um_bridge import serve
 
 __version__: str

@@ -11,7 +11,7 @@ import numpy as np
 import emulator as em
 from calibrate.project import Run, by_fem, make_data, simulator_of
 from calibrate.statistical_model import Model
-from calibrate.statistical_model.build import model
+from calibrate.statistical_model.model import model
 from emulator.fem import Simulator
 from emulator.scenes import Scene
 from emulator.surrogates.protocol import ForwardMap, Prediction

@@ -7,7 +7,7 @@ r"""The posterior of a heart: one material, three cubes, nine modes.
 
 Each mode m is off by a fraction of its own, half of it the same along the curve and half changing
 with the amount :math:`\gamma` (Matern 3/2, length half of the largest amount; what
-:mod:`calibrate.statistical_model.curve` is for), so that a hundred points of a curve are not a
+:mod:`calibrate.model_error.systematic` is for), so that a hundred points of a curve are not a
 hundred facts; 3 % of each point are its own, for what the emulator is
 off. :math:`\omega` is inferred, the load cell's noise is 3 mN. Each cube has fibre angles of its
 own, 15 degrees about the direction it was cut along.
@@ -34,8 +34,8 @@ from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.moves import EXPLORING, Modes, joined, modes, unknown
 
+from calibrate.model_error.systematic import curve_covariance
 from calibrate.samplers.diagnostics import least_ess, r_hat
-from calibrate.statistical_model.curve import curve_covariance
 
 CELL = 3e-3  # N, noise of the load cell
 POINT = 0.03  # of a force, at each point for itself

@@ -18,7 +18,7 @@ from studies.silicone_beam.experiment import BLIND, FORCE, Measured, measured, r
 import calibrate as cal
 import emulator as em
 from calibrate.figures.drawing import pyplot
-from calibrate.statistical_model.systematic import SystematicError
+from calibrate.model_error import ModelError
 from emulator.core.errors import InputError
 from emulator.training.plan import recipe
 
@@ -50,7 +50,7 @@ def posterior(
 def what_was_unknown(found: cal.Posterior, seen: Measured) -> Case:
     """Posterior mean and sd of hand, rig, pins and the loose marker, in mm and degrees."""
     error = found.model.error
-    assert isinstance(error, SystematicError)
+    assert isinstance(error, ModelError)
     draws = flat(found)
     each = []
     for k in range(0, len(draws["mu"]), max(1, len(draws["mu"]) // 200)):

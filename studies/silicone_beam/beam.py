@@ -15,9 +15,9 @@ from studies.silicone_beam.experiment import (
 )
 
 import calibrate as cal
+from calibrate.model_error import ModelError, Systematic
+from calibrate.model_error.kinds import rotation_of
 from calibrate.statistical_model import Model
-from calibrate.statistical_model.shared_errors import turned
-from calibrate.statistical_model.systematic import Systematic, SystematicError
 from emulator.geometry.generators.box import box, toward_ends
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
@@ -71,7 +71,9 @@ def rig(places: Mapping[str, np.ndarray]) -> Systematic:
 def pins(displacements: Mapping[str, np.ndarray], seen: Measured) -> Systematic:
     """A marker that stands elsewhere by d moves by (R - I) d more where the tip has turned by R."""
     modes = {
-        name: np.stack([np.tile(PIN * row, (3, 1)) for row in (turned(seen.rest, u) - np.eye(3)).T])
+        name: np.stack(
+            [np.tile(PIN * row, (3, 1)) for row in (rotation_of(seen.rest, u) - np.eye(3)).T]
+        )
         for name, u in displacements.items()
     }
     return Systematic(tuple(f"pins {axis}" for axis in "xyz"), modes)
@@ -132,7 +134,7 @@ def predict(
 
     stayed, moved = [], []
     error = calibrated.error
-    assert isinstance(error, SystematicError)
+    assert isinstance(error, ModelError)
     for k in range(len(draws["mu"])):
         draw = {name: jnp.asarray(values[k]) for name, values in draws.items()}
         means, _ = calibrated.predict(draw)

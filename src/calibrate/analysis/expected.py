@@ -37,9 +37,9 @@ from jax.scipy.special import gammaln
 
 from calibrate.analysis.fisher import Errors, information_at, log_ratio, of_each, sizes_of
 from calibrate.analysis.identifiability import combinations, prior_table
+from calibrate.model_error.marginal import ModelError
 from calibrate.statistical_model import Model
-from calibrate.statistical_model.error_modes import ErrorModes
-from calibrate.statistical_model.shared_errors import errors_of_data
+from calibrate.statistical_model.errors import errors_of_data
 from emulator.core.errors import InputError
 
 _DATA_SETS = 64
@@ -66,7 +66,7 @@ def expected_precision(
     at : unknowns by name where the map is taken as linear and the prior as normal; posteriors of
         ``data_sets`` draws of the prior and its data by default.
     systematic : errors that many numbers share, by name, as in an experiment file
-        (:mod:`~calibrate.statistical_model.shared_errors`), made for each data set. Those of
+        (:mod:`~calibrate.model_error.kinds`), made for each data set. Those of
         :func:`calibrate.with_systematic` are the model's already, the same for all data.
 
     Returns
@@ -169,7 +169,7 @@ def _posterior_covariances(
         x: jax.Array,
         answer: tuple[dict[str, jax.Array], jax.Array],
         data: dict[str, jax.Array],
-        error: ErrorModes | None,
+        error: ModelError | None,
     ) -> jax.Array:
         means, valid = answer
         covariances = model.log_density(means, model.noise_values({}), data)
@@ -187,7 +187,7 @@ def _posterior_covariances(
     share = len(shared) / (len(shared) + _AROUND)
 
     def first(
-        x: jax.Array, sizes: jax.Array, data: dict[str, jax.Array], error: ErrorModes | None
+        x: jax.Array, sizes: jax.Array, data: dict[str, jax.Array], error: ModelError | None
     ) -> _Around:
         """A Newton step from where the data was made, in the linear map with a normal prior."""
         Q = _inverse(information(x, error, sizes)[0] + precision)
@@ -201,7 +201,7 @@ def _posterior_covariances(
         sizes: jax.Array,
         keys: jax.Array,
         means: dict[str, jax.Array],
-        error: ErrorModes | None,
+        error: ModelError | None,
     ) -> jax.Array:
         noise, *rounds, own = keys
         if error is not None:

@@ -7,7 +7,7 @@ data hold the information
 .. math:: F = J^T S^{-1} J, \qquad J = \partial g / \partial x, \qquad S = C + \alpha^2 V V^T
 
 about x, with the noise's covariance C and, where many numbers share errors, their modes V and
-size :math:`\alpha` (:mod:`calibrate.statistical_model.error_modes`, which has :math:`S^{-1}` by
+size :math:`\alpha` (:mod:`calibrate.model_error.marginal`, which has :math:`S^{-1}` by
 Woodbury's identity). With a normal prior of covariance P the posterior's covariance is about
 :math:`(F + P^{-1})^{-1}`. S is in the data's units squared, F in one over those of x squared: none
 for :math:`\log\theta`. How S changes with x is left out of F. For noise that is not Gaussian
@@ -23,7 +23,7 @@ all sets are one object with a leading axis. They are marginalised: y is Gaussia
 the covariance of the noise, of errors of known size and of errors whose size :math:`\alpha` is
 inferred, in the data's units squared. An error that is a share of the prediction follows x itself.
 A fit to measured data does not know :math:`g(x_r)` and takes the data for it where points were seen
-(:mod:`calibrate.statistical_model.shared_errors`).
+(:mod:`calibrate.model_error.kinds`).
 
 Before data, a size that is inferred is integrated over its prior, with distribution function
 :math:`\Phi`, by K values that are equally probable:
@@ -44,13 +44,12 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.special import logsumexp
 
 from calibrate.measurements import Observations
-from calibrate.noise import Noise
-from calibrate.noise.information import information_about_means
+from calibrate.model_error.marginal import Means, ModelError
+from calibrate.noise import Noise, information_about_means
 from calibrate.statistical_model import Model
-from calibrate.statistical_model.error_modes import ErrorModes, Means
 from emulator.core.errors import InputError
 
-At = Callable[[jax.Array, ErrorModes | None, jax.Array], tuple[jax.Array, jax.Array]]
+At = Callable[[jax.Array, ModelError | None, jax.Array], tuple[jax.Array, jax.Array]]
 """From x (q,), the errors that numbers share, if any, and the unknowns (m,) of these: F (q, q), and
 whether the map is valid there."""
 
@@ -83,7 +82,7 @@ def information_at(
         valid = jnp.all(jnp.stack([p.valid for p in predictions]))
         return ravel_pytree(means)[0], (means, valid)
 
-    def at(x: jax.Array, error: ErrorModes | None, sizes: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def at(x: jax.Array, error: ModelError | None, sizes: jax.Array) -> tuple[jax.Array, jax.Array]:
         J, (means, valid) = jax.jacfwd(data, has_aux=True)(x)
         about_means = information_about_means(noise, means)
         if error is not None:
@@ -96,11 +95,11 @@ def information_at(
 
 _SIZES = 32
 
-Errors = Callable[[Mapping[str, Any]], ErrorModes | None]
+Errors = Callable[[Mapping[str, Any]], ModelError | None]
 """From data without noise by name to the errors besides noise that a model has about it."""
 
 
-def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ErrorModes | None:
+def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError | None:
     """Errors of each data set, as one with a leading axis, from means (r, ...) by name."""
     arrays = {name: np.asarray(values) for name, values in means.items()}
     count = len(next(iter(arrays.values())))
@@ -119,7 +118,7 @@ def _stacked(arrays: Sequence[Any]) -> np.ndarray:
     return stack
 
 
-def sizes_of(error: ErrorModes | None, count: int = _SIZES) -> jax.Array:
+def sizes_of(error: ModelError | None, count: int = _SIZES) -> jax.Array:
     """Sizes (count, 1) that are inferred, each as probable; (count, 0) where none is."""
     priors = [] if error is None else list(error.priors.values())
     if not priors:
@@ -128,7 +127,7 @@ def sizes_of(error: ErrorModes | None, count: int = _SIZES) -> jax.Array:
     return prior.icdf((jnp.arange(count) + 0.5) / count)[:, None]
 
 
-def log_ratio(error: ErrorModes, theta: jax.Array, residual: Means, means: Means) -> jax.Array:
+def log_ratio(error: ModelError, theta: jax.Array, residual: Means, means: Means) -> jax.Array:
     """What an error adds to the log likelihood of ``residual`` at ``theta`` (q,), shape ()."""
     sizes = sizes_of(error) if error.priors else jnp.zeros((1, 0))
 

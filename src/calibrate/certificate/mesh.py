@@ -102,7 +102,7 @@ def mesh_change(
         runs=solves,
         nodes=len(error.finer.scene.mesh.nodes),
         linear=simulator.scene.mesh.order == 1,
-        widened=model_error is not None and model_error.with_mesh,
+        widened=model_error is not None and model_error.of_mesh,
     )
 
 

@@ -3,8 +3,8 @@
 from calibrate.noise.correlated import CorrelatedNoise
 from calibrate.noise.discrepancy import DiscrepancyNoise, with_discrepancy
 from calibrate.noise.gaussian import GaussianNoise
-from calibrate.noise.protocol import Noise, Sites
-from calibrate.noise.registry import NOISES, noise_from_json, noise_of, parse_noise
+from calibrate.noise.protocol import Noise, Sites, information_about_means
+from calibrate.noise.registry import NOISES, noise_of, parse_noise
 from calibrate.noise.student_t import StudentTNoise
 
 __all__ = [
@@ -15,7 +15,7 @@ __all__ = [
     "Noise",
     "Sites",
     "StudentTNoise",
-    "noise_from_json",
+    "information_about_means",
     "noise_of",
     "parse_noise",
     "with_discrepancy",

@@ -5,7 +5,7 @@ r"""A model that is wrong: Gaussian noise and a discrepancy between body and sim
 
 (Kennedy and O'Hagan 2001, Equation 5, with scale factor 1). The discrepancy :math:`\delta` is
 integrated out, which leaves the covariance :math:`\sigma^2 I + \omega^2 K`
-(:mod:`calibrate.noise.spatial`); :math:`\omega` has a half-normal prior and is inferred.
+(:mod:`calibrate.noise.correlated`); :math:`\omega` has a half-normal prior and is inferred.
 
 Data alone cannot tell a discrepancy from a change of theta that looks the same (Brynjarsdóttir and
 O'Hagan 2014). A mean of zero and a length that is given keep it from taking all shapes and sizes:
@@ -21,10 +21,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from calibrate.noise.correlated import SpatialNoise
 from calibrate.noise.gaussian import GaussianNoise
-from calibrate.noise.protocol import Noise, Sites
-from calibrate.noise.scale import Scale
-from calibrate.noise.spatial_noise import SpatialNoise
+from calibrate.noise.protocol import Noise, Scale, Sites
+from emulator.core import schema
 from emulator.core.errors import InputError
 
 DISCREPANCY_SD = "discrepancy_sd"
@@ -39,7 +39,7 @@ class DiscrepancyNoise(SpatialNoise):
     scale : of the half-normal prior of the discrepancy's standard deviation.
     length : correlation length of the discrepancy over reference positions, mm, known.
     sd, sd_scale : of the independent noise, as in :class:`~calibrate.noise.GaussianNoise`.
-    kernel : a name of :data:`calibrate.noise.spatial.KERNELS`.
+    kernel : a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
     sites : where the data was measured; a model sets it.
     """
 
@@ -54,16 +54,17 @@ class DiscrepancyNoise(SpatialNoise):
     usage: ClassVar[str] = "discrepancy:scale=SCALE,length=MM,sd=SD"
 
     @property
-    def _spatial(self) -> Scale:
+    def spatial(self) -> Scale:
+        """Standard deviation of the discrepancy, which is always inferred."""
         return Scale(DISCREPANCY_SD, ("", "scale"), None, self.scale)
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """Independent noise alone: data made by the model itself has no discrepancy."""
-        return rng.normal(0.0, self._independent.needed(), shape)
+        """Return independent noise alone: data made by the model itself has no discrepancy."""
+        return rng.normal(0.0, self.scales[0].needed(), shape)
 
 
 def with_discrepancy(noise: Noise, options: Mapping[str, Any]) -> DiscrepancyNoise:
-    """``noise`` and a discrepancy.
+    """Return ``noise`` and a discrepancy.
 
     Parameters
     ----------
@@ -75,9 +76,10 @@ def with_discrepancy(noise: Noise, options: Mapping[str, Any]) -> DiscrepancyNoi
     InputError
         Noise of another kind, or options that are wrong.
     """
-    given = noise.to_json()
-    if given["kind"] != GaussianNoise.kind:
+    independent = noise.to_json()
+    if independent["kind"] != GaussianNoise.kind:
         raise InputError(
-            f"a discrepancy adds to {GaussianNoise.kind} noise, not to {given['kind']} noise"
+            f"a discrepancy adds to {GaussianNoise.kind} noise, not to {noise.kind} noise"
         )
-    return DiscrepancyNoise.from_json({**given, **options})
+    kinds = {DiscrepancyNoise.kind: DiscrepancyNoise}
+    return schema.restore(kinds, {**independent, **options, "kind": DiscrepancyNoise.kind}, "noise")

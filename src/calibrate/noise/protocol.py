@@ -1,20 +1,31 @@
-"""What measurement noise is: the density of data given its mean, with what of it is unknown."""
+"""Measurement noise: the density of data given their mean, and which of its numbers are unknown."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
+from jax.flatten_util import ravel_pytree
+
+from emulator.core import schema
+from emulator.core.errors import InputError
+
+_PLAUSIBLE = 3.0  # scales of a half-normal prior, which hold 99.7 % of its mass
 
 
 class Sites(NamedTuple):
     """Where each number of an observation's data was measured, the data's axes raveled.
 
-    positions : (e, 3) mm in the reference body.
-    component : (e,) which component of a vector or tensor it is; components do not correlate.
+    positions : positions in the reference body, (e, 3) mm.
+    component : which component of a vector or tensor each number is, (e,); components do not
+        correlate with one another.
     """
 
     positions: np.ndarray
@@ -22,13 +33,70 @@ class Sites(NamedTuple):
 
     @classmethod
     def of(cls, positions: np.ndarray, components: int) -> Sites:
-        """Sites of data (d, components) measured at ``positions`` (d, 3)."""
+        """Return the sites of data (d, components) measured at ``positions`` (d, 3)."""
         count = len(positions)
         return cls(np.repeat(positions, components, axis=0), np.tile(np.arange(components), count))
 
 
-class Noise(Protocol):
+@dataclass(frozen=True)
+class Scale:
+    """A standard deviation or another scale: known, or inferred under a half-normal prior.
+
+    Parameters
+    ----------
+    name : name of the scale in the posterior, where it is inferred.
+    options : names of the two options that give it, for errors.
+    known : its value in the observation's unit; or
+    prior_scale : the scale of its half-normal prior.
+
+    Raises
+    ------
+    InputError
+        Both are given, neither, or one that is not above 0.
+    """
+
+    name: str
+    options: tuple[str, str]
+    known: float | None
+    prior_scale: float | None
+
+    def __post_init__(self) -> None:
+        if (self.known is None) == (self.prior_scale is None):
+            first, second = self.options
+            raise InputError(f"give either {first} (known) or {second} (of its prior)")
+        check_positive("standard deviation", self._given)
+
+    @property
+    def _given(self) -> float:
+        value = self.prior_scale if self.known is None else self.known
+        assert value is not None
+        return value
+
+    @property
+    def priors(self) -> dict[str, dist.Distribution]:
+        """Its half-normal prior by its name; empty where it is known."""
+        return {} if self.known is not None else {self.name: dist.HalfNormal(self._given)}
+
+    @property
+    def upper(self) -> float:
+        """Its value, or the 99.7 % quantile of its half-normal prior."""
+        return self._given if self.known is not None else _PLAUSIBLE * self._given
+
+    def value(self, values: Mapping[str, jax.Array]) -> float | jax.Array:
+        """Return its value, from ``values`` by name where it is inferred."""
+        return values[self.name] if self.known is None else self.known
+
+    def needed(self) -> float:
+        """Return its value, for synthetic data; :class:`InputError` where it is not known."""
+        if self.known is None:
+            raise InputError("noise: to make data, give its standard deviation")
+        return self.known
+
+
+class Noise(ABC):
     """Noise of one observation, in the observation's unit.
+
+    A kind is a frozen dataclass that derives from this class; its fields are its options.
 
     Attributes
     ----------
@@ -38,53 +106,81 @@ class Noise(Protocol):
     """
 
     kind: ClassVar[str]
-    gaussian: ClassVar[bool]
+    gaussian: ClassVar[bool] = True
     usage: ClassVar[str]
 
+    def __post_init__(self) -> None:
+        self.scales  # noqa: B018 - scales that cannot be are refused here
+
+    @property
+    @abstractmethod
+    def scales(self) -> tuple[Scale, ...]:
+        """Its scales, known or inferred."""
+
+    @property
+    def priors(self) -> dict[str, dist.Distribution]:
+        """Priors of its unknown scales by name, e.g. ``noise_sd``; empty if all are known."""
+        return {name: prior for scale in self.scales for name, prior in scale.priors.items()}
+
+    @property
+    @abstractmethod
+    def upper_sd(self) -> float:
+        """Largest plausible standard deviation of data combined with weights of norm 1.
+
+        It is the sd itself for independent Gaussian noise of known sd.
+        """
+
     def at(self, sites: Sites | None) -> Self:
-        """The noise of data measured at ``sites``.
+        """Return the noise of data measured at ``sites``; independent noise is the same everywhere.
 
         Raises
         ------
         InputError
-            Noise that correlates in space, for data that has no one place.
+            The noise correlates in space, and there are no sites.
         """
-        ...
+        del sites
+        return self
 
+    @abstractmethod
     def inferred(self, scale: float) -> Self:
-        """The noise with its sd unknown, under a half-normal prior of this scale."""
-        ...
+        """Return the noise with its independent sd unknown, under a half-normal prior of scale."""
 
-    @property
-    def priors(self) -> Mapping[str, dist.Distribution]:
-        """Priors of its unknown numbers, by their names, e.g. ``noise_sd``; empty if all known."""
-        ...
-
-    @property
-    def upper_sd(self) -> float:
-        """Largest standard deviation of any combination of the data whose weights have norm 1.
-
-        The sd itself for independent noise. Where it is unknown, the largest that its prior makes
-        plausible.
-        """
-        ...
-
+    @abstractmethod
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
-        """Distribution of data with mean ``mean``; ``values`` of the unknown numbers by name.
+        """Return the distribution of data with mean ``mean``, all of whose axes are event axes.
 
-        All axes of ``mean`` are event axes, so that the log density is one number.
+        Parameters
+        ----------
+        values : the inferred scales by name.
         """
-        ...
 
+    @abstractmethod
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """Noise of data of this shape; :class:`InputError` where a number of it is unknown."""
-        ...
+        """Return noise of data of this shape; :class:`InputError` where a scale is unknown."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON from which :meth:`from_json` makes it again; ``kind`` is its kind."""
-        ...
+        """Return plain JSON: its kind and its options."""
+        return schema.describe(self)
 
-    @classmethod
-    def from_json(cls, description: Mapping[str, Any]) -> Self:
-        """The noise that :meth:`to_json` described."""
-        ...
+
+def information_about_means(
+    noise: Mapping[str, Noise], means: Mapping[str, jax.Array]
+) -> jax.Array:
+    """Return the information (d, d) of data with known noises about their means.
+
+    It is the curvature of the log density at the mean, in the order of ``ravel_pytree``.
+    """
+    flat, unravel = ravel_pytree(means)
+
+    def log_density(shifted: jax.Array) -> jax.Array:
+        at = unravel(shifted)
+        terms = [noise[n].distribution(at[n], {}).log_prob(means[n]) for n in means]
+        return sum(terms, jnp.zeros(()))
+
+    return -jax.hessian(log_density)(flat)
+
+
+def check_positive(what: str, value: object) -> None:
+    """Raise :class:`InputError` unless ``value`` is a finite number above 0."""
+    if not isinstance(value, Real) or not 0.0 < float(value) < float("inf"):
+        raise InputError(f"{what} is {value}; it must be above 0")

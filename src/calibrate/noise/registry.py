@@ -10,25 +10,29 @@ from calibrate.noise.discrepancy import DiscrepancyNoise
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise
 from calibrate.noise.student_t import StudentTNoise
-from emulator.core.errors import InputError, look_up
+from emulator.core import schema
+from emulator.core.errors import InputError
 
 NOISES: dict[str, type[Noise]] = {
     kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise, DiscrepancyNoise)
 }
 
 
-def noise_from_json(description: Mapping[str, Any]) -> Noise:
-    """The noise that :meth:`Noise.to_json` described."""
-    return look_up(NOISES, description.get("kind"), "noise kind").from_json(description)
+def noise_of(description: float | Mapping[str, Any]) -> Noise:
+    """Return the noise of a run: Gaussian of a known sd, or a kind with its options.
 
-
-def noise_of(given: float | Mapping[str, Any]) -> Noise:
-    """The noise that a run names: Gaussian of a known sd, or a kind with its options."""
-    return noise_from_json(given) if isinstance(given, Mapping) else GaussianNoise(given)
+    Raises
+    ------
+    InputError
+        An unknown kind or option, an option that is missing, or one that cannot be.
+    """
+    if not isinstance(description, Mapping):
+        description = {"kind": GaussianNoise.kind, "sd": description}
+    return schema.restore(NOISES, description, "noise")
 
 
 def parse_noise(text: str) -> float | dict[str, Any]:
-    """What ``0.2`` or ``student_t:dof=4,scale=0.2`` asks for; :func:`noise_of` makes it.
+    """Return the description of ``0.2`` or ``student_t:dof=4,scale=0.2``, for :func:`noise_of`.
 
     Raises
     ------
@@ -48,7 +52,7 @@ def parse_noise(text: str) -> float | dict[str, Any]:
         if not equals:
             raise InputError(f"'{text}': '{option}' is not option=value; give {NOISES[kind].usage}")
         description[name] = _number(value)
-    noise_of(description)  # refuses what the kind does not take
+    noise_of(description)  # refuses options that the kind does not take
     return description
 
 

@@ -4,7 +4,7 @@ r"""Independent noise with outliers: Student's t distribution.
     p(\varepsilon) = \frac{\Gamma(\frac{\nu+1}{2})}{\Gamma(\frac{\nu}{2})\sqrt{\nu\pi}\,s}
     \left[1 + \frac{\varepsilon^2}{\nu s^2}\right]^{-(\nu+1)/2}
 
-with scale :math:`s` and :math:`\nu` degrees of freedom. Far out its log density grows like
+with scale :math:`s` and :math:`\nu` degrees of freedom. In its tails the log density falls like
 :math:`-(\nu + 1)\log|\varepsilon|` and not like :math:`-\varepsilon^2`: one outlier does not move
 the posterior (Lange, Little and Taylor 1989). Its standard deviation is
 :math:`s\sqrt{\nu/(\nu-2)}`, infinite at 2 degrees of freedom or fewer.
@@ -14,22 +14,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import jax
 import numpy as np
 import numpyro.distributions as dist
 
-from calibrate.noise.description import describe, restore
-from calibrate.noise.protocol import Sites
-from calibrate.noise.scale import Scale, check_positive
+from calibrate.noise.protocol import Noise, Scale, check_positive
 
 NOISE_SCALE = "noise_scale"
 _FAR = 5.0  # sds of a Gaussian, at which data is judged (`calibrate.measurements.magnitude`)
 
 
 @dataclass(frozen=True)
-class StudentTNoise:
+class StudentTNoise(Noise):
     """Independent Student-t noise on every number of an observation, in the observation's unit.
 
     Parameters
@@ -49,25 +47,12 @@ class StudentTNoise:
 
     def __post_init__(self) -> None:
         check_positive("number of degrees of freedom", self.dof)
-        self._scale  # noqa: B018 - values that cannot be are refused here
+        super().__post_init__()
 
     @property
-    def _scale(self) -> Scale:
-        options = ("scale", "prior_scale")
-        return Scale(NOISE_SCALE, options, self.scale, self.prior_scale)
-
-    def at(self, sites: Sites | None) -> Self:
-        """Itself: independent noise is the same everywhere."""
-        return self
-
-    def inferred(self, scale: float) -> Self:
-        """Student-t noise of unknown scale and the same degrees of freedom."""
-        return replace(self, scale=None, prior_scale=scale)
-
-    @property
-    def priors(self) -> dict[str, dist.Distribution]:
-        """``noise_scale`` with its half-normal prior, where it is not known."""
-        return self._scale.priors
+    def scales(self) -> tuple[Scale, ...]:
+        """The scale s."""
+        return (Scale(NOISE_SCALE, ("scale", "prior_scale"), self.scale, self.prior_scale),)
 
     @property
     def upper_sd(self) -> float:
@@ -75,21 +60,16 @@ class StudentTNoise:
         from scipy import stats  # half a second, for this noise alone
 
         beyond = float(stats.t.isf(stats.norm.sf(_FAR), self.dof))
-        return self._scale.upper * beyond / _FAR
+        return self.scales[0].upper * beyond / _FAR
+
+    def inferred(self, scale: float) -> Self:
+        """Return Student-t noise of unknown scale, its degrees of freedom unchanged."""
+        return replace(self, scale=None, prior_scale=scale)
 
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
-        """Independent Student-t distributions around ``mean``."""
-        return dist.StudentT(self.dof, mean, self._scale.value(values)).to_event(mean.ndim)
+        """Return independent Student-t distributions around ``mean``."""
+        return dist.StudentT(self.dof, mean, self.scales[0].value(values)).to_event(mean.ndim)
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """Noise of data of this shape; :class:`InputError` where the scale is not known."""
-        return self._scale.needed() * rng.standard_t(self.dof, shape)
-
-    def to_json(self) -> dict[str, Any]:
-        """Kind and the constructor's arguments."""
-        return describe(self)
-
-    @classmethod
-    def from_json(cls, description: Mapping[str, Any]) -> Self:
-        """The noise that :meth:`to_json` described."""
-        return restore(cls, description)
+        """Return noise of data of this shape; :class:`InputError` where the scale is not known."""
+        return self.scales[0].needed() * rng.standard_t(self.dof, shape)

@@ -43,6 +43,8 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
 
+from emulator.core.small_matrices import eliminated
+
 _LEAST = 1e-300  # a mass of which ndtri is finite
 _FARTHEST = 30.0  # sd, beyond which a value's score is taken to be that of 30 sd
 
@@ -134,41 +136,10 @@ def _scores_of_member(
     *cut, factor = population
     score, slope = to_score(information.value, *cut)
     root = slope[:, None] * factor
-    C = _cholesky(jnp.eye(len(e)) + root.T @ information.precision @ root)
+    P = jnp.eye(len(e)) + root.T @ information.precision @ root
     gradient = information.slope + information.precision @ (slope * score)
-    z = _substitute_back(C, _substitute(C, root.T @ gradient) + e)
-    return z, -sum((jnp.log(C[k][k]) for k in range(len(e))), jnp.zeros(()))
-
-
-# LAPACK on batches of small matrices can hang, so these are written out; k is 1 to 10.
-
-
-def _cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
-    """Return the rows of the lower factor of a positive definite matrix (k, k)."""
-    rows: list[list[jax.Array]] = []
-    for i in range(len(matrix)):
-        row: list[jax.Array] = []
-        for j in range(i):
-            rest = sum((row[k] * rows[j][k] for k in range(j)), jnp.zeros(()))
-            row.append((matrix[i, j] - rest) / rows[j][j])
-        row.append(jnp.sqrt(matrix[i, i] - sum((r * r for r in row), jnp.zeros(()))))
-        rows.append(row)
-    return rows
-
-
-def _substitute(C: list[list[jax.Array]], b: jax.Array) -> jax.Array:
-    """Return ``C^-1 b`` (k,) for the lower factor C."""
-    x: list[jax.Array] = []
-    for i, row in enumerate(C):
-        rest = sum((row[j] * x[j] for j in range(i)), jnp.zeros(()))
-        x.append((b[i] - rest) / row[i])
-    return jnp.stack(x)
-
-
-def _substitute_back(C: list[list[jax.Array]], b: jax.Array) -> jax.Array:
-    """Return ``C^-T b`` (k,) for the lower factor C."""
-    x: dict[int, jax.Array] = {}
-    for i in reversed(range(len(C))):
-        rest = sum((C[j][i] * x[j] for j in range(i + 1, len(C))), jnp.zeros(()))
-        x[i] = (b[i] - rest) / C[i][i]
-    return jnp.stack([x[i] for i in range(len(C))])
+    # P = L diag(pivots) L^T, so that C = L diag(sqrt(pivots)).
+    pivots, inverse_L = eliminated(P, jnp.eye(len(e)))
+    inverse_C = inverse_L / jnp.sqrt(pivots)[:, None]
+    z = inverse_C.T @ (inverse_C @ (root.T @ gradient) + e)
+    return z, -0.5 * jnp.sum(jnp.log(pivots))

@@ -21,7 +21,7 @@ from numpyro import handlers
 
 from calibrate.measurements import Observation
 from calibrate.measurements.outputs import Outputs
-from calibrate.noise.spatial import SpatialNormal
+from calibrate.noise.correlated import SpatialNormal
 from calibrate.statistical_model import Data, Model
 from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, evaluate_all
 

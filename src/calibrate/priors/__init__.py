@@ -1,12 +1,14 @@
 """Priors: of one parameter, of several that correlate, and of a population of ventricles."""
 
-from calibrate.priors.joint_prior import Dependence, JointPrior, dependence_of
 from calibrate.priors.population import Population, population_of_fits, prior_of
 from calibrate.priors.priors import (
+    Dependence,
+    JointPrior,
     Prior,
     bisect,
     bounds,
     box_prior,
+    dependence_of,
     log_normal,
     truncated,
     truncated_normal,

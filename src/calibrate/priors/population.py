@@ -3,8 +3,8 @@ r"""A population as a prior: medians, spreads and correlations of log parameters
 .. math:: \log\theta \sim N(\log \text{median},\ D R D), \qquad D = \text{diag(log\_sd)}
 
 each parameter cut to its scene's range, the correlations of the normal scores kept
-(``joint_prior``). A population is a few numbers in a JSON file, so that what another
-cohort was found to have is one argument, ``--prior FILE``:
+(:class:`~calibrate.priors.JointPrior`). A population is a few numbers in a JSON file, so that the
+numbers of another cohort are one argument, ``--prior FILE``:
 
 .. code-block:: json
 
@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.priors.joint_prior import Dependence, JointPrior
-from calibrate.priors.priors import log_normal, truncated
+from calibrate.priors.priors import Dependence, JointPrior, log_normal, truncated
 from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
@@ -37,8 +36,8 @@ BOX = "box"
 class Population:
     """Correlated log-normals.
 
-    median : by parameter, in its unit.
-    log_sd : sd of its logarithm by parameter, about its relative sd.
+    median : median by parameter, in its unit.
+    log_sd : sd of the logarithm by parameter, about its relative sd.
     correlation : of the logarithms, by two names joined by a comma; 0 where none is given.
     source : where the numbers are from.
 
@@ -76,7 +75,7 @@ class Population:
         return Dependence(names, matrix)
 
     def prior(self, scene: Scene) -> JointPrior:
-        """The population as the prior of ``scene``, cut to its range.
+        """Return the population as the prior of ``scene``, cut to its range.
 
         Raises
         ------
@@ -89,15 +88,15 @@ class Population:
                     f"the population is of '{name}'; scene '{scene.name}' has "
                     f"{', '.join(scene.parameter_names)}"
                 )
-        found = {name: log_normal(self.median[name], self.log_sd[name]) for name in self.median}
-        return JointPrior(truncated(found, scene), self.dependence)
+        priors = {name: log_normal(self.median[name], self.log_sd[name]) for name in self.median}
+        return JointPrior(truncated(priors, scene), self.dependence)
 
 
 def population_of_fits(fits: Mapping[str, Sequence[float]], source: str = "") -> Population:
-    """The population of subjects with these fitted parameters, by name, each (n,).
+    """Return the population of subjects with these fitted parameters, by name, each (n,).
 
-    Medians, sds and correlations of the logarithms. Scatter of fits contains the errors of the
-    fits: where those are large, it is wider than the subjects' own.
+    Its numbers are medians, sds and correlations of the logarithms. The scatter of fits contains
+    the errors of the fits: where those are large, it is wider than the subjects' own.
 
     Raises
     ------
@@ -145,27 +144,26 @@ diagonal, -0.0612, 0.102 and -0.141 beside it, of the factors of a, a_f and b_f 
 POPULATIONS = {"ventricles": VENTRICLES}
 
 
-def prior_of(given: str | Mapping[str, Any], scene: Scene) -> JointPrior | None:
-    """The prior that a run asks for: the name of a population, or its numbers; none for ``box``.
+def prior_of(description: str | Mapping[str, Any], scene: Scene) -> JointPrior | None:
+    """Return the prior of a run: that of a population by name or numbers; ``None`` for ``box``.
 
     Raises
     ------
     InputError
         An unknown name, or a population that does not fit the scene.
     """
-    if given == BOX:
+    if description == BOX:
         return None
-    if isinstance(given, str):
-        if given not in POPULATIONS:
-            raise InputError(
-                f"prior '{given}' is unknown; known: {', '.join((BOX, *POPULATIONS))}, or a file"
-            )
-        return POPULATIONS[given].prior(scene)
-    return schema.read_as(Population, given, "prior").prior(scene)
+    if not isinstance(description, str):
+        return schema.read_as(Population, description, "prior").prior(scene)
+    if description not in POPULATIONS:
+        known = ", ".join((BOX, *POPULATIONS))
+        raise InputError(f"prior '{description}' is unknown; known: {known}, or a file")
+    return POPULATIONS[description].prior(scene)
 
 
 def read_population(path: str | Path) -> Population:
-    """The population in a JSON file.
+    """Return the population in a JSON file.
 
     Raises
     ------

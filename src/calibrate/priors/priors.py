@@ -1,17 +1,34 @@
-"""Priors over a scene's parameters."""
+r"""Priors over a scene's parameters: of each parameter, and of several that correlate.
+
+A prior maps a parameter's name to a distribution; a parameter without one has the scene's box. A
+:class:`JointPrior` adds a correlation of the parameters' normal scores (a Gaussian copula, Nelsen
+2006, Section 2.8): with the cumulative distribution function :math:`F_i` of each parameter,
+
+.. math:: q_i = \Phi^{-1}(F_i(x_i)), \qquad q \sim N(0, R)
+
+so that correlated log-normals are exactly that, and parameters that are cut to a range stay in it:
+the density is normalised, and a draw is :math:`x_i = F_i^{-1}(\Phi(q_i))`, never rejected. The
+parameters are sampled one after the other, each given those before,
+
+.. math:: p(x_k \mid x_{<k}) = p_k(x_k)\, \frac{N(q_k;\, m_k, s_k^2)}{N(q_k;\, 0, 1)}, \qquad
+          m_k = R_{k,<k} R_{<k,<k}^{-1} q_{<k}, \quad s_k^2 = 1 - R_{k,<k} R_{<k,<k}^{-1} R_{<k,k}
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro.distributions as dist
+from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from calibrate.priors.joint_prior import JointPrior, dependence_of
 from calibrate.state_names import split
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
@@ -19,10 +36,11 @@ from emulator.scenes.scene import Scene
 Prior = Mapping[str, dist.Distribution]
 
 _BISECTIONS = 80  # halves an interval until double precision ends
+_EDGE = 1e-15  # mass beyond which scores end, at 7.9 sd: the ends of a range have infinite ones
 
 
 def box_prior(scene: Scene) -> dict[str, dist.Distribution]:
-    """Uniform over each parameter's range, on its scale: log-uniform where that is ``log``."""
+    """Return uniform priors over the parameters' ranges, log-uniform where the scale is ``log``."""
     return {
         p.name: dist.LogUniform(p.low, p.high) if p.scale == "log" else dist.Uniform(p.low, p.high)
         for p in scene.parameters
@@ -32,7 +50,7 @@ def box_prior(scene: Scene) -> dict[str, dist.Distribution]:
 def truncated_normal(
     mean: float, sd: float, low: float = -math.inf, high: float = math.inf
 ) -> dist.Distribution:
-    """Normal with mean ``mean`` and sd ``sd`` before it is cut to ``low`` ... ``high``.
+    """Return the normal with mean ``mean`` and sd ``sd``, cut to ``low`` ... ``high``.
 
     Raises
     ------
@@ -52,7 +70,7 @@ def truncated_normal(
 def log_normal(
     median: float, log_sd: float, low: float = 0.0, high: float = math.inf
 ) -> dist.Distribution:
-    """Log-normal with ``median`` and sd ``log_sd`` of the logarithm, cut to ``low`` ... ``high``.
+    """Return the log-normal with ``median`` and sd ``log_sd`` of the logarithm, cut to a range.
 
     ``log_sd`` is about the relative sd: 0.1 stands for 10 %.
 
@@ -72,7 +90,7 @@ def log_normal(
 
 
 def truncated(prior: Prior, scene: Scene) -> Prior:
-    """``prior`` with each distribution cut to the parameter's range in ``scene``.
+    """Return ``prior`` with each distribution cut to the parameter's range in ``scene``.
 
     A posterior under it speaks about the range only: a parameter that piles up at an end of it is
     probably outside. A joint prior keeps its correlations.
@@ -84,6 +102,23 @@ def truncated(prior: Prior, scene: Scene) -> Prior:
     cut = {name: _cut(d, *ranges[split(name)[0]]) for name, d in prior.items()}
     dependence = dependence_of(prior)
     return cut if dependence is None else JointPrior(cut, dependence)
+
+
+def bounds(distribution: dist.Distribution) -> tuple[float, float]:
+    """Return the ends of a distribution's support, infinite where it has none."""
+    low = getattr(distribution.support, "lower_bound", -math.inf)
+    high = getattr(distribution.support, "upper_bound", math.inf)
+    return float(low), float(high)
+
+
+def _cut(distribution: dist.Distribution, low: float, high: float) -> dist.Distribution:
+    """Return ``distribution`` on the part of its support between ``low`` and ``high``."""
+    first, last = bounds(distribution)
+    if low <= first and last <= high:
+        return distribution
+    if not max(low, first) < min(high, last):
+        raise InputError(f"prior {type(distribution).__name__} lies outside {low:g} to {high:g}")
+    return Truncated(distribution, max(low, first), min(high, last))
 
 
 class Truncated(dist.Distribution):
@@ -114,31 +149,31 @@ class Truncated(dist.Distribution):
         return self.base_dist.cdf(self.low), self.base_dist.cdf(self.high)
 
     def log_prob(self, value: ArrayLike) -> jax.Array:
-        """Log density of the base less the log of its mass in the interval; -inf outside."""
+        """Return the log density: the base's less the log of its mass inside; -inf outside."""
         below, above = self._ends
         inside = self._support(value)
         safe = jnp.where(inside, value, 0.5 * (self.low + self.high))
         return jnp.where(inside, self.base_dist.log_prob(safe) - jnp.log(above - below), -jnp.inf)
 
     def cdf(self, value: ArrayLike) -> jax.Array:
-        """Cumulative distribution function."""
+        """Return the cumulative distribution function."""
         below, above = self._ends
         within = jnp.clip(value, self.low, self.high)
         return (self.base_dist.cdf(within) - below) / (above - below)
 
     def icdf(self, q: ArrayLike) -> jax.Array:
-        """Quantiles, by bisection: many bases have no inverse of their own."""
+        """Return quantiles, by bisection: many bases have no inverse of their own."""
         return bisect(self.cdf, q, self.low, self.high)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        """Draws, by inversion."""
+        """Return draws, by inversion."""
         return self.icdf(jax.random.uniform(key, sample_shape))
 
 
 def bisect(
     cdf: Callable[[jax.Array], jax.Array], q: ArrayLike, low: ArrayLike, high: ArrayLike
 ) -> jax.Array:
-    """Where the increasing function ``cdf`` reaches ``q`` between ``low`` and ``high``."""
+    """Return the point between ``low`` and ``high`` where the increasing ``cdf`` reaches ``q``."""
     q = jnp.asarray(q)
 
     def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -151,22 +186,153 @@ def bisect(
     return 0.5 * (first + last)
 
 
-def bounds(distribution: dist.Distribution) -> tuple[float, float]:
-    """Ends of a distribution's support, infinite where it has none."""
-    low = getattr(distribution.support, "lower_bound", -math.inf)
-    high = getattr(distribution.support, "upper_bound", math.inf)
-    return float(low), float(high)
+@dataclass(frozen=True, eq=False)
+class Dependence:
+    """Correlation of the normal scores of some parameters.
+
+    names : the parameters, (k,). correlation : (k, k), unit diagonal, positive definite.
+
+    Raises
+    ------
+    InputError
+        A matrix that is no correlation of these names.
+    """
+
+    names: tuple[str, ...]
+    correlation: np.ndarray
+
+    def __post_init__(self) -> None:
+        R = np.array(self.correlation, dtype=float)
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "correlation", R)
+        count = len(self.names)
+        if len(set(self.names)) != count or R.shape != (count, count):
+            raise InputError(
+                f"correlation has shape {R.shape}; give one row for each of "
+                f"{', '.join(self.names)}, named once"
+            )
+        if not (np.allclose(R, R.T) and np.allclose(np.diag(R), 1.0)):
+            raise InputError("correlation is not symmetric with ones on its diagonal")
+        if not np.linalg.eigvalsh(R).min() > 1e-10:
+            raise InputError(
+                f"correlation of {', '.join(self.names)} is not positive definite: no parameters "
+                "can have all these correlations"
+            )
+
+    def ordered(self, names: tuple[str, ...]) -> Dependence:
+        """Return the dependence with its parameters in the order they have in ``names``.
+
+        Raises
+        ------
+        InputError
+            One that is not among ``names``.
+        """
+        for name in self.names:
+            if name not in names:
+                raise InputError(
+                    f"prior correlates '{name}', which is not inferred; inferred: "
+                    f"{', '.join(names)}"
+                )
+        rows = sorted(range(len(self.names)), key=lambda k: names.index(self.names[k]))
+        chosen = tuple(self.names[k] for k in rows)
+        return Dependence(chosen, self.correlation[np.ix_(rows, rows)])
+
+    def given_earlier(
+        self, name: str, prior: Mapping[str, dist.Distribution], draw: Mapping[str, Any]
+    ) -> tuple[ArrayLike, float]:
+        """Return mean and sd of the score of ``name``, given the parameters before it."""
+        k = self.names.index(name)
+        before = self.correlation[:k, :k]
+        weights = np.linalg.solve(before, self.correlation[:k, k]) if k else np.zeros(0)
+        sd = float(np.sqrt(1.0 - weights @ self.correlation[:k, k]))
+        scores = [_score(prior[n], draw[n]) for n in self.names[:k]]
+        return sum((w * q for w, q in zip(weights, scores, strict=True)), jnp.zeros(())), sd
+
+    def to_json(self) -> dict[str, Any]:
+        """Return names and correlation."""
+        return {"names": list(self.names), "correlation": self.correlation.tolist()}
 
 
-def _cut(distribution: dist.Distribution, low: float, high: float) -> dist.Distribution:
-    """``distribution`` on the part of its support between ``low`` and ``high``."""
-    first, last = bounds(distribution)
-    if low <= first and last <= high:
-        return distribution
-    if not max(low, first) < min(high, last):
-        raise InputError(f"prior {type(distribution).__name__} lies outside {low:g} to {high:g}")
-    low, high = max(low, first), min(high, last)
-    return Truncated(distribution, low, high)
+@dataclass(frozen=True, eq=False)
+class JointPrior(Mapping[str, dist.Distribution]):
+    """A prior by parameter, as every prior, and how the parameters depend on each other.
+
+    ``{**joint, "pressure": ...}`` is an ordinary prior without the dependence; to add a parameter,
+    make a new joint prior.
+
+    Parameters
+    ----------
+    marginals : distribution of each parameter. Those that depend on each other need ``cdf`` and
+        ``icdf``.
+    dependence : the correlation of some of them.
+
+    Raises
+    ------
+    InputError
+        A parameter that depends on others and has no distribution.
+    """
+
+    marginals: Mapping[str, dist.Distribution]
+    dependence: Dependence
+
+    def __post_init__(self) -> None:
+        self.dependence.ordered(tuple(self.marginals))
+
+    def __getitem__(self, name: str) -> dist.Distribution:
+        return self.marginals[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.marginals)
+
+    def __len__(self) -> int:
+        return len(self.marginals)
+
+
+def dependence_of(prior: Mapping[str, dist.Distribution] | None) -> Dependence | None:
+    """Return the dependence between the parameters of ``prior``; ``None`` where independent."""
+    return prior.dependence if isinstance(prior, JointPrior) else None
+
+
+class Conditional(dist.Distribution):
+    """One parameter given those before it: its marginal, its score normal(``centre``, ``width``).
+
+    support : of the marginal, in the coordinates samplers use.
+    """
+
+    arg_constraints: dict = {}  # noqa: RUF012
+    pytree_data_fields = ("marginal", "centre", "width", "_support")
+
+    def __init__(
+        self,
+        marginal: dist.Distribution,
+        centre: ArrayLike,
+        width: float,
+        support: constraints.Constraint,
+    ) -> None:
+        self.marginal, self._support = marginal, support
+        self.centre, self.width = centre, width
+        super().__init__(batch_shape=(), event_shape=())
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """The marginal's support."""
+        return self._support
+
+    def log_prob(self, value: ArrayLike) -> jax.Array:
+        """Return the log density; the marginal's ``-inf`` outside the support."""
+        q = _score(self.marginal, value)
+        change = 0.5 * (q**2 - ((q - self.centre) / self.width) ** 2) - jnp.log(self.width)
+        return self.marginal.log_prob(value) + change
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Return draws, by inversion."""
+        q = jnp.asarray(self.centre) + self.width * jax.random.normal(key, sample_shape)
+        return self.marginal.icdf(jnp.clip(ndtr(q), _EDGE, 1.0 - _EDGE))
+
+
+def _score(marginal: dist.Distribution, value: ArrayLike) -> jax.Array:
+    """Return the normal score of ``value`` under ``marginal``."""
+    return ndtri(jnp.clip(marginal.cdf(value), _EDGE, 1.0 - _EDGE))
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -11,15 +11,15 @@ from typing import Annotated, Any, Literal, Union
 
 from pydantic import Field, create_model
 
+from calibrate.model_error.kinds import SYSTEMATIC_ERRORS
 from calibrate.noise import NOISES, DiscrepancyNoise
-from calibrate.noise.spatial import KERNELS
 from calibrate.priors.population import BOX, POPULATIONS, Population
 from calibrate.project.members import POPULATION, Members, Shared
 from calibrate.project.results import MEMBERS
 from calibrate.project.run import Run
 from calibrate.samplers import SAMPLERS
-from calibrate.statistical_model.shared_errors import SHARED_ERRORS
 from emulator.core.docstrings import documented
+from emulator.core.gaussian_process import CORRELATIONS
 from emulator.core.schema import OneOf, Table, json_schema, table_of
 from emulator.surrogates.registry import FORWARD_MAPS, known_options
 
@@ -36,7 +36,7 @@ def experiment_schema() -> dict[str, Any]:
     schema["description"] = "What was measured on which body, and what is not known of it."
     for table in schema["$defs"].values():
         if "kernel" in table["properties"]:
-            table["properties"]["kernel"]["enum"] = list(KERNELS)
+            table["properties"]["kernel"]["enum"] = list(CORRELATIONS)
     # An entry that the file lacks for all members is required of each member.
     schema["$defs"][Run.__name__].pop("required")
     whole = [_required(key) for key in schema.pop("required")]
@@ -53,7 +53,7 @@ def _entries() -> type[Table]:
         "prior": Union[named, in_file, table_of(Population)],  # noqa: UP007
         "noise": Mapping[str, float | noise] | float,
         "discrepancy": dict[str, discrepancy],
-        "systematic": dict[str, Annotated[Any, OneOf("kind", SHARED_ERRORS)]],
+        "systematic": dict[str, Annotated[Any, OneOf("kind", SYSTEMATIC_ERRORS)]],
         "forward": Literal[tuple(FORWARD_MAPS)],
         "forward_options": _forward_options(),
         "sampler": Literal[tuple(SAMPLERS)],

@@ -30,9 +30,9 @@ from calibrate.priors import prior_of
 from calibrate.project.run import Run
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, with_error
-from calibrate.statistical_model.build import model
+from calibrate.statistical_model.errors import with_described_errors
 from calibrate.statistical_model.load_states import known_thetas, load_states
-from calibrate.statistical_model.shared_errors import with_shared_errors
+from calibrate.statistical_model.model import model
 from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
 from emulator.fem import NewtonOptions, Simulator
@@ -239,7 +239,7 @@ def model_before_data(run: Run | Problem, *, progress: bool = False) -> Model:
     # Some of these errors depend on where a body is seen: at a draw of the prior.
     draw = {name: each[0] for name, each in built.prior_draws(jax.random.key(run.seed), 1).items()}
     means = {name: np.asarray(mean) for name, mean in built.predict(draw)[0].items()}
-    return with_shared_errors(built, means, run.systematic)[0]
+    return with_described_errors(built, means, run.systematic)[0]
 
 
 def build_model(problem: Problem, *, progress: bool = False) -> tuple[Model, Mapping[str, Any]]:
@@ -250,7 +250,7 @@ def build_model(problem: Problem, *, progress: bool = False) -> tuple[Model, Map
     forward = build_forward(problem, progress=progress)
     built = model_of(run, forward, problem.observe, check_scale=run.check_scale)
     if run.systematic:
-        built, data = with_shared_errors(built, data, run.systematic)
+        built, data = with_described_errors(built, data, run.systematic)
     if runs := run.error_runs or run.mesh_error_runs:
         built, data = built.given(data)
         built = with_error(

@@ -31,12 +31,10 @@ import xarray as xr
 from calibrate.measurements import Observations, observations_from_json
 from calibrate.measurements.data import write_data
 from calibrate.measurements.present import leave_out_missing
+from calibrate.model_error import ModelError
 from calibrate.posterior import Posterior, read_tree
 from calibrate.project.problem import Problem, model_of, restore_forward
 from calibrate.project.run import Run
-from calibrate.statistical_model.approximation_error import ApproximationError
-from calibrate.statistical_model.error_modes import ErrorModes
-from calibrate.statistical_model.systematic import SystematicError
 from emulator.catalogue import find_scene
 from emulator.core import schema
 from emulator.core.errors import InputError
@@ -235,26 +233,18 @@ def _check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
         )
 
 
-def _save_error(path: Path, error: ErrorModes) -> None:
-    metadata = {}
-    if isinstance(error, SystematicError):
-        metadata[_DESCRIPTION] = json.dumps(error.words)
+def _save_error(path: Path, error: ModelError) -> None:
+    metadata = {_DESCRIPTION: json.dumps(error.words)} if error.words else {}
     save_arrays(path, error.arrays(), metadata)
 
 
-def _read_error(path: Path, posterior: Path, tree: xr.DataTree) -> ErrorModes:
+def _read_error(path: Path, posterior: Path, tree: xr.DataTree) -> ModelError:
     """The errors besides noise that the likelihood of a posterior allows for."""
     if not path.is_file():
         raise InputError(f"{path}, the error in the likelihood of the posterior, is missing")
     arrays, metadata = read_arrays(path)
-    error: ErrorModes
     try:
-        if _DESCRIPTION in metadata:
-            error = SystematicError.restore(arrays, json.loads(metadata[_DESCRIPTION]))
-        else:
-            error = ApproximationError.restore(arrays)
-    except KeyError as missing:
-        raise InputError(f"{path}: array {missing} is missing; infer again") from missing
+        error = ModelError.restore(arrays, json.loads(metadata.get(_DESCRIPTION, "{}")))
     except TypeError as wrong:
         raise InputError(f"{path} holds other arrays than an error has; infer again") from wrong
     if tree.attrs.get("forward_error") != error.fingerprint:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from calibrate.measurements import DISPLACEMENT, Observations
+from calibrate.model_error.kinds import read_systematic
 from calibrate.noise import Noise, noise_of, with_discrepancy
 from calibrate.samplers import Sampler, find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
-from calibrate.statistical_model.shared_errors import shared_error
 from emulator.core.errors import InputError
 from emulator.surrogates import registry
 
@@ -52,7 +52,7 @@ class Run:
     discrepancy : discrepancy of the model (:mod:`calibrate.noise.discrepancy`) by the
         observation's name, e.g. ``{"scale": 0.5, "length": 20.0}``; synthetic data has none.
     systematic : errors that several numbers share, by a name of their own, each a kind of
-        :data:`calibrate.statistical_model.shared_errors.SHARED_ERRORS` with its options, e.g.
+        :data:`calibrate.model_error.kinds.SYSTEMATIC_ERRORS` with its options, e.g.
         ``{"camera": {"kind": "rigid_motion", "of": "displacement", "shift": 2.0, "turn": 1.0}}``;
         synthetic data has none.
     check_scale : refuse data that is far from every prediction
@@ -114,7 +114,7 @@ class Run:
                 "error_runs and mesh_error_runs are both given; the latter see the map's error, too"
             )
         for name, description in self.systematic.items():
-            shared_error(name, description)
+            read_systematic(name, description)
         if self.systematic and (self.error_runs or self.mesh_error_runs):
             raise InputError(
                 "systematic and error_runs are both given; a likelihood allows for one of them"

@@ -1,6 +1,6 @@
-"""FEM's log likelihood at a draw of a posterior, beside the cheap map's.
+"""FEM's log likelihood at draws of a posterior, beside the cheap map's.
 
-Whatever compares a posterior with FEM asks here: certificates, and samplers with FEM in a second
+It serves all that compares a posterior with FEM: certificates, and samplers with FEM in a second
 stage. It is the only place that solves FEM for a draw.
 """
 
@@ -31,7 +31,7 @@ class Likelihoods(NamedTuple):
         ``-inf`` where FEM did not converge in a load state.
     cheap : with the model's forward map and its error, where the model allows for one; ``-inf``
         where the map has no answer.
-    converged : whether FEM did, in every load state.
+    converged : whether FEM converged in every load state.
     smallest_J : smallest volume ratio det F in the body, by FEM; NaN where it did not converge.
     means : FEM's data without noise, by the observation's name; empty where it did not converge.
     stable : whether FEM's equilibrium is a minimum of the energy; ``None`` where that was not asked
@@ -53,7 +53,11 @@ class Likelihoods(NamedTuple):
 class FEMLikelihood:
     """FEM's log likelihood under ``model``; solves start from the cheap map's prediction.
 
-    execute : solves, in this process by default.
+    Parameters
+    ----------
+    model : the statistical model.
+    simulator : the FEM simulator of the model's scene.
+    execute : the executor of the solves, in this process by default.
 
     Raises
     ------
@@ -72,7 +76,7 @@ class FEMLikelihood:
     def __call__(
         self, draw: Mapping[str, Any], data: Data, *, stability: bool = False
     ) -> Likelihoods:
-        """Log likelihoods at ``draw``: a number for each of the model's ``names``.
+        """Return the log likelihoods at ``draw``, a number for each of the model's ``names``.
 
         ``stability`` asks for ``stable`` as well, at the cost of one more factorisation a state.
         """
@@ -86,23 +90,52 @@ class FEMLikelihood:
         stability: Collection[int] = (),
         slopes: bool = False,
     ) -> Iterator[tuple[int, Likelihoods]]:
-        """Numbers of ``draws`` and their log likelihoods, as they are finished.
+        """Yield numbers of ``draws`` and their log likelihoods, as they are finished.
 
-        ``stability`` : numbers of the draws of which ``stable`` is asked, too. ``slopes`` : whether
-        those are, of every draw, at a tenth of the time of a solve.
+        Parameters
+        ----------
+        stability : numbers of the draws for which ``stable`` is asked, too.
+        slopes : whether ``slopes`` are asked for every draw, at a tenth of the time of a solve.
         """
-        thetas = [self.model.states.thetas(draw) for draw in draws]
+        for number, fields in self.equilibria(draws):
+            draw, thetas = draws[number], self.model.states.thetas(draws[number])
+            cheap = float(self._cheap(dict(draw), data))
+            if fields is None:
+                yield number, Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
+                continue
+            fem, means, smallest_J = self._fem(jnp.stack(fields), thetas, dict(draw), data)
+            yield (
+                number,
+                Likelihoods(
+                    fem=float(fem),
+                    cheap=cheap,
+                    converged=True,
+                    smallest_J=float(smallest_J),
+                    means=means,
+                    stable=self._stable(fields, thetas) if number in stability else None,
+                    slopes=self._slopes(fields, thetas) if slopes else None,
+                ),
+            )
+
+    def equilibria(
+        self, draws: Sequence[Mapping[str, Any]]
+    ) -> Iterator[tuple[int, list[jax.Array] | None]]:
+        """Yield numbers of ``draws`` and their equilibria, as they are finished.
+
+        An equilibrium is FEM's displacement (n, 3) mm in each load state; ``None`` stands for a
+        draw at which FEM did not converge in one of the states.
+        """
+        thetas = jnp.concatenate([self.model.states.thetas(draw) for draw in draws])
         states = len(self.model.states.states)
-        each = jnp.concatenate(thetas)
         solved: dict[int, dict[int, jax.Array]] = {number: {} for number in range(len(draws))}
         # A draw that fails in one load state is done: its other states are not begun.
-        numbers = (k for k in range(len(each)) if k // states in solved)
+        numbers = (k for k in range(len(thetas)) if k // states in solved)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
         for row in solve_rows(
             self._solver,
-            each,
+            thetas,
             numbers=numbers,
-            starts=lambda k: (self._start(each[k]),),
+            starts=lambda k: (self._start(thetas[k]),),
             execute=self.execute,
         ):
             number, state = divmod(row.number, states)
@@ -110,34 +143,15 @@ class FEMLikelihood:
                 continue
             if not row.converged:
                 del solved[number]
-                cheap = float(self._cheap(dict(draws[number]), data))
-                yield number, Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
+                yield number, None
                 continue
             solved[number][state] = row.solution.displacement
             if len(solved[number]) == states:
-                fields = [jnp.asarray(solved[number][k]) for k in range(states)]
-                del solved[number]
-                told = self._told(draws[number], thetas[number], fields, data, number in stability)
-                if slopes:
-                    told = told._replace(slopes=self._slopes(fields, thetas[number]))
-                yield number, told
+                fields = solved.pop(number)
+                yield number, [jnp.asarray(fields[k]) for k in range(states)]
 
-    def _told(
-        self,
-        draw: Mapping[str, Any],
-        thetas: jax.Array,
-        fields: list[jax.Array],
-        data: Data,
-        stability: bool,
-    ) -> Likelihoods:
-        """Log likelihoods from FEM's displacements (n, 3) mm, one a load state."""
-        cheap = float(self._cheap(dict(draw), data))
-        fem, means, smallest = self._fem(jnp.stack(fields), thetas, dict(draw), data)
-        stable = self._stable(fields, thetas) if stability else None
-        return Likelihoods(float(fem), cheap, True, float(smallest), means, stable)
-
-    def _stable(self, solved: list[jax.Array], thetas: jax.Array) -> bool | None:
-        """Whether every load state's equilibrium is a minimum of the energy, where there is one."""
+    def _stable(self, fields: list[jax.Array], thetas: jax.Array) -> bool | None:
+        """Return whether every state's equilibrium is a minimum of the energy, if there is one."""
         scene = self.simulator.scene
         if scene.loaded_by:  # without a system of its own: one at rest for each theta
             has_energy = all(load.has_potential for load in scene.loads)
@@ -146,27 +160,27 @@ class FEMLikelihood:
         if not has_energy:
             return None
         return all(
-            self.simulator.is_stable(u, theta) for u, theta in zip(solved, thetas, strict=True)
+            self.simulator.is_stable(u, theta) for u, theta in zip(fields, thetas, strict=True)
         )
 
-    def _slopes(self, solved: list[jax.Array], thetas: jax.Array) -> np.ndarray | None:
-        """Derivatives (m, S, p) of the flat means, by those of the equilibria."""
+    def _slopes(self, fields: list[jax.Array], thetas: jax.Array) -> np.ndarray | None:
+        """Return derivatives (m, S, p) of the flat means, by those of the equilibria."""
         nodes = self.model.observe.nodes
         try:
             each = [
                 self.simulator.sensitivities(u, theta)[:, nodes]
-                for u, theta in zip(solved, thetas, strict=True)
+                for u, theta in zip(fields, thetas, strict=True)
             ]
         except SolverError:
             return None
-        return np.asarray(self._derivatives(jnp.stack(solved)[:, nodes], jnp.stack(each), thetas))
+        return np.asarray(self._derivatives(jnp.stack(fields)[:, nodes], jnp.stack(each), thetas))
 
     @cached_property
     def _derivatives(self):  # noqa: ANN202
         def derivatives(u, slopes, thetas):  # noqa: ANN001, ANN202
-            def means(moved):  # noqa: ANN001, ANN202
-                step = jnp.einsum("sp,sp...->s...", moved - thetas, slopes)
-                return ravel_pytree(self.model.observe(u + step, moved))[0]
+            def means(shifted):  # noqa: ANN001, ANN202
+                step = jnp.einsum("sp,sp...->s...", shifted - thetas, slopes)
+                return ravel_pytree(self.model.observe(u + step, shifted))[0]
 
             return jax.jacfwd(means)(thetas)
 

@@ -7,8 +7,7 @@ With S states the model's unknowns determine S rows of theta,
 .. math:: \theta_s = (m, \ell_s), \qquad s = 1, \dots, S,
 
 with the material :math:`m` and the loads :math:`\ell_s`; each entry is either inferred or known.
-
-Names say which state is meant (:mod:`calibrate.state_names`).
+Names say which state is meant, ``pressure@p8`` (:mod:`calibrate.state_names`).
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ from emulator.scenes.scene import Scene
 
 @dataclass(frozen=True)
 class LoadStates:
-    """Where every entry of theta comes from, in every state. :func:`load_states` makes it.
+    """The source of every entry of theta in every state. :func:`load_states` makes it.
 
     states : names of the states; one empty name where there is but one.
-    entries : (S, p) of names of unknowns and of known values.
+    entries : for each state and parameter, (S, p), the name of an unknown, or a known value.
     """
 
     states: tuple[str, ...]
@@ -40,18 +39,18 @@ class LoadStates:
 
     @property
     def unknowns(self) -> tuple[str, ...]:
-        """Names of what is inferred: in theta's order, and within it in the states' order."""
+        """Names of the unknowns, in theta's order, and within it in the states' order."""
         columns = zip(*self.entries, strict=True)
         return tuple(
             dict.fromkeys(entry for column in columns for entry in column if isinstance(entry, str))
         )
 
     def to_json(self) -> dict[str, list[str | float]]:
-        """Each state's entries of theta: a name where it is inferred, else its known value."""
+        """Return each state's entries of theta: a name where inferred, else the known value."""
         return dict(zip(self.states, map(list, self.entries), strict=True))
 
     def thetas(self, values: Mapping[str, Any]) -> jax.Array:
-        """Theta (..., S, p) from a value (...) of every unknown."""
+        """Return theta (..., S, p) from a value (...) of every unknown."""
         shape = jnp.broadcast_shapes(*(jnp.shape(values[name]) for name in self.unknowns))
 
         def entry(source: str | float) -> jax.Array:
@@ -68,55 +67,50 @@ def load_states(
     prior: Mapping[str, dist.Distribution] | None = None,
     known: Mapping[str, float] | None = None,
 ) -> tuple[LoadStates, dict[str, dist.Distribution]]:
-    """The states' entries of theta, and the prior of each unknown.
+    """Return the states' entries of theta, and the prior of each unknown.
 
     Parameters
     ----------
     prior, known : distributions and known values by ``parameter`` or ``parameter@state``; a
         parameter of the loads that is named without a state is meant in every state that is not
-        named. What neither names has the scene's box as its prior.
+        named. A parameter that neither names has the scene's box as its prior.
 
     Raises
     ------
     InputError
         A name that is no parameter or state, or one both known and with a prior.
     """
-    given, known = dict(prior or {}), dict(known or {})
-    by_state = _by_state(scene, states, (*given, *known))
+    prior, known = dict(prior or {}), dict(known or {})
+    by_state = _parameters_by_state(scene, states, (*prior, *known))
     default = box_prior(scene)
-    entries: list[list[str | float]] = []
     priors: dict[str, dist.Distribution] = {}
-    for state in states:
-        row: list[str | float] = []
-        for parameter in scene.parameter_names:
-            name = in_state(parameter, state) if parameter in by_state else parameter
-            value, distribution = known.get(name), given.get(name)
-            if value is None and distribution is None:
-                value, distribution = known.get(parameter), given.get(parameter)
-            if value is not None and distribution is not None:
-                raise InputError(f"'{name}' is known and has a prior; give one of them")
-            if value is not None:
-                row.append(float(value))
-                continue
-            distribution = distribution or default[parameter]
-            row.append(name)
-            priors[name] = distribution
-        entries.append(row)
-    found = LoadStates(states, tuple(map(tuple, entries)))
-    if not found.unknowns:
+
+    def entry(parameter: str, state: str) -> str | float:
+        name = in_state(parameter, state) if parameter in by_state else parameter
+        source = name if name in known or name in prior else parameter
+        if source in known and source in prior:
+            raise InputError(f"'{name}' is known and has a prior; give one of them")
+        if source in known:
+            return float(known[source])
+        priors[name] = prior.get(source, default[parameter])
+        return name
+
+    rows = [tuple(entry(parameter, s) for parameter in scene.parameter_names) for s in states]
+    result = LoadStates(states, tuple(rows))
+    if not result.unknowns:
         raise InputError("every parameter is known; leave one to be inferred")
-    return found, {name: priors[name] for name in found.unknowns}
+    return result, {name: priors[name] for name in result.unknowns}
 
 
 def known_thetas(scene: Scene, states: tuple[str, ...], values: Mapping[str, float]) -> jax.Array:
-    """Theta (S, p) of states in which ``values`` names every parameter.
+    """Return theta (S, p) of states in which ``values`` names every parameter.
 
     Raises
     ------
     InputError
         A name that is no parameter or state, a parameter without a value or outside its range.
     """
-    by_state = _by_state(scene, states, tuple(values))
+    by_state = _parameters_by_state(scene, states, values)
     rows = []
     for state in states:
         row = {}
@@ -130,9 +124,9 @@ def known_thetas(scene: Scene, states: tuple[str, ...], values: Mapping[str, flo
     return jnp.stack(rows)
 
 
-def _by_state(scene: Scene, states: tuple[str, ...], names: Iterable[str]) -> set[str]:
-    """Parameters that each state has for itself: the loads', and those ``names`` give a state."""
-    found = set(scene.load_parameters) if states != ("",) else set()
+def _parameters_by_state(scene: Scene, states: tuple[str, ...], names: Iterable[str]) -> set[str]:
+    """Return parameters with a value of their own in each state: the loads', and by ``names``."""
+    by_state = set(scene.load_parameters) if states != ("",) else set()
     for name in names:
         parameter, state = split(name)
         if parameter not in scene.parameter_names:
@@ -144,5 +138,5 @@ def _by_state(scene: Scene, states: tuple[str, ...], names: Iterable[str]) -> se
             known = ", ".join(filter(None, states)) or "none; nothing is observed at a state"
             raise InputError(f"'{name}': load state '{state}' is unknown; known: {known}")
         if state:
-            found.add(parameter)
-    return found
+            by_state.add(parameter)
+    return by_state

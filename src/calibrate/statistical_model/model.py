@@ -1,11 +1,13 @@
 r"""The statistical model around a forward map.
 
-.. math:: y_{sj} = \mathcal{O}_j\,u(\theta_s) + \varepsilon_{sj}
+.. math:: y_{sj} = \mathcal{O}_j\,u(\theta_s) + (V^T z)_{sj} + \varepsilon_{sj}
 
 for each observation j in each load state s, with the unknowns of :math:`\theta_s` from their priors
-(``load_states``). The noise :math:`\varepsilon_{sj}` of each observation has a distribution of its
-own (:mod:`calibrate.noise`), whose unknown numbers have priors too. The model does not know whether
-the forward map is the emulator, the emulator with a correction, a reduced model or FEM.
+(:mod:`~calibrate.statistical_model.load_states`). The noise :math:`\varepsilon_{sj}` of each
+observation has a distribution of its own (:mod:`calibrate.noise`), whose unknown scales have priors
+too. Errors :math:`V^T z` that correlate numbers, if there are any, are integrated out
+(:mod:`calibrate.model_error`). The model does not know whether the forward map is the emulator, the
+emulator with a correction, a reduced model or FEM.
 """
 
 from __future__ import annotations
@@ -23,16 +25,16 @@ import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 
-from calibrate.measurements import Observations
+from calibrate.measurements import Observation, Observations, observations
 from calibrate.measurements.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.measurements.present import leave_out_missing
+from calibrate.model_error import ModelError
 from calibrate.noise import Noise
-from calibrate.priors import Prior
-from calibrate.priors.joint_prior import Conditional, Dependence
+from calibrate.priors import Dependence, Prior, dependence_of
+from calibrate.priors.priors import Conditional
 from calibrate.state_names import split
-from calibrate.statistical_model.error_modes import ErrorModes
-from calibrate.statistical_model.load_states import LoadStates
-from calibrate.statistical_model.prior_range import standardised
+from calibrate.statistical_model.load_states import LoadStates, load_states
+from calibrate.statistical_model.prior_range import check_known, fit_to, standardised
 from calibrate.whole_numpyro import mend_numpyro
 from emulator.core.errors import InputError
 from emulator.surrogates.protocol import ForwardMap, Prediction
@@ -42,10 +44,10 @@ mend_numpyro()
 Data = Mapping[str, jax.Array]
 """Data by the observation's name; each of the observation's shape and unit."""
 
-_GROUP = "observed_data"  # of a posterior's DataTree
+_GROUP = "observed_data"  # group of a posterior's DataTree
 
 NoiseValues = Mapping[str, Mapping[str, jax.Array]]
-"""Inferred numbers of each observation's noise: observation to number's name to value."""
+"""Inferred scales of each observation's noise: observation to the scale's name to its value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,19 +56,19 @@ class Model:
 
     Parameters
     ----------
-    forward : map restricted to the observed nodes.
+    forward : the forward map, restricted to the observed nodes.
     full : the same map over all nodes.
-    observe : what was measured, by name.
-    noise : noise of each observation.
-    noise_names : the name each observation's noise was given under; observations with one name
-        share its unknown numbers.
-    states : where theta comes from in each load state.
-    prior : one distribution an unknown of theta.
-    error : what the likelihood allows for besides noise: the forward map's own error, or systematic
-        ones of the measurement.
-    prior_cut : unknown to the mass of its prior that was cut off (``prior_range``).
+    observe : the observations by name.
+    noise : the noise of each observation.
+    noise_names : the name under which each observation's noise was given; observations with one
+        name share its unknown scales.
+    states : the source of each entry of theta in each load state.
+    prior : the prior of each unknown of theta.
+    error : errors of the data besides noise: the forward map's own, or systematic ones of the
+        measurement.
+    prior_cut : the mass of each prior that was cut off, by unknown (``prior_range``).
     check_scale : whether :meth:`check_data` refuses data far from every prediction.
-    dependence : of the prior of some unknowns of theta, in theta's order.
+    dependence : the dependence between the priors of some unknowns, in theta's order.
     """
 
     forward: ForwardMap
@@ -76,39 +78,41 @@ class Model:
     noise_names: Mapping[str, str]
     states: LoadStates
     prior: Prior
-    error: ErrorModes | None = None
+    error: ModelError | None = None
     prior_cut: Mapping[str, float] = field(default_factory=dict)
     check_scale: bool = True
     dependence: Dependence | None = None
 
+    # What is inferred, and its prior.
+
     @cached_property
     def noise_sites(self) -> dict[str, dict[str, str]]:
-        """Observation to the unknown numbers of its noise, each with its name in the posterior.
+        """Name in the posterior of each unknown scale, by observation and the scale's name.
 
         ``noise_sd`` when one thing is observed, ``noise_sd_<observation>`` when several are.
         """
         alone = len(set(self.noise_names.values())) == 1
         return {
             name: {
-                number: number if alone else f"{number}_{self.noise_names[name]}"
-                for number in noise.priors
+                scale: scale if alone else f"{scale}_{self.noise_names[name]}"
+                for scale in noise.priors
             }
             for name, noise in self.noise.items()
         }
 
     @cached_property
     def noise_priors(self) -> dict[str, dist.Distribution]:
-        """Prior of every unknown number of noises and error, by its name in the posterior."""
+        """Prior of every unknown scale of noises and errors, by its name in the posterior."""
         noises = {
-            site: self.noise[name].priors[number]
+            site: self.noise[name].priors[scale]
             for name, sites in self.noise_sites.items()
-            for number, site in sites.items()
+            for scale, site in sites.items()
         }
         return noises if self.error is None else {**noises, **self.error.priors}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is inferred: the unknowns of theta, then those of noises and error."""
+        """Names of all that is inferred: unknowns of theta, then scales of noises and errors."""
         return (*self.states.unknowns, *self.noise_priors)
 
     @property
@@ -123,12 +127,42 @@ class Model:
         theta = {name: standardised(self.prior[name]) for name in self.states.unknowns}
         return {**theta, **self.noise_priors}
 
+    def given_earlier(
+        self, name: str, prior: dist.Distribution, draw: Mapping[str, jax.Array]
+    ) -> dist.Distribution:
+        """Return ``prior`` of ``name``, conditional on the unknowns before it in ``draw``."""
+        if self.dependence is None or name not in self.dependence.names:
+            return prior
+        mean, sd = self.dependence.given_earlier(name, self.prior, draw)
+        return Conditional(self.prior[name], mean, sd, prior.support)
+
+    def prior_draws(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
+        """Return draws (count,) from the prior of each unknown of theta."""
+        keys = jax.random.split(key, len(self.states.unknowns))
+        draws: dict[str, jax.Array] = {}
+        for name, k in zip(self.states.unknowns, keys, strict=True):
+            draws[name] = self.given_earlier(name, self.prior[name], draws).sample(k, (count,))
+        return draws
+
+    def log_prior(self, values: Mapping[str, jax.Array]) -> jax.Array:
+        """Return the log density of theta's prior, (), at ``values``, a number by name."""
+        log_density = jnp.zeros(())
+        for name in self.states.unknowns:
+            prior = self.given_earlier(name, self.prior[name], values)
+            log_density += prior.log_prob(values[name])
+        return log_density
+
+    # The likelihood.
+
     def __call__(
         self, data: jax.Array | Data | None = None, prediction: Prediction | None = None
     ) -> None:
-        """The NumPyro program; ``data`` by name, or as it is when one thing is observed.
+        """Run as a NumPyro program.
 
-        ``prediction`` of :meth:`evaluate` at the drawn theta, where it is known already.
+        Parameters
+        ----------
+        data : the data by name, or as they are when one thing is observed.
+        prediction : the result of :meth:`evaluate` at the drawn theta, where it is known already.
         """
         draw: dict[str, jax.Array] = {}
         for name, prior in self.sampled_priors.items():
@@ -148,19 +182,10 @@ class Model:
             obs = None if observed is None else observed[name]
             numpyro.sample(f"observed_{name}", distribution, obs=obs)
 
-    def given_earlier(
-        self, name: str, prior: dist.Distribution, draw: Mapping[str, jax.Array]
-    ) -> dist.Distribution:
-        """``prior`` of ``name``, given the unknowns before it that it depends on."""
-        if self.dependence is None or name not in self.dependence.names:
-            return prior
-        mean, sd = self.dependence.given_earlier(name, self.prior, draw)
-        return Conditional(self.prior[name], mean, sd, prior.support)
-
     def evaluate(self, thetas: jax.Array) -> Prediction:
-        """Displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p), in one call.
+        """Return the displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p).
 
-        It is valid where the forward map is valid in every state.
+        It is one call of the forward map, valid where the map is valid in every state.
         """
         if len(thetas) == 1:
             displacement, valid = self.forward.evaluate(thetas[0])
@@ -169,56 +194,56 @@ class Model:
         return Prediction(displacement, jnp.all(valid))
 
     def predict(self, values: Mapping[str, Any]) -> tuple[dict[str, jax.Array], jax.Array]:
-        """Data without noise by observation, and its validity, from a value of each unknown."""
+        """Return data without noise by observation, and its validity, from each unknown's value."""
         thetas = self.states.thetas(values)
         prediction = self.evaluate(thetas)
         return self.observe(prediction.displacement, thetas), prediction.valid
 
     def noise_values(self, draw: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
-        """The inferred numbers of each observation's noise, from ``draw`` by the names there."""
+        """Return the inferred scales of each observation's noise, from ``draw``."""
         return {
-            name: {number: jnp.asarray(draw[site]) for number, site in sites.items()}
+            name: {scale: jnp.asarray(draw[site]) for scale, site in sites.items()}
             for name, sites in self.noise_sites.items()
         }
 
     def distributions(self, means: Data, values: NoiseValues) -> dict[str, dist.Distribution]:
-        """Distribution of each observation's data around its mean, by name.
+        """Return the distribution of each observation's data around its mean, by name.
 
-        ``values`` of the inferred numbers of the noises (:meth:`noise_values`).
+        ``values`` are the inferred scales of the noises (:meth:`noise_values`).
         """
         return {n: self.noise[n].distribution(mean, values[n]) for n, mean in means.items()}
 
     def log_density(self, means: Data, values: NoiseValues, data: Data) -> jax.Array:
-        """Log density of ``data`` around ``means``, shape ()."""
+        """Return the log density of ``data`` around ``means`` with noise alone, ()."""
         parts = self.distributions(means, values)
         return sum((d.log_prob(data[name]) for name, d in parts.items()), jnp.zeros(()))
 
     def fem_log_likelihood(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
-        """Log density of ``data``, (), around FEM's ``means`` at ``draw``.
+        """Return the log density of ``data``, (), around FEM's ``means`` at ``draw``.
 
         Where the likelihood allows for errors of the mesh or of the measurement, FEM has them, too.
         """
-        found = self.log_density(means, self.noise_values(draw), data)
+        log_density = self.log_density(means, self.noise_values(draw), data)
         if self.error is not None and self.error.of_fem:
-            found += self._error_ratio(draw, means, data)
-        return found
+            log_density += self._error_ratio(draw, means, data)
+        return log_density
 
     def fem_means(self, rng_key: jax.Array, draw: Mapping[str, Any], means: Data) -> Data:
-        """FEM's ``means`` at ``draw``, with a draw of errors that are not the map's alone."""
+        """Return FEM's ``means`` at ``draw``, plus a draw of the errors that FEM has, too."""
         if self.error is None or not self.error.of_fem:
             return means
         return self.error.draw(rng_key, self._stacked(draw), means)
 
     def map_log_likelihood(self, draw: Mapping[str, Any], data: Data) -> jax.Array:
-        """Log density of ``data``, (), with the forward map and what is allowed for its error.
+        """Return the log density of ``data``, (), with the forward map and its errors.
 
-        ``-inf`` where the map has no answer. ``draw`` has a number for each of ``names``.
+        It is ``-inf`` where the map has no answer. ``draw`` has a number for each of :attr:`names`.
         """
         observed = [site for site in self.trace(draw, data).values() if site.get("is_observed")]
         return sum((jnp.sum(s["fn"].log_prob(s["value"])) for s in observed), jnp.zeros(()))
 
     def trace(self, draw: Mapping[str, Any], data: Data) -> dict[str, dict[str, Any]]:
-        """The program's sites at ``draw`` (a number by name) and ``data``, as NumPyro has them."""
+        """Return NumPyro's sites of the program at ``draw`` (a number by name) and ``data``."""
         return handlers.trace(handlers.substitute(self, data=dict(draw))).get_trace(data)
 
     def _error_ratio(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
@@ -227,33 +252,17 @@ class Model:
         return self.error.log_ratio(self._stacked(draw), residual, means)
 
     def _stacked(self, draw: Mapping[str, Any]) -> jax.Array:
-        own = () if self.error is None else self.error.priors
-        names = (*self.states.unknowns, *own)
+        """Return theta's unknowns, then the size of errors that is inferred, as one array."""
+        sizes = () if self.error is None else self.error.priors
+        names = (*self.states.unknowns, *sizes)
         return jnp.stack([jnp.asarray(draw[name], float) for name in names])
 
-    def prior_draws(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
-        """Draws (count,) from the prior of each unknown of theta."""
-        keys = jax.random.split(key, len(self.states.unknowns))
-        found: dict[str, jax.Array] = {}
-        for name, k in zip(self.states.unknowns, keys, strict=True):
-            prior = self.given_earlier(name, self.prior[name], found)
-            found[name] = prior.sample(k, (count,))
-        return found
-
-    def log_prior(self, values: Mapping[str, jax.Array]) -> jax.Array:
-        """Log density of the prior of theta's unknowns, (); ``values`` are numbers by name."""
-        found = jnp.zeros(())
-        for name in self.states.unknowns:
-            prior = self.given_earlier(name, self.prior[name], values)
-            found += prior.log_prob(values[name])
-        return found
+    # Its data.
 
     def given(
         self, data: np.ndarray | Mapping[str, np.ndarray]
     ) -> tuple[Model, dict[str, jax.Array]]:
-        """The model of the values that are not missing, and these, checked.
-
-        Missing values are NaN (:mod:`calibrate.measurements.present`).
+        """Return the model of the values that are not missing (NaN), and these, checked.
 
         Raises
         ------
@@ -272,7 +281,7 @@ class Model:
         return reduced, reduced.check_data(present)
 
     def check_data(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
-        """``data`` in float64 by name; :class:`InputError` on data that cannot be the model's."""
+        """Return ``data`` in float64 by name; :class:`InputError` if they cannot be the model's."""
         named = self._fitting(data)
         for name, values in named.items():
             if np.isnan(values).any():
@@ -281,26 +290,31 @@ class Model:
                     "missing (NaN); Model.given leaves them out"
                 )
         if self.check_scale:
+            unknowns = self.states.unknowns
             draws = jax.jit(lambda key: self.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))
-            stacked = np.stack([np.asarray(draws[n]) for n in self.states.unknowns], axis=1)
-            check_magnitudes(self._predict_stacked, self.observe, self._sds(named), stacked, named)
+            stacked = np.stack([np.asarray(draws[name]) for name in unknowns], axis=1)
+
+            def predict(values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+                return self.predict(dict(zip(unknowns, values, strict=True)))
+
+            check_magnitudes(predict, self.observe, self._largest_sds(named), stacked, named)
         return {name: jnp.asarray(values) for name, values in named.items()}
 
-    def _sds(self, data: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Largest plausible sd of each observation's noise and what else data has, in its unit."""
-        found = {name: noise.upper_sd for name, noise in self.noise.items()}
+    def _largest_sds(self, data: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return the largest plausible sd of each observation by noise and errors, in its unit."""
+        sds = {name: noise.upper_sd for name, noise in self.noise.items()}
         if self.error is not None and self.error.of_fem:
             like = {name: jnp.asarray(values) for name, values in data.items()}
             each = jax.vmap(ravel_pytree(like)[1])(jnp.asarray(self.error.largest(like)))
             for name, modes in each.items():
-                most = np.linalg.norm(np.reshape(modes, (len(modes), -1)), 2)
-                found[name] = float(np.hypot(found[name], most))
-        return found
+                largest = np.linalg.norm(np.reshape(modes, (len(modes), -1)), 2)
+                sds[name] = float(np.hypot(sds[name], largest))
+        return sds
 
     def _fitting(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """``data`` in float64 by name, of the right shapes; NaN where missing.
+        """Return ``data`` in float64 by name, of the right shapes; NaN where missing.
 
-        A number may be an array of one, and ``data`` a DataTree with what was observed in a group.
+        A number may be an array of one, and ``data`` a DataTree whose group has what was observed.
         """
         if isinstance(data, Mapping) and _GROUP in data and _GROUP not in self.observe.parts:
             data = data[_GROUP]
@@ -314,16 +328,81 @@ class Model:
             self.observe.parts[name].check(name, values)
         return named
 
-    def _predict_stacked(self, values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-        return self.predict(dict(zip(self.states.unknowns, values, strict=True)))
+
+def model(
+    forward: ForwardMap,
+    observe: Observation | Mapping[str, Observation] | Observations,
+    noise: Noise | Mapping[str, Noise],
+    prior: Prior | None = None,
+    *,
+    known: Mapping[str, float] | None = None,
+    check_scale: bool = True,
+) -> Model:
+    """Return the model of data observed through ``observe``.
+
+    Parameters
+    ----------
+    observe : one observation, or several by name, e.g. ``{"displacement": ..., "volume": ...}``;
+        noise and data are then given by the same names. ``volume@p8`` is the volume in the load
+        state ``p8``; a noise under ``volume`` is that of every state.
+    prior : priors of parameters by name; the others have the scene's box. In several load states,
+        the loads' parameters have one prior for each state, or separate ones under ``pressure@p8``.
+        A :class:`~calibrate.priors.JointPrior` correlates some.
+    known : values of parameters that are not inferred, by the same names.
+    check_scale : ``False`` to take data however far from every prediction
+        (:mod:`calibrate.measurements.magnitude`).
+
+    Raises
+    ------
+    InputError
+        Noise that does not fit its observation, a prior that does not fit the scene, or one with
+        more than a thousandth of its mass where the forward map has no answer
+        (:mod:`calibrate.statistical_model.prior_range`).
+    """
+    several = observations(observe)
+    names, noises = _noises(several, noise)
+    noises = at_sites(noises, several)
+    restricted = forward.at(several.nodes)
+    states, priors = load_states(forward.scene, several.states, prior, known)
+    check_known(restricted, states)
+    cut_priors, cut = fit_to(restricted, priors)
+    dependence = dependence_of(prior)
+    return Model(
+        forward=restricted,
+        full=forward,
+        observe=several,
+        noise=noises,
+        noise_names=names,
+        states=states,
+        prior=cut_priors,
+        prior_cut=cut,
+        check_scale=check_scale,
+        dependence=None if dependence is None else dependence.ordered(states.unknowns),
+    )
+
+
+def _noises(
+    observe: Observations, noise: Noise | Mapping[str, Noise]
+) -> tuple[dict[str, str], dict[str, Noise]]:
+    """Return the name under which each observation's noise was given, and the noise."""
+    if not isinstance(noise, Mapping):
+        if len(observe.bases) > 1:
+            raise InputError(f"noise: give one for each of {', '.join(observe.bases)}, by name")
+        noise = {observe.bases[0]: noise}
+    expanded = observe.expand(noise, "noise")
+    for name in observe.parts:
+        if name not in expanded:
+            raise InputError(f"noise: nothing for '{name}'; observed: {', '.join(observe.parts)}")
+    names = {name: source for name, (source, _) in expanded.items()}
+    return names, {name: each for name, (_, each) in expanded.items()}
 
 
 def at_sites(noise: Mapping[str, Noise], observe: Observations) -> dict[str, Noise]:
-    """Each noise at the sites of its observation; :class:`InputError` names the observation."""
-    found = {}
+    """Return each noise at the sites of its observation; InputError names the observation."""
+    bound = {}
     for name, part in observe.parts.items():
         try:
-            found[name] = noise[name].at(part.sites)
+            bound[name] = noise[name].at(part.sites)
         except InputError as error:
             raise InputError(f"noise of {name}: {error}") from error
-    return found
+    return bound

@@ -27,12 +27,12 @@ from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap
 
 NEGLIGIBLE = 1e-3
-_NONE = 1e-9  # mass that round-off in a cumulative distribution function may leave
+_ROUND_OFF = 1e-9  # mass that round-off in a cumulative distribution function may leave
 _DRAWS = 512  # from which the centre and the width of a prior are taken
 
 
 def fit_to(forward: ForwardMap, prior: Prior) -> tuple[Prior, dict[str, float]]:
-    """``prior``, cut where ``forward`` has no answer, and the mass cut off, by name.
+    """Return ``prior``, cut where ``forward`` has no answer, and the mass cut off, by name.
 
     A name is a parameter, or a parameter in a load state (:mod:`calibrate.state_names`).
 
@@ -62,7 +62,7 @@ def fit_to(forward: ForwardMap, prior: Prior) -> tuple[Prior, dict[str, float]]:
 
 
 def check_known(forward: ForwardMap, states: LoadStates) -> None:
-    """:class:`InputError` where a known value lies outside the range in which the map answers."""
+    """Raise :class:`InputError` where a known value is outside the range of the map's answers."""
     for row in states.entries:
         for k, entry in enumerate(row):
             parameter = forward.scene.parameters[k]
@@ -81,7 +81,7 @@ def _percent(mass: float) -> str:
 
 
 def _tails(parameter: Parameter, prior: dist.Distribution) -> Iterator[tuple[float, float]]:
-    """Median and mass of the prior below the parameter's range and above it, where any is."""
+    """Yield median and mass of the prior below the parameter's range and above it, if any."""
     low, high = bounds(prior)
     if parameter.low <= low and high <= parameter.high:
         return
@@ -94,22 +94,62 @@ def _tails(parameter: Parameter, prior: dist.Distribution) -> Iterator[tuple[flo
             "function, so its mass outside the scene's range is unknown; use another one"
         ) from error
     width = parameter.high - parameter.low
-    if below > _NONE:
+    if below > _ROUND_OFF:
         start = max(low, parameter.low - 1e6 * width)
         yield float(bisect(prior.cdf, 0.5 * below, start, parameter.low)), below
-    if above > _NONE:
+    if above > _ROUND_OFF:
         end = min(high, parameter.high + 1e6 * width)
         yield float(bisect(prior.cdf, 1.0 - 0.5 * above, parameter.high, end)), above
 
 
 def _answers(forward: ForwardMap, k: int, value: float) -> bool:
-    """Whether the map is valid with parameter ``k`` at ``value``, the others at their centres."""
+    """Return whether the map is valid with parameter ``k`` at ``value``, the others at centre."""
     theta = forward.scene.centre.at[k].set(value)
     return bool(forward.evaluate(theta).valid)
 
 
-class _Around(constraints.Constraint):
-    """``base`` with unconstrained coordinates of centre 0 and width 1 for the prior at hand."""
+def standardised(prior: dist.Distribution) -> dist.Distribution:
+    """Return ``prior`` itself where its support is an interval, else :class:`Standardised`."""
+    bounded = bool(np.isfinite(bounds(prior)).all())
+    return prior if bounded else Standardised(prior)
+
+
+class Standardised(dist.Distribution):
+    """A prior whose unconstrained coordinate has centre 0 and width 1; its density is unchanged.
+
+    Samplers start within a few units of 0. For a normal prior around 75 kPa that would be where no
+    forward map answers; NumPyro then gives up.
+    """
+
+    arg_constraints: dict = {}  # noqa: RUF012
+    pytree_data_fields = ("prior", "_support")
+
+    def __init__(self, prior: dist.Distribution) -> None:
+        self.prior = prior
+        with jax.ensure_compile_time_eval():
+            draws = prior.sample(jax.random.key(0), (_DRAWS,))
+            unconstrained = np.asarray(biject_to(prior.support).inv(draws))
+        self._support = _StandardisedSupport(
+            prior.support, float(np.median(unconstrained)), float(unconstrained.std())
+        )
+        super().__init__(batch_shape=(), event_shape=())
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """The prior's support, with the standardised coordinate."""
+        return self._support
+
+    def log_prob(self, value: ArrayLike) -> jax.Array:
+        """Return the log density of the prior."""
+        return self.prior.log_prob(value)
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Return draws from the prior."""
+        return self.prior.sample(key, sample_shape)
+
+
+class _StandardisedSupport(constraints.Constraint):
+    """The constraint ``base``, whose unconstrained coordinate is shifted and scaled."""
 
     def __init__(self, base: constraints.Constraint, centre: float, width: float) -> None:
         self.base, self.centre, self.width = base, centre, width
@@ -124,48 +164,8 @@ class _Around(constraints.Constraint):
         return (self.centre, self.width), (("centre", "width"), {"base": self.base})
 
 
-@biject_to.register(_Around)
-def _transform_around(constraint: _Around) -> ComposeTransform:
+@biject_to.register(_StandardisedSupport)
+def _standardised_transform(constraint: _StandardisedSupport) -> ComposeTransform:
     return ComposeTransform(
         [AffineTransform(constraint.centre, constraint.width), biject_to(constraint.base)]
     )
-
-
-class Standardised(dist.Distribution):
-    """A prior whose unconstrained coordinate has centre 0 and width 1.
-
-    Samplers start within a few units of 0. For a normal prior around 75 kPa that would be where no
-    forward map answers; NumPyro then gives up. The density is the prior's own.
-    """
-
-    arg_constraints: dict = {}  # noqa: RUF012
-    pytree_data_fields = ("prior", "_support")
-
-    def __init__(self, prior: dist.Distribution) -> None:
-        self.prior = prior
-        with jax.ensure_compile_time_eval():
-            draws = prior.sample(jax.random.key(0), (_DRAWS,))
-            unconstrained = np.asarray(biject_to(prior.support).inv(draws))
-        self._support = _Around(
-            prior.support, float(np.median(unconstrained)), float(unconstrained.std())
-        )
-        super().__init__(batch_shape=(), event_shape=())
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """The prior's support, with the standardised coordinate."""
-        return self._support
-
-    def log_prob(self, value: ArrayLike) -> jax.Array:
-        """Log density of the prior."""
-        return self.prior.log_prob(value)
-
-    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        """Draws from the prior."""
-        return self.prior.sample(key, sample_shape)
-
-
-def standardised(prior: dist.Distribution) -> dist.Distribution:
-    """``prior`` itself where its support is an interval, else :class:`Standardised`."""
-    bounded = bool(np.isfinite(bounds(prior)).all())
-    return prior if bounded else Standardised(prior)

@@ -9,8 +9,7 @@ from scipy.stats import halfnorm
 import calibrate as cal
 from calibrate.analysis.expected import expected_precision
 from calibrate.analysis.identifiability import prior_table
-from calibrate.statistical_model.curve import curve_covariance
-from calibrate.statistical_model.systematic import Systematic
+from calibrate.model_error.systematic import Systematic, curve_covariance
 from emulator.core.errors import InputError
 from linear_support import linear_forward
 from scene_support import block

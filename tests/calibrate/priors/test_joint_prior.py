@@ -12,8 +12,9 @@ from scipy import stats
 
 import calibrate as cal
 from calibrate.posterior import predictions
-from calibrate.priors.joint_prior import Conditional, Dependence, JointPrior
+from calibrate.priors import Dependence, JointPrior
 from calibrate.priors.population import POPULATIONS, prior_of, read_population
+from calibrate.priors.priors import Conditional
 from calibrate.project import Run
 from calibrate.samplers.density import density_of
 from emulator.core.errors import InputError

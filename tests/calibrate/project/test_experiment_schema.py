@@ -12,6 +12,7 @@ import pytest
 
 import calibrate.project.experiment as reader
 from calibrate.cli import main
+from calibrate.model_error.kinds import SYSTEMATIC_ERRORS
 from calibrate.noise import NOISES
 from calibrate.priors import Population
 from calibrate.project import Run
@@ -19,7 +20,6 @@ from calibrate.project.experiment import read_experiment
 from calibrate.project.experiment_schema import experiment_schema
 from calibrate.project.members import Shared
 from calibrate.samplers import SAMPLERS
-from calibrate.statistical_model.shared_errors import SHARED_ERRORS
 from emulator.core.errors import InputError
 from emulator.core.schema import read_as
 from emulator.surrogates.registry import FORWARD_MAPS, known_options
@@ -169,7 +169,7 @@ TABLES = [
     Population,
     Shared,
     *NOISES.values(),
-    *SHARED_ERRORS.values(),
+    *SYSTEMATIC_ERRORS.values(),
     *(sampler.options for sampler in SAMPLERS.values()),
 ]
 
@@ -191,7 +191,7 @@ def test_words_and_kinds_are_those_of_the_registries(validator):
     assert keys["forward"]["enum"] == list(FORWARD_MAPS)
     assert keys["sampler"]["enum"] == list(SAMPLERS)
     assert set(tables["ForwardOptions"]["properties"]) == set(known_options())
-    for kinds in (NOISES, SHARED_ERRORS):
+    for kinds in (NOISES, SYSTEMATIC_ERRORS):
         for name, kind in kinds.items():
             assert tables[kind.__name__]["properties"]["kind"]["const"] == name
     assert set(keys) == set(tables["Run"]["properties"]) | {"members", "population"}
@@ -209,7 +209,7 @@ def test_a_new_kind_is_in_the_schema_at_once(monkeypatch):
         of: str
         rate: float
 
-    monkeypatch.setitem(SHARED_ERRORS, "drift", Drift)
+    monkeypatch.setitem(SYSTEMATIC_ERRORS, "drift", Drift)
     found = experiment_schema()["$defs"]["Drift"]["properties"]
     assert found["kind"] == {"const": "drift", "description": "A transducer that drifts."}
     assert found["rate"]["description"] == "sd of the drift, in the unit of the data an hour."

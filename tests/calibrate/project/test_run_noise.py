@@ -68,7 +68,7 @@ def test_a_discrepancy_is_switched_on_by_name(beam):
             {"discrepancy": {"displacement": {"scale": 0.5}}},
             "displacement .mm.: .*'length' is miss",
         ),
-        ({"noise": {"displacement": {"kind": "pink"}}}, "displacement .mm.: noise kind 'pink' is"),
+        ({"noise": {"displacement": {"kind": "pink"}}}, "displacement .mm.: noise 'pink' is"),
     ):
         with pytest.raises(InputError, match=message):
             cal.model(linear_forward(beam), observe, run_of(**options).noises(observe))

@@ -11,9 +11,10 @@ from numpyro.infer.util import log_density
 from scipy.stats import multivariate_normal
 
 import calibrate as cal
+from calibrate.model_error import ModelError
+from calibrate.model_error.learned import fit
 from calibrate.posterior import sample
 from calibrate.statistical_model import with_error
-from calibrate.statistical_model.approximation_error import ApproximationError, fit
 from emulator.core.errors import InputError
 from linear_support import LinearSimulator, closed_form, linear_forward
 
@@ -88,7 +89,7 @@ def test_fem_on_the_mesh_shares_the_error_of_the_mesh_only(aware, truth):
     moved = jax.vmap(lambda key: whole.fem_means(key, draw, means)["displacement"])(keys)
     spread = np.cov(np.asarray(moved).reshape(len(keys), -1).T)
     np.testing.assert_allclose(spread, of_mesh, atol=0.1 * np.abs(of_mesh).max())
-    again = ApproximationError.restore(whole.error.arrays())
+    again = ModelError.restore(whole.error.arrays(), {})
     assert again.of_mesh
     assert again.fingerprint == whole.error.fingerprint != aware.error.fingerprint
 
@@ -118,7 +119,9 @@ def test_its_size_follows_the_unknowns():
     low, high = (float(found.size(jnp.array([v]))) for v in (0.05, 0.95))
     assert 4.0 < high / low < 15.0
     # Far outside the runs it stays between the sizes they have.
-    assert float(found.size(jnp.array([50.0]))) <= np.exp(found.log_sizes.max()) * (1 + 1e-12)
+    assert float(found.size(jnp.array([50.0]))) <= np.exp(found.amplitude.log_sizes.max()) * (
+        1 + 1e-12
+    )
 
 
 def test_a_poor_map_widens_the_posterior_instead_of_moving_it(truth, poor, aware):
@@ -164,7 +167,7 @@ def test_an_exact_map_changes_nothing(truth):
 
 
 def test_it_is_kept_and_restored(aware):
-    back = ApproximationError.restore(aware.error.arrays())
+    back = ModelError.restore(aware.error.arrays(), aware.error.words)
     x = jnp.array([71.0, 66.0])
     assert float(back.size(x)) == float(aware.error.size(x))
     key = jax.random.key(0)

@@ -1,4 +1,4 @@
-"""Systematic errors in words, against the arrays they stand for."""
+"""Kinds of systematic error in an experiment file, against the arrays they stand for."""
 
 from dataclasses import replace
 
@@ -10,14 +10,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 import calibrate as cal
-from calibrate.statistical_model.curve import curve_covariance
-from calibrate.statistical_model.shared_errors import (
-    Seen,
-    shared_error,
-    turned,
-    with_shared_errors,
-)
-from calibrate.statistical_model.systematic import Systematic, SystematicError
+from calibrate.model_error import ModelError, Systematic
+from calibrate.model_error.kinds import Measured, read_systematic, rotation_of
+from calibrate.model_error.systematic import curve_covariance
+from calibrate.statistical_model.errors import with_described_errors
 from emulator.core.errors import InputError
 from emulator.scenes import Scene
 from linear_support import linear_forward
@@ -44,7 +40,7 @@ def data(model):
 
 def of(model, data, **description):
     """The one error that a description makes."""
-    return shared_error("e", description).systematic("e", Seen(model, data))
+    return read_systematic("e", description).systematic("e", Measured(model.observe, data, {}))
 
 
 def test_a_rigid_motion_turns_points_where_they_were_seen_or_at_rest(model, data):
@@ -74,7 +70,7 @@ def test_pins_move_as_the_turn_of_their_surface_says(model):
     rest = model.observe.parts[A].points
     R = Rotation.from_rotvec([0.1, -0.3, 0.2]).as_matrix()
     moved = {A: rest @ R.T - rest + [1.0, 2.0, 3.0], B: np.zeros((3, 3))}
-    np.testing.assert_allclose(turned(rest, moved[A]), R, atol=1e-12)
+    np.testing.assert_allclose(rotation_of(rest, moved[A]), R, atol=1e-12)
     made = of(model, moved, kind="pins", of="displacement", sd=2.0)
     for k, axis in enumerate(np.eye(3)):
         expected = np.tile(2.0 * (R - np.eye(3)) @ axis, (3, 1))
@@ -93,7 +89,7 @@ def test_missing_values_are_left_out_of_the_modes(model, data):
     gappy = {A: data[A].copy(), B: data[B]}
     gappy[A][1, 2] = np.nan
     words = {"gain": {"kind": "gain", "of": "displacement", "share": 0.1}}
-    found, present = with_shared_errors(model, gappy, words)
+    found, present = with_described_errors(model, gappy, words)
     assert present[A].shape == (8,)
     shares = {A: np.full((1, 8), 0.1), B: np.full((1, 3, 3), 0.1)}
     by_hand = cal.with_systematic(model.given(gappy)[0], Systematic(("gain",), {}, shares=shares))
@@ -108,10 +104,10 @@ def test_data_may_be_as_far_off_as_the_errors_are(model):
     far = {name: np.full((3, 3), 10.0) for name in (A, B)}
     checking = replace(model, check_scale=True)
     camera = {"kind": "rigid_motion", "of": "displacement", "shift": 10.0}
-    found, present = with_shared_errors(checking, far, {"camera": camera})
+    found, present = with_described_errors(checking, far, {"camera": camera})
     found.check_data(present)
     little = {"camera": {**camera, "shift": 0.01}}
-    found, present = with_shared_errors(checking, far, little)
+    found, present = with_described_errors(checking, far, little)
     with pytest.raises(InputError, match="larger than predicted"):
         found.check_data(present)
 
@@ -145,7 +141,7 @@ def test_data_may_be_as_far_off_as_the_errors_are(model):
 )
 def test_what_cannot_be_is_one_line(model, data, description, message):
     with pytest.raises(InputError) as told:
-        with_shared_errors(model, data, {"e": description})
+        with_described_errors(model, data, {"e": description})
     assert message in str(told.value)
     assert str(told.value).startswith("systematic 'e'")
     assert "\n" not in str(told.value)
@@ -170,7 +166,7 @@ def test_a_hundred_points_of_a_curve_are_not_a_hundred_facts():
         words = {
             "kind": "curve", "of": "parameter:lam", "along": "mu", "length": 1e3, "share": 0.04
         }  # fmt: skip
-        found, _ = with_shared_errors(model, data, {"e": words})
+        found, _ = with_described_errors(model, data, {"e": words})
         information = np.eye(count) / 1e-6
         means = {name: jnp.asarray(5.0) for name in data}
         left = found.error.information_left(information, jnp.ones(1), means)
@@ -184,9 +180,9 @@ def test_where_a_curve_is_must_be_known():
     data = {name: np.array(5.0) for name in model.observe.parts}
     words = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 0.1, "share": 0.1}
     with pytest.raises(InputError, match="along: 'mu' is not known; give its value as known"):
-        with_shared_errors(model, data, {"e": words})
+        with_described_errors(model, data, {"e": words})
     with pytest.raises(InputError, match="along: 'shear' is no parameter; there are mu, lam"):
-        with_shared_errors(model, data, {"e": {**words, "along": "shear"}})
+        with_described_errors(model, data, {"e": {**words, "along": "shear"}})
 
 
 def test_a_share_that_is_inferred_after_errors_of_known_sds_is_the_dense_covariance():
@@ -199,7 +195,7 @@ def test_a_share_that_is_inferred_after_errors_of_known_sds_is_the_dense_covaria
         "gain": {"kind": "gain", "of": "parameter:lam", "share": 0.01},
         "law": {**curve, "share_scale": 0.3, "constant": 0.5},
     }
-    found, present = with_shared_errors(model, data, words)
+    found, present = with_described_errors(model, data, words)
     assert found.names == ("lam", "curve_share")
     at = 2.0 + np.arange(4) / 4
     predicted = np.full(4, 5.2)
@@ -220,7 +216,7 @@ def test_a_share_that_is_inferred_after_errors_of_known_sds_is_the_dense_covaria
     drawn = jax.vmap(lambda key: jnp.stack(list(found.fem_means(key, draw, means).values())))(keys)
     np.testing.assert_allclose(np.cov(np.asarray(drawn).T), C - 1e-6 * np.eye(4), atol=0.1)
     # Kept and read again it is the same error.
-    back = SystematicError.restore(found.error.arrays(), found.error.words)
+    back = ModelError.restore(found.error.arrays(), found.error.words)
     assert back.fingerprint == found.error.fingerprint
     assert back.priors.keys() == {"curve_share"}
     with pytest.raises(InputError, match="the size 'curve_share' is inferred"):
@@ -241,7 +237,7 @@ def test_curves_tell_the_share_that_a_law_is_off_by():
     values = 5.0 * (1.0 + 0.1 * np.random.default_rng(1).normal(size=8))
     data = {name: np.array(v) for name, v in zip(names, values, strict=True)}
     curve = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 1.0}
-    found, present = with_shared_errors(model, data, {"e": {**curve, "share_scale": 0.3}})
+    found, present = with_described_errors(model, data, {"e": {**curve, "share_scale": 0.3}})
     posterior = cal.sample(found, present, sampler="laplace", seed=1, predictions=False)
     row, scatter = posterior.summary()["curve_share"], float(np.std(values / values.mean()))
     assert abs(row["mean"] - scatter) < 1.5 * row["sd"]
@@ -253,12 +249,12 @@ def test_one_share_is_inferred_and_not_beside_a_known_one():
     data = {name: np.array(5.0) for name in model.observe.parts}
     curve = {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 0.4}
     with pytest.raises(InputError, match="share_scale is beside share or sd; give one of them"):
-        with_shared_errors(model, data, {"e": {**curve, "share_scale": 0.3, "share": 0.1}})
+        with_described_errors(model, data, {"e": {**curve, "share_scale": 0.3, "share": 0.1}})
     with pytest.raises(InputError, match=r"share_scale is -0.3; it must be above 0"):
-        with_shared_errors(model, data, {"e": {**curve, "share_scale": -0.3}})
+        with_described_errors(model, data, {"e": {**curve, "share_scale": -0.3}})
     two = {"a": {**curve, "share_scale": 0.3}, "b": {**curve, "share_scale": 0.2}}
     with pytest.raises(InputError, match="only one can be, by one name and scale"):
-        with_shared_errors(model, data, two)
+        with_described_errors(model, data, two)
 
 
 def scale(count: int, sd: float):
@@ -286,7 +282,7 @@ def test_a_scale_of_sixty_numbers_is_not_fitted_too_low(words):
     model = scale(60, 1.5)
     rng = np.random.default_rng(0)
     data = {name: np.array(75.0 + 1.5 * rng.normal()) for name in model.observe.parts}
-    found, present = with_shared_errors(model, data, {"e": words})
+    found, present = with_described_errors(model, data, {"e": words})
 
     def density(lam):
         return found.map_log_likelihood({"lam": lam}, present)
@@ -308,7 +304,7 @@ def test_intervals_hold_the_truth_of_data_with_a_gain():
     words = {"e": {"kind": "gain", "of": "parameter:lam", "share": 0.1}}
     grid = jnp.linspace(30.0, 200.0, 341)
     inside, low = 0, 0
-    found, _ = with_shared_errors(model, {n: np.array(75.0) for n in model.observe.parts}, words)
+    found, _ = with_described_errors(model, {n: np.array(75.0) for n in model.observe.parts}, words)
 
     @jax.jit
     def densities(values):
@@ -330,8 +326,8 @@ def test_intervals_hold_the_truth_of_data_with_a_gain():
 def test_a_posterior_kept_with_shares_of_data_is_refused_in_one_line(model, data):
     """Of a gain nothing in its arrays says what it is a share of; what was kept says it now."""
     words = {"e": {"kind": "gain", "of": "displacement", "share": 0.1}}
-    error = with_shared_errors(model, data, words)[0].error
-    assert SystematicError.restore(error.arrays(), error.words).fingerprint == error.fingerprint
+    error = with_described_errors(model, data, words)[0].error
+    assert ModelError.restore(error.arrays(), error.words).fingerprint == error.fingerprint
     old = {name: value for name, value in error.words.items() if name != "shares"}
     with pytest.raises(InputError, match="older than systematic errors that are shares of pred"):
-        SystematicError.restore(error.arrays(), old)
+        ModelError.restore(error.arrays(), old)

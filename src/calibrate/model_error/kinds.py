@@ -1,0 +1,304 @@
+r"""The kinds of systematic error that an experiment file may name, each a table of a few numbers.
+
+A kind says what is unknown of a measurement in the terms of the person who measured. From the
+observations and their data it makes a :class:`~calibrate.model_error.systematic.Systematic`. The
+share of a gain or a curve is one of the prediction. All other modes are fixed numbers: where one
+depends on the deformed body (where a marker was seen), the data says it, and it is off by the noise
+of a datum, which at an angle of one degree is a sixtieth of that noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from calibrate.measurements import Observations
+from calibrate.measurements.points import DisplacementPoints
+from calibrate.measurements.present import Present
+from calibrate.model_error.systematic import (
+    Systematic,
+    check_curve,
+    curve_modes,
+    placement,
+    rigid_motion,
+)
+from calibrate.state_names import split
+from emulator.core import schema
+from emulator.core.errors import InputError, look_up
+
+CURVE_SHARE = "curve_share"
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """The observations and data that errors are of.
+
+    Attributes
+    ----------
+    observe : the observations, without missing values.
+    data : their data by name.
+    theta : by load state, the entry of theta of each parameter: its known value, or a name where it
+        is inferred.
+    """
+
+    observe: Observations
+    data: Mapping[str, np.ndarray]
+    theta: Mapping[str, Mapping[str, str | float]]
+
+    def named(self, words: str) -> list[str]:
+        """Return the observations that words joined by ``+`` name, in one load state or in all."""
+        return list(self.observe.expand(dict.fromkeys(words.split("+"), True), "of"))
+
+    def whole(self, name: str) -> tuple[Any, np.ndarray]:
+        """Return the observation with all its entries, and its data, NaN where missing."""
+        part, data = self.observe.parts[name], np.asarray(self.data[name])
+        return (part.whole, part.filled(data)) if isinstance(part, Present) else (part, data)
+
+    def points(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return points at rest and their displacements, 0 where missing, both (d, 3) mm."""
+        part, data = self.whole(name)
+        if not isinstance(part, DisplacementPoints):
+            raise InputError(f"of: '{name}' is no displacement of points ({part.quantity})")
+        return part.points, np.nan_to_num(data)
+
+    def known(self, parameter: str, name: str) -> float:
+        """Return the known value of ``parameter`` in the load state of observation ``name``."""
+        entries = self.theta[split(name)[1]]
+        if parameter not in entries:
+            raise InputError(
+                f"along: '{parameter}' is no parameter; there are {', '.join(entries)}"
+            )
+        value = entries[parameter]
+        if isinstance(value, str):
+            raise InputError(f"along: '{value}' is not known; give its value as known")
+        return value
+
+    def present(self, error: Systematic) -> Systematic:
+        """Return ``error`` in the entries that are not missing."""
+
+        def reduced(modes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+            parts = self.observe.parts
+            return {
+                name: each.reshape(len(each), -1)[:, part.entries]
+                if isinstance(part := parts[name], Present)
+                else each
+                for name, each in modes.items()
+            }
+
+        return replace(error, modes=reduced(error.modes), shares=reduced(error.shares))
+
+
+class SystematicKind(Protocol):
+    """A kind of systematic error; its fields are the entries of a file."""
+
+    def systematic(self, name: str, measured: Measured) -> Systematic:
+        """Return the error called ``name``; :class:`InputError` where it does not fit the data."""
+        ...
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """Points shifted and turned together: a camera or a clamp that moved, a hand that held.
+
+    of : observations of displacements, joined by ``+``.
+    shift : sd along x, y and z, mm; one for all, or three.
+    turn : sd about x, y and z, degrees; one for all, or three.
+    about : point that only shifts, mm; by default the mean of all points.
+    at : where the points are when their frame moves: ``loaded``, where they were seen, or ``rest``.
+    """
+
+    of: str
+    shift: float | Vector = 0.0
+    turn: float | Vector = 0.0
+    about: Vector | None = None
+    at: Literal["loaded", "rest"] = "loaded"
+
+    def systematic(self, name: str, measured: Measured) -> Systematic:
+        """Three shifts and three turns."""
+        positions = {}
+        for each in measured.named(self.of):
+            points, displacement = measured.points(each)
+            positions[each] = points + displacement if self.at == "loaded" else points
+        return rigid_motion(name, positions, self.shift, self.turn, self.about)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Numbers with offsets of their own, each the same in all the observations.
+
+    of : observations with as many numbers each, joined by ``+``.
+    sd : of each offset, in the unit of the data.
+    rows : points that have one, counted from 0; by default all.
+    """
+
+    of: str
+    sd: float
+    rows: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        _check_not_negative(sd=self.sd)
+
+    def systematic(self, name: str, measured: Measured) -> Systematic:
+        """One offset a number."""
+        observed = measured.named(self.of)
+        shapes = {np.shape(measured.whole(each)[1]) for each in observed}
+        if len(shapes) > 1:
+            raise InputError(f"of: {', '.join(observed)} have different numbers of points")
+        sd = np.zeros(shapes.pop())
+        rows = range(len(sd) if sd.ndim else 1) if self.rows is None else self.rows
+        for row in rows:
+            if not 0 <= row < len(np.atleast_1d(sd)):
+                raise InputError(f"rows: there is no point {row}; they are counted from 0")
+            sd[row if sd.ndim else ()] = self.sd
+        every = placement(name, observed, sd)
+        used = np.flatnonzero(np.ravel(sd))
+        modes = {each: modes[used] for each, modes in every.modes.items()}
+        return Systematic(tuple(every.names[k] for k in used), modes)
+
+
+@dataclass(frozen=True)
+class Pins:
+    r"""Markers that stand elsewhere in the body's frame than the file says, all by one offset.
+
+    Where their surface has turned by R, as their data says, an offset d moves a marker by
+    :math:`(R - I)\,d` more.
+
+    of : observations of three markers or more, joined by ``+``.
+    sd : of the offset along each axis, mm.
+    """
+
+    of: str
+    sd: float
+
+    def __post_init__(self) -> None:
+        _check_not_negative(sd=self.sd)
+
+    def systematic(self, name: str, measured: Measured) -> Systematic:
+        """One offset along each axis."""
+        modes = {}
+        for each in measured.named(self.of):
+            points, displacement = measured.points(each)
+            if len(points) < 3 or np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:
+                raise InputError(f"of: '{each}' has no three markers, not on one line")
+            rows = self.sd * (rotation_of(points, displacement) - np.eye(3)).T
+            modes[each] = np.repeat(rows[:, None], len(points), axis=1)
+        return Systematic(tuple(f"{name} {axis}" for axis in "xyz"), modes)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """All the data larger or smaller by one factor: a load cell, a scale of an image.
+
+    of : observations, joined by ``+``.
+    share : sd of the factor, 0.02 for two percent.
+    """
+
+    of: str
+    share: float
+
+    def __post_init__(self) -> None:
+        _check_not_negative(share=self.share)
+
+    def systematic(self, name: str, measured: Measured) -> Systematic:
+        """One factor."""
+        shapes = {each: np.shape(measured.whole(each)[1]) for each in measured.named(self.of)}
+        shares = {each: np.full((1, *shape), self.share) for each, shape in shapes.items()}
+        return Systematic((name,), {}, shares=shares)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The model is off along a loading curve, and at points near each other alike.
+
+    of : a single number in several load states, as ``reaction:top:x``.
+    along : parameter that is known in each state and says where on the curve it is.
+    length : over which the error changes, in the unit of ``along``.
+    share : sd of the error as a share of what is predicted, known.
+    share_scale : instead, the scale of the share's half-normal prior: it is inferred, as
+        ``curve_share``, one for all curves.
+    sd : sd of the rest of it, in the unit of the data.
+    constant : part of the variance that is the same along the whole curve.
+    """
+
+    of: str
+    along: str
+    length: float
+    share: float = 0.0
+    share_scale: float | None = None
+    sd: float = 0.0
+    constant: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_not_negative(share=self.share, sd=self.sd)
+        if self.share_scale is not None:
+            if not self.share_scale > 0.0:
+                raise InputError(f"share_scale is {self.share_scale}; it must be above 0")
+            if self.share or self.sd:
+                raise InputError("share_scale is beside share or sd; give one of them")
+        check_curve(self.length, self.constant)
+
+    def systematic(self, name: str, measured: Measured) -> Systematic:
+        """As many unknowns as the curve can tell apart."""
+        observed = measured.named(self.of)
+        for each in observed:
+            if np.shape(measured.whole(each)[1]) != ():
+                raise InputError(f"of: '{each}' is not a single number, as a force is")
+        amounts = np.array([measured.known(self.along, each) for each in observed])
+        size = None if self.share_scale is None else (CURVE_SHARE, self.share_scale)
+        unit = curve_modes(amounts, self.length, constant=self.constant)
+        share = self.share if size is None else 1.0
+        # Shares of the prediction and the error beside them have unknowns of their own.
+        zeros = np.zeros_like(unit)
+        shares, modes = np.vstack([share * unit, zeros]), np.vstack([zeros, self.sd * unit])
+        used = np.abs(shares + modes).max(axis=1) > 0.0
+        names = tuple(f"{name} {k + 1}" for k in range(int(used.sum())))
+        return Systematic(
+            names,
+            {each: modes[used, k] for k, each in enumerate(observed)},
+            size,
+            {each: shares[used, k] for k, each in enumerate(observed)},
+        )
+
+
+SYSTEMATIC_ERRORS: dict[str, type[Any]] = {
+    "rigid_motion": RigidMotion,
+    "placement": Placement,
+    "pins": Pins,
+    "gain": Gain,
+    "curve": Curve,
+}
+"""Kinds of systematic error by their word in a file."""
+
+
+def rotation_of(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) that carries ``points`` (d, 3) nearest to where they went."""
+    deformed = points + displacement
+    U, _, V = np.linalg.svd((deformed - deformed.mean(axis=0)).T @ (points - points.mean(axis=0)))
+    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
+
+
+def read_systematic(name: str, description: Mapping[str, Any]) -> SystematicKind:
+    """Return the error that a run describes under ``name``.
+
+    Raises
+    ------
+    InputError
+        An unknown kind, an unknown or missing key, or a negative standard deviation.
+    """
+    where = f"systematic '{name}'"
+    if "kind" not in description:
+        raise InputError(f"{where}: key 'kind' is missing; give {', '.join(SYSTEMATIC_ERRORS)}")
+    kind = look_up(SYSTEMATIC_ERRORS, description["kind"], f"{where}: kind")
+    entries = {key: value for key, value in description.items() if key != "kind"}
+    error: SystematicKind = schema.read_as(kind, entries, where)
+    return error
+
+
+def _check_not_negative(**sizes: float) -> None:
+    for name, size in sizes.items():
+        if size < 0.0:
+            raise InputError(f"{name} is {size}; it must be 0 or more")

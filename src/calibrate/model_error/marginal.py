@@ -1,0 +1,330 @@
+r"""Gaussian errors of a model's data besides its noise, integrated out in closed form.
+
+.. math:: y = g(x) + V(x)^T z + \varepsilon, \qquad z \sim N(0, I_r), \qquad
+          \varepsilon \sim N(0, W^{-1})
+
+with the unknowns x, the predicted data g of all observations (d numbers), the information W (d, d)
+of the noise, and modes V (r, d) in the unit of the data: what one standard deviation of each
+:math:`z_i` changes. Every error that correlates numbers is a set of modes,
+
+.. math:: V_i(x) = \alpha_i(x)\, \left(A_i + B_i \circ g(x)\right),
+
+with known A and B. Modes B are shares of the prediction, such as a load cell's gain. The size
+:math:`\alpha_i` is 1, or a function of the unknowns learned from FEM runs (:class:`Amplitude`), or
+a number that is inferred under a half-normal prior.
+
+Elimination without exchanges, :math:`I + V W V^T = L P L^T` with pivots P and a unit lower
+triangular L, gives all that is needed. With the reduced rows :math:`R = L^{-1} V W` the log
+likelihood of the residual r = y - g changes by
+
+.. math:: \tfrac12 \sum_i \left[\frac{(R_i r)^2}{P_i} - \log P_i\right]
+
+(Woodbury's identity and the matrix determinant lemma), and of the information about the means
+
+.. math:: W - R^T P^{-1} R
+
+is left. Where B = 0 and the size is common to all modes, the modes are chosen such that
+:math:`G = A W A^T` is diagonal, once: then L = I, :math:`P = I + \alpha^2 G`. These are the *fixed*
+modes. Those that vary with x come after them, beside the information that the fixed modes leave.
+
+Shares are of the prediction g and not of the data y: the noise of the data would be scaled in the
+modes, too, so that smaller predictions would err less, and a scale of n numbers with share s would
+be fitted too low by the factor :math:`1 + (n - 1) s^2` (Peelle's puzzle; D'Agostini 1994).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from jax.flatten_util import ravel_pytree
+
+from emulator.core.errors import InputError
+from emulator.core.small_matrices import eliminated
+from emulator.surrogates.protocol import fingerprint_of
+
+Means = Mapping[str, jax.Array]
+"""Data without noise by the observation's name."""
+
+_PLAUSIBLE = 3.0  # scales of a half-normal prior, which hold 99.7 % of its mass
+_VARYING = "varying_"  # before the names of arrays of modes that vary
+_SHARES = "of the prediction"  # recorded beside the arrays; earlier shares were of the data
+
+
+@dataclass(frozen=True, eq=False)
+class Amplitude:
+    r"""Size of the errors as a function of the unknowns, by kernel regression on its logarithm.
+
+    .. math:: \log\alpha(x) = \sum_j w_j \log\alpha_j, \qquad
+              w_j \propto \exp\left(-\tfrac12 |x - x_j|^2 / h^2\right)
+
+    Attributes
+    ----------
+    x : the standardised unknowns (n, q) of the FEM runs.
+    log_sizes : the logarithm of the size of each run's error, (n,).
+    width : the kernel's width h, in standardised unknowns.
+    centre, scale : mean and standard deviation (q,) by which the unknowns are standardised.
+    """
+
+    x: np.ndarray
+    log_sizes: np.ndarray
+    width: float
+    centre: np.ndarray
+    scale: np.ndarray
+
+    def __call__(self, unknowns: jax.Array) -> jax.Array:
+        """Return the size, (), at ``unknowns`` (q,): between the least and greatest of the runs."""
+        at = (unknowns - self.centre) / self.scale
+        log_weights = -0.5 * jnp.sum(((at - self.x) / self.width) ** 2, axis=-1)
+        return jnp.exp(jax.nn.softmax(log_weights) @ self.log_sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class VaryingModes:
+    """Modes that depend on the prediction, or whose size is inferred.
+
+    Attributes
+    ----------
+    modes, shares : A and B, (r, d).
+    sized : 1 for each mode whose size is inferred, 0 where it is 1, (r,).
+    information : W beside these modes, (d, d), or its diagonal (d,) where it has no other entries.
+    name, scale : name of the inferred size in the posterior, and the scale of its half-normal
+        prior; empty and 0 where every size is 1.
+    """
+
+    modes: np.ndarray
+    shares: np.ndarray
+    sized: np.ndarray
+    information: np.ndarray
+    name: str = ""
+    scale: float = 0.0
+
+    def at(self, size: jax.Array | float, means: jax.Array) -> jax.Array:
+        """Return V (r, d) where the inferred size is ``size`` and the prediction ``means`` (d,)."""
+        alpha = jnp.where(self.sized > 0.0, size, 1.0)
+        return alpha[:, None] * (self.modes + self.shares * means)
+
+    def weighted(self, V: jax.Array) -> jax.Array:
+        """Return V W (r, d)."""
+        diagonal = self.information.ndim == V.ndim - 1
+        return V * self.information if diagonal else V @ self.information
+
+
+@dataclass(frozen=True, eq=False)
+class ModelError:
+    """All errors of a model's data besides its noise.
+
+    Attributes
+    ----------
+    weights : A W of the fixed modes, (r, d).
+    strength : the diagonal of G, (r,).
+    modes : A, the fixed modes at size 1, (r, d).
+    amplitude : the size of the fixed modes; ``None`` for 1.
+    varying : the modes that vary; ``None`` where there are none.
+    names : names of the s unknowns z of systematic errors with known modes.
+    mixing : orthogonal matrix (r, s) that makes the fixed modes of those of the named unknowns,
+        less the rows of modes that no datum could tell from nothing.
+    of_mesh : whether the errors were learned on a finer mesh, so that they are the mesh's as well.
+    """
+
+    weights: np.ndarray
+    strength: np.ndarray
+    modes: np.ndarray
+    amplitude: Amplitude | None = None
+    varying: VaryingModes | None = None
+    mixing: np.ndarray | None = None
+    names: tuple[str, ...] = ()
+    of_mesh: bool = False
+
+    @property
+    def of_fem(self) -> bool:
+        """Whether data differ from FEM on the map's mesh by these errors, too."""
+        return self.amplitude is None or self.of_mesh
+
+    @property
+    def priors(self) -> dict[str, dist.Distribution]:
+        """Prior of the size that is inferred, by its name in the posterior; empty if none is."""
+        varying = self.varying
+        if varying is None or not varying.name:
+            return {}
+        return {varying.name: dist.HalfNormal(varying.scale)}
+
+    def size(self, unknowns: jax.Array) -> jax.Array:
+        """Return the size of the fixed modes, (), at ``unknowns``."""
+        return jnp.ones(()) if self.amplitude is None else self.amplitude(unknowns)
+
+    def log_ratio(self, unknowns: jax.Array, residual: Means, means: Means) -> jax.Array:
+        """Return what the errors add to the log likelihood of ``residual``, data less ``means``.
+
+        Parameters
+        ----------
+        unknowns : theta's unknowns (q,), then the size of :attr:`priors` if one is inferred.
+        """
+        flat, _ = ravel_pytree(dict(residual))
+        pivots, rows = self._eliminated(unknowns, means, flat[:, None])
+        return 0.5 * jnp.sum(rows[:, 0] ** 2 / pivots - jnp.log(pivots))
+
+    def information_left(
+        self, information: jax.Array, unknowns: jax.Array, means: Means
+    ) -> jax.Array:
+        """Return what is left of the noise's ``information`` (d, d) about ``means``.
+
+        It is the inverse covariance of the data given the unknowns. How the covariance itself
+        depends on the unknowns is not counted.
+        """
+        pivots, rows = self._eliminated(unknowns, means, jnp.eye(len(information)))
+        return information - (rows.T / pivots) @ rows
+
+    def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
+        """Return data without noise that might have come: ``means`` plus a draw of the errors."""
+        flat, unravel = ravel_pytree(dict(means))
+        key, varying_key = rng_key, rng_key
+        if self.varying is not None:
+            key, varying_key = jax.random.split(rng_key)
+        z = jax.random.normal(key, self.strength.shape)
+        drawn = flat + self.size(unknowns) * (z @ self.modes)
+        if self.varying is not None:
+            V = self.varying.at(self._inferred_size(unknowns), flat)
+            drawn += jax.random.normal(varying_key, (len(V),)) @ V
+        return unravel(drawn)
+
+    def largest(self, means: Means) -> np.ndarray:
+        """Return V (r, d) beside data like ``means``, an inferred size at its 99.7 % quantile."""
+        if self.varying is None:
+            return self.modes
+        flat, _ = ravel_pytree(dict(means))
+        V = self.varying.at(_PLAUSIBLE * self.varying.scale, flat)
+        return np.vstack([self.modes, np.asarray(V)])
+
+    def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean (s,) and covariance (s, s) of the named z given ``residual``, at one draw.
+
+        Raises
+        ------
+        InputError
+            Some of the errors vary with the prediction or in size.
+        """
+        if self.varying is not None:
+            of_size = f"the size '{self.varying.name}' is inferred"
+            reason = of_size if self.varying.name else "some are shares of what is predicted"
+            raise InputError(f"what is known of errors: {reason}")
+        assert self.mixing is not None
+        flat = np.asarray(ravel_pytree(dict(residual))[0])
+        pivots = 1.0 + self.strength
+        mean = self.mixing.T @ ((self.weights @ flat) / pivots)
+        learned = (self.mixing.T * (1.0 - 1.0 / pivots)) @ self.mixing
+        return mean, np.eye(len(self.names)) - learned
+
+    def _eliminated(
+        self, unknowns: jax.Array, means: Means, columns: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the pivots P (r,), and R ``columns`` (r, m) of columns (d, m)."""
+        alpha = self.size(unknowns)
+        pivots, rows = 1.0 + alpha**2 * self.strength, alpha * (self.weights @ columns)
+        if self.varying is None:
+            return pivots, rows
+        flat, _ = ravel_pytree(dict(means))
+        V = self.varying.at(self._inferred_size(unknowns), flat)
+        VW = self.varying.weighted(V)
+        more = eliminated(VW @ V.T + jnp.eye(len(V)), VW @ columns)
+        return jnp.concatenate([pivots, more[0]]), jnp.concatenate([rows, more[1]])
+
+    def _inferred_size(self, unknowns: jax.Array) -> jax.Array | float:
+        return unknowns[-1] if self.priors else 1.0
+
+    @property
+    def fingerprint(self) -> str:
+        """Short hash of all that changes a likelihood."""
+        return fingerprint_of(*self.arrays().values())
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all that changes a likelihood, by its name in a file."""
+        arrays: dict[str, Any] = {n: getattr(self, n) for n in ("weights", "strength", "modes")}
+        if self.amplitude is not None:
+            arrays |= {each.name: getattr(self.amplitude, each.name) for each in fields(Amplitude)}
+        if self.mixing is not None:
+            arrays["mixing"] = self.mixing
+        if self.varying is not None:
+            names = ("modes", "shares", "sized", "information", "scale")
+            arrays |= {f"{_VARYING}{n}": getattr(self.varying, n) for n in names}
+        if self.of_mesh:
+            arrays["of_mesh"] = True
+        return {name: np.asarray(value) for name, value in arrays.items()}
+
+    @property
+    def words(self) -> dict[str, Any]:
+        """What :meth:`restore` needs besides the arrays: plain JSON, empty for learned errors."""
+        if self.mixing is None:
+            return {}
+        size = None if self.varying is None else self.varying.name
+        return {"names": self.names, "size": size, "shares": _SHARES}
+
+    @classmethod
+    def restore(cls, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> ModelError:
+        """Return the errors of these :meth:`arrays` and :attr:`words`.
+
+        Raises
+        ------
+        InputError
+            Shares were of the data when the posterior was saved; the arrays do not tell.
+        TypeError
+            An array is missing, or one is unknown.
+        """
+        if words and words.get("shares") != _SHARES:
+            raise InputError(
+                "the posterior is older than systematic errors that are shares of predictions; "
+                "infer again"
+            )
+        own: dict[str, Any] = dict(arrays)
+        of_mesh = own.pop("of_mesh", None) is not None
+        varying = {n.removeprefix(_VARYING): own.pop(n) for n in arrays if n.startswith(_VARYING)}
+        size = {each.name: own.pop(each.name) for each in fields(Amplitude) if each.name in own}
+        return cls(
+            **own,
+            amplitude=Amplitude(**_scalar(size, "width")) if size else None,
+            varying=VaryingModes(**_scalar(varying, "scale"), name=words["size"] or "")
+            if varying
+            else None,
+            names=tuple(words.get("names", ())),
+            of_mesh=of_mesh,
+        )
+
+
+def _scalar(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, Any]:
+    """Return ``arrays`` with the one called ``name`` as a number."""
+    return {key: float(array) if key == name else array for key, array in arrays.items()}
+
+
+jax.tree_util.register_dataclass(Amplitude, [each.name for each in fields(Amplitude)], [])
+jax.tree_util.register_dataclass(
+    VaryingModes, ["modes", "shares", "sized", "information"], ["name", "scale"]
+)
+jax.tree_util.register_dataclass(
+    ModelError,
+    ["weights", "strength", "modes", "amplitude", "varying", "mixing"],
+    ["names", "of_mesh"],
+)
+
+
+def diagonal(modes: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return fixed modes of the same covariance with a diagonal G.
+
+    Parameters
+    ----------
+    modes : the modes as they are declared, (s, d).
+    information : W, (d, d).
+
+    Returns
+    -------
+    weights, strength, modes, mixing : as in :class:`ModelError`.
+    """
+    strength, mixing = np.linalg.eigh(modes @ information @ modes.T)
+    visible = strength > 1e-12 * max(float(strength.max(initial=0.0)), 1e-300)
+    rows = mixing[:, visible].T
+    mixed = rows @ modes
+    return mixed @ information, strength[visible], mixed, rows

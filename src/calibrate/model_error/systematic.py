@@ -1,0 +1,244 @@
+r"""Systematic errors: what is unknown of a measurement itself, or of a law along a whole curve.
+
+Such an error is the same in many numbers: a camera that was moved between two loads shifts and
+turns all markers of one state together. Left out, it passes for material. Each error is a
+:class:`Systematic`: its unknowns, in units of their standard deviations, and the change of the data
+for each. :func:`marginalised` integrates all of them out, so that sampling has no more unknowns
+than before.
+
+Small rotations are linear: an angle :math:`\omega` moves a point at x by
+:math:`\omega \times (x - c)`, to second order in the angle.
+
+Points of a loading curve at amounts :math:`\gamma_j` (a shear, a stretch), with values
+:math:`y_j`, are off together, so that a hundred points are not a hundred facts:
+
+.. math:: \delta \sim N(0, C), \qquad
+          C_{jk} = (\omega^2 y_j y_k + \sigma^2)\,
+                   \big[c + (1 - c)\, k(|\gamma_j - \gamma_k| / \ell)\big]
+
+with the share :math:`\omega` of the values, the standard deviation :math:`\sigma`, the part c of
+the variance that is the same along the whole curve, and Matérn's kernel k of smoothness 3/2
+(:func:`emulator.core.gaussian_process.matern32`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.model_error.marginal import ModelError, VaryingModes, diagonal
+from emulator.core.errors import InputError
+from emulator.core.gaussian_process import matern32
+
+Number = float | jax.Array
+Shapes = Mapping[str, tuple[int, ...]]
+
+_NEGLIGIBLE = 1e-8  # of the largest variance along a curve: no datum could tell it
+
+
+@dataclass(frozen=True, eq=False)
+class Systematic:
+    """One error that several numbers share.
+
+    Attributes
+    ----------
+    names : names of its s unknowns, each a standard normal.
+    modes : by the observation's name, the change of its data for one standard deviation of each
+        unknown, (s, *shape).
+    size : where the size of the error is inferred, its name in the posterior and the scale of its
+        half-normal prior; modes are then those of size 1. Errors with one name have one size.
+    shares : as ``modes``, but each as a share of the predicted data; the change is the sum of both.
+    """
+
+    names: tuple[str, ...]
+    modes: Mapping[str, np.ndarray]
+    size: tuple[str, float] | None = None
+    shares: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def varies(self) -> bool:
+        """Whether the change of the data depends on unknowns of the model."""
+        return self.size is not None or any(np.any(each) for each in self.shares.values())
+
+    def check(self, shapes: Shapes) -> None:
+        """Raise :class:`InputError` unless the error fits observations of these shapes, by name."""
+        for name, modes in (*self.modes.items(), *self.shares.items()):
+            if name not in shapes:
+                raise InputError(
+                    f"{self.names[0]}: '{name}' is not observed; observed: {', '.join(shapes)}"
+                )
+            expected = (len(self.names), *shapes[name])
+            if np.shape(modes) != expected:
+                raise InputError(
+                    f"{self.names[0]}: modes of '{name}' have shape {np.shape(modes)}; expected "
+                    f"{expected}"
+                )
+
+
+def marginalised(
+    errors: Sequence[Systematic], shapes: Shapes, information: np.ndarray, unknowns: Sequence[str]
+) -> ModelError:
+    """Return ``errors`` together, integrated out.
+
+    Parameters
+    ----------
+    shapes : shape of each observation's data, by name.
+    information : information of the noise about the data's means, (d, d).
+    unknowns : names of the model's unknowns, which a size that is inferred may not have.
+
+    Raises
+    ------
+    InputError
+        An error does not fit the observations, or two sizes are to be inferred.
+    """
+    for error in errors:
+        error.check(shapes)
+    known = [error for error in errors if not error.varies]
+    weights, strength, modes, mixing = diagonal(_rows(known, shapes, "modes"), information)
+    names = tuple(name for error in known for name in error.names)
+    fixed = ModelError(weights, strength, modes, mixing=mixing, names=names)
+    varying = [error for error in errors if error.varies]
+    if not varying:
+        return fixed
+    left = np.asarray(fixed.information_left(jnp.asarray(information), jnp.zeros(0), {}))
+    on_diagonal = np.diagonal(left)
+    name, scale = _inferred_size(varying, unknowns)
+    sized = [np.full(len(error.names), float(error.size is not None)) for error in varying]
+    return replace(
+        fixed,
+        varying=VaryingModes(
+            modes=_rows(varying, shapes, "modes"),
+            shares=_rows(varying, shapes, "shares"),
+            sized=np.concatenate(sized),
+            information=on_diagonal if np.array_equal(left, np.diag(on_diagonal)) else left,
+            name=name,
+            scale=scale,
+        ),
+    )
+
+
+def _inferred_size(errors: Sequence[Systematic], unknowns: Sequence[str]) -> tuple[str, float]:
+    """Return name and scale of the one size that is inferred; empty and 0 where none is."""
+    sizes = list(dict.fromkeys(error.size for error in errors if error.size is not None))
+    if len(sizes) > 1:
+        raise InputError(
+            f"systematic errors: sizes {sizes[0]} and {sizes[1]} are to be inferred; only one can "
+            "be, by one name and scale"
+        )
+    name, scale = sizes[0] if sizes else ("", 0.0)
+    if name in unknowns:
+        raise InputError(
+            f"systematic errors: a size is called '{name}', as an unknown of the model"
+        )
+    return name, scale
+
+
+def _rows(errors: Sequence[Systematic], shapes: Shapes, kind: str) -> np.ndarray:
+    """Return the ``modes`` or ``shares`` of all errors as rows (s, d) of all data."""
+    rows = [np.zeros((0, sum(int(np.prod(shape)) for shape in shapes.values())))]
+    for error in errors:
+        s = len(error.names)
+        each = {name: np.zeros((s, *shape)) for name, shape in shapes.items()}
+        each |= dict(getattr(error, kind))
+        rows.append(np.hstack([np.reshape(e, (s, -1)) for e in jax.tree.leaves(each)]))
+    return np.vstack(rows)
+
+
+def rigid_motion(
+    name: str,
+    positions: Mapping[str, np.ndarray],
+    shift: float | Sequence[float],
+    turn: float | Sequence[float],
+    about: Sequence[float] | None = None,
+) -> Systematic:
+    """Return the error of a frame that moved: all points of some observations shift and turn.
+
+    Parameters
+    ----------
+    name : the beginning of the unknowns' names, ``camera shift x`` to ``camera turn z``.
+    positions : by the observation's name, where its points were seen, (d, 3) mm; displacements of
+        these points are measured.
+    shift : standard deviation along x, y and z in mm, or one for all.
+    turn : standard deviation about x, y and z in degrees, or one for all.
+    about : the point that only shifts, (3,) mm; by default the mean of all positions.
+
+    Raises
+    ------
+    InputError
+        Positions of another shape, or a negative standard deviation.
+    """
+    points = {key: np.asarray(each, dtype=float) for key, each in positions.items()}
+    for key, each in points.items():
+        if each.ndim != 2 or each.shape[1] != 3 or not np.isfinite(each).all():
+            raise InputError(f"{name}: positions of '{key}' have shape {each.shape}; give (d, 3)")
+    sds = [np.broadcast_to(np.asarray(sd, dtype=float), 3) for sd in (shift, turn)]
+    if not all((sd >= 0.0).all() and np.isfinite(sd).all() for sd in sds):
+        raise InputError(f"{name}: sds {shift} mm and {turn} degrees; they must be 0 or more")
+    centre = np.concatenate(list(points.values())).mean(axis=0) if about is None else about
+    axes = np.eye(3)
+    modes = {}
+    for key, each in points.items():
+        shifts = [np.broadcast_to(sds[0][k] * axes[k], each.shape) for k in range(3)]
+        turns = [np.deg2rad(sds[1][k]) * np.cross(axes[k], each - centre) for k in range(3)]
+        modes[key] = np.stack([*shifts, *turns])
+    names = tuple(f"{name} {motion} {axis}" for motion in ("shift", "turn") for axis in "xyz")
+    return Systematic(names, modes)
+
+
+def placement(name: str, observed: Sequence[str], sd: np.ndarray) -> Systematic:
+    """Return an error in which every number has an offset, the same in all observations.
+
+    An example is where a marker was at rest, from which its displacements are measured.
+
+    Parameters
+    ----------
+    observed : names of the observations, whose data have one shape.
+    sd : standard deviation of each offset, of the data's shape, in their unit.
+    """
+    sd = np.asarray(sd, dtype=float)
+    each = np.diag(sd.ravel()).reshape(-1, *sd.shape)
+    names = tuple(f"{name} {','.join(map(str, index))}" for index in np.ndindex(*sd.shape))
+    return Systematic(names, dict.fromkeys(observed, each))
+
+
+def curve_covariance(
+    amounts: jax.Array,
+    values: jax.Array,
+    length: Number,
+    *,
+    share: Number = 0.0,
+    sd: Number = 0.0,
+    constant: Number = 0.0,
+) -> jax.Array:
+    """Return C (..., n, n) of points at ``amounts`` (..., n) with ``values`` (..., n).
+
+    Parameters
+    ----------
+    length : the correlation length, () or (..., 1, 1), in the unit of the amounts.
+    share : omega. sd : sigma, in the unit of ``values``.
+    constant : c, 0 to 1.
+    """
+    distance = (amounts[..., :, None] - amounts[..., None, :]) / length
+    shape = constant + (1.0 - constant) * matern32(distance**2)
+    return (share**2 * values[..., :, None] * values[..., None, :] + sd**2) * shape
+
+
+def curve_modes(amounts: np.ndarray, length: float, *, constant: float = 0.0) -> np.ndarray:
+    """Return modes V (r, n) of :func:`curve_covariance` with sd 1, :math:`C = V^T V`."""
+    zeros = jnp.zeros(len(amounts))
+    C = curve_covariance(jnp.asarray(amounts), zeros, length, sd=1.0, constant=constant)
+    variances, vectors = np.linalg.eigh(np.asarray(C))
+    used = variances > _NEGLIGIBLE * max(float(variances.max()), 1e-300)
+    return np.sqrt(variances[used])[::-1, None] * vectors.T[used][::-1]
+
+
+def check_curve(length: float, constant: float) -> None:
+    """Raise :class:`InputError` on a length not above 0, or a constant part outside 0 to 1."""
+    if not length > 0.0:
+        raise InputError(f"length is {length}; it must be above 0, in the unit of the amount")
+    if not 0.0 <= constant <= 1.0:
+        raise InputError(f"constant is {constant}; it is a part, 0 to 1")
