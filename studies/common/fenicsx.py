@@ -20,7 +20,7 @@ from studies.common.timing import Clock, clocked
 
 from emulator.core.errors import InputError
 from emulator.fem import Simulator, uniform
-from emulator.fem.options import NewtonOptions
+from emulator.fem.newton import NewtonOptions
 from emulator.geometry.discretisation import quadrature_points
 from emulator.scenes import Scene
 from emulator.scenes.loads import CavityPressure, Gravity

@@ -18,7 +18,6 @@ from studies.common.timing import clocked
 import emulator as em
 from calibrate.measurements import landmarks, spread_landmarks
 from emulator.fem import sobol
-from emulator.fem.balance import balance
 from emulator.scenes.scene import Scene
 
 SEED = 3
@@ -58,7 +57,7 @@ def parts(simulator: em.Simulator, theta: jax.Array, u: jax.Array, count: int) -
     system = simulator.system
     fields = [u * (1.0 + 1e-6 * k) for k in range(count + 1)]
     tangent = jax.jit(lambda v: system.step_equations(v, theta, 1.0, 1.0)[0])
-    residual = jax.jit(lambda v: balance(system, v, theta))
+    residual = jax.jit(lambda v: system.balance(v, theta))
     attempt = jax.jit(lambda pair: system.attempt(*pair)[0])
     rhs = jnp.ones(len(system.free))
     tangents = [tangent(v) for v in fields]

@@ -31,10 +31,10 @@ from studies.mesh_to_certificate.__main__ import one as from_mesh_to_certificate
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
+from emulator.fem.assembly import System
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.suitesparse import SUITESPARSE
 from emulator.fem.solution import Status
-from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 
 HERE = Path(__file__).parent

@@ -28,7 +28,7 @@ from emulator.core.errors import InputError
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.petsc import Factor, petsc_module
 from emulator.fem.linear.suitesparse import FACTORS, SUITESPARSE
-from emulator.fem.system import System
+from emulator.fem.assembly import System
 from emulator.scenes.scene import Scene
 
 # PETSC_OPTIONS of MUMPS: as it is, factors on disk, and block low-rank factors to six digits with

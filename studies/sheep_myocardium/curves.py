@@ -31,9 +31,9 @@ import emulator as em
 from emulator.core.errors import SolverError
 from emulator.core.machine import cores
 from emulator.fem.campaign import at_once, in_order
-from emulator.fem.implicit import Quantity
-from emulator.fem.options import NewtonOptions
-from emulator.fem.support_force import SupportForce
+from emulator.fem.derivatives import Quantity
+from emulator.fem.newton import NewtonOptions
+from emulator.fem.reactions import SupportForce
 
 _AXES = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))  # along which each mode moves
 

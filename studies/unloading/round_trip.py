@@ -16,7 +16,7 @@ from studies.unloading.bodies import direction, farthest, some_theta
 import emulator as em
 from emulator.fem import NewtonOptions, Status
 from emulator.fem.loaded import LoadedEquilibrium
-from emulator.fem.moved import at_rest
+from emulator.fem.unloading import scene_at_rest
 from emulator.geometry.generators.sphere import sphere_octant
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Scene
@@ -95,7 +95,7 @@ def itself(scene: Scene, count: int, seed: int) -> Case:
     simulator, missed = em.Simulator(scene), []
     for theta in some_theta(scene, count, seed):
         u = simulator.solve(theta).require_converged().displacement
-        image = at_rest(scene, u)  # the scene on the mesh x + u
+        image = scene_at_rest(scene, u)  # the scene on the mesh x + u
         unloaded = em.unload(image, theta).require_converged()
         missed.append(farthest(unloaded.displacement + u))
     return {"missed_mm": missed}

@@ -13,7 +13,7 @@ import numpy as np
 from calibrate.measurements.scalar import Scalar
 from calibrate.noise.protocol import Noise
 from emulator.core.errors import InputError
-from emulator.fem.support_force import SupportForce
+from emulator.fem.reactions import SupportForce
 from emulator.scenes.loads.force import MN_PER_N
 from emulator.scenes.scene import Scene
 

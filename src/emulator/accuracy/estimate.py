@@ -57,9 +57,9 @@ from emulator.accuracy.step import (
     sound_state,
 )
 from emulator.core.errors import InputError
-from emulator.fem.loop import cond, jit
+from emulator.fem.assembly import System
+from emulator.fem.compiled import compiled, cond
 from emulator.fem.simulator import Simulator
-from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 
@@ -161,26 +161,26 @@ class ErrorBar:
 
     @cached_property
     def _prepare(self):  # noqa: ANN202
-        return jit(partial(sound_state, self.scene, self.centre))
+        return compiled(partial(sound_state, self.scene, self.centre))
 
     @cached_property
     def _step(self):  # noqa: ANN202
-        return jit(partial(newton_distance, self.simulator.system))
+        return compiled(partial(newton_distance, self.simulator.system))
 
     @cached_property
     def _guarded(self):  # noqa: ANN202
-        return jit(partial(guarded_distance, self.simulator))
+        return compiled(partial(guarded_distance, self.simulator))
 
     @cached_property
     def _by_gradients(self):  # noqa: ANN202
         system = self.simulator.system
         with jax.ensure_compile_time_eval():
             values = np.asarray(self.simulator.tangent(self.centre, self.scene.centre))
-        return jit(partial(gradients_distance, system, values, self.iterations))
+        return compiled(partial(gradients_distance, system, values, self.iterations))
 
     @cached_property
     def _finish(self):  # noqa: ANN202
-        return jit(partial(_report, self.simulator.system, self.centre))
+        return compiled(partial(_report, self.simulator.system, self.centre))
 
 
 def error_bar(

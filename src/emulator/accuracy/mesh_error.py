@@ -32,7 +32,7 @@ import numpy as np
 from emulator.accuracy.step import Distance, newton_distance
 from emulator.core.errors import InputError
 from emulator.fem.linear.suitesparse import FACTORS
-from emulator.fem.loop import jit
+from emulator.fem.compiled import compiled
 from emulator.fem.simulator import Simulator
 from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene
@@ -134,7 +134,7 @@ class MeshError:
 
     @cached_property
     def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:
-        return jit(partial(newton_distance, self.fine.system))
+        return compiled(partial(newton_distance, self.fine.system))
 
     def _stepped(self, theta: jax.Array, u: jax.Array) -> jax.Array | None:
         """The finer mesh's displacement (f, 3) a few steps from ``u``; None if one is not sound."""

@@ -14,16 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.balance import balance
+from emulator.fem.assembly import System
+from emulator.fem.compiled import while_loop
 from emulator.fem.energy import volume_ratio
+from emulator.fem.formulations.displacement import UNBALANCED
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
-from emulator.fem.loop import while_loop
-from emulator.fem.newton import Newton
+from emulator.fem.load_stepping import LoadStepping
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Status
-from emulator.fem.state import UNBALANCED, NewtonState
-from emulator.fem.system import System
+from emulator.fem.state import NewtonState
 from emulator.scenes.scene import Scene
 
 ENDLESS = 1e100  # mm; larger displacements count as not finite: J, their cube, would overflow
@@ -85,7 +85,8 @@ def sound_state(
 
 def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
     """Newton's step with the opposite sign, and a check by one more back-substitution."""
-    (residual, out_of_balance), tangent = balance(system, u, theta), system.tangent(u, theta)
+    residual, _, out_of_balance = system.balance(u, theta)
+    tangent = system.tangent(u, theta)
     values = system.pattern.safe_values(tangent)
     step, outcome = system.attempt(values, residual)
     move = system.extend(step)
@@ -112,20 +113,22 @@ def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
 def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Distance:
     """Distance FEM's iteration travels from ``u`` until its steps are short beside it."""
     system = simulator.system
-    newton = Newton(system, simulator.options, theta)
+    newton = LoadStepping(system, simulator.options, theta)
 
     def advance(carry: tuple[NewtonState, jax.Array, jax.Array]):  # noqa: ANN202
         state, _, _ = carry
         after = newton.step(state)
         way, step = _norm(after.u - u), _norm(after.u - state.u)
         # A shortened step is small too, but leaves most of its residual.
-        good = (after.error <= _GOOD_STEP * state.error) & (step <= _CONTRACTION * way)
-        good &= after.level >= 1.0
+        good = (after.relative_residual <= _GOOD_STEP * state.relative_residual) & (
+            step <= _CONTRACTION * way
+        )
+        good &= after.load >= 1.0
         return after, good | (after.status == Status.CONVERGED), step / jnp.where(way > 0, way, 1.0)
 
     def unfinished(carry: tuple[NewtonState, jax.Array, jax.Array]) -> jax.Array:
         state, near, _ = carry
-        going = (state.status == Status.RUNNING) & (state.level >= 1.0)
+        going = (state.status == Status.RUNNING) & (state.load >= 1.0)
         return going & ~near & (state.iterations < _MOST_ITERATIONS)
 
     begun = newton.begin(u)

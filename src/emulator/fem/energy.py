@@ -5,17 +5,18 @@ r"""Total potential energy of a scene, summed over the terms the scene has.
         - \sum_\text{loads} \text{work}
 
 in mN mm (= micro J; kPa mm3), Dalton et al. (2023), Eq. 20. The displacement ``u`` is the full
-nodal field, (n, 3) in mm, supports included.
+nodal field, (n, 3) in mm, prescribed displacements included.
 
-With mean dilatation the volume ratio of an element is its mean,
+With mean dilatation the law sees the mean volume ratio of the element,
 
 .. math::
     \hat F = \left(\bar J / J\right)^{1/3} F, \qquad
     \bar J = \frac{\int_e J\, dX}{\int_e dX},
 
 and W is evaluated at :math:`\hat F`: one volume constraint an element, which quadratic tetrahedra
-can meet without locking (Simo, Taylor & Pister 1985). With patch dilatation the mean is that of a
-patch of linear tetrahedra (:mod:`emulator.geometry.patches`).
+can meet without locking (Simo, Taylor & Pister 1985). With patch dilatation the mean is taken over
+a patch of linear tetrahedra (:mod:`emulator.geometry.patches`). A *block* is what shares a mean: an
+element, or a patch.
 """
 
 from __future__ import annotations
@@ -48,59 +49,62 @@ def require_rest(scene: Scene) -> None:
 
 
 def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
-    """``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
+    """Return ``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
     local = u[scene.discretisation.connectivity]
     return jnp.einsum("mai,mqaj->mqij", local, scene.discretisation.gradients)
 
 
 def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
-    """``J = det F`` at every quadrature point, (m, q); not above 0 means an inverted element."""
+    """Return ``J = det F`` at every quadrature point, (m, q); J <= 0 is an inverted element."""
     H = displacement_gradient(scene, u)
     F = H + jnp.eye(3, dtype=H.dtype)
     return jax.vmap(determinant)(F.reshape(-1, 3, 3)).reshape(F.shape[:2])
 
 
-def strain_law(scene: Scene, theta: jax.Array) -> Callable:
-    """``W(strain, tissue)`` in kPa, from the strain at one point, at ``theta`` (p,)."""
+def parameters_at(scene: Scene, theta: jax.Array) -> Callable[[Tissue], list[jax.Array]]:
+    """Return the law's parameters as a function of a point's tissue, at ``theta`` (p,).
+
+    A region scales the moduli that the law names in ``shape_moduli``.
+    """
     require_rest(scene)
     values, law = scene.resolve(theta), scene.law
     scale = factors(scene.regions, values)
 
-    def energy(strain: Strain, at: Tissue) -> jax.Array:
-        here = {}
+    def parameters(at: Tissue) -> list[jax.Array]:
+        regional = {}
         if scale is not None:
-            here = {name: scale[at.region] * values[name] for name in law.shape_moduli}
-        return law.energy(strain, *(here.get(name, values[name]) for name in law.parameters))
+            regional = {name: scale[at.region] * values[name] for name in law.shape_moduli}
+        return [regional.get(name, values[name]) for name in law.parameters]
 
-    return energy
+    return parameters
 
 
 def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
-    """``W(H, tissue)`` in kPa, from one displacement gradient (3, 3), at ``theta`` (p,)."""
-    constitutive = strain_law(scene, theta)
+    """Return ``W(H, tissue)`` in kPa, of one displacement gradient (3, 3), at ``theta`` (p,)."""
+    law, parameters = scene.law, parameters_at(scene, theta)
 
     def energy(H: jax.Array, at: Tissue = Tissue()) -> jax.Array:
-        return constitutive(Strain(H, barriers, at.directions), at)
+        return law.energy(Strain(H, barriers, at.directions), *parameters(at))
 
     return energy
 
 
 def at_points(function: Callable, tissue: Tissue, *fields: jax.Array) -> Any:
-    """``function(*point, tissue)`` at every point of ``fields`` (m, q, ...); leaves (m, q, ...).
+    """Return ``function(*point, tissue)`` at every point of ``fields`` (m, q, ...).
 
-    All points are one batch: a ``vmap`` in a ``vmap`` takes half as long again to trace.
+    Leaves of the result are (m, q, ...). All points are one batch: a ``vmap`` in a ``vmap`` takes
+    half as long again to trace.
     """
     shape = fields[0].shape[:2]
-    every = (*fields, tissue)
-    flat = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), every)
-    found = jax.vmap(function)(*flat)
-    return jax.tree.map(lambda array: array.reshape(*shape, *array.shape[1:]), found)
+    points = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), (*fields, tissue))
+    values = jax.vmap(function)(*points)
+    return jax.tree.map(lambda array: array.reshape(*shape, *array.shape[1:]), values)
 
 
 def with_volume_change(
     H: jax.Array, change: jax.Array, barriers: Barriers | None = None
 ) -> jax.Array:
-    """Displacement gradient ``H`` (3, 3) of a point scaled isotropically to ``J - 1 = change``."""
+    """Return the displacement gradient ``H`` (3, 3) scaled isotropically to ``J - 1 = change``."""
     stretch = jnp.expm1((jnp.log1p(change) - Strain(H, barriers).ln_J) / 3.0)
     return H + stretch * (H + jnp.eye(3, dtype=H.dtype))
 
@@ -108,38 +112,38 @@ def with_volume_change(
 def with_mean_dilatation(
     H: jax.Array, weights: jax.Array, barriers: Barriers | None = None
 ) -> jax.Array:
-    """Displacement gradients (q, 3, 3) of one block, each point's J replaced by their mean."""
+    """Return the displacement gradients (q, 3, 3) of one block, scaled to the block's mean J."""
     J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
     change = jnp.vdot(weights, J_minus_1) / jnp.sum(weights)
     return jax.vmap(lambda h: with_volume_change(h, change, barriers))(H)
 
 
 def nodal_vectors(blocks: Blocks, P: jax.Array) -> jax.Array:
-    """Derivatives (b, a, 3) in the nodal displacements from ``P = dW/dH`` (b, q, 3, 3)."""
+    """Return nodal forces (b, a, 3) in mN of the blocks from ``P = dW/dH`` (b, q, 3, 3) in kPa."""
     return jnp.einsum("bq,bqij,bqaj->bai", blocks.weights, P, blocks.gradients)
 
 
-_CHUNK = 128  # elements whose products of gradients stay in a processor's cache
+_CHUNK = 128  # blocks whose products of gradients stay in a processor's cache
 
 
 def pair_matrices(
     blocks: Blocks, A: jax.Array, pairs: tuple[np.ndarray, np.ndarray] | None = None
 ) -> jax.Array:
-    r"""Second ones (b, pairs, 3, 3) of pairs of nodes, from ``A`` (b, q, 3, 3, 3, 3).
+    r"""Return nodal stiffnesses (b, pairs, 3, 3) in mN/mm from moduli ``A`` (b, q, 3, 3, 3, 3).
 
-    Pairs are by default those of ``np.triu_indices``: each once, for a symmetric ``A``. With the
-    products of gradients at the points,
-    :math:`G_{ab,kl} = w N_{a,k} N_{b,l}`, one matrix product an element gives all of them,
-    :math:`K_{ab} = \sum_{q,kl} G_{ab,kl} A_{kl}`. Made for a few elements at a time, the products
-    stay in the cache.
+    pairs : the pairs of a block's nodes; by default those of ``np.triu_indices``, each once, for a
+    symmetric ``A``. With the products of gradients at the points,
+    :math:`G_{ab,kl} = w N_{a,k} N_{b,l}`, one matrix product a block gives all of them,
+    :math:`K_{ab} = \sum_{q,kl} G_{ab,kl} A_{kl}`. Blocks are taken a few at a time, so that the
+    products stay in the cache.
     """
     one, other = np.triu_indices(blocks.gradients.shape[2]) if pairs is None else pairs
     count, points = A.shape[:2]
     chunks = -(-count // _CHUNK)
     size = -(-count // chunks)
 
-    def some(part: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        weights, N, A = part
+    def chunk_matrices(chunk: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        weights, N, A = chunk
         products = weights[:, :, None, None, None] * N[:, :, one, :, None] * N[:, :, other, None, :]
         left = products.transpose(0, 2, 1, 3, 4).reshape(size, len(one), points * 9)
         right = A.transpose(0, 1, 3, 5, 2, 4).reshape(size, points * 9, 9)
@@ -149,23 +153,22 @@ def pair_matrices(
         spare = [(0, chunks * size - count), *[(0, 0)] * (array.ndim - 1)]
         return jnp.pad(jnp.asarray(array), spare).reshape(chunks, size, *array.shape[1:])
 
-    parts = chunked(blocks.weights), chunked(blocks.gradients), chunked(A)
-    found = jax.lax.map(some, parts).reshape(chunks * size, len(one), 3, 3)
-    return found[:count]
+    data = chunked(blocks.weights), chunked(blocks.gradients), chunked(A)
+    matrices = jax.lax.map(chunk_matrices, data).reshape(chunks * size, len(one), 3, 3)
+    return matrices[:count]
 
 
 def pair_products(pairs: jax.Array, local: jax.Array) -> jax.Array:
-    """Products (b, a, 3) of symmetric blocks (b, pairs, 3, 3) and vectors ``local`` (b, a, 3)."""
+    """Return the products (b, a, 3) of symmetric ``pairs`` (b, pairs, 3, 3) and ``local``."""
     one, other = np.triu_indices(local.shape[1])
     below = jnp.where((one != other)[:, None], local[:, one], 0.0)
-    there = (
-        jnp.zeros_like(local).at[:, one].add(jnp.einsum("bpij,bpj->bpi", pairs, local[:, other]))
-    )
-    return there.at[:, other].add(jnp.einsum("bpij,bpi->bpj", pairs, below))
+    upper = jnp.einsum("bpij,bpj->bpi", pairs, local[:, other])
+    lower = jnp.einsum("bpij,bpi->bpj", pairs, below)
+    return jnp.zeros_like(local).at[:, one].add(upper).at[:, other].add(lower)
 
 
 def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
-    """``(u, theta) -> int W dX`` in mN mm."""
+    """Return ``(u, theta) -> int W dX`` in mN mm."""
 
     def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
         return energy_of_gradient(scene, displacement_gradient(scene, u), theta, barriers)
@@ -176,7 +179,7 @@ def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
 def energy_of_gradient(
     scene: Scene, H: jax.Array, theta: jax.Array, barriers: Barriers | None = None
 ) -> jax.Array:
-    """``int W dX`` in mN mm from the displacement gradient ``H`` (m, q, 3, 3)."""
+    """Return ``int W dX`` in mN mm from the displacement gradient ``H`` (m, q, 3, 3)."""
     density = point_energy(scene, theta, barriers)
     seen = seen_by_law(scene, H, barriers)
     values = at_points(density, scene.block_tissue_at(theta), seen)
@@ -184,7 +187,7 @@ def energy_of_gradient(
 
 
 def seen_by_law(scene: Scene, H: jax.Array, barriers: Barriers | None = None) -> jax.Array:
-    """Displacement gradients (b, q, 3, 3) that the law sees, of those of the elements' points."""
+    """Return the displacement gradients (b, q, 3, 3) that the law sees, from ``H`` (m, q, 3, 3)."""
     H = scene.blocks.gather(H)
     if scene.dilatation == "pointwise":
         return H
@@ -192,37 +195,37 @@ def seen_by_law(scene: Scene, H: jax.Array, barriers: Barriers | None = None) ->
 
 
 def spring_terms(scene: Scene) -> list[LocalTerm]:
-    """Potentials of the elastic supports."""
+    """Return the potentials of the elastic supports."""
     terms = (support.term(scene.discretisation) for support in scene.supports)
     return [term for term in terms if term is not None]
 
 
 def local_terms(scene: Scene) -> list[LocalTerm]:
-    """Potentials of the loads that follow the deformation."""
+    """Return the potentials of the loads that follow the deformation."""
     fibres = scene.fibres_of_loads
     terms = (load.term(scene.discretisation, fibres) for load in scene.loads)
     return [term for term in terms if term is not None]
 
 
 def local_forces(scene: Scene) -> list[LocalForce]:
-    """Loads that follow the deformation and have no potential."""
+    """Return the loads that follow the deformation and have no potential."""
     forces = (load.force(scene.discretisation) for load in scene.loads)
     return [force for force in forces if force is not None]
 
 
 @dataclass(frozen=True, eq=False)
 class DeadForce:
-    """Nodal force of the loads that do not follow the deformation.
+    """The nodal force of the dead loads, which do not follow the deformation.
 
-    constant : (n, 3) in mN.
-    per_unit : (n, 3) in mN per unit of a parameter, by the parameter's name.
+    constant : the part that no parameter scales, (n, 3) in mN.
+    per_unit : the force (n, 3) in mN per unit of a parameter, by the parameter's name.
     """
 
     constant: np.ndarray
     per_unit: Mapping[str, np.ndarray]
 
     def total(self, values: Values) -> jax.Array:
-        """The force (n, 3) in mN."""
+        """Return the force (n, 3) in mN at the scene's parameter ``values``."""
         return sum(
             (values[name] * force for name, force in self.per_unit.items()),
             jnp.asarray(self.constant),
@@ -230,7 +233,7 @@ class DeadForce:
 
 
 def dead_force(scene: Scene) -> DeadForce | None:
-    """Force of the dead loads; ``None`` when there are none."""
+    """Return the force of the dead loads; ``None`` when there are none."""
     forces = [load.nodal_force(scene.discretisation) for load in scene.loads]
     constant = [force for force in forces if force is not None]
     per_unit: dict[str, np.ndarray] = {}
@@ -243,12 +246,12 @@ def dead_force(scene: Scene) -> DeadForce | None:
 
 
 def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
-    """Total potential energy ``Pi(u, theta)`` in mN mm.
+    """Return the total potential energy ``Pi(u, theta)`` in mN mm.
 
     Parameters
     ----------
-    scene : what is simulated.
-    barriers : limits on the invariants for training; ``None`` gives the exact energy, which is
+    scene : the scene whose terms the energy has.
+    barriers : the limits on the invariants for training; ``None`` gives the exact energy, which is
         NaN wherever an element is inverted.
 
     Raises

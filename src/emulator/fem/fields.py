@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 
 def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np.ndarray]:
-    """Means over each element, weighted by reference volume.
+    """Return means over each element, weighted by reference volume.
 
     Parameters
     ----------
-    scene : what was simulated.
-    u : (n, 3) displacement, mm.
-    theta : (p,) parameters.
+    scene : the scene that was simulated.
+    u : the displacement, (n, 3) mm.
+    theta : the parameters, (p,).
 
     Returns
     -------
@@ -71,7 +71,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
 
 def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
-    """First Piola-Kirchhoff stress (m, q, 3, 3) in kPa, from the strain energy's gradient."""
+    """Return the first Piola-Kirchhoff stress (m, q, 3, 3) in kPa of the strain energy."""
     if scene.dilatation == "pointwise":
         return at_points(jax.grad(point_energy(scene, theta)), scene.tissue_at(theta), H)
     slope = jax.grad(energy_of_gradient, argnums=1)(scene, H, theta)

@@ -13,133 +13,133 @@ derivatives follow by the chain rule,
     K\, du = -\left(\frac{\partial r}{\partial \theta}\, d\theta
         + \frac{\partial r}{\partial w}\, dw\right), \qquad dv = dw + du .
 
-The mesh x + w is a new one for every theta; the program that loads it is one for all of them
-(:func:`emulator.fem.moved.moved_system`).
+The mesh x + w is a new one for every theta; one program loads all of them
+(:func:`emulator.fem.unloading.system_at_rest`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.continuation import find_equilibrium
-from emulator.fem.implicit import Equations, inert
+from emulator.fem.assembly import System
+from emulator.fem.compiled import compiled, is_traced, one_by_one
+from emulator.fem.derivatives import Equations, zero_tangents
+from emulator.fem.fallbacks import find_equilibrium
 from emulator.fem.linear import Outcome
-from emulator.fem.loop import jit, one_by_one
-from emulator.fem.moved import moved_system
-from emulator.fem.options import NewtonOptions
+from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Solution
-from emulator.fem.system import System
-from emulator.fem.unloading import Unloaded, Unloader
+from emulator.fem.unloading import Unloaded, Unloader, system_at_rest
 from emulator.scenes.image import image_theta, unmarked
 from emulator.scenes.scene import Scene
 
-_KEPT = 16  # shapes at rest that are kept, for the derivatives asked for after a solve
+_RECENT = 16  # stress-free shapes that are kept for the derivatives asked for after a solve
 
 
 @dataclass(frozen=True, eq=False)
 class LoadedEquilibrium:
-    """Unloads the mesh of ``scene`` by the loads of its image and loads it by theta."""
+    """Unloads the mesh of a scene by the loads of its image, and loads it at theta.
+
+    scene : the scene, with ``loaded_by``.
+    options : the controls of Newton's method.
+    factorisation : the name of the linear solver.
+    """
 
     scene: Scene
     options: NewtonOptions
     factorisation: str
 
     @cached_property
-    def _plain(self) -> Scene:
+    def _on_mesh(self) -> Scene:
+        """The scene as if its mesh were at rest."""
         return unmarked(self.scene)
 
     @cached_property
     def unloader(self) -> Unloader:
-        """The way to the shape at rest."""
-        return Unloader(self._plain, options=self.options, factorisation=self.factorisation)
+        """What finds the stress-free shape."""
+        return Unloader(self._on_mesh, options=self.options, factorisation=self.factorisation)
 
     @cached_property
     def system(self) -> System:
         """The equations on the mesh, whose pattern those at rest have."""
-        return System(self._plain, self.factorisation)
+        return System(self._on_mesh, self.factorisation)
 
     def solve(self, theta: jax.Array, start: jax.Array | None) -> Solution:
-        """Equilibrium at ``theta`` (p,), its displacement (n, 3) in mm from the mesh.
+        """Return the equilibrium at ``theta`` (p,), its displacement (n, 3) in mm from the mesh.
 
-        From ``start`` (n, 3) mm, likewise, or from the unloaded shape. Where that is not found, the
-        status is why, and the displacement zero.
+        It is sought from ``start`` (n, 3) mm, also from the mesh, or from the stress-free shape.
+        Where that is not found, the status is why, and the displacement zero.
         """
         unloaded = self.unloaded(theta)
         w = unloaded.displacement
         begin = jnp.zeros_like(w) if start is None else start - w
         loaded = self._load(theta, w, jax.lax.stop_gradient(begin))
-        fine = unloaded.converged
 
-        def chosen(yes: jax.Array, no: jax.Array | float) -> jax.Array:
-            return jnp.where(fine, yes, no)
+        def select(if_unloaded: jax.Array, otherwise: jax.Array | float) -> jax.Array:
+            return jnp.where(unloaded.converged, if_unloaded, otherwise)
 
         return Solution(
-            displacement=chosen(w + loaded.displacement, 0.0),
-            status=chosen(loaded.status, unloaded.status),
+            displacement=select(w + loaded.displacement, 0.0),
+            status=select(loaded.status, unloaded.status),
             iterations=unloaded.iterations + loaded.iterations,
             factorisations=unloaded.factorisations + loaded.factorisations,
-            residual=chosen(loaded.residual, unloaded.residual),
-            load_reached=chosen(loaded.load_reached, 0.0),
+            residual=select(loaded.residual, unloaded.residual),
+            load_reached=select(loaded.load_reached, 0.0),
         )
 
+    def unloaded(self, theta: jax.Array) -> Unloaded:
+        """Return the stress-free shape; a solve and the derivatives after it share one."""
+        image = image_theta(self.scene, theta)
+        if is_traced(image):
+            return self.unloader.solve(image)
+        return self._recent(tuple(np.asarray(image).tolist()))
+
+    @cached_property
+    def _recent(self) -> Callable[[tuple[float, ...]], Unloaded]:
+        """The stress-free shape by the numbers of theta; the most recent ones are kept."""
+        return lru_cache(_RECENT)(lambda theta: self.unloader.solve(jnp.array(theta)))
+
     def sensitivities(self, v: jax.Array, theta: jax.Array) -> jax.Array:
-        """Derivatives (p, n, 3) of the displacement ``v`` (n, 3) mm from the mesh, for numbers."""
+        """Return the derivatives (p, n, 3) of the displacement ``v`` (n, 3) mm, for numbers."""
         unloaded, image = self.unloaded(theta), image_theta(self.scene, theta)
-        turned = jax.jacfwd(partial(image_theta, self.scene))(theta)
-        ways = jnp.tensordot(turned.T, self.unloader.sensitivities(unloaded, image), 1)
-        w = unloaded.displacement
-        return self._columns(theta, w, v - w, ways)
+        image_slopes = jax.jacfwd(partial(image_theta, self.scene))(theta)
+        by_image = self.unloader.sensitivities(unloaded, image)
+        w, w_slopes = unloaded.displacement, jnp.tensordot(image_slopes.T, by_image, 1)
+        return self._total_derivatives(theta, w, v - w, w_slopes)
 
     def equations(self, v: jax.Array, theta: jax.Array) -> tuple[Equations, ...]:
-        """Those of w, and those of u, at ``v`` (n, 3) mm from the mesh, for numbers."""
+        """Return the equations of w and those of u, at ``v`` (n, 3) mm from the mesh."""
         image = partial(image_theta, self.scene)
         w = self.unloaded(theta).displacement
         (unloading,) = self.unloader.equations(w, image(theta))
-        at_rest = unloading.residual
+        residual = unloading.residual
         tangent = self._tangent(theta, w, v - w)
         return (
-            unloading._replace(residual=lambda theta, w: at_rest(image(theta), w)),
+            unloading._replace(residual=lambda theta, w: residual(image(theta), w)),
             Equations(self.system, v - w, tangent, lambda t, w, u: self._residual(u, t, w)),
         )
 
     def is_stable(self, v: jax.Array, theta: jax.Array) -> bool:
-        """Whether the body at ``v`` (n, 3) mm from the mesh is at a minimum of its energy."""
+        """Return whether ``v`` (n, 3) mm from the mesh is a minimum of the energy."""
         w = self.unloaded(theta).displacement
-        K, nothing = self._tangent(theta, w, v - w), jnp.zeros(len(self.system.free))
-        return int(self.system.attempt(K, nothing)[1]) == Outcome.OK
-
-    def unloaded(self, theta: jax.Array) -> Unloaded:
-        """The shape at rest; a solve and the derivatives after it share one."""
-        image = image_theta(self.scene, theta)
-        if isinstance(image, jax.core.Tracer):
-            return self.unloader.solve(image)
-        key = np.asarray(image).tobytes()
-        if key not in self._shapes:
-            while len(self._shapes) >= _KEPT:
-                self._shapes.pop(next(iter(self._shapes)), None)
-            self._shapes[key] = self.unloader.solve(image)
-        return self._shapes[key]
-
-    @cached_property
-    def _shapes(self) -> dict[bytes, Unloaded]:
-        return {}
+        K, zero = self._tangent(theta, w, v - w), jnp.zeros(len(self.system.free))
+        return int(self.system.attempt(K, zero)[1]) == Outcome.OK
 
     def _residual(self, u: jax.Array, theta: jax.Array, w: jax.Array) -> jax.Array:
-        return moved_system(self.system, w, theta).residual(u, theta)
+        return system_at_rest(self.system, w, theta).residual(u, theta)
 
     @cached_property
     def _tangent(self) -> Callable[[jax.Array, jax.Array, jax.Array], jax.Array]:
-        """Nonzeros (nnz,) of the tangent at theta, w and u."""
+        """``(theta, w, u) -> nonzeros (nnz,)`` of the tangent."""
 
-        @jit
+        @compiled
         def tangent(theta: jax.Array, w: jax.Array, u: jax.Array) -> jax.Array:
-            return moved_system(self.system, w, theta).safe_tangent(u, theta)[0]
+            return system_at_rest(self.system, w, theta).safe_tangent(u, theta)[0]
 
         return tangent
 
@@ -149,43 +149,40 @@ class LoadedEquilibrium:
         system, residual = self.system, self._residual
 
         def find(theta: jax.Array, w: jax.Array, start: jax.Array) -> Solution:
-            return find_equilibrium(moved_system(system, w, theta), self.options, theta, start)
+            return find_equilibrium(system_at_rest(system, w, theta), self.options, theta, start)
 
-        closed = jit(one_by_one(find))
-
-        @jit
-        def moved(
+        @compiled
+        def directional_derivative(
             u: jax.Array, theta: jax.Array, w: jax.Array, *directions: jax.Array
         ) -> jax.Array:
             force = jax.jvp(partial(residual, u), (theta, w), directions)[1]
-            tangent = moved_system(system, w, theta).safe_tangent(u, theta)[0]
+            tangent = system_at_rest(system, w, theta).safe_tangent(u, theta)[0]
             return system.extend(-system.solve(tangent, force))
 
-        @jax.custom_jvp
-        def load(theta: jax.Array, w: jax.Array, start: jax.Array) -> Solution:
-            return closed(theta, w, start)
+        load = jax.custom_jvp(compiled(one_by_one(find)))
 
         @load.defjvp
         def derivative(primals, tangents):  # noqa: ANN001, ANN202
             theta, w, start = primals
             solution = load(theta, w, start)
-            way = moved(solution.displacement, theta, w, *tangents[:2])
-            return solution, inert(solution)._replace(displacement=way)
+            du = directional_derivative(solution.displacement, theta, w, *tangents[:2])
+            return solution, zero_tangents(solution)._replace(displacement=du)
 
         return load
 
     @cached_property
-    def _columns(self) -> Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]:
-        """Derivatives (p, n, 3) of v, from those of w."""
+    def _total_derivatives(
+        self,
+    ) -> Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]:
+        """``(theta, w, u, dw/dtheta) -> dv/dtheta``, derivatives (p, n, 3)."""
         system, residual = self.system, self._residual
 
-        @jit
-        def columns(theta: jax.Array, w: jax.Array, u: jax.Array, ways: jax.Array) -> jax.Array:
-            along = jax.vmap(
+        @compiled
+        def total(theta: jax.Array, w: jax.Array, u: jax.Array, w_slopes: jax.Array) -> jax.Array:
+            forces = jax.vmap(
                 lambda *directions: jax.jvp(partial(residual, u), (theta, w), directions)[1]
-            )
-            forces = along(jnp.eye(len(theta)), ways)
-            tangent = moved_system(system, w, theta).safe_tangent(u, theta)[0]
-            return ways + jax.vmap(system.extend, 1)(-system.solve(tangent, forces.T))
+            )(jnp.eye(len(theta)), w_slopes)
+            tangent = system_at_rest(system, w, theta).safe_tangent(u, theta)[0]
+            return w_slopes + jax.vmap(system.extend, 1)(-system.solve(tangent, forces.T))
 
-        return columns
+        return total

@@ -1,10 +1,10 @@
-r"""What happens at one integration point: a law as a function of strain measures, linearised.
+r"""Stress and moduli at one integration point: a law as a function of strain measures.
 
 .. math:: W(H) = \varphi(\xi(H)), \qquad
     \frac{\partial^2 W}{\partial H^2} = \xi'^T \varphi''\, \xi' + \varphi' \cdot \xi''
 
-with the measures' derivatives in closed form (:mod:`emulator.mechanics.measures`): a quarter of
-the time that differentiating W twice takes, and of its compilation.
+with the measures' derivatives in closed form (:mod:`emulator.mechanics.measures`). That takes a
+quarter of the time of differentiating W twice, and a quarter of the compilation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.energy import point_energy, strain_law
+from emulator.fem.energy import parameters_at, point_energy
 from emulator.mechanics.measures import Measures, measures_read
 from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
@@ -28,7 +28,7 @@ _REFINEMENTS = 3
 def stress_and_moduli(
     scene: Scene, theta: jax.Array
 ) -> Callable[[jax.Array, Tissue], tuple[jax.Array, jax.Array]]:
-    """``dW/dH`` (3, 3) and ``d2W/dH2`` (3, 3, 3, 3) in kPa at a gradient (3, 3) and its tissue."""
+    """Return ``(H, tissue) -> dW/dH (3, 3), d2W/dH2 (3, 3, 3, 3)``, both in kPa."""
     if measures_read(scene.law) is None:
         energy = point_energy(scene, theta)
         return lambda H, at: (jax.grad(energy)(H, at), jax.hessian(energy)(H, at))
@@ -40,15 +40,9 @@ def stress_and_moduli(
     return at_point
 
 
-def _measures(scene: Scene) -> Measures:
-    names = measures_read(scene.law)
-    assert names is not None
-    return Measures(names)
-
-
 @dataclass(frozen=True)
 class MaterialPoint:
-    """What happens at one integration point, at ``theta`` (p,)."""
+    """One integration point of a scene whose law reads nothing but measures, at ``theta`` (p,)."""
 
     scene: Scene
     theta: jax.Array
@@ -56,20 +50,27 @@ class MaterialPoint:
     @cached_property
     def measures(self) -> Measures:
         """The strain measures that the law reads."""
-        return _measures(self.scene)
+        names = measures_read(self.scene.law)
+        assert names is not None
+        return Measures(names)
 
     def energy(self, at: Tissue) -> Callable[[jax.Array], jax.Array]:
-        """Strain energy density in kPa as a function of the measures (k,)."""
-        law = strain_law(self.scene, self.theta)
-        return self.measures.energy(lambda strain: law(strain, at), at.directions)
+        """Return the strain energy density in kPa as a function of the measures (k,)."""
+        law, parameters = self.scene.law, parameters_at(self.scene, self.theta)(at)
+        return self.measures.energy(lambda strain: law.energy(strain, *parameters), at.directions)
 
     def linearise(
         self, H: jax.Array, own: jax.Array, at: Tissue, geometric: jax.Array | float = 1.0
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Stress P (3, 3), tangent (3, 3, 3, 3) and known stress (3, 3) in kPa at a point.
+        """Return stress P (3, 3), moduli (3, 3, 3, 3) and known stress (3, 3) in kPa.
 
-        The known stress is that whose stiffness the tangent has. geometric : fraction of the
-        stresses' change since rest that is known.
+        Parameters
+        ----------
+        H : the displacement gradient, (3, 3).
+        own : the measures (k,) that the point's stresses belong to.
+        at : the tissue.
+        geometric : the fraction of the stresses' change since rest whose geometric stiffness the
+            moduli have: the known stress is that at rest and this fraction of the change.
         """
         phi = self.energy(at)
 
@@ -88,7 +89,11 @@ class MaterialPoint:
         return stress, tangent, jnp.tensordot(known, slope, 1)
 
     def at_stress(self, H: jax.Array, change: jax.Array, own: jax.Array, at: Tissue) -> jax.Array:
-        """Measures (k,) of a point where the law has the stress that its step promises."""
+        """Return the measures (k,) at which the law has the stress that the step predicts.
+
+        H, change : the displacement gradient (3, 3) and its change in the step.
+        own : the measures before it.
+        """
         phi = self.energy(at)
         xi, along = jax.jvp(lambda H: self.measures.of(H, at.directions), (H,), (change,))
         step, blocks = xi + along - own, jnp.asarray(self.measures.blocks)
@@ -97,15 +102,15 @@ class MaterialPoint:
 
 
 def fractions_at_stress(count: int, energy: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    r"""The parts of a step, (count,) in [0, 1], that take a law to the stresses that are promised.
+    r"""Return the fractions (count,) in [0, 1] of a step at which a law has the predicted stresses.
 
-    ``energy`` e is a function of the parts. They have
-    :math:`e_{,i}(\beta) = e_{,i}(0) + \sum_j e_{,ij}(0)`; 1 where the whole step does not stiffen
-    the law, and short of where the energy is not finite. All are sought at the same time, each by
-    its own equation: most laws are sums of functions of one measure each, and there they do not
-    know of each other. Where the law begins without stiffness it promises nothing: a fibre that
-    pulls taut on the way is taken just past that point, for its stiffness to be met there by the
-    next iteration.
+    ``energy`` e is a function of the fractions. They satisfy
+    :math:`e_{,i}(\beta) = e_{,i}(0) + \sum_j e_{,ij}(0)`; they are 1 where the whole step does not
+    stiffen the law, and stop where the energy is no longer finite. Each has its own scalar
+    equation, and all are solved at the same time: most laws are sums of functions of one measure
+    each, whose equations do not interact. A law that begins without stiffness predicts no stress. A
+    fibre that becomes taut on the way is therefore taken just past that point, so that the next
+    iteration has its stiffness.
     """
 
     def slopes(beta: jax.Array) -> jax.Array:
@@ -118,21 +123,21 @@ def fractions_at_stress(count: int, energy: Callable[[jax.Array], jax.Array]) ->
         return jax.jvp(slopes, (beta,), (jnp.ones(count),))
 
     start, stiffness = both(jnp.zeros(count))
-    wanted = start + stiffness
+    predicted = start + stiffness
 
     def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        below = slopes(middle) <= wanted
+        below = slopes(middle) <= predicted
         return jnp.where(below, middle, low), jnp.where(below, high, middle)
 
     low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (jnp.zeros(count), jnp.ones(count)))
 
     def refine(_: int, beta: jax.Array) -> jax.Array:
         value, rise = both(beta)
-        better = beta - (value - wanted) / jnp.where(rise > 0.0, rise, jnp.inf)
+        better = beta - (value - predicted) / jnp.where(rise > 0.0, rise, jnp.inf)
         return jnp.where(jnp.isfinite(better), jnp.clip(better, low, high), beta)
 
     beta = jax.lax.fori_loop(0, _REFINEMENTS, refine, 0.5 * (low + high))
     beta = jnp.where(stiffness > 0.0, beta, high)
-    return jnp.where(slopes(jnp.ones(count)) <= wanted, 1.0, beta)
+    return jnp.where(slopes(jnp.ones(count)) <= predicted, 1.0, beta)

@@ -1,6 +1,12 @@
-"""The FEM simulator: theta to displacement, differentiable through the equilibrium it solves.
+"""The FEM simulator: the displacement as a differentiable function of theta.
 
-Derivatives are those of the equilibrium (:mod:`emulator.fem.implicit`), not of the iterations.
+From the call to the equation, a reader goes through the files in this order:
+:mod:`~emulator.fem.simulator` checks the arguments and compiles the solve
+(:mod:`~emulator.fem.compiled`), :mod:`~emulator.fem.fallbacks` tries strategies one after the
+other, :mod:`~emulator.fem.load_stepping` chooses load factors, :mod:`~emulator.fem.newton` iterates
+at one of them, :mod:`~emulator.fem.assembly` has residual and tangent, and
+:mod:`~emulator.fem.energy` the strain energy of the law. Derivatives are those of the equilibrium
+(:mod:`~emulator.fem.derivatives`), not of the iterations.
 """
 
 from __future__ import annotations
@@ -17,34 +23,35 @@ from emulator.core.errors import InputError, SolverError
 from emulator.core.machine import require_cpu
 from emulator.core.precision import require_float64
 from emulator.core.representation import TableRepr
-from emulator.fem.implicit import (
+from emulator.fem.assembly import System
+from emulator.fem.compiled import scan
+from emulator.fem.derivatives import (
     Equations,
-    Found,
     Quantity,
+    SolutionMap,
     adjoint,
-    derivatives,
     differentiable,
+    sensitivities,
 )
 from emulator.fem.linear import Outcome, find_solver
 from emulator.fem.loaded import LoadedEquilibrium
-from emulator.fem.loop import scan
-from emulator.fem.options import NewtonOptions
+from emulator.fem.newton import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
-from emulator.fem.system import System
 from emulator.scenes.scene import Scene
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulator(TableRepr):
-    """Finite elements for a scene; use it alone, under ``jit``, ``vmap`` or ``grad``.
+    """Simulates a scene by finite elements, alone or under ``jit``, ``vmap`` or ``grad``.
 
     Parameters
     ----------
-    scene : what to simulate.
-    options : controls of Newton's method.
-    factorisation : ``suitesparse``: CHOLMOD where it works and UMFPACK where it does not; or
-        ``petsc`` (an extra): MUMPS, for meshes whose factors do not fit (docs/large_meshes.md).
+    scene : the scene to simulate.
+    options : the controls of Newton's method.
+    factorisation : the linear solver. ``suitesparse`` is CHOLMOD where it works and UMFPACK where
+        it does not; ``petsc`` (an extra) is MUMPS, for meshes whose factors do not fit
+        (docs/large_meshes.md).
 
     Raises
     ------
@@ -60,18 +67,18 @@ class Simulator(TableRepr):
         require_cpu("FEM")
         find_solver(self.factorisation)
         if self.scene.loaded_by:
-            self._loaded.unloader  # noqa: B018 - what cannot be unloaded is named first
+            self._loaded.unloader  # noqa: B018 - raises for scenes that cannot be unloaded
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
-        """What it simulates and how."""
+        """Return the title and the rows of the printed summary."""
         unknowns = int((~self.scene.held).sum())
         _, rows = self.scene.summary_rows()
-        how = [("unknowns", str(unknowns)), ("factorisation", self.factorisation)]
-        return f"Simulator of '{self.scene.name}'", [*rows, *how]
+        solver = [("unknowns", str(unknowns)), ("factorisation", self.factorisation)]
+        return f"Simulator of '{self.scene.name}'", [*rows, *solver]
 
     @cached_property
     def system(self) -> System:
-        """Residual and tangent of the scene."""
+        """The discrete equations of the scene."""
         return System(self.scene, self.factorisation)
 
     @cached_property
@@ -84,7 +91,7 @@ class Simulator(TableRepr):
 
     @property
     def stepwise(self) -> bool:
-        """Whether solves are better taken step by step from Python."""
+        """Whether solves from Python take one compiled step after the other."""
         return not self.scene.loaded_by and self.system.stepwise
 
     @property
@@ -93,24 +100,23 @@ class Simulator(TableRepr):
         return jnp.zeros(self.scene.held.shape)
 
     def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:
-        """Equilibrium at ``theta`` (p,), from ``start`` (n, 3) mm or from rest.
+        """Return the equilibrium at ``theta`` (p,), sought from ``start`` (n, 3) mm or from rest.
 
         A soft body may have several equilibria. The one sought is the end of the loading path from
-        rest, in Python as under ``jit``, ``vmap`` and ``grad``; :mod:`emulator.fem.continuation`
-        has the strategy. An answer from ``start`` is kept if Newton's method came to it at the full
-        load in a few full steps, each down the potential; otherwise ``start`` is left and the body
-        is loaded from rest.
+        rest, in Python as under ``jit``, ``vmap`` and ``grad`` (:mod:`emulator.fem.fallbacks`). The
+        solution from ``start`` is accepted if Newton's method reached it at the full load in a few
+        full steps, each down the potential; otherwise the body is loaded from rest.
 
-        What this cannot exclude: a ``start`` close to another equilibrium leads there in a few
-        good steps, or is one already; a path that jumps where it loses stability may jump
+        This does not exclude every other equilibrium: a ``start`` close to one leads there in a few
+        good steps, or is one already; and a path that jumps where it loses stability may jump
         elsewhere with other load steps. ``NewtonOptions.load_steps`` follows the path in small
         steps, whatever the start.
 
-        Of a scene whose mesh is loaded, the displacement is that from the mesh, and rest the
-        unloaded shape, which is found first (:mod:`emulator.fem.loaded`).
+        If the scene's mesh is its shape under load, the displacement is measured from the mesh, and
+        the stress-free shape is found first (:mod:`emulator.fem.loaded`).
 
-        The displacement is differentiable in ``theta``. Never raises on a hard case: read
-        ``status``. ``vmap`` solves one theta after the other.
+        The displacement is differentiable in ``theta``. A failure is no exception: read ``status``.
+        ``vmap`` solves one theta after the other.
 
         Raises
         ------
@@ -118,18 +124,17 @@ class Simulator(TableRepr):
             ``theta`` or ``start`` has the wrong shape, or float64 is off.
         """
         require_float64("FEM")
+        theta, u = self._checked(theta, self.rest if start is None else start)
         if self.scene.loaded_by:
-            theta, place = self._checked(theta, self.rest if start is None else start)
-            return self._loaded.solve(theta, None if start is None else place)
-        theta, start = self._checked(theta, self.rest if start is None else start)
-        return self._equilibrium(theta, jax.lax.stop_gradient(start))
+            return self._loaded.solve(theta, None if start is None else u)
+        return jax.block_until_ready(self._equilibrium(theta, jax.lax.stop_gradient(u)))
 
     def path(self, thetas: jax.Array) -> Solution:
-        """Equilibria along a path of theta (m, p), such as a loading curve; fields gain an axis m.
+        """Return the equilibria along a path of theta (m, p), such as a loading curve.
 
-        Each is sought from the two before it, continued along their difference, and the first one
-        (and one after a body at rest) from rest: a curve of many points costs a few iterations a
-        point. Differentiable as :meth:`solve` is.
+        Fields of the solution gain an axis m. Each equilibrium is sought from the extrapolation of
+        the two before it, and the first one (and one after a body at rest) from rest: a curve of
+        many points costs a few iterations a point. Differentiable as :meth:`solve` is.
 
         Raises
         ------
@@ -143,24 +148,24 @@ class Simulator(TableRepr):
                 f"(m, {len(self.scene.parameters)})"
             )
 
-        def onwards(
-            before: tuple[jax.Array, jax.Array], theta: jax.Array
+        def next_point(
+            last_two: tuple[jax.Array, jax.Array], theta: jax.Array
         ) -> tuple[tuple[jax.Array, jax.Array], Solution]:
-            u, earlier = before
-            ahead = self.scene.on_supports(2.0 * u - earlier, theta)
-            # At rest there is nothing to continue, and supports that jump alone crush elements.
-            found = self.solve(theta, jnp.where(jnp.any(u != 0.0), ahead, self.rest))
-            return (found.displacement, u), found
+            u, u_before = last_two
+            ahead = self.scene.on_supports(2.0 * u - u_before, theta)
+            # Nothing can be extrapolated at rest, and supports that jump alone invert elements.
+            solution = self.solve(theta, jnp.where(jnp.any(u != 0.0), ahead, self.rest))
+            return (solution.displacement, u), solution
 
-        found: Solution = scan(onwards, (self.rest, self.rest), thetas)[1]
-        return found
+        solutions: Solution = scan(next_point, (self.rest, self.rest), thetas)[1]
+        return solutions
 
     def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Derivatives (p, n, 3) of the equilibrium ``u`` (n, 3) mm in each entry of ``theta`` (p,).
+        """Return the derivatives (p, n, 3) of the equilibrium ``u`` (n, 3) mm in ``theta`` (p,).
 
-        One tangent and one factor serve them all: on a ventricle with five parameters they take a
-        tenth of the time of the solve they follow. For numbers; under ``jit`` differentiate
-        :meth:`solve`. Of a force or a volume alone, :meth:`gradient_of` is cheaper.
+        One tangent and one factor serve all parameters: on a ventricle with five of them they take
+        a tenth of the time of the solve. For numbers; under ``jit`` differentiate :meth:`solve`.
+        For a force or a volume alone, :meth:`gradient_of` is cheaper.
 
         Raises
         ------
@@ -169,48 +174,48 @@ class Simulator(TableRepr):
         """
         theta, u = self._checked(theta, u, "displacement")
         if self.scene.loaded_by:
-            found = self._loaded.sensitivities(u, theta)
+            rows = self._loaded.sensitivities(u, theta)
         else:
-            found = derivatives(self.system, self.tangent(u, theta), u, theta)
-        if not isinstance(found, jax.core.Tracer) and not np.isfinite(found).all():
+            rows = sensitivities(self.system, self.tangent(u, theta), u, theta)
+        if not isinstance(rows, jax.core.Tracer) and not np.isfinite(rows).all():
             raise SolverError(
                 f"scene '{self.scene.name}': the equilibrium has no derivatives: singular tangent"
             )
-        return found
+        return rows
 
     def gradient_of(
         self, quantity: Quantity
     ) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-        """A program that gives a quantity of an equilibrium and its derivatives in theta.
+        """Return a program for the value and the gradient in theta of a quantity of equilibria.
 
         ``quantity(u, theta)`` is a number () of displacements (n, 3) mm and theta (p,), such as
         the force of a support. The program takes an equilibrium (n, 3) mm and its theta (p,), and
-        gives the number and its gradient (p,): one more solve with the tangent, however many
-        parameters there are. Keep it: each call of this method compiles one. For numbers; NaN
-        where the tangent is singular.
+        returns the number and its gradient (p,): one more solve with the tangent, however many
+        parameters there are. Keep the program: each call of this method compiles one. For numbers;
+        NaN where the tangent is singular.
         """
         if not self.scene.loaded_by:
             return adjoint(self.system, quantity)
-        both = jax.jit(jax.value_and_grad(quantity, (0, 1)))
+        partial_gradients = jax.jit(jax.value_and_grad(quantity, (0, 1)))
 
-        def along_theta(u: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
-            value, (by_u, by_theta) = both(u, theta)
+        def value_and_gradient(u: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+            value, (by_u, by_theta) = partial_gradients(u, theta)
             return value, by_theta + jnp.tensordot(self.sensitivities(u, theta), by_u, 2)
 
-        return along_theta
+        return value_and_gradient
 
     def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
-        """Whether the equilibrium ``u`` (n, 3) mm at ``theta`` (p,) is a minimum of the energy.
+        """Return whether the equilibrium ``u`` (n, 3) mm at ``theta`` is a minimum of the energy.
 
         Its tangent is then positive definite. At a saddle, such as a column that stays straight
-        under twice its critical load, forces balance but any disturbance leads away. Of a scene
-        whose mesh is loaded, it is the body loaded from its stress-free shape that is asked. For
-        numbers, not under ``jit``.
+        under twice its critical load, forces balance but any disturbance leads away. If the scene's
+        mesh is loaded, the body is loaded from its stress-free shape. For numbers, not under
+        ``jit``.
 
         Raises
         ------
         InputError
-            A load without a potential: there is no energy to be least.
+            A load has no potential, so that there is no energy to be least.
         """
         theta, u = self._checked(theta, u, "displacement")
         if not all(load.has_potential for load in self.scene.loads):
@@ -220,12 +225,13 @@ class Simulator(TableRepr):
             )
         if self.scene.loaded_by:
             return bool(np.isfinite(u).all()) and self._loaded.is_stable(u, theta)
-        sound = bool(np.isfinite(u).all() and self.system.least_volume_ratio(u) > 0.0)
-        nothing = jnp.zeros(len(self.system.free))
-        return sound and int(self.system.attempt(self.tangent(u, theta), nothing)[1]) == Outcome.OK
+        if not (np.isfinite(u).all() and self.system.least_volume_ratio(u) > 0.0):
+            return False
+        zero = jnp.zeros(len(self.system.free))
+        return int(self.system.attempt(self.tangent(u, theta), zero)[1]) == Outcome.OK
 
     def reactions(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Force (n, 3) in mN of the supports on the body at the equilibrium ``u`` (n, 3) mm.
+        """Return the force (n, 3) in mN of the supports on the body at the equilibrium ``u``.
 
         Springs count as supports; where the body is free the force is zero. Their sum is minus the
         resultant of the loads (:mod:`emulator.fem.reactions`).
@@ -234,22 +240,21 @@ class Simulator(TableRepr):
         return reactions(self._balanced, u, theta)
 
     def reaction(self, name: str, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Resultant (3,) in mN of :meth:`reactions` over the node set or facet set ``name``.
+        """Return the resultant (3,) in mN of :meth:`reactions` over the set ``name``.
 
-        A node that two supports share counts in both.
+        ``name`` is a node set or a facet set. A node that two supports share counts in both.
 
         Raises
         ------
         InputError
-            No such set.
+            The mesh has no set of this name.
         """
         return _resultant(self.reactions(u, theta), nodes_of(self.scene.mesh, name))
 
     def equations(self, u: jax.Array, theta: jax.Array) -> tuple[Equations, ...]:
-        """What the equilibrium ``u`` (n, 3) mm at ``theta`` (p,) solves.
+        """Return the equations whose root is the equilibrium ``u`` (n, 3) mm at ``theta`` (p,).
 
-        One set of equations; of a scene whose mesh is loaded two, of displacements whose sum is
-        ``u``.
+        A scene whose mesh is loaded has two, of displacements whose sum is ``u``; others have one.
         """
         if self.scene.loaded_by:
             return self._loaded.equations(u, theta)
@@ -257,13 +262,13 @@ class Simulator(TableRepr):
         return (Equations(self.system, u, self.tangent(u, theta), residual),)
 
     def tangent(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Nonzeros (nnz,) of the tangent at ``u`` (n, 3) mm and ``theta`` (p,), for the system."""
+        """Return the nonzeros (nnz,) of the tangent at ``u`` (n, 3) mm and ``theta`` (p,)."""
         return self.system.safe_tangent(u, theta, 1.0)[0]
 
     def _checked(
         self, theta: jax.Array, start: jax.Array, what: str = "start"
     ) -> tuple[jax.Array, jax.Array]:
-        """Both in float64. A theta of the wrong length would be read past its end, silently."""
+        """Return both in float64; a short theta would be read past its end without an error."""
         theta, start = jnp.asarray(theta, dtype=float), jnp.asarray(start, dtype=float)
         for name, array, shape in (
             ("theta", theta, (len(self.scene.parameters),)),
@@ -276,7 +281,7 @@ class Simulator(TableRepr):
         return theta, start
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Displacement (n, 3) in mm; :class:`SolverError` when it does not converge.
+        """Return the displacement (n, 3) in mm; :class:`SolverError` when it does not converge.
 
         Inside ``jit`` nothing can be raised; use :meth:`solve` and its status there.
         """
@@ -286,11 +291,11 @@ class Simulator(TableRepr):
         return solution.require_converged().displacement
 
     @cached_property
-    def _equilibrium(self) -> Found:
+    def _equilibrium(self) -> SolutionMap:
         return differentiable(self.system, self.options)
 
 
 @jax.jit
 def _resultant(forces: jax.Array, nodes: jax.Array) -> jax.Array:
-    """Sum (3,) of ``forces`` (n, 3) at ``nodes``."""
+    """Return the sum (3,) of ``forces`` (n, 3) at ``nodes``."""
     return forces[nodes].sum(axis=0)

@@ -1,4 +1,4 @@
-"""Result of a simulation: a displacement, how the solve ended, and its residual."""
+"""The result of a simulation: a displacement, how the solve ended, and its residual."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Status(IntEnum):
 
     @property
     def text(self) -> str:
-        """One line in words."""
+        """The status in words, one line."""
         return _TEXT[self]
 
 
@@ -40,16 +40,17 @@ _TEXT = {
 
 
 class Solution(NamedTuple):
-    """Result of a simulation; every field gains leading axes under ``vmap``.
+    """The result of a simulation; every field gains leading axes under ``vmap``.
 
-    displacement : (n, 3) mm; when not converged, the solution at ``load_reached``.
-    status : a :class:`Status` as an integer.
-    iterations : of Newton's method and of the stress iterates, over all routes and load levels.
-    factorisations : tangents used on the way; the other iterations kept the last one. Each is
+    displacement : the displacement, (n, 3) mm; when not converged, the one at ``load_reached``.
+    status : how the solve ended, a :class:`Status` as an integer.
+    iterations : the iterations of Newton's method and of the stress iterates, over all fallbacks
+        and load levels.
+    factorisations : the tangents assembled; the other iterations kept the last one. Each is
         factorised, except on a large mesh where the factor of another serves
         (:class:`emulator.fem.linear.reuse.KeptFactor`).
-    residual : norm of the residual relative to the internal and external forces.
-    load_reached : largest fraction of the load with a converged solution.
+    residual : the norm of the residual relative to the internal and external forces.
+    load_reached : the largest fraction of the load with a converged solution.
     """
 
     displacement: jax.Array
@@ -65,7 +66,7 @@ class Solution(NamedTuple):
         return self.status == Status.CONVERGED
 
     def require_converged(self, what: str = "simulation") -> Solution:
-        """The solution itself, or :class:`~emulator.core.errors.SolverError` naming the failure."""
+        """Return itself, or raise :class:`~emulator.core.errors.SolverError` naming the failure."""
         status = np.atleast_1d(np.asarray(self.status)).ravel()
         failed = np.flatnonzero(status != Status.CONVERGED)
         if failed.size:

@@ -1,4 +1,4 @@
-"""What Newton's method carries from one iteration to the next."""
+"""The state of Newton's method, from one iteration to the next."""
 
 from __future__ import annotations
 
@@ -9,65 +9,72 @@ import jax.numpy as jnp
 
 from emulator.fem.solution import Solution, Status
 
-# Relative residual below which a step is judged by the residual alone, and stress iterates hand
-# over to Newton's method (docs/experiments.md, "Stresses as iterates").
-NEAR = 0.05
-# Relative residual above which the load stiffness is left out of the tangent
-# (docs/experiments.md, "Fewer factorisations from rest").
-UNBALANCED = 0.5
 
+class RoundOff(NamedTuple):
+    """A residual () in mN and a correction () in mm that together may be round-off.
 
-class Negligible(NamedTuple):
-    """What floating point cannot tell from nothing, together: shape () in mN, and in mm.
-
-    A residual alone may be so small and yet bend a slender body by metres.
+    A residual alone may be as small and still bend a slender body by metres.
     """
 
     residual: jax.Array
     correction: jax.Array
 
 
-class NewtonState(NamedTuple):
-    """What the next iteration needs.
+class LoadHistory(NamedTuple):
+    """The progress along the loading path.
 
-    u : (n, 3) mm, current iterate. iterates : the formulation's own, or None.
-    level : load level being solved. u_reached : (n, 3) mm, solution at ``reached``, the last level
-    that converged. increment : of the load.
-    at_level : iterations spent at this level. iterations, factorisations : all of them.
-    residual : (f,) mN at ``u`` and ``level``, not yet evaluated while at_level is 0.
-    error : the residual relative to the forces at work; inf until the supports are met.
-    negligible : residual in mN, and correction of a node in mm, that may be round-off.
-    tangent : (nnz,) mN/mm, the last one assembled. refresh : whether the next iteration needs a
-    new one.
-    convex : whether every step at this level was a full one, down the potential, with a positive
-    definite tangent.
-    careful : a level whose way is not convex is given up if its next increment would be this or
-    more; inf for never.
-    crushed : whether the last level was given up because elements would invert.
+    u : the displacement (n, 3) in mm at the last converged load factor ``load``.
+    increment : the load increment.
+    largest_indefinite : the largest load increment that is still tried after an indefinite tangent;
+        larger ones end the load level. Infinite: every increment is.
+    iterations : the iterations at this load level.
+    monotone : whether every step at this level was a full one, down the potential, with a positive
+        definite tangent.
+    inversions : the steps at this level that inverting elements shortened.
+    inverted : whether inverting elements ended the last level that was given up.
     singular : whether the last step came of a singular tangent.
-    flattened : steps at this level shortened because elements would invert.
+    """
+
+    u: jax.Array
+    load: jax.Array
+    increment: jax.Array
+    largest_indefinite: jax.Array
+    iterations: jax.Array
+    monotone: jax.Array
+    inversions: jax.Array
+    inverted: jax.Array
+    singular: jax.Array
+
+
+class NewtonState(NamedTuple):
+    """The state that the next iteration needs.
+
+    u : the displacement, (n, 3) mm.
+    auxiliary : the formulation's other unknowns, or None.
+    load : the load factor that is being solved for.
+    residual : the residual (f,) in mN at ``u`` and ``load``; not evaluated before a level's first
+        iteration.
+    relative_residual : its norm relative to the forces; infinite until the prescribed displacements
+        are met.
+    round_off : the residual and correction that may be round-off.
+    tangent : the last tangent, (nnz,) mN/mm.
+    renew : whether the next iteration assembles a new tangent.
+    iterations, factorisations : the total numbers of both.
+    history : the progress along the loading path.
     status : a :class:`Status`.
     """
 
     u: jax.Array
-    iterates: Any
-    level: jax.Array
-    u_reached: jax.Array
-    reached: jax.Array
-    increment: jax.Array
-    at_level: jax.Array
+    auxiliary: Any
+    load: jax.Array
+    residual: jax.Array
+    relative_residual: jax.Array
+    round_off: RoundOff
+    tangent: jax.Array
+    renew: jax.Array
     iterations: jax.Array
     factorisations: jax.Array
-    residual: jax.Array
-    error: jax.Array
-    negligible: Negligible
-    tangent: jax.Array
-    refresh: jax.Array
-    convex: jax.Array
-    careful: jax.Array
-    crushed: jax.Array
-    singular: jax.Array
-    flattened: jax.Array
+    history: LoadHistory
     status: jax.Array
 
     @property
@@ -76,18 +83,18 @@ class NewtonState(NamedTuple):
         return self.status == Status.RUNNING
 
     @property
-    def alone(self) -> bool:
-        """Whether the displacement is all that is iterated."""
-        return not jax.tree.leaves(self.iterates)
+    def displacement_only(self) -> bool:
+        """Whether the displacement is the only unknown."""
+        return not jax.tree.leaves(self.auxiliary)
 
     def solution(self) -> Solution:
-        """The result the iteration ended with."""
+        """Return the result the iteration ended with."""
         converged = self.status == Status.CONVERGED
         return Solution(
-            displacement=jnp.where(converged, self.u, self.u_reached),
+            displacement=jnp.where(converged, self.u, self.history.u),
             status=self.status,
             iterations=self.iterations,
             factorisations=self.factorisations,
-            residual=self.error,
-            load_reached=jnp.where(converged, 1.0, self.reached),
+            residual=self.relative_residual,
+            load_reached=jnp.where(converged, 1.0, self.history.load),
         )

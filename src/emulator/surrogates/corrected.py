@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.fem.assembly import System
 from emulator.fem.energy import volume_ratio
 from emulator.fem.simulator import Simulator
-from emulator.fem.system import System
 from emulator.scenes.nodes import all_nodes, check_nodes
 from emulator.scenes.scene import Scene
 from emulator.surrogates.files import EMULATOR
@@ -81,7 +81,7 @@ class CorrectedForward:
             (theta,), (direction,) = primals, tangents
             u = correct(theta)
             tangent = system.pattern.safe_values(system.tangent(u, theta))
-            _, (force, held) = jax.jvp(system.moved_supports(u), (theta,), (direction,))
+            _, (force, held) = jax.jvp(system.residual_on_supports(u), (theta,), (direction,))
             return u, held + system.extend(-system.solve(tangent, force))
 
         return correct

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
-from emulator.fem.implicit import Equations
+from emulator.fem.derivatives import Equations
 from emulator.fem.simulator import Simulator
 from emulator.fem.unloading import Unloader
 from emulator.scenes.scene import Scene

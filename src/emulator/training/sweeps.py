@@ -37,8 +37,8 @@ from emulator.core.progress import counting
 from emulator.core.store import read_arrays, save_arrays
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
+from emulator.fem.compiled import compiled
 from emulator.fem.energy import potential_energy
-from emulator.fem.loop import jit
 from emulator.scenes.scene import Scene
 from emulator.surrogates.polynomial import (
     Polynomial,
@@ -334,7 +334,7 @@ def runs_of(simulator: Simulator, swept: Swept, thetas: jax.Array) -> Runs:
         u, slopes = at(theta), jax.jacfwd(at)(theta)
         return u, system.potential(u, theta)[0], jnp.moveaxis(slopes, -1, 0)
 
-    displacement, energy, slopes = jit(lambda t: jax.lax.map(each, t))(thetas)
+    displacement, energy, slopes = compiled(lambda t: jax.lax.map(each, t))(thetas)
     return Runs(thetas, displacement, energy, slopes)
 
 

@@ -20,11 +20,11 @@ import numpy as np
 
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once, in_order
-from emulator.fem.halving import ARMIJO, falls_enough, largest_good
+from emulator.fem.line_search import ARMIJO, armijo, backtrack
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
-from emulator.fem.loop import compiled
-from emulator.fem.system import System
+from emulator.fem.compiled import compiled
+from emulator.fem.assembly import System
 
 _GROUP = 8  # theta beside one factor
 _MIDDLES = 3  # of a group, whose tangents are tried
@@ -144,8 +144,8 @@ def _target(
     def sound(fraction: jax.Array) -> jax.Array:
         return system.least_volume_ratio(at(fraction)) > _LEAST_J  # False for NaN
 
-    trial = largest_good(sound, falls_enough(potential, ARMIJO * slope), _LEAST_FRACTION)
-    usable = trial.good & (slope <= 0.0)  # False for NaN
+    trial = backtrack(sound, armijo(potential, ARMIJO * slope), _LEAST_FRACTION)
+    usable = trial.accepted & (slope <= 0.0)  # False for NaN
     fraction = jnp.where(usable, trial.fraction, 0.0)
     moved = jnp.where(usable, v + fraction * step, v)
     left = residual(moved)

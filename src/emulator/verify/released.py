@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 from emulator.core.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign, solve_together
-from emulator.fem.balance import relative_residual
 from emulator.fem.energy import potential_energy
 from emulator.released.files import models_in, units
 from emulator.released.scenes import MODELS, published_scene, published_tests
@@ -96,7 +95,7 @@ def _verify_model(root: str | Path, model: str, most: int | None) -> list[Benchm
     add("relative displacement error", error, DISPLACEMENT_TOLERANCE)
     energy = jax.jit(jax.vmap(potential_energy(scene)))(solution.displacement, thetas)
     add("relative energy error", jnp.abs(energy / energies - 1.0), ENERGY_TOLERANCE)
-    balance = jax.jit(jax.vmap(lambda u, theta: relative_residual(simulator.system, u, theta)))
+    balance = jax.jit(jax.vmap(simulator.system.relative_residual))
     left = balance(reference, thetas)
     add("force out of balance in the stored fields", left, BALANCE_TOLERANCE)
     return rows

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from emulator.accuracy.step import gradients_distance, newton_distance, sound_state
+from emulator.fem.assembly import System
 from emulator.fem.energy import volume_ratio
-from emulator.fem.system import System
 
 
 @pytest.fixture(scope="module")

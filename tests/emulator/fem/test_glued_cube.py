@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.support_force import SupportForce
+from emulator.fem.reactions import SupportForce
 from emulator.geometry.generators.box import box, toward_ends
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support

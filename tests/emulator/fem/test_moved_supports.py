@@ -10,7 +10,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
-from emulator.fem.support_force import SupportForce
+from emulator.fem.reactions import SupportForce
 from emulator.geometry.generators.box import box
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law

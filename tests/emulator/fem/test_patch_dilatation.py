@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 import emulator as em
 from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
+from emulator.fem.assembly import System
 from emulator.fem.energy import (
     at_points,
     displacement_gradient,
@@ -23,7 +24,6 @@ from emulator.fem.fields import element_fields
 from emulator.fem.formulations import formulation_of
 from emulator.fem.formulations.mean_dilatation import MeanDilatation
 from emulator.fem.formulations.stress_iterates import applies
-from emulator.fem.system import System
 from emulator.geometry.generators.box import box
 from emulator.geometry.io import write_mesh
 from emulator.geometry.patches import patches

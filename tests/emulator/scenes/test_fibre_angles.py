@@ -13,7 +13,7 @@ from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
 from emulator.fem.energy import potential_energy
 from emulator.fem.fields import element_fields
-from emulator.fem.inverse import InverseSystem
+from emulator.fem.inverse_motion import InverseSystem
 from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support

@@ -7,10 +7,10 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
+from emulator.fem.assembly import System
 from emulator.fem.condensation import consistent, linearise
 from emulator.fem.energy import strain_energy
 from emulator.fem.fields import element_fields
-from emulator.fem.system import System
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter
 from emulator.scenes.loads import Gravity

@@ -21,7 +21,6 @@ import numpy as np
 
 from emulator.core.errors import SolverError
 from emulator.core.machine import cores, inherited, memory
-from emulator.fem.balance import relative_residual
 from emulator.fem.energy import potential_energy, volume_ratio
 from emulator.fem.linear.suitesparse import FACTORS
 from emulator.fem.simulator import Simulator
@@ -140,7 +139,7 @@ class Solver:
         @jax.jit
         def choose(starts: jax.Array, theta: jax.Array) -> jax.Array:
             def residual(u: jax.Array) -> jax.Array:
-                error = relative_residual(simulator.system, u, theta)
+                error = simulator.system.relative_residual(u, theta)
                 valid = jnp.isfinite(error) & (jnp.min(volume_ratio(simulator.scene, u)) > 0.0)
                 return jnp.where(valid, error, jnp.inf)
 

@@ -1,15 +1,14 @@
-"""Formulations: how a scene's equations are linearised, and what is iterated on.
+"""Formulations: the unknowns of Newton's method and the linearisation of a scene's equations.
 
-At equilibrium it is one of :data:`FORMULATIONS`; on the way there, :mod:`.stress_iterates`.
+Near equilibrium it is one of :data:`FORMULATIONS`; far from it, :mod:`.stress_iterates`.
 """
 
+from emulator.fem.assembly import System
 from emulator.fem.formulations.displacement import Displacement
-from emulator.fem.formulations.inverse import Inverse
-from emulator.fem.formulations.mean_dilatation import MeanDilatation
+from emulator.fem.formulations.mean_dilatation import Inverse, MeanDilatation
 from emulator.fem.formulations.protocol import Formulation, Linearised
-from emulator.fem.system import System
 
-FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation] | type[Inverse]] = {
+FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation]] = {
     "inverse motion": Inverse,
     "mean dilatation": MeanDilatation,
     "displacement alone": Displacement,
@@ -18,7 +17,7 @@ FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation] | type[Inverse
 
 
 def formulation_of(system: System) -> Formulation:
-    """How Newton's method solves the equations of ``system``."""
+    """Return the formulation by which Newton's method solves the equations of ``system``."""
     serving = (each for each in FORMULATIONS.values() if each.serves(system))
     return next(serving)(system)
 

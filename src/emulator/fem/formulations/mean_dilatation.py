@@ -1,8 +1,10 @@
-r"""Newton's method for mean dilatation, with each block's volume and pressure as iterates.
+r"""Newton's method for saddle points: mean dilatation, and inverse motion.
 
-They are eliminated block by block (:mod:`emulator.fem.condensation`).
+With mean dilatation, each block's volume ratio and pressure are unknowns beside the displacement;
+they are eliminated block by block (:mod:`emulator.fem.condensation`). In inverse motion
+(:mod:`emulator.fem.inverse_motion`) the tangent is not symmetric, with or without such blocks.
 
-The solution is a saddle point, so no energy can judge a step, and the residual is dominated by the
+The solution is then no minimum, so no energy can judge a step, and the residual is dominated by the
 stiff volumes. Deuflhard's natural monotonicity test does: the simplified Newton step (with the old
 tangent) after a fraction of the step must be shorter than the step,
 
@@ -20,94 +22,118 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.condensation import (
-    Condensed,
-    Volumes,
-    advance,
-    carried,
-    consistent,
-    linearise,
-)
-from emulator.fem.formulations.protocol import Linearised, Nearer
-from emulator.fem.loop import compiled
+from emulator.fem import condensation, inverse_motion
+from emulator.fem.assembly import System
+from emulator.fem.compiled import compiled
+from emulator.fem.condensation import Volumes
+from emulator.fem.formulations.displacement import renewed_or_kept
+from emulator.fem.formulations.protocol import Linearised, MonotonicityTest
 from emulator.fem.state import NewtonState
-from emulator.fem.system import System
 
 
 @dataclass(frozen=True, eq=False)
 class MeanDilatation:
-    """Volumes and pressures of the blocks are iterates, too: see :class:`Formulation`."""
+    """The formulation with volume ratios and pressures (:class:`.protocol.Formulation`)."""
 
     system: System
 
+    blocks: ClassVar[Any] = condensation
+    """The module that linearises the blocks and eliminates their unknowns."""
+
     @staticmethod
     def serves(system: System) -> bool:
-        """A scene whose elements, or patches of them, share a volume ratio."""
+        """Return whether elements, or patches of them, share a volume ratio."""
         return system.scene.dilatation != "pointwise"
 
     @property
-    def programs(self) -> dict[Callable, Callable]:
-        """Compiled functions, of the system's."""
+    def programs(self) -> dict[Any, Callable[..., Any]]:
+        """The compiled functions, which the system keeps."""
         return self.system.programs
 
     @compiled
-    def begin(self, u: jax.Array, theta: jax.Array) -> Volumes:
-        """Volumes and pressures that follow from the displacement ``u`` (n, 3)."""
-        return consistent(self.system.scene, u, theta)
+    def begin(self, u: jax.Array, theta: jax.Array) -> Any:
+        """Return the volumes and pressures that follow from the displacement ``u`` (n, 3) mm."""
+        return self.blocks.consistent(self.system.scene, u, theta)
 
     def linearise(self, state: NewtonState, theta: jax.Array) -> Linearised:
-        """The equations at ``state``, volumes eliminated."""
-        return self._linearise(state.u, state.iterates, theta, state.level)
+        """Return the equations at ``state``, volumes and pressures eliminated."""
+        return self._linearise(state.u, state.auxiliary, theta, state.load)
 
     @compiled
     def _linearise(
-        self, u: jax.Array, volumes: Volumes, theta: jax.Array, level: jax.Array
+        self, u: jax.Array, volumes: Any, theta: jax.Array, load: jax.Array
     ) -> Linearised:
         system = self.system
-        condensed = linearise(system.scene, u, volumes, theta)
-        residual = system.scatter(condensed.force) + system.others(u, theta, level)
-        tangent, solvable, pull = system.equations(condensed.tangent, u, theta, level, level)
-        return Linearised(tangent, solvable, system.restrict(residual), pull, condensed)
+        condensed = self.blocks.linearise(system.scene, u, volumes, theta)
+        residual = system.scatter(condensed.force) + system.springs_less_loads(u, theta, load)
+        tangent, solvable, offset_force = system.equations(condensed.tangent, u, theta, load, load)
+        residual = system.restrict(residual)
+        return Linearised(tangent, solvable, residual, offset_force, condensed.couplings)
 
-    def nearer(
-        self, state: NewtonState, theta: jax.Array, equations: Linearised, move: jax.Array
-    ) -> Nearer:
-        """Whether a fraction of the step passes the test of natural monotonicity."""
-        return partial(self._nearer, state.u, state.iterates, state.level, theta, equations, move)
+    def monotonicity_test(
+        self, state: NewtonState, theta: jax.Array, equations: Linearised, step: jax.Array
+    ) -> MonotonicityTest:
+        """Return the test of natural monotonicity of fractions of ``step`` (n, 3) mm."""
+        return partial(self._test, state.u, state.auxiliary, state.load, theta, equations, step)
 
     @compiled
-    def _nearer(
+    def _test(
         self,
         u: jax.Array,
-        volumes: Volumes,
-        level: jax.Array,
+        volumes: Any,
+        load: jax.Array,
         theta: jax.Array,
         equations: Linearised,
-        move: jax.Array,
+        step: jax.Array,
         fraction: jax.Array,
     ) -> jax.Array:
-        system, at = self.system, equations.eliminated
-        after = advance(system.scene, volumes, at, move, fraction)
-        there = u + fraction * move
-        force = system.scatter(carried(system.scene, there, after, theta, at))
-        force = system.restrict(force + system.others(there, theta, level))
-        rest = 1.0 - fraction
-        left = system.extend(system.solve(equations.tangent, -(force + rest * equations.pull)))
-        left = left + rest * jnp.where(system.scene.held, move, 0.0)
-        kept_open = jnp.min(after.change) > -1.0
-        return kept_open & (_size(left) <= (1.0 - 0.25 * fraction) * _size(move))
+        system, couplings = self.system, equations.couplings
+        after = self.blocks.advance(system.scene, volumes, couplings, step, fraction)
+        v = u + fraction * step
+        force = system.scatter(
+            self.blocks.eliminated_force(system.scene, v, after, theta, couplings)
+        )
+        force = system.restrict(force + system.springs_less_loads(v, theta, load))
+        remainder = 1.0 - fraction
+        rhs = -(force + remainder * equations.offset_force)
+        simplified = system.extend(system.solve(equations.tangent, rhs))
+        simplified = simplified + remainder * jnp.where(system.scene.held, step, 0.0)
+        valid = jnp.array(True)
+        if isinstance(after, Volumes):
+            valid = jnp.min(after.change) > -1.0
+        return valid & (_norm(simplified) <= (1.0 - 0.25 * fraction) * _norm(step))
 
     @compiled
-    def advance(
-        self, iterates: Volumes, eliminated: Condensed, move: jax.Array, fraction: jax.Array
-    ) -> Volumes:
-        """Volumes and pressures after ``fraction`` of the step by ``move`` (n, 3) mm."""
-        return advance(self.system.scene, iterates, eliminated, move, fraction)
+    def advance(self, auxiliary: Any, couplings: Any, step: jax.Array, fraction: jax.Array) -> Any:
+        """Return volumes and pressures after ``fraction`` of the full ``step`` (n, 3) mm."""
+        return self.blocks.advance(self.system.scene, auxiliary, couplings, step, fraction)
 
 
-def _size(field: jax.Array) -> jax.Array:
+class Inverse(MeanDilatation):
+    """The formulation of inverse motion, from the loaded shape to the stress-free one.
+
+    Without blocks that share a volume ratio its auxiliary unknowns are empty, and tangents are kept
+    as in :class:`.displacement.Displacement`.
+    """
+
+    blocks: ClassVar[Any] = inverse_motion
+
+    @staticmethod
+    def serves(system: System) -> bool:
+        """Return whether the equations are those of inverse motion."""
+        return system.inverse
+
+    def linearise(self, state: NewtonState, theta: jax.Array) -> Linearised:
+        """Return the equations at ``state``, or with the tangent it keeps."""
+        if state.displacement_only:
+            return renewed_or_kept(self.system, state, theta, state.load)
+        return super().linearise(state, theta)
+
+
+def _norm(field: jax.Array) -> jax.Array:
     return jnp.sqrt(jnp.sum(field**2))

@@ -1,4 +1,4 @@
-"""What a formulation does: the equations of a step, what judges it, what it changes."""
+"""The interface of a formulation: the equations of a step, its test, its other unknowns."""
 
 from __future__ import annotations
 
@@ -7,55 +7,58 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
+from emulator.fem.assembly import System
 from emulator.fem.state import NewtonState
-from emulator.fem.system import System
 
 
 class Linearised(NamedTuple):
-    """The equations of a step.
+    """The linear equations of a step.
 
-    tangent : (nnz,) mN/mm. solvable : whether it can be factorised. residual : (f,) mN.
-    pull : (f,) mN, the change of the residual as the supports are moved.
-    eliminated : what :meth:`Formulation.advance` needs to know, or None.
+    tangent : the nonzeros (nnz,) of the tangent, mN/mm.
+    solvable : whether it can be factorised.
+    residual : the residual, (f,) mN.
+    offset_force : the change of the residual as the prescribed displacements go to their values,
+        (f,) mN.
+    couplings : what :meth:`Formulation.advance` needs to update the other unknowns, or None.
     """
 
     tangent: jax.Array
     solvable: jax.Array
     residual: jax.Array
-    pull: jax.Array
-    eliminated: Any
+    offset_force: jax.Array
+    couplings: Any
 
 
-Nearer = Callable[[jax.Array], jax.Array]
-"""Of a fraction of a step: whether it leads nearer to the saddle, shape ()."""
+MonotonicityTest = Callable[[jax.Array], jax.Array]
+"""Whether a fraction of a step leads towards the saddle point, ()."""
 
 
 class Formulation(Protocol):
-    """How Newton's method solves for the displacement, and what else it iterates on.
+    """How Newton's method solves for the displacement and for its other unknowns.
 
-    ``iterates`` are a tree of arrays besides the displacement, or None. With them, were the tree
-    empty, the point sought is no minimum, and :meth:`nearer` judges a step; without, the potential
+    The *auxiliary* unknowns are a tree of arrays, or None. With a tree, even an empty one, the
+    solution is no minimum, and :meth:`monotonicity_test` judges a step; without, the potential
     energy does.
     """
 
     @staticmethod
     def serves(system: System) -> bool:
-        """Whether it can solve the equations of ``system``."""
+        """Return whether the formulation can solve the equations of ``system``."""
 
     @property
     def system(self) -> System:
         """The equations of the scene."""
 
     def begin(self, u: jax.Array, theta: jax.Array) -> Any:
-        """The iterates that belong to the displacement ``u`` (n, 3) mm."""
+        """Return the auxiliary unknowns that follow from the displacement ``u`` (n, 3) mm."""
 
     def linearise(self, state: NewtonState, theta: jax.Array) -> Linearised:
-        """The equations at ``state``."""
+        """Return the equations at ``state``."""
 
-    def nearer(
-        self, state: NewtonState, theta: jax.Array, equations: Linearised, move: jax.Array
-    ) -> Nearer | None:
-        """What judges the step ``move`` (n, 3); None without iterates."""
+    def monotonicity_test(
+        self, state: NewtonState, theta: jax.Array, equations: Linearised, step: jax.Array
+    ) -> MonotonicityTest | None:
+        """Return the test of fractions of ``step`` (n, 3) mm; None where the potential judges."""
 
-    def advance(self, iterates: Any, eliminated: Any, move: jax.Array, fraction: jax.Array) -> Any:
-        """``iterates`` after ``fraction`` of a step by ``move`` (n, 3) mm."""
+    def advance(self, auxiliary: Any, couplings: Any, step: jax.Array, fraction: jax.Array) -> Any:
+        """Return ``auxiliary`` after ``fraction`` of the full ``step`` (n, 3) mm."""

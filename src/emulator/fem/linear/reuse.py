@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.solve import Direct, Outcome
 from emulator.fem.linear.suitesparse import FACTORS
-from emulator.fem.loop import jit, while_loop
+from emulator.fem.compiled import compiled, while_loop
 
 TOLERANCE = 1e-10  # of the residual, in the norm of the inverse of the factorised tangent
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
@@ -115,8 +115,8 @@ class KeptFactor:
         self._factorised: jax.Array | None = None  # the tangent whose factor is kept
         affordable = int(_ITERATIONS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
         self._iterations = max(_PATIENCE, affordable)
-        program = (lambda function: function) if direct.on_host else jit
-        self._product = jit(pattern.product)
+        program = (lambda function: function) if direct.on_host else compiled
+        self._product = compiled(pattern.product)
         self._solve = program(partial(direct.solve, pattern, definite=True))
         self._solve_beside = program(self._conjugate_gradients)
         self.factorisations = 0

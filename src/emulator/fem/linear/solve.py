@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.loop import cond, one_by_one
+from emulator.fem.compiled import cond, one_by_one
 
 
 class Outcome(IntEnum):

@@ -104,7 +104,7 @@ class Load(ABC):
         """Its force on the body whose *loaded* shape is the mesh, of w from there to rest.
 
         What is given per volume or area at rest depends on w; what follows the surface does not.
-        Its local displacements are those of w (:mod:`emulator.fem.inverse`). fibres : of the
+        Its local displacements are those of w (:mod:`emulator.fem.inverse_motion`). fibres : of the
         loaded tissue, None in a scene without.
 
         Raises

@@ -9,6 +9,7 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
+from emulator.fem.assembly import System
 from emulator.fem.energy import (
     displacement_gradient,
     local_terms,
@@ -16,9 +17,8 @@ from emulator.fem.energy import (
     strain_energy,
 )
 from emulator.fem.fields import element_fields
-from emulator.fem.options import NewtonOptions
-from emulator.fem.support_force import SupportForce
-from emulator.fem.system import System
+from emulator.fem.newton import NewtonOptions
+from emulator.fem.reactions import SupportForce
 from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.continuation import find_equilibrium
-from emulator.fem.halving import largest_sound
+from emulator.fem.fallbacks import find_equilibrium
+from emulator.fem.line_search import largest_admissible
 
 
 def conditions(jaxpr):
@@ -36,8 +36,8 @@ def test_conditions_of_loops_read_flags_only(name, request):
 
 
 @pytest.mark.parametrize(("limit", "expected"), [(2.0, 1.0), (0.6, 0.5), (0.1, 0.0625), (0.0, 0.0)])
-def test_the_largest_sound_fraction(limit, expected):
-    find = lambda limit: largest_sound(lambda fraction: fraction <= limit, 2.0**-4)
+def test_the_largest_admissible_fraction(limit, expected):
+    find = lambda limit: largest_admissible(lambda fraction: fraction <= limit, 2.0**-4)
     assert find(limit) == expected
     together = jax.jit(jax.vmap(find))(jnp.array([limit, 0.3]))
     np.testing.assert_array_equal(together, [expected, 0.25])

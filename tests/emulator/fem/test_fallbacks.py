@@ -1,4 +1,4 @@
-"""One equilibrium for every route: Python, jit, vmap, cold and warm."""
+"""One equilibrium for every strategy: Python, jit, vmap, cold and warm."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem.continuation import LoadingPath, Route
+from emulator.fem.fallbacks import EquilibriumSearch
 from emulator.scenes import Support
 from emulator.scenes.loads import Gravity
 from scene_support import block
@@ -64,25 +64,25 @@ def test_the_soft_corner_of_the_linear_ventricle():
             np.testing.assert_allclose(solve(theta).displacement, expected, atol=1e-4)
 
 
-def routes(simulator, theta, start):
-    """The routes that the steps of the search take, by name."""
-    path = LoadingPath(simulator.system, simulator.options, theta)
-    step = jax.jit(path.step)
-    state, seen = path.begin(start), []
+def strategies(simulator, theta, start):
+    """The strategies that the steps of the search belong to, and how they iterate."""
+    search = EquilibriumSearch(simulator.system, simulator.options, theta)
+    step = jax.jit(search.step)
+    state, seen = search.begin(start), []
     while bool(state.running):
-        if not bool(state.entering):
-            seen.append((int(state.route), "ramp" if bool(state.ramping) else "newton"))
+        if not bool(state.begins):
+            seen.append((int(state.strategy), "stress" if bool(state.by_stress) else "newton"))
         state = step(state)
     return list(dict.fromkeys(seen)), state
 
 
 @pytest.mark.slow
-def test_from_rest_up_a_ramp_then_newton(ventricle_simulator, inside_jit):
+def test_from_rest_by_stress_iterates_then_newton(ventricle_simulator, inside_jit):
     theta = ventricle_simulator.scene.centre
-    seen, state = routes(ventricle_simulator, theta, ventricle_simulator.rest)
-    assert seen == [(Route.RAMP, "ramp"), (Route.RAMP, "newton")]
+    seen, state = strategies(ventricle_simulator, theta, ventricle_simulator.rest)
+    assert seen == [(1, "stress"), (1, "newton")]
     inside = inside_jit(theta)
-    assert inside.iterations == state.newton.iterations + state.ramped
+    assert inside.iterations == state.newton.iterations + state.stress_steps
     np.testing.assert_allclose(inside.displacement, state.newton.u, atol=1e-10)
 
 
@@ -102,8 +102,8 @@ def test_a_warm_start_whose_way_is_not_convex_is_left_for_rest(ventricle_simulat
     theta = scene.centre
     expected = ventricle_simulator(theta)
     start = -0.5 * expected  # a ventricle sucked empty
-    seen, _ = routes(ventricle_simulator, theta, start)
-    assert seen[-1][0] != Route.WARM
+    seen, _ = strategies(ventricle_simulator, theta, start)
+    assert seen[-1][0] != 0
     for solve in (ventricle_simulator.solve, inside_jit):
         np.testing.assert_allclose(solve(theta, start).displacement, expected, atol=1e-8)
 
@@ -128,14 +128,14 @@ def test_a_rough_start_takes_fewer_steps_than_rest(ventricle_simulator, inside_j
 def test_a_good_warm_start_is_kept(ventricle_simulator):
     scene = ventricle_simulator.scene
     theta = scene.centre
-    seen, _ = routes(ventricle_simulator, theta, ventricle_simulator(1.01 * theta))
-    assert [route for route, _ in seen] == [Route.WARM]
+    seen, _ = strategies(ventricle_simulator, theta, ventricle_simulator(1.01 * theta))
+    assert [strategy for strategy, _ in seen] == [0]
 
 
-def test_a_scene_without_ramps_goes_from_warm_to_rest(beam, simulator):
+def test_a_scene_without_stress_iterates_goes_from_the_start_to_rest(beam, simulator):
     theta = beam.centre
-    seen, state = routes(simulator, theta, -simulator(theta))
-    assert {route for route, _ in seen} <= {Route.WARM, Route.CLIMB}
+    seen, state = strategies(simulator, theta, -simulator(theta))
+    assert {strategy for strategy, _ in seen} <= {0, 1}
     np.testing.assert_allclose(state.newton.u, simulator(theta), atol=1e-8)
 
 

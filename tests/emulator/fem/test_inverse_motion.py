@@ -9,10 +9,9 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
-from emulator.fem.inverse import InverseSystem
-from emulator.fem.loaded_point import carried_back, from_rest
-from emulator.fem.moved import at_rest, moved_system
-from emulator.fem.system import System
+from emulator.fem.assembly import System
+from emulator.fem.inverse_motion import InverseSystem, carried_back, from_rest
+from emulator.fem.unloading import scene_at_rest, system_at_rest
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.refinement import to_quadratic
 from emulator.mechanics.laws import find_law
@@ -87,7 +86,7 @@ def both_residuals(scene):
     """Of inverse motion, and of the scene on the stress-free mesh; with their size."""
     w, theta = some_way(scene), scene.centre
     inverse = jax.jit(InverseSystem(scene).residual)(w, theta)
-    ordinary = System(at_rest(scene, w))
+    ordinary = System(scene_at_rest(scene, w))
     return inverse, jax.jit(ordinary.residual)(-w, theta)
 
 
@@ -166,9 +165,9 @@ def test_a_system_on_a_traced_mesh_is_that_of_the_mesh(load):
     scene = loaded_block(load, supports=(em.Support("left"), SLIDING))
     w, u = some_way(scene), some_way(scene, seed=1)
     there = jax.jit(
-        lambda w, u: moved_system(System(scene), w, scene.centre).residual(u, scene.centre)
+        lambda w, u: system_at_rest(System(scene), w, scene.centre).residual(u, scene.centre)
     )
-    expected = System(at_rest(scene, w)).residual(u, scene.centre)
+    expected = System(scene_at_rest(scene, w)).residual(u, scene.centre)
     np.testing.assert_allclose(there(w, u), expected, atol=1e-12)
 
 

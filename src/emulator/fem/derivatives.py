@@ -1,0 +1,137 @@
+r"""Solutions of the discrete equations as differentiable functions of theta.
+
+Where :math:`r(u(\theta), \theta) = 0`,
+
+.. math::
+    K\, \frac{\partial u}{\partial \theta} = -\frac{\partial r}{\partial \theta}
+
+at the free degrees of freedom, the right-hand side with the reactions to the prescribed
+displacements that theta moves. Forward derivatives are one more solve with the tangent, and reverse
+ones a solve with its transpose: for a quantity :math:`q(u(\theta), \theta)`
+
+.. math::
+    \frac{dq}{d\theta} = \frac{\partial q}{\partial \theta}
+        - \lambda^T \frac{\partial r}{\partial \theta}, \qquad
+    K^T \lambda = \frac{\partial q}{\partial u}
+
+whatever the number of parameters (:func:`adjoint`). A displacement may be a sum of several, each
+the root of equations that depend on the displacements before it (:class:`Equations`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from emulator.fem.assembly import System
+from emulator.fem.compiled import compiled, is_traced, one_by_one
+from emulator.fem.fallbacks import find_equilibrium
+from emulator.fem.newton import NewtonOptions
+from emulator.fem.solution import Solution
+
+RootFinder = Callable[[System, NewtonOptions, jax.Array, jax.Array], Solution]
+"""The solution of a system's equations, from its options, theta (p,) and a start (n, 3) mm."""
+SolutionMap = Callable[[jax.Array, jax.Array], Solution]
+"""The solution at theta (p,), sought from a start (n, 3) mm."""
+Quantity = Callable[[jax.Array, jax.Array], jax.Array]
+"""A number () of an equilibrium (n, 3) mm and theta (p,)."""
+
+
+class Equations(NamedTuple):
+    """The equations of one displacement at one theta, and their root.
+
+    system : the system whose free degrees of freedom and linear solver the equations have.
+    u : the root, (n, 3) mm.
+    tangent : the nonzeros (nnz,) of the tangent at ``u``, mN/mm.
+    residual : the residual (f,) in mN, a function of theta (p,), of the displacements before this
+        one, and of this one.
+    """
+
+    system: System
+    u: jax.Array
+    tangent: jax.Array
+    residual: Callable[..., jax.Array]
+
+
+def differentiable(
+    system: System, options: NewtonOptions, find: RootFinder = find_equilibrium
+) -> SolutionMap:
+    """Return ``(theta, start) -> Solution``, whose displacement has derivatives in theta.
+
+    The function works in Python and under ``jit``, ``vmap`` (one theta after the other) and
+    ``grad``.
+
+    Parameters
+    ----------
+    system : the equations.
+    options : the controls of Newton's method.
+    find : the function that finds their root.
+    """
+    by_steps = partial(find, system, options)
+    whole = compiled(one_by_one(by_steps))
+
+    def stepwise(theta: jax.Array, start: jax.Array) -> Solution:
+        return (whole if is_traced(theta, start) else by_steps)(theta, start)
+
+    solution_at = jax.custom_jvp(stepwise if system.stepwise else whole)
+
+    @solution_at.defjvp
+    def derivative(primals, tangents):  # noqa: ANN001, ANN202
+        theta, start = primals
+        solution = solution_at(theta, start)
+        u = solution.displacement
+        tangent = system.safe_tangent(u, theta, 1.0)[0]
+        du = _directional_derivative(system, tangent, u, theta, tangents[0])
+        return solution, zero_tangents(solution)._replace(displacement=du)
+
+    return solution_at
+
+
+@compiled
+def _directional_derivative(
+    system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
+) -> jax.Array:
+    """Return the derivative (n, 3) of the equilibrium ``u`` along ``direction`` (p,) in theta."""
+    _, (force, prescribed) = jax.jvp(system.residual_on_supports(u), (theta,), (direction,))
+    return prescribed + system.extend(-system.solve(tangent, force))
+
+
+@compiled
+def sensitivities(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array) -> jax.Array:
+    """Return the derivatives (p, n, 3) of the equilibrium ``u`` in each entry of theta."""
+    forces, prescribed = jax.jacfwd(system.residual_on_supports(u))(theta)
+    free = jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
+    return free + jnp.moveaxis(prescribed, -1, 0)
+
+
+def adjoint(
+    system: System, quantity: Quantity
+) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    """Return a program ``(u, theta) -> (value, gradient (p,))`` of ``quantity`` at equilibria."""
+
+    @compiled
+    def value_and_gradient(u: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value, (by_u, by_theta) = jax.value_and_grad(quantity, (0, 1))(u, theta)
+        tangent = system.safe_tangent(u, theta, 1.0)[0]
+        slope = system.restrict(by_u)
+        (multiplier,) = jax.linear_transpose(partial(system.solve, tangent), slope)(slope)
+        pull_back = jax.vjp(system.residual_on_supports(u), theta)[1]
+        return value, by_theta + pull_back((-multiplier, by_u))[0]
+
+    return value_and_gradient
+
+
+def zero_tangents(solution: Solution) -> Solution:
+    """Return the zero tangents of a solution: float0 for its integers."""
+    return jax.tree.map(
+        lambda x: (
+            jnp.zeros_like(x)
+            if jnp.issubdtype(x.dtype, jnp.floating)
+            else jnp.zeros(x.shape, dtype=jax.dtypes.float0)
+        ),
+        solution,
+    )

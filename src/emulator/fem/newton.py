@@ -1,0 +1,369 @@
+r"""One iteration of Newton's method at a fixed load factor: direction, then step length.
+
+.. math::
+    K\, \Delta u = -\left[r_s(u) + K\, \Delta \bar u\right], \qquad
+    \Delta \bar u = s \bar u - u|_\text{prescribed}
+
+at load factor s, where the loads are :math:`s f` and the prescribed displacements :math:`s \bar u`.
+Where the tangent is indefinite and the direction raises the potential, the opposite one is taken.
+The step is taken whole where the residual alone shows that it is good, and otherwise by a line
+search on the potential energy (:mod:`emulator.fem.line_search`). An accepted fraction is halved
+again while that lowers the potential further: a soft start overshoots, and from there the tangent
+is indefinite and the way back long. Loads without a potential keep their present force while a step
+is judged.
+
+Two measures save factorisations, which are most of the cost. The tangent of the last iteration is
+kept while a step with it cuts the residual at least tenfold. And while the loads are hardly
+balanced, as at rest, their stiffness is left out of the tangent.
+
+The unknowns besides the displacement, and the linearisation, are the formulation's
+(:mod:`emulator.fem.formulations`). Load factors are chosen in :mod:`emulator.fem.load_stepping`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from emulator.core.errors import InputError
+from emulator.fem.assembly import System
+from emulator.fem.compiled import compiled, cond, while_loop
+from emulator.fem.formulations import Linearised, formulation_of
+from emulator.fem.line_search import ARMIJO, Progress, armijo, backtrack
+from emulator.fem.linear import Outcome
+from emulator.fem.state import NewtonState
+
+# Relative residual below which the residual alone judges a step, and Newton's method takes over
+# from the stress iterates (docs/experiments.md, "Stresses as iterates").
+NEAR = 0.05
+_LEAST_FRACTION = 2.0**-19
+# A step that fails the monotonicity test fails early: a lower load is cheaper than many short steps
+# (docs/experiments.md, "Mean dilatation from far away").
+_LEAST_MONOTONE = 2.0**-6
+# Least fraction that is halved because the potential falls further; below, the search has found a
+# valley (docs/experiments.md, "Fewer factorisations from rest").
+_SMALLEST_HALVED = 0.02
+_SINGULAR = 1e13  # a step this much longer than force over stiffness comes of a singular tangent
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """Options of the solver.
+
+    tolerance : the largest norm of the residual relative to the internal and external forces,
+        reactions included (docs/experiments.md, "The stopping rule of the released solutions").
+    round_off : the relative residual that is accepted where Newton's method no longer reduces it.
+    absolute : the residual in mN that is accepted whatever the forces; round-off of the forces at
+        rest always is.
+    max_iterations : the most Newton iterations over all fallbacks and load levels; stress iterates
+        have limits of their own (:mod:`emulator.fem.fallbacks`).
+    level_iterations : the iterations after which a load level is given up and its increment halved.
+    increment : the first and largest load increment, as a fraction of the load. Small increments
+        follow the loading path from rest, for bodies with several equilibria (docs/experiments.md,
+        "Several equilibria in the soft corner"); another start is then used only if it is already
+        the solution.
+    min_increment : the smallest load increment.
+    shrink : the least fraction of the smallest ``J`` that a step keeps.
+    keep_tangent : the fraction of the residual below which a step's tangent is used again; 0 is the
+        full Newton method (docs/experiments.md, "Fewer factorisations from rest").
+    stress_iterates : whether to begin, far from equilibrium, with
+        :mod:`emulator.fem.formulations.stress_iterates` where the scene allows it (see ``applies``
+        there); never with load increments (docs/experiments.md, "Stresses as iterates: the
+        ventricle from rest in five factorisations").
+    """
+
+    tolerance: float = 1e-11
+    round_off: float = 1e-8
+    absolute: float = 0.0
+    max_iterations: int = 300
+    level_iterations: int = 40
+    increment: float = 1.0
+    min_increment: float = 1.0 / 256.0
+    shrink: float = 0.2
+    keep_tangent: float = 0.1
+    stress_iterates: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.min_increment <= self.increment <= 1.0:
+            raise InputError(
+                f"load increment {self.increment:g}: give {self.min_increment:g} (the least) to 1"
+            )
+
+    @classmethod
+    def load_steps(cls, steps: int) -> NewtonOptions:
+        """Return options that follow the loading path in ``steps`` equal or smaller increments."""
+        if steps < 1:
+            raise InputError(f"{steps} load steps; give 1 or more")
+        return cls(increment=1.0 / steps, max_iterations=max(cls.max_iterations, 20 * steps))
+
+
+class Direction(NamedTuple):
+    """Newton's full step.
+
+    step : the displacement increment, (n, 3) mm.
+    equations : the linear equations that it solves.
+    slope : residual . step in mN mm, before the step was reversed.
+    on_supports : whether the prescribed displacements are met.
+    singular : whether the tangent is singular.
+    definite : whether its factorisation found it positive definite.
+    refused : whether there is no step, because the tangent had to be positive definite and is not.
+    descends : whether the tangent's own direction lowers the potential, as far as that is known.
+    """
+
+    step: jax.Array
+    equations: Linearised
+    slope: jax.Array
+    on_supports: jax.Array
+    singular: jax.Array
+    definite: jax.Array
+    refused: jax.Array
+    descends: jax.Array
+
+
+class Step(NamedTuple):
+    """The part of Newton's step that is taken.
+
+    u : the displacement after it, (n, 3) mm.
+    residual : the residual there, (f,) mN.
+    relative_residual : its norm relative to the forces.
+    fraction : the fraction of the full step; 0 where none makes progress.
+    inverting : whether inverting elements forbade twice the fraction.
+    """
+
+    u: jax.Array
+    residual: jax.Array
+    relative_residual: jax.Array
+    fraction: jax.Array
+    inverting: jax.Array
+
+
+class _Descent(NamedTuple):
+    """A fraction, its potential, and whether half of it may be lower."""
+
+    fraction: jax.Array
+    energy: jax.Array
+    falls: jax.Array
+
+
+class _TrialStep(NamedTuple):
+    """A trial step, whether the line search has been used, and whether the trials end."""
+
+    step: Step
+    searched: jax.Array
+    ends: jax.Array
+
+
+def newton_direction(
+    system: System, theta: jax.Array, state: NewtonState, *, allow_indefinite: jax.Array | bool
+) -> Direction:
+    """Return Newton's step at ``state``, reversed where it would raise the potential."""
+    on_supports = system.supports_met(state.u, theta, state.load)
+    equations = formulation_of(system).linearise(state, theta)
+    force = equations.residual + equations.offset_force
+    full, outcome = system.attempt(equations.tangent, -force)
+    indefinite = outcome == Outcome.INDEFINITE
+    solve_again = indefinite & allow_indefinite
+    full = cond(solve_again, lambda: system.solve(equations.tangent, -force), lambda: full)
+    saddle = state.auxiliary is not None
+    reversible = on_supports & (not saddle)
+    step, slope, singular = _full_step(
+        system, state.u, theta, state.load, equations._replace(couplings=None), reversible, full
+    )
+    refused = indefinite & ~solve_again
+    descends = ~on_supports | (slope <= 0.0) | saddle
+    return Direction(step, equations, slope, on_supports, singular, ~indefinite, refused, descends)
+
+
+@compiled
+def _full_step(
+    system: System,
+    u: jax.Array,
+    theta: jax.Array,
+    load: jax.Array,
+    equations: Linearised,
+    reversible: jax.Array,
+    step: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the step (n, 3), residual . step before a reversal, and whether K is singular.
+
+    reversible : whether a step that raises the potential is reversed.
+    step : the solution (f,) of the equations.
+    """
+    force = equations.residual + equations.offset_force
+    slope = jnp.vdot(equations.residual, step)
+    singular = _is_singular(equations.tangent, step, force)
+    step = jnp.where(reversible & (slope > 0.0), -step, step)
+    step = system.extend(step) + system.support_offset(u, theta, load)
+    solvable = equations.solvable
+    return jnp.where(solvable, step, jnp.nan), slope, ~solvable | singular
+
+
+def _is_singular(tangent: jax.Array, step: jax.Array, force: jax.Array) -> jax.Array:
+    """Return whether a step is so long for its force that the tangent must be singular."""
+    size = jnp.max(jnp.abs(tangent)) * jnp.max(jnp.abs(step))
+    return ~(size <= _SINGULAR * jnp.max(jnp.abs(force)))
+
+
+def take_step(
+    system: System,
+    theta: jax.Array,
+    state: NewtonState,
+    direction: Direction,
+    options: NewtonOptions,
+) -> Step:
+    """Take the full step where the residual shows that it is good; otherwise search along it.
+
+    A kept tangent is worth a full step or none: its direction is not searched along.
+    """
+    none = Step(state.u, state.residual, state.relative_residual, jnp.zeros(()), jnp.array(False))
+    near = _is_near(direction.on_supports, state.relative_residual) & state.displacement_only
+
+    def attempt(before: _TrialStep) -> _TrialStep:
+        searches = before.searched | ~near
+        fraction, inverting = cond(
+            searches,
+            lambda: _searched_fraction(system, theta, state, direction, options),
+            lambda: (jnp.ones(()), jnp.array(False)),
+        )
+        u = _advance(system, state.u, theta, direction.step, fraction, state.load)
+        residual, relative = system.admissible_balance(u, theta, state.load)
+        J, J_before = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
+        good = searches | _is_good(relative, state.relative_residual, J, options.shrink, J_before)
+        step = Step(u, residual, relative, fraction, inverting)
+        step = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), step, none)
+        return _TrialStep(step, jnp.array(True), good | ~state.renew)
+
+    first = _TrialStep(none, jnp.array(False), ~near & ~state.renew)
+    return while_loop(lambda trial: ~trial.ends, attempt, first).step
+
+
+@jax.jit
+def _is_near(on_supports: jax.Array, relative_residual: jax.Array) -> jax.Array:
+    return on_supports & (relative_residual < NEAR)
+
+
+@jax.jit
+def _is_good(
+    relative: jax.Array, before: jax.Array, J: jax.Array, shrink: float, J_before: jax.Array
+) -> jax.Array:
+    """Return whether a step halves the residual and inverts no element."""
+    return (relative <= 0.5 * before) & (shrink * J_before < J)
+
+
+def _searched_fraction(
+    system: System,
+    theta: jax.Array,
+    state: NewtonState,
+    direction: Direction,
+    options: NewtonOptions,
+) -> tuple[jax.Array, jax.Array]:
+    """Return the line search's fraction, and whether inverting elements forbade twice it."""
+    test = formulation_of(system).monotonicity_test(
+        state, theta, direction.equations, direction.step
+    )
+    monotone = None
+    if test is not None:
+        # Where only round-off remains, it cannot be told from progress.
+        unclear = state.relative_residual <= options.round_off
+        monotone = lambda fraction: unclear | test(fraction)  # noqa: E731
+    return _search(system, theta, state, direction, options.shrink, monotone)
+
+
+def _search(
+    system: System,
+    theta: jax.Array,
+    state: NewtonState,
+    direction: Direction,
+    shrink: float,
+    monotone: Callable[[jax.Array], jax.Array] | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """Return the fraction of the step to take, and whether inverting elements forbade twice it.
+
+    The fraction is 0 where none makes progress.
+
+    Parameters
+    ----------
+    system : the equations.
+    theta : the parameters (p,).
+    state : the state where the step starts.
+    direction : the step.
+    shrink : the least fraction of the present smallest ``J`` that the step may leave.
+    monotone : the monotonicity test that replaces the potential where a saddle point is sought.
+    """
+    u, load = state.u, state.load
+    floor = shrink * system.least_volume_ratio(u)
+    follower = system.follower_force(u, theta)
+
+    def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return system.potential(u + fraction * direction.step, theta, load, follower)
+
+    def admissible(fraction: jax.Array) -> jax.Array:
+        J = system.least_volume_ratio(u + fraction * direction.step)
+        return floor < J  # False for NaN
+
+    if monotone is not None:
+        trial = backtrack(admissible, lambda f: (monotone(f), jnp.zeros(())), _LEAST_MONOTONE)
+        return jnp.where(trial.accepted, trial.fraction, 0.0), trial.inverting
+    progress = _progress(system, u, load, theta, direction, potential)
+    trial = backtrack(admissible, progress, _LEAST_FRACTION)
+    first = _Descent(trial.fraction, trial.energy, direction.on_supports & trial.accepted)
+    fraction = _lowest(lambda f: potential(f)[0], first)
+    return jnp.where(trial.accepted, fraction, 0.0), trial.inverting
+
+
+def _lowest(potential: Callable[[jax.Array], jax.Array], first: _Descent) -> jax.Array:
+    """Halve the fraction as long as that lowers the potential."""
+
+    def halve(at: _Descent) -> _Descent:
+        half = 0.5 * at.fraction
+        energy = potential(half)
+        lower = energy < at.energy
+        fraction = jnp.where(lower, half, at.fraction)
+        return _Descent(fraction, jnp.where(lower, energy, at.energy), lower)
+
+    def proceeds(at: _Descent) -> jax.Array:
+        return at.falls & (at.fraction > _SMALLEST_HALVED)
+
+    return while_loop(proceeds, halve, first).fraction
+
+
+def _progress(
+    system: System,
+    u: jax.Array,
+    load: jax.Array,
+    theta: jax.Array,
+    direction: Direction,
+    potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+) -> Progress:
+    """Return Armijo's rule; with loads without a potential, a smaller residual is progress too."""
+    descent = jnp.where(direction.on_supports, -ARMIJO * jnp.abs(direction.slope), jnp.inf)
+    falls = armijo(potential, descent)
+
+    def progress(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        lower, energy = falls(fraction)
+        if system.forces:
+            residual = system.balance(u + fraction * direction.step, theta, load).residual
+            before = jnp.sum(direction.equations.residual**2)
+            lower |= jnp.sum(residual**2) < (1.0 - ARMIJO * fraction) * before
+        return lower, energy
+
+    return progress
+
+
+@compiled
+def _advance(
+    system: System,
+    u: jax.Array,
+    theta: jax.Array,
+    step: jax.Array,
+    fraction: jax.Array,
+    load: jax.Array,
+) -> jax.Array:
+    """Return ``u`` (n, 3) mm after a fraction of the step."""
+    u = jnp.where(fraction > 0.0, u + fraction * step, u)
+    # A full step meets the prescribed displacements; setting them avoids the last bit of round-off.
+    return jnp.where(fraction == 1.0, system.scene.on_supports(u, theta, level=load), u)

@@ -1,0 +1,89 @@
+"""How many of this project's frames lie between a call and the equation it comes to.
+
+``python -m tests.journeys`` prints the frames and the files of each journey in
+:data:`JOURNEYS`. A journey is the call stack at the moment the equation is first evaluated,
+cut to the frames whose code is in ``src/``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
+
+SRC = Path(__file__).resolve().parents[1] / "src"
+
+
+class Frame(NamedTuple):
+    """One call of a function of this project: its file in ``src`` and its qualified name."""
+
+    file: str
+    function: str
+
+
+class Reached(Exception):
+    """The journey has come to its equation."""
+
+
+def stack(frame: FrameType | None) -> list[Frame]:
+    """Return the frames in ``src`` from the outermost call to ``frame``."""
+    frames: list[Frame] = []
+    while frame is not None:
+        code = frame.f_code
+        path = Path(code.co_filename)
+        if path.is_relative_to(SRC):
+            frames.append(Frame(str(path.relative_to(SRC)), code.co_qualname))
+        frame = frame.f_back
+    return frames[::-1]
+
+
+def journey(owner: object, name: str, call: Callable[[], object]) -> list[Frame]:
+    """Return the frames from ``call`` to the first call of the function ``owner.name``.
+
+    The function is replaced on the way, so ``owner`` may be a class, a module or an object.
+    """
+    original = getattr(owner, name)
+    file = str(Path(original.__code__.co_filename).relative_to(SRC))
+    frames: list[Frame] = []
+
+    def arrive(*_: object, **__: object) -> object:
+        frames.extend([*stack(sys._getframe(1)), Frame(file, original.__qualname__)])
+        raise Reached
+
+    object.__setattr__(owner, name, arrive)
+    try:
+        call()
+    except Reached:
+        pass
+    finally:
+        object.__setattr__(owner, name, original)
+    return frames
+
+
+def solve() -> list[Frame]:
+    """Return the frames from ``Simulator.solve`` to the strain energy of the law."""
+    import emulator as em
+
+    scene = em.scenes.once_clamped_beam(cells=(2, 1, 1), order=1)
+    simulator = em.Simulator(scene)
+    return journey(scene.law, "energy", lambda: simulator.solve(scene.centre))
+
+
+JOURNEYS: dict[str, Callable[[], list[Frame]]] = {"Simulator.solve to law.energy": solve}
+"""Journeys by what they lead from and to."""
+
+
+def main() -> None:
+    """Print the frames and the number of files of each journey."""
+    for name, travel in JOURNEYS.items():
+        frames = travel()
+        files = {frame.file for frame in frames}
+        print(f"{name}: {len(frames)} frames in {len(files)} files")
+        for frame in frames:
+            print(f"  {frame.file:44} {frame.function}")
+
+
+if __name__ == "__main__":
+    main()
