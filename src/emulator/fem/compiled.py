@@ -58,7 +58,7 @@ def compiled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
             programs[key] = _program(_name(function), *trace)
         return programs[key](leaves)
 
-    return run  # type: ignore[return-value]
+    return run
 
 
 def _program(name: str, traced: Any, shapes: Any) -> Callable[[list[jax.Array]], Any]:
@@ -80,10 +80,10 @@ def _evaluation(name: str, jaxpr: Any, form: Any) -> Program:
 
 
 def _name(function: Any) -> str:
-    """Return the name under which XLA logs the program of a function, or of a partial one."""
-    while not hasattr(function, "__name__"):
-        function = function.func
-    return str(function.__name__)
+    """Return the name under which XLA logs the program: that of the innermost function."""
+    function = getattr(function, "fun", function)  # of a function with a rule of its own
+    function = getattr(function, "func", function)  # of a partial one
+    return str(getattr(function, "__name__", "program"))
 
 
 class SharedPrograms:

@@ -191,7 +191,7 @@ class SupportForce:
         return position
 
     def __call__(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Return the force in mN (...) of ``u`` (..., k, 3) mm of ``nodes`` at ``theta`` (..., p)."""
+        """Return the force (...) in mN from ``u`` (..., k, 3) mm of ``nodes`` and ``theta``."""
         return jnp.vectorize(self._force, signature="(k,i),(p)->()")(u, theta)
 
     def _force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
