@@ -25,10 +25,10 @@ from studies.common.output import Case, Results
 from studies.common.processes import peak_gb, run
 
 from emulator.core.errors import InputError
+from emulator.fem.assembly import System
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.petsc import Factor, petsc_module
 from emulator.fem.linear.suitesparse import FACTORS, SUITESPARSE
-from emulator.fem.assembly import System
 from emulator.scenes.scene import Scene
 
 # PETSC_OPTIONS of MUMPS: as it is, factors on disk, and block low-rank factors to six digits with

@@ -31,8 +31,8 @@ import numpy as np
 
 from emulator.accuracy.step import Distance, newton_distance
 from emulator.core.errors import InputError
-from emulator.fem.linear.suitesparse import FACTORS
 from emulator.fem.compiled import compiled
+from emulator.fem.linear.suitesparse import FACTORS
 from emulator.fem.simulator import Simulator
 from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene

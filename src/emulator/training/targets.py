@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem import Simulator
+from emulator.fem.assembly import System
 from emulator.fem.campaign import at_once, in_order
+from emulator.fem.compiled import compiled
 from emulator.fem.line_search import ARMIJO, armijo, backtrack
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
-from emulator.fem.compiled import compiled
-from emulator.fem.assembly import System
 
 _GROUP = 8  # theta beside one factor
 _MIDDLES = 3  # of a group, whose tangents are tried

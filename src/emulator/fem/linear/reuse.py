@@ -14,10 +14,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from emulator.fem.compiled import compiled, while_loop
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.solve import Direct, Outcome
 from emulator.fem.linear.suitesparse import FACTORS
-from emulator.fem.compiled import compiled, while_loop
 
 TOLERANCE = 1e-10  # of the residual, in the norm of the inverse of the factorised tangent
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up

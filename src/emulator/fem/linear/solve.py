@@ -13,8 +13,8 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.linear.pattern import Pattern
 from emulator.fem.compiled import cond, one_by_one
+from emulator.fem.linear.pattern import Pattern
 
 
 class Outcome(IntEnum):

@@ -11,13 +11,13 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
+from emulator.fem.assembly import System
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.petsc import PETSC, Factor, petsc_module
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.solve import attempt
 from emulator.fem.linear.solve import solve as solve_any
-from emulator.fem.assembly import System
 from emulator.scenes.loads import FollowerPressure
 from emulator.verify.consistency import block as nearly_incompressible
 from scene_support import block
