@@ -28,9 +28,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Program = Callable[[list[jax.Array], list[jax.Array]], Any]
-"""A compiled function of the arrays that it closes over and of its arguments' leaves."""
-
 
 def compiled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Compile ``function`` once for each shape of its arguments, as ``jax.jit`` does.
@@ -55,28 +52,10 @@ def compiled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
         if key not in programs:
             rest, by_name = jax.tree.unflatten(form, leaves)
             trace = jax.make_jaxpr(call, return_shape=True)(*rest, **by_name)
-            programs[key] = _program(_name(function), *trace)
+            programs[key] = _Program(_name(function), *trace)
         return programs[key](leaves)
 
     return run
-
-
-def _program(name: str, traced: Any, shapes: Any) -> Callable[[list[jax.Array]], Any]:
-    """Return the traced function, of its arguments' leaves."""
-    form, jaxpr, arrays = jax.tree.structure(shapes), traced.jaxpr, traced.consts
-    if any(isinstance(array, jax.core.Tracer) for array in arrays):
-        return partial(jax.jit(_evaluation(name, jaxpr, form)), arrays)
-    with jax.ensure_compile_time_eval():
-        arrays = jax.device_put(arrays)  # as jnp.asarray, without a program for each shape
-    return partial(_SharedProgram(jax.jit(_evaluation(name, jaxpr, form))), arrays)
-
-
-def _evaluation(name: str, jaxpr: Any, form: Any) -> Program:
-    def evaluate(arrays: list[jax.Array], leaves: list[jax.Array]) -> Any:
-        return jax.tree.unflatten(form, jax.core.eval_jaxpr(jaxpr, arrays, *leaves))
-
-    evaluate.__name__ = name
-    return evaluate
 
 
 def _name(function: Any) -> str:
@@ -84,6 +63,37 @@ def _name(function: Any) -> str:
     function = getattr(function, "fun", function)  # of a function with a rule of its own
     function = getattr(function, "func", function)  # of a partial one
     return str(getattr(function, "__name__", "program"))
+
+
+class _Program:
+    """A traced function, compiled as a function of the arrays it closes over and of its leaves.
+
+    Calls with numbers go through the first body's program with the same text. Derivatives and
+    ``vmap`` are not in that text, because custom rules close over arrays; so calls with tracers go
+    through the body's own program.
+    """
+
+    def __init__(self, name: str, traced: Any, shapes: Any) -> None:
+        form, jaxpr = jax.tree.structure(shapes), traced.jaxpr
+
+        def evaluate(arrays: list[jax.Array], leaves: list[jax.Array]) -> Any:
+            return jax.tree.unflatten(form, jax.core.eval_jaxpr(jaxpr, arrays, *leaves))
+
+        evaluate.__name__ = name
+        self.own: Any = jax.jit(evaluate)
+        self.shared: Any = None
+        self.arrays = traced.consts
+        if not is_traced(self.arrays):
+            with jax.ensure_compile_time_eval():  # as jnp.asarray, without a program a shape
+                self.arrays = jax.device_put(self.arrays)
+
+    def __call__(self, leaves: list[jax.Array]) -> Any:
+        if is_traced(self.arrays, leaves):
+            return self.own(self.arrays, leaves)
+        if self.shared is None:
+            text = self.own.lower(self.arrays, leaves).as_text()
+            self.shared = PROGRAMS.same_as(text, self.own)
+        return self.shared(self.arrays, leaves)
 
 
 class SharedPrograms:
@@ -116,26 +126,6 @@ class SharedPrograms:
 
 
 PROGRAMS = SharedPrograms()
-
-
-class _SharedProgram:
-    """A program that calls with numbers share with other bodies.
-
-    Derivatives and ``vmap`` are not in a program's text, because custom rules close over arrays.
-    Calls with tracers therefore go through the body's own program.
-    """
-
-    def __init__(self, program: Any) -> None:
-        self.own = program
-        self._for_numbers: Callable[..., Any] | None = None
-
-    def __call__(self, arrays: list[jax.Array], leaves: list[jax.Array]) -> Any:
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            return self.own(arrays, leaves)
-        if self._for_numbers is None:
-            text = self.own.lower(arrays, leaves).as_text()
-            self._for_numbers = PROGRAMS.same_as(text, self.own)
-        return self._for_numbers(arrays, leaves)
 
 
 def is_traced(*values: Any) -> bool:

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from emulator.fem.assembly import System
 from emulator.fem.compiled import cond
 from emulator.fem.formulations import formulation_of
-from emulator.fem.newton import Direction, NewtonOptions, Step, newton_direction, take_step
+from emulator.fem.newton import Direction, Newton, NewtonOptions, Step
 from emulator.fem.solution import Status
 from emulator.fem.state import LoadHistory, NewtonState, RoundOff
 
@@ -66,6 +66,10 @@ class LoadStepping:
     options: NewtonOptions
     theta: jax.Array
 
+    @property
+    def _newton(self) -> Newton:
+        return Newton(self.system, self.options, self.theta)
+
     def begin(self, start: jax.Array, round_off: RoundOff | None = None) -> NewtonState:
         r"""Return the first state: at ``start`` (n, 3) mm, or at rest if ``start`` is not valid.
 
@@ -101,21 +105,21 @@ class LoadStepping:
         allow_indefinite : whether to step with a tangent that is not positive definite. Otherwise
             the state stays where it is at such a one, and is no longer monotone.
         """
-        system, theta, history = self.system, self.theta, state.history
+        history = state.history
         residual, relative = cond(
             history.iterations == 0,
-            lambda: system.admissible_balance(state.u, theta, state.load),
+            lambda: self.system.admissible_balance(state.u, self.theta, state.load),
             lambda: (state.residual, state.relative_residual),
         )
         state = state._replace(residual=residual, relative_residual=relative)
-        direction = newton_direction(system, theta, state, allow_indefinite=allow_indefinite)
+        direction = self._newton.direction(state, allow_indefinite)
         history = history._replace(monotone=history.monotone & direction.definite)
         state = state._replace(history=history)
         return cond(direction.refused, lambda: state, lambda: self._after(state, direction))
 
     def _after(self, state: NewtonState, direction: Direction) -> NewtonState:
         """Return the state after the part of a step that is taken."""
-        step = take_step(self.system, self.theta, state, direction, self.options)
+        step = self._newton.take_step(state, direction)
         state = state._replace(
             tangent=direction.equations.tangent,
             history=state.history._replace(singular=direction.singular),

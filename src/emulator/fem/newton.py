@@ -157,25 +157,129 @@ class _TrialStep(NamedTuple):
     ends: jax.Array
 
 
-def newton_direction(
-    system: System, theta: jax.Array, state: NewtonState, *, allow_indefinite: jax.Array | bool
-) -> Direction:
-    """Return Newton's step at ``state``, reversed where it would raise the potential."""
-    on_supports = system.supports_met(state.u, theta, state.load)
-    equations = formulation_of(system).linearise(state, theta)
-    force = equations.residual + equations.offset_force
-    full, outcome = system.attempt(equations.tangent, -force)
-    indefinite = outcome == Outcome.INDEFINITE
-    solve_again = indefinite & allow_indefinite
-    full = cond(solve_again, lambda: system.solve(equations.tangent, -force), lambda: full)
-    saddle = state.auxiliary is not None
-    reversible = on_supports & (not saddle)
-    step, slope, singular = _full_step(
-        system, state.u, theta, state.load, equations._replace(couplings=None), reversible, full
-    )
-    refused = indefinite & ~solve_again
-    descends = ~on_supports | (slope <= 0.0) | saddle
-    return Direction(step, equations, slope, on_supports, singular, ~indefinite, refused, descends)
+@dataclass(frozen=True, eq=False)
+class Newton:
+    """One iteration of Newton's method at one theta.
+
+    system : the equations.
+    options : the controls of the iteration.
+    theta : the parameters (p,).
+    """
+
+    system: System
+    options: NewtonOptions
+    theta: jax.Array
+
+    def direction(self, state: NewtonState, allow_indefinite: jax.Array | bool) -> Direction:
+        """Return the full step at ``state``, reversed where it would raise the potential."""
+        system, theta = self.system, self.theta
+        on_supports = system.supports_met(state.u, theta, state.load)
+        equations = formulation_of(system).linearise(state, theta)
+        force = equations.residual + equations.offset_force
+        full, outcome = system.attempt(equations.tangent, -force)
+        indefinite = outcome == Outcome.INDEFINITE
+        again = indefinite & allow_indefinite
+        full = cond(again, lambda: system.solve(equations.tangent, -force), lambda: full)
+        saddle = state.auxiliary is not None
+        step, slope, singular = _full_step(
+            system,
+            state.u,
+            theta,
+            state.load,
+            equations._replace(couplings=None),
+            on_supports & (not saddle),
+            full,
+        )
+        return Direction(
+            step,
+            equations,
+            slope,
+            on_supports,
+            singular,
+            definite=~indefinite,
+            refused=indefinite & ~again,
+            descends=~on_supports | (slope <= 0.0) | saddle,
+        )
+
+    def take_step(self, state: NewtonState, direction: Direction) -> Step:
+        """Take the full step where the residual shows that it is good; otherwise search along it.
+
+        A kept tangent is worth a full step or none: its direction is not searched along.
+        """
+        system, theta, before = self.system, self.theta, state.relative_residual
+        none = Step(state.u, state.residual, before, jnp.zeros(()), jnp.array(False))
+        near = _is_near(direction.on_supports, before) & state.displacement_only
+
+        def attempt(trial: _TrialStep) -> _TrialStep:
+            searches = trial.searched | ~near
+            fraction, inverting = cond(
+                searches,
+                lambda: self._search(state, direction),
+                lambda: (jnp.ones(()), jnp.array(False)),
+            )
+            u = _advance(system, state.u, theta, direction.step, fraction, state.load)
+            residual, relative = system.admissible_balance(u, theta, state.load)
+            J, J_before = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
+            good = searches | _is_good(relative, before, J, self.options.shrink, J_before)
+            step = Step(u, residual, relative, fraction, inverting)
+            step = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), step, none)
+            return _TrialStep(step, jnp.array(True), good | ~state.renew)
+
+        first = _TrialStep(none, jnp.array(False), ~near & ~state.renew)
+        return while_loop(lambda trial: ~trial.ends, attempt, first).step
+
+    def _search(self, state: NewtonState, direction: Direction) -> tuple[jax.Array, jax.Array]:
+        """Return the fraction of the step to take, and whether inverting elements forbade twice it.
+
+        The fraction is 0 where none makes progress.
+        """
+        system, u, step = self.system, state.u, direction.step
+        test = formulation_of(system).monotonicity_test(
+            state, self.theta, direction.equations, step
+        )
+        floor = self.options.shrink * system.least_volume_ratio(u)
+        follower = system.follower_force(u, self.theta)
+
+        def admissible(fraction: jax.Array) -> jax.Array:
+            return floor < system.least_volume_ratio(u + fraction * step)  # False for NaN
+
+        if test is not None:
+            # Where only round-off remains, it cannot be told from progress.
+            unclear = state.relative_residual <= self.options.round_off
+            trial = backtrack(
+                admissible, lambda f: (unclear | test(f), jnp.zeros(())), _LEAST_MONOTONE
+            )
+            return jnp.where(trial.accepted, trial.fraction, 0.0), trial.inverting
+
+        def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return system.potential(u + fraction * step, self.theta, state.load, follower)
+
+        progress = self._progress(state, direction, potential)
+        trial = backtrack(admissible, progress, _LEAST_FRACTION)
+        first = _Descent(trial.fraction, trial.energy, direction.on_supports & trial.accepted)
+        fraction = _lowest(lambda f: potential(f)[0], first)
+        return jnp.where(trial.accepted, fraction, 0.0), trial.inverting
+
+    def _progress(
+        self,
+        state: NewtonState,
+        direction: Direction,
+        potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    ) -> Progress:
+        """Return Armijo's rule, or a smaller residual where loads have no potential."""
+        descent = jnp.where(direction.on_supports, -ARMIJO * jnp.abs(direction.slope), jnp.inf)
+        falls = armijo(potential, descent)
+
+        def progress(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+            lower, energy = falls(fraction)
+            if self.system.forces:
+                u = state.u + fraction * direction.step
+                residual = self.system.balance(u, self.theta, state.load).residual
+                before = jnp.sum(direction.equations.residual**2)
+                lower |= jnp.sum(residual**2) < (1.0 - ARMIJO * fraction) * before
+            return lower, energy
+
+        return progress
 
 
 @compiled
@@ -208,39 +312,6 @@ def _is_singular(tangent: jax.Array, step: jax.Array, force: jax.Array) -> jax.A
     return ~(size <= _SINGULAR * jnp.max(jnp.abs(force)))
 
 
-def take_step(
-    system: System,
-    theta: jax.Array,
-    state: NewtonState,
-    direction: Direction,
-    options: NewtonOptions,
-) -> Step:
-    """Take the full step where the residual shows that it is good; otherwise search along it.
-
-    A kept tangent is worth a full step or none: its direction is not searched along.
-    """
-    none = Step(state.u, state.residual, state.relative_residual, jnp.zeros(()), jnp.array(False))
-    near = _is_near(direction.on_supports, state.relative_residual) & state.displacement_only
-
-    def attempt(before: _TrialStep) -> _TrialStep:
-        searches = before.searched | ~near
-        fraction, inverting = cond(
-            searches,
-            lambda: _searched_fraction(system, theta, state, direction, options),
-            lambda: (jnp.ones(()), jnp.array(False)),
-        )
-        u = _advance(system, state.u, theta, direction.step, fraction, state.load)
-        residual, relative = system.admissible_balance(u, theta, state.load)
-        J, J_before = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
-        good = searches | _is_good(relative, state.relative_residual, J, options.shrink, J_before)
-        step = Step(u, residual, relative, fraction, inverting)
-        step = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), step, none)
-        return _TrialStep(step, jnp.array(True), good | ~state.renew)
-
-    first = _TrialStep(none, jnp.array(False), ~near & ~state.renew)
-    return while_loop(lambda trial: ~trial.ends, attempt, first).step
-
-
 @jax.jit
 def _is_near(on_supports: jax.Array, relative_residual: jax.Array) -> jax.Array:
     return on_supports & (relative_residual < NEAR)
@@ -252,67 +323,6 @@ def _is_good(
 ) -> jax.Array:
     """Return whether a step halves the residual and inverts no element."""
     return (relative <= 0.5 * before) & (shrink * J_before < J)
-
-
-def _searched_fraction(
-    system: System,
-    theta: jax.Array,
-    state: NewtonState,
-    direction: Direction,
-    options: NewtonOptions,
-) -> tuple[jax.Array, jax.Array]:
-    """Return the line search's fraction, and whether inverting elements forbade twice it."""
-    test = formulation_of(system).monotonicity_test(
-        state, theta, direction.equations, direction.step
-    )
-    monotone = None
-    if test is not None:
-        # Where only round-off remains, it cannot be told from progress.
-        unclear = state.relative_residual <= options.round_off
-        monotone = lambda fraction: unclear | test(fraction)  # noqa: E731
-    return _search(system, theta, state, direction, options.shrink, monotone)
-
-
-def _search(
-    system: System,
-    theta: jax.Array,
-    state: NewtonState,
-    direction: Direction,
-    shrink: float,
-    monotone: Callable[[jax.Array], jax.Array] | None = None,
-) -> tuple[jax.Array, jax.Array]:
-    """Return the fraction of the step to take, and whether inverting elements forbade twice it.
-
-    The fraction is 0 where none makes progress.
-
-    Parameters
-    ----------
-    system : the equations.
-    theta : the parameters (p,).
-    state : the state where the step starts.
-    direction : the step.
-    shrink : the least fraction of the present smallest ``J`` that the step may leave.
-    monotone : the monotonicity test that replaces the potential where a saddle point is sought.
-    """
-    u, load = state.u, state.load
-    floor = shrink * system.least_volume_ratio(u)
-    follower = system.follower_force(u, theta)
-
-    def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return system.potential(u + fraction * direction.step, theta, load, follower)
-
-    def admissible(fraction: jax.Array) -> jax.Array:
-        J = system.least_volume_ratio(u + fraction * direction.step)
-        return floor < J  # False for NaN
-
-    if monotone is not None:
-        trial = backtrack(admissible, lambda f: (monotone(f), jnp.zeros(())), _LEAST_MONOTONE)
-        return jnp.where(trial.accepted, trial.fraction, 0.0), trial.inverting
-    progress = _progress(system, u, load, theta, direction, potential)
-    trial = backtrack(admissible, progress, _LEAST_FRACTION)
-    first = _Descent(trial.fraction, trial.energy, direction.on_supports & trial.accepted)
-    fraction = _lowest(lambda f: potential(f)[0], first)
-    return jnp.where(trial.accepted, fraction, 0.0), trial.inverting
 
 
 def _lowest(potential: Callable[[jax.Array], jax.Array], first: _Descent) -> jax.Array:
@@ -329,29 +339,6 @@ def _lowest(potential: Callable[[jax.Array], jax.Array], first: _Descent) -> jax
         return at.falls & (at.fraction > _SMALLEST_HALVED)
 
     return while_loop(proceeds, halve, first).fraction
-
-
-def _progress(
-    system: System,
-    u: jax.Array,
-    load: jax.Array,
-    theta: jax.Array,
-    direction: Direction,
-    potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
-) -> Progress:
-    """Return Armijo's rule; with loads without a potential, a smaller residual is progress too."""
-    descent = jnp.where(direction.on_supports, -ARMIJO * jnp.abs(direction.slope), jnp.inf)
-    falls = armijo(potential, descent)
-
-    def progress(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-        lower, energy = falls(fraction)
-        if system.forces:
-            residual = system.balance(u + fraction * direction.step, theta, load).residual
-            before = jnp.sum(direction.equations.residual**2)
-            lower |= jnp.sum(residual**2) < (1.0 - ARMIJO * fraction) * before
-        return lower, energy
-
-    return progress
 
 
 @compiled
