@@ -1,5 +1,6 @@
 """Scenes whose mesh is the loaded shape of an image: unload, load, answer from the mesh."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.campaign.designs import design
+from emulator.fem.loaded import LoadedEquilibrium
 from emulator.geometry.facets import Cavity
 from emulator.scenes.image import image_theta
 
@@ -119,6 +121,22 @@ def test_a_campaign_and_emulators(simulator, imaged, tmp_path):
     assert errors["err_u"]["mean"] == pytest.approx(off.mean())
     assert "err_V" in errors
     assert "err_Pi" not in errors
+
+
+def test_threads_share_the_recent_shapes(imaged, monkeypatch):
+    solves = []
+    monkeypatch.setattr(em.Unloader, "solve", lambda _, theta: solves.append(theta) or theta)
+    loaded = LoadedEquilibrium(imaged, em.NewtonOptions(), "suitesparse")
+    thetas = [theta_of(1.0, 0.3 + 0.01 * k) for k in range(40)]
+    with ThreadPoolExecutor(8) as pool:
+        shapes = list(pool.map(loaded.unloaded, thetas))
+    for theta, shape in zip(thetas, shapes, strict=True):
+        np.testing.assert_array_equal(shape, image_theta(imaged, theta))
+    before = len(solves)
+    loaded.unloaded(thetas[0])  # long forgotten
+    loaded.unloaded(thetas[0])
+    assert len(solves) == before + 1
+    assert loaded._recent.cache_info().currsize == 16
 
 
 @pytest.mark.slow

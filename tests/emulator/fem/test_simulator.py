@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 
 import emulator as em
+import journeys
 from emulator.core.errors import InputError, SolverError
 from emulator.geometry.generators.box import box
 from emulator.scenes import Support
 from emulator.scenes.loads import FollowerPressure, Gravity
 from scene_support import block, slope
+
+
+def test_the_law_is_eleven_frames_from_the_call():
+    frames = journeys.solve()
+    assert frames[0].function == "Simulator.solve"
+    assert frames[-1].file.startswith("emulator/mechanics/laws/")
+    assert len(frames) <= 11
 
 
 def test_patch_test():
