@@ -166,10 +166,10 @@ class SupportForce:
     @cached_property
     def _parts(self) -> tuple[list[LocalTerm], list[LocalForce], list[LocalTerm]]:
         """Potentials and forces of loads where prescribed, potentials of springs where free."""
-        held, sprung = self._virtual
+        prescribed, sprung = self._virtual
         scene = self._balanced
-        terms = _touching(local_terms(scene), self._moves(held))
-        forces = _touching(local_forces(scene), self._moves(held))
+        terms = _touching(local_terms(scene), self._moves(prescribed))
+        forces = _touching(local_forces(scene), self._moves(prescribed))
         return terms, forces, _touching(spring_terms(scene), self._moves(sprung))
 
     @staticmethod
@@ -225,11 +225,13 @@ class SupportForce:
     @cached_property
     def _dead(self) -> tuple[float, dict[str, float]]:
         """The work (mN mm) of dead loads on the virtual displacement; and per unit of theta."""
-        held, dead = self._virtual[0], dead_force(self._balanced)
+        prescribed, dead = self._virtual[0], dead_force(self._balanced)
         if dead is None:
             return 0.0, {}
-        per_unit = {name: float(np.vdot(force, held)) for name, force in dead.per_unit.items()}
-        return float(np.vdot(dead.constant, held)), per_unit
+        per_unit = {
+            name: float(np.vdot(force, prescribed)) for name, force in dead.per_unit.items()
+        }
+        return float(np.vdot(dead.constant, prescribed)), per_unit
 
     def _dead_work(self, values: Values) -> jax.Array:
         constant, per_unit = self._dead
