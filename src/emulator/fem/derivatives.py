@@ -77,16 +77,28 @@ def differentiable(
     def stepwise(theta: jax.Array, start: jax.Array) -> Solution:
         return (whole if is_traced(theta, start) else by_steps)(theta, start)
 
-    solution_at = jax.custom_jvp(stepwise if system.stepwise else whole)
+    def derivative(u: jax.Array, theta: jax.Array, direction: jax.Array) -> jax.Array:
+        tangent = system.safe_tangent(u, theta, 1.0)[0]
+        return _directional_derivative(system, tangent, u, theta, direction)
+
+    return implicit(stepwise if system.stepwise else whole, derivative)
+
+
+def implicit(
+    find: Callable[..., Solution], derivative: Callable[..., jax.Array]
+) -> Callable[..., Solution]:
+    """Return ``find(*parameters, start)`` with derivatives in the parameters.
+
+    derivative : the derivative (n, 3) of a root, a function of the root (n, 3) mm, of the
+        parameters, and of a direction for each of them.
+    """
+    solution_at = jax.custom_jvp(find)
 
     @solution_at.defjvp
-    def derivative(primals, tangents):  # noqa: ANN001, ANN202
-        theta, start = primals
-        solution = solution_at(theta, start)
-        u = solution.displacement
-        tangent = system.safe_tangent(u, theta, 1.0)[0]
-        du = _directional_derivative(system, tangent, u, theta, tangents[0])
-        return solution, zero_tangents(solution)._replace(displacement=du)
+    def rule(primals, tangents):  # noqa: ANN001, ANN202
+        solution = solution_at(*primals)
+        du = derivative(solution.displacement, *primals[:-1], *tangents[:-1])
+        return solution, _zero_tangents(solution)._replace(displacement=du)
 
     return solution_at
 
@@ -125,7 +137,7 @@ def adjoint(
     return value_and_gradient
 
 
-def zero_tangents(solution: Solution) -> Solution:
+def _zero_tangents(solution: Solution) -> Solution:
     """Return the zero tangents of a solution: float0 for its integers."""
     return jax.tree.map(
         lambda x: (

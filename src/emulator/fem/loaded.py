@@ -29,7 +29,7 @@ import numpy as np
 
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, is_traced, one_by_one
-from emulator.fem.derivatives import Equations, zero_tangents
+from emulator.fem.derivatives import Equations, implicit
 from emulator.fem.fallbacks import find_equilibrium
 from emulator.fem.linear import Outcome
 from emulator.fem.newton import NewtonOptions
@@ -152,23 +152,14 @@ class LoadedEquilibrium:
             return find_equilibrium(system_at_rest(system, w, theta), self.options, theta, start)
 
         @compiled
-        def directional_derivative(
+        def derivative(
             u: jax.Array, theta: jax.Array, w: jax.Array, *directions: jax.Array
         ) -> jax.Array:
             force = jax.jvp(partial(residual, u), (theta, w), directions)[1]
             tangent = system_at_rest(system, w, theta).safe_tangent(u, theta)[0]
             return system.extend(-system.solve(tangent, force))
 
-        load = jax.custom_jvp(compiled(one_by_one(find)))
-
-        @load.defjvp
-        def derivative(primals, tangents):  # noqa: ANN001, ANN202
-            theta, w, start = primals
-            solution = load(theta, w, start)
-            du = directional_derivative(solution.displacement, theta, w, *tangents[:2])
-            return solution, zero_tangents(solution)._replace(displacement=du)
-
-        return load
+        return implicit(compiled(one_by_one(find)), derivative)
 
     @cached_property
     def _total_derivatives(
