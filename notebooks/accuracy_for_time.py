@@ -26,11 +26,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.measurements import spread_landmarks
-from emulator.fem import run_campaign, sobol
-from emulator.fem.campaign.designs import fem_reference
-from emulator.surrogates.corrected import corrected
-from emulator.surrogates.pod_gp import fit_reduced
 
 COLOURS = {"fem": "#009E73", "emulator": "#0072B2", "corrected": "#CC79A7", "reduced": "#E69F00"}
 
@@ -60,15 +55,15 @@ def series(order):
 
 simulator.solve(scene.centre)  # compiles, so that the runs below are timed without it
 began = time.process_time()
-runs = run_campaign(simulator, sobol(scene, 30, seed=4))
-reduced = fit_reduced(scene, runs)
+runs = em.run_campaign(simulator, em.fem.sobol(scene, 30, seed=4))
+reduced = em.fit_reduced(scene, runs)
 offline_reduced = time.process_time() - began
 print(f"30 FEM runs and the fit of POD + GP: {offline_reduced:.0f} s")
 
 full = emulator.cache()
 rungs = {
     "FEM from rest": em.fem_forward(simulator),
-    "emulator + 1 Newton step": corrected(full, simulator, steps=1),
+    "emulator + 1 Newton step": em.corrected(full, simulator, steps=1),
     "emulator": full,
     "POD + GP, 30 runs": reduced,
     **{f"series, order {order}": series(order) for order in (3, 2, 1)},
@@ -83,8 +78,8 @@ rungs = {
 # FEM runs inside `jit` here, as a gradient-based sampler needs it; called from Python with numbers it is faster.
 
 # %%
-reference = fem_reference(simulator, 8)
-points = cal.landmarks(scene, spread_landmarks(scene, 24, seed=3))
+reference = em.fem_reference(simulator, 8)
+points = cal.landmarks(scene, cal.spread_landmarks(scene, 24, seed=3))
 volume = cal.CavityVolume(scene)
 seen = np.union1d(points.nodes, volume.nodes)
 
@@ -103,7 +98,7 @@ def seconds_of(forward, calls):
     gradient = jax.jit(jax.value_and_grad(lambda theta: jnp.sum(local(theta) ** 2)))
     jax.block_until_ready(gradient(scene.centre))
     taken = []
-    for theta in sobol(scene, calls, seed=9):
+    for theta in em.fem.sobol(scene, calls, seed=9):
         began = time.process_time()
         jax.block_until_ready(gradient(theta))
         taken.append(time.process_time() - began)

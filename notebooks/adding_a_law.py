@@ -26,14 +26,6 @@ from scipy.optimize import brentq
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.identifiability import identify, in_words
-from emulator.geometry.generators.box import box
-from emulator.mechanics.kinematics import Strain
-from emulator.mechanics.laws import LAWS, Law, find_law
-from emulator.mechanics.laws.law import modulus, number
-from emulator.mechanics.laws.volumetric import quadratic
-from emulator.scenes.loads import CavityPressure, Traction
-from emulator.training import recipe, train
 
 BLUE, ORANGE = "#0072B2", "#D55E00"
 
@@ -65,11 +57,11 @@ def isochoric_I2_minus_3(strain):
 def energy(strain, c_1, c_2, kappa):
     """Strain energy density in kPa."""
     shape = c_1 * jnp.expm1(c_2 * strain.isochoric_I1_minus_3)
-    return shape - 0.5 * c_1 * c_2 * isochoric_I2_minus_3(strain) + quadratic(strain, kappa)
+    return shape - 0.5 * c_1 * c_2 * isochoric_I2_minus_3(strain) + em.laws.quadratic(strain, kappa)
 
 
-parameters = (modulus("c_1"), number("c_2"), modulus("kappa"))
-law = Law("veronda_westmann", parameters, energy, exponential=True)
+parameters = (em.laws.modulus("c_1"), em.laws.number("c_2"), em.laws.modulus("kappa"))
+law = em.laws.Law("veronda_westmann", parameters, energy, exponential=True)
 
 # %% [markdown]
 # The quantities come in the order in which the function takes them. `modulus` is in kPa and above 0, `number` has no unit.
@@ -79,8 +71,8 @@ law = Law("veronda_westmann", parameters, energy, exponential=True)
 # would be found by itself. In a notebook, the next line does the same.
 
 # %%
-LAWS[law.name] = law
-assert find_law("veronda_westmann") is law
+em.laws.LAWS[law.name] = law
+assert em.find_law("veronda_westmann") is law
 
 # %% [markdown]
 # ## Is it a law?
@@ -93,7 +85,7 @@ values = (8.0, 2.0, 200.0)  # c_1 (kPa), c_2, kappa (kPa)
 
 def W(H):
     """Energy of one point at the displacement gradient H."""
-    return law.energy(Strain(H), *values)
+    return law.energy(em.laws.Strain(H), *values)
 
 
 stress, tangent = jax.jit(jax.grad(W)), jax.jit(jax.hessian(W))  # first Piola, and its derivative
@@ -189,13 +181,13 @@ def uniaxial(stretch, *values):
 lateral, pull = uniaxial(1.3, *values)
 cube = em.Scene(
     name="pulled cube",
-    mesh=box((10.0, 10.0, 10.0), (2, 2, 2)),
+    mesh=em.generators.box((10.0, 10.0, 10.0), (2, 2, 2)),
     law=law,
     parameters=(
         em.Parameter("c_1", "kPa", 4.0, 16.0, "log"),
         em.Parameter("c_2", "", 1.0, 4.0, "log"),
     ),
-    loads=(Traction("right", (pull, 0.0, 0.0)),),
+    loads=(em.loads.Traction("right", (pull, 0.0, 0.0)),),
     supports=(
         em.Support("left", components="x"),
         em.Support("front", components="y"),
@@ -230,7 +222,7 @@ plt.show()
 # $-pV$ and `CavityPressure` may be used.
 
 # %%
-mesh = box((40.0, 40.0, 2.0), (10, 10, 1))
+mesh = em.generators.box((40.0, 40.0, 2.0), (10, 10, 1))
 scene = em.Scene(
     name="bulge test",
     mesh=mesh,
@@ -240,7 +232,7 @@ scene = em.Scene(
         em.Parameter("c_2", "", 1.0, 4.0, "log"),
         em.Parameter("pressure", "kPa", 0.3, 4.0),
     ),
-    loads=(CavityPressure("bottom"),),
+    loads=(em.loads.CavityPressure("bottom"),),
     supports=tuple(em.Support(side) for side in ("left", "right", "front", "back")),
     constants={"kappa": kappa},
 )
@@ -256,7 +248,7 @@ for p, u in fields.items():
 # once for every FEM run.
 
 # %%
-emulator = train(scene, replace(recipe("mechanics"), simulations=30), "training")
+emulator = em.train(scene, replace(em.recipe("mechanics"), simulations=30), "training")
 forward = emulator.cache()
 for p, u in fields.items():
     error = np.linalg.norm(forward(scene.theta(**truth, pressure=p)) - u, axis=1).max()
@@ -295,7 +287,7 @@ for states in (("low",), ("low", "high")):
         seed=1,
     )
     print(f"seen at {' and '.join(states)} pressure:")
-    print(in_words(identify(posteriors[states])))
+    print(cal.in_words(cal.identify(posteriors[states])))
 
 # %%
 figure, axes = plt.subplots(figsize=(4.6, 3.8), layout="constrained")

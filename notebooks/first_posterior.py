@@ -27,7 +27,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.measurements import spread_landmarks
 
 # %% [markdown]
 # ## The scene and its FEM solution
@@ -62,7 +61,7 @@ assert np.median(error) < 2e-2  # the paper's median, after a million steps on a
 # Twenty material points inside the body, wherever they happen to lie between nodes, each displacement with 0.2 mm of noise.
 
 # %%
-observe = cal.landmarks(scene, spread_landmarks(scene, 20, seed=7))
+observe = cal.landmarks(scene, cal.spread_landmarks(scene, 20, seed=7))
 noise = np.random.default_rng(7).normal(0.0, 0.2, (20, 3))
 data = np.asarray(observe(solution.displacement[observe.nodes], truth)) + noise
 

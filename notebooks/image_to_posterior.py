@@ -24,10 +24,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from emulator.fem.energy import displacement_gradient
-from emulator.scenes.loads import ActiveTension, CavityPressure
-from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.supports import Support
 
 MMHG = 0.133322  # kPa
 BLUE, ORANGE = "#0072B2", "#D55E00"
@@ -42,11 +38,11 @@ BLUE, ORANGE = "#0072B2", "#D55E00"
 PULL, WALL = {"transverse": 0.3}, {"kappa": 350.0}
 built_in = em.scenes.left_ventricle(5, 12, 1, **WALL)
 muscle = tuple(p for p in built_in.parameters if p.name != "pressure")
-tension = Parameter("tension", "kPa", 60.0, 110.0)
+tension = em.Parameter("tension", "kPa", 60.0, 110.0)
 heart = replace(
     built_in,
-    parameters=(*muscle, Parameter("pressure", "kPa", 0.0, 16.0), tension),
-    loads=(CavityPressure("endocardium"), ActiveTension(**PULL)),
+    parameters=(*muscle, em.Parameter("pressure", "kPa", 0.0, 16.0), tension),
+    loads=(em.loads.CavityPressure("endocardium"), em.loads.ActiveTension(**PULL)),
     dilatation="mean",
     origin={},
 )
@@ -77,7 +73,7 @@ print(f"in the image {volume_of(filled):.0f}; at the end of systole {volume_of(c
 
 # %%
 image = replace(heart.mesh, nodes=heart.mesh.nodes + filled)
-F = np.eye(3) + np.asarray(displacement_gradient(heart, filled))
+F = np.eye(3) + np.asarray(em.displacement_gradient(heart, filled))
 fibres = np.einsum("mqij,mqj->mqi", F, heart.fibres_at_points)
 fibres /= np.linalg.norm(fibres, axis=-1, keepdims=True)
 
@@ -86,7 +82,7 @@ def scene_of(mesh, *, loaded):
     """Two bodies of one image; with ``loaded``, an image under the pressure ``imaged``."""
     states = ("filling", "systole")
     bodies = em.side_by_side(dict.fromkeys(states, mesh), gap=20.0)
-    imaged = (Parameter("imaged", "kPa", 5.0 * MMHG, 15.0 * MMHG),)
+    imaged = (em.Parameter("imaged", "kPa", 5.0 * MMHG, 15.0 * MMHG),)
     under = {"pressure": "imaged", "systolic": "imaged", "tension": "slack"}
     return em.Scene(
         name="imaged_heart",
@@ -95,16 +91,16 @@ def scene_of(mesh, *, loaded):
         parameters=(
             *muscle,
             *(imaged if loaded else ()),
-            Parameter("pressure", "kPa", 0.0, 12.0 * MMHG),
-            Parameter("systolic", "kPa", 85.0 * MMHG, 115.0 * MMHG),
+            em.Parameter("pressure", "kPa", 0.0, 12.0 * MMHG),
+            em.Parameter("systolic", "kPa", 85.0 * MMHG, 115.0 * MMHG),
             tension,
         ),
         loads=(
-            CavityPressure("filling.endocardium"),
-            CavityPressure("systole.endocardium", parameter="systolic"),
-            ActiveTension(**PULL, within="systole.endocardium"),
+            em.loads.CavityPressure("filling.endocardium"),
+            em.loads.CavityPressure("systole.endocardium", parameter="systolic"),
+            em.loads.ActiveTension(**PULL, within="systole.endocardium"),
         ),
-        supports=tuple(Support(f"{state}.base") for state in states),
+        supports=tuple(em.Support(f"{state}.base") for state in states),
         constants={**WALL, **({"slack": 0.0} if loaded else {})},
         fibres=np.concatenate([fibres, fibres]),
         dilatation="mean",

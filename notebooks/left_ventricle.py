@@ -22,8 +22,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.identifiability import identify, in_words, stress_band
-from calibrate.measurements import spread_landmarks
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "0.75"
 
@@ -54,7 +52,7 @@ for parameter in scene.parameters:
 # %%
 truth = {"a": 0.36, "b": 1.8, "a_f": 4.6, "b_f": 2.4, "pressure": 1.0}
 solution = simulator.solve(scene.theta(**truth)).require_converged("the data")
-points = cal.landmarks(scene, spread_landmarks(scene, 24, seed=3))
+points = cal.landmarks(scene, cal.spread_landmarks(scene, 24, seed=3))
 volume = cal.CavityVolume(scene)
 
 
@@ -88,7 +86,7 @@ only_volume = cal.sample(
 only_volume
 
 # %%
-print(in_words(identify(only_volume)))
+print(cal.in_words(cal.identify(only_volume)))
 
 # %% [markdown]
 # The table warns that this run is short for a long ridge. It will do for a comparison, and not for a result.
@@ -104,8 +102,8 @@ posterior = cal.sample(model, data, options=length, seed=2)
 posterior
 
 # %%
-found = identify(posterior)
-print(in_words(found))
+found = cal.identify(posterior)
+print(cal.in_words(found))
 summary = posterior.summary()
 for name, row in summary.items():
     assert row["r_hat"] < 1.02, name
@@ -187,7 +185,7 @@ for label, found_by, colour in (
     ("images", posterior, BLUE),
     ("images and catheter", invasive, ORANGE),
 ):
-    band = stress_band(found_by, "fibre", stretches=np.linspace(1.0, 1.2, 21))
+    band = cal.stress_band(found_by, "fibre", stretches=np.linspace(1.0, 1.2, 21))
     left.fill_between(
         band.stretch, band.low, band.high, color=colour, alpha=0.35, lw=0, label=label
     )

@@ -28,10 +28,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from emulator.geometry.generators.box import box, toward_ends
-from emulator.mechanics.laws import find_law
-from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads import Force, Gravity
 
 # %% [markdown]
 # ## The scene
@@ -39,22 +35,22 @@ from emulator.scenes.loads import Force, Gravity
 # The force's amount is a parameter: 0 in the first experiment, 0.51 N in the second. They are two *load states* of one body.
 
 # %%
-mesh = box((100.0, 30.0, 30.0), (8, 2, 2), 2, toward_ends(8, 1.5, ("left",)))
+mesh = em.generators.box((100.0, 30.0, 30.0), (8, 2, 2), 2, em.generators.toward_ends(8, 1.5, ("left",)))
 edge = np.intersect1d(mesh.node_set("right"), mesh.node_set("top"))
-beam = Scene(
+beam = em.Scene(
     name="silicone beam",
     mesh=replace(mesh, node_sets={**mesh.node_sets, "edge": edge}),
-    law=find_law("neo_hookean_split"),
+    law=em.find_law("neo_hookean_split"),
     parameters=(
-        Parameter("mu", "kPa", 40.0, 200.0, "log"),
-        Parameter("kappa", "kPa", 1e3, 1e5, "log"),
-        Parameter("hung", "", 0.0, 0.6),
+        em.Parameter("mu", "kPa", 40.0, 200.0, "log"),
+        em.Parameter("kappa", "kPa", 1e3, 1e5, "log"),
+        em.Parameter("hung", "", 0.0, 0.6),
     ),
     loads=(
-        Gravity(density=1.07, direction=(0.0, 0.0, -1.0), acceleration=9.81),
-        Force("edge", (0.0, 0.0, -1.0), amount="hung"),
+        em.loads.Gravity(density=1.07, direction=(0.0, 0.0, -1.0), acceleration=9.81),
+        em.loads.Force("edge", (0.0, 0.0, -1.0), amount="hung"),
     ),
-    supports=(Support("left"),),
+    supports=(em.Support("left"),),
     dilatation="mean",
 )
 simulator = em.Simulator(beam)

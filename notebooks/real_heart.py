@@ -30,9 +30,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.project import infer
-from calibrate.project.experiment import read_experiment
-from emulator.geometry.generators.box import box
 
 # %% [markdown]
 # ## The scene
@@ -40,7 +37,7 @@ from emulator.geometry.generators.box import box
 # A coarse mesh, which is stiffer than the truth by a few percent; the study uses a finer one. One plate is held, the other is a support that three parameters move: each load state has its own amounts. `a_fs` is what our law leaves out.
 
 # %%
-em.write_mesh("cube.vtu", box((10.0, 10.0, 10.0), (2, 2, 2)))
+em.write_mesh("cube.vtu", em.generators.box((10.0, 10.0, 10.0), (2, 2, 2)))
 MODES = {"shear_y": ("y", 0.3), "shear_z": ("z", 0.3), "stretch": ("x", 0.12)}
 plates = "".join(
     f"""
@@ -158,7 +155,7 @@ constant = 0.5
 )
 Path("noise.toml").write_text(common)
 Path("curves.toml").write_text(common + off)
-found = {name: infer(read_experiment(f"{name}.toml"), name) for name in ("noise", "curves")}
+found = {name: cal.infer(cal.read_experiment(f"{name}.toml"), name) for name in ("noise", "curves")}
 for name, posterior in found.items():
     for parameter, row in posterior.summary().items():
         print(f"{name}: {parameter} {row['mean']:.3g}, 90 % {row['low']:.3g} to {row['high']:.3g}")

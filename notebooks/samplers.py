@@ -35,16 +35,6 @@ from numpyro.infer import MCMC, NUTS
 
 import calibrate as cal
 import emulator as em
-from calibrate.arviz import array_stats
-from calibrate.measurements import spread_landmarks
-from calibrate.samplers import (
-    BlackJAXNUTSOptions,
-    DelayedAcceptanceOptions,
-    LaplaceOptions,
-    MCLMCOptions,
-    SMCOptions,
-    density_of,
-)
 
 BLUE, ORANGE = "#0072B2", "#D55E00"
 
@@ -57,7 +47,7 @@ BLUE, ORANGE = "#0072B2", "#D55E00"
 forward = em.load("liver").cache()
 scene, simulator = forward.scene, em.Simulator(forward.scene)
 truth = scene.theta(lam=6.0, mu=5.0)
-observe = cal.landmarks(scene, spread_landmarks(scene, 20, seed=5))
+observe = cal.landmarks(scene, cal.spread_landmarks(scene, 20, seed=5))
 exact = np.asarray(observe(simulator(truth)[observe.nodes], truth))
 data = exact + np.random.default_rng(5).normal(0.0, 0.3, exact.shape)  # mm
 model = cal.model(forward, observe, cal.GaussianNoise(sd=0.3))
@@ -69,7 +59,7 @@ model = cal.model(forward, observe, cal.GaussianNoise(sd=0.3))
 # line, and the Jacobian is included. The data is an argument, so a compiled sampler serves the next data set too.
 
 # %%
-density = density_of(model)
+density = cal.density_of(model)
 _, given = model.given(data)  # checked, by name
 print("coordinates:", density.names)
 
@@ -114,7 +104,7 @@ own = {
 }
 print(f"acceptance rate {float(acceptance.mean()):.2f}")
 for name, values in own.items():
-    r_hat = float(array_stats.rhat(values))
+    r_hat = float(cal.array_stats.rhat(values))
     print(f"{name}: {values.mean():.3f} +- {values.std():.3f}, R-hat {r_hat:.4f}")
     assert r_hat < 1.02
 
@@ -176,11 +166,11 @@ assert abs(found["noise_sd"].mean() - 0.3) < 4.0 * found["noise_sd"].std()
 size = {"warmup": 300, "draws": 400, "chains": 4}
 OPTIONS = {
     "nuts": cal.NUTSOptions(**size, rounds=1),
-    "blackjax_nuts": BlackJAXNUTSOptions(**size, rounds=1),
-    "mclmc": MCLMCOptions(**size, rounds=1),
-    "smc": SMCOptions(draws=300, transitions=5),
-    "laplace": LaplaceOptions(draws=400),
-    "delayed_acceptance": DelayedAcceptanceOptions(warmup=300, draws=75, chains=4, rounds=1),
+    "blackjax_nuts": cal.BlackJAXNUTSOptions(**size, rounds=1),
+    "mclmc": cal.MCLMCOptions(**size, rounds=1),
+    "smc": cal.SMCOptions(draws=300, transitions=5),
+    "laplace": cal.LaplaceOptions(draws=400),
+    "delayed_acceptance": cal.DelayedAcceptanceOptions(warmup=300, draws=75, chains=4, rounds=1),
 }
 posteriors, seconds = {}, {}
 for name, options in OPTIONS.items():
@@ -225,7 +215,7 @@ assert tables["laplace"]["lam"]["sd"] < reference["lam"]["sd"]
 
 # %%
 for name, values in own.items():
-    ess = float(array_stats.ess(values, method="bulk", chain_axis=0, draw_axis=1))
+    ess = float(cal.array_stats.ess(values, method="bulk", chain_axis=0, draw_axis=1))
     error = values.std() * np.hypot(ess**-0.5, reference[name]["ess_bulk"] ** -0.5)
     both = f"{values.mean():.3f}, by the toolkit {reference[name]['mean']:.3f}"
     print(f"{name}: {both}; effective draws {ess:.0f}")

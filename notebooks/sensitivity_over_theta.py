@@ -21,7 +21,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures.sensitivity import body_figure, index_figure
 
 forward = em.load("left_ventricle").cache()
 scene = forward.scene
@@ -42,7 +41,7 @@ for k, name in enumerate(volume["factor"].values):
     first, total = (float(volume[index][k, 0]) for index in ("first", "total"))
     near = float(volume["total_half_width"][k, 0])
     print(f"{name:9s} first {first:6.3f}   total {total:6.3f} +- {near:.3f}")
-index_figure(found)
+cal.index_figure(found)
 plt.show()
 
 # %% [markdown]
@@ -59,7 +58,7 @@ assert total["pressure"] + total["a_f"] > 0.8
 # The same, node by node. Grey is held. Where a map is bright, a landmark tells that parameter from the others.
 
 # %%
-body_figure(found, scene)
+cal.body_figure(found, scene)
 plt.show()
 
 # %% [markdown]

@@ -22,9 +22,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.sbc import LEVELS, sbc
-from calibrate.measurements import spread_landmarks
-from calibrate.project import by_fem
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "0.85"
 
@@ -41,7 +38,7 @@ scene
 # %%
 truth = scene.theta(lam=6.0, mu=5.0)
 exact = simulator(truth)
-observe = cal.landmarks(scene, spread_landmarks(scene, 20, seed=5))
+observe = cal.landmarks(scene, cal.spread_landmarks(scene, 20, seed=5))
 noise_sd = 0.3  # mm
 rng = np.random.default_rng(5)
 clean = np.asarray(observe(exact[observe.nodes], truth))
@@ -142,10 +139,10 @@ assert certificate.verdict == "accepted"
 
 # %%
 short = cal.NUTSOptions(warmup=150, draws=200, chains=1, rounds=1)
-found = sbc(model, 60, truth=by_fem(model), options=short, seed=11)
+found = cal.sbc(model, 60, truth=cal.by_fem(model), options=short, seed=11)
 print("inside the 95 % band" if found.passed else "outside the 95 % band")
 for name, rows in found.coverage().items():
-    covered = ", ".join(f"{100 * level:.0f} %: {100 * rows[level][0]:.0f}" for level in LEVELS)
+    covered = ", ".join(f"{100 * level:.0f} %: {100 * rows[level][0]:.0f}" for level in cal.LEVELS)
     print(f"{name:15s} nominal and actual coverage {covered}")
 assert not any(found.outside(0.99).values())  # of right posteriors 1 in 100 leaves this band
 
@@ -155,7 +152,7 @@ assert not any(found.outside(0.99).values())  # of right posteriors 1 in 100 lea
 
 # %%
 overconfident = cal.model(forward, observe, cal.GaussianNoise(sd=0.5 * noise_sd))
-wrong = sbc(overconfident, 40, truth=by_fem(model), options=short, seed=12)
+wrong = cal.sbc(overconfident, 40, truth=cal.by_fem(model), options=short, seed=12)
 covered, low, high = wrong.coverage()["mu"][0.9]
 interval = f"{100 * low:.0f} to {100 * high:.0f}"
 print(f"90 % intervals of mu cover {100 * covered:.0f} % (from 40 data sets: {interval})")

@@ -33,11 +33,6 @@ import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import emulator as em
-from emulator.geometry.facets import Cavity
-from emulator.geometry.fibres import depth
-from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
-from emulator.geometry.mesh import boundary_facets
-from emulator.scenes.draft import draft
 
 # %% [markdown]
 # ## 1. A mesh file
@@ -47,7 +42,7 @@ from emulator.scenes.draft import draft
 # Gmsh's format. Bending shifts every cross-section within its own plane, so it changes no volume; we use that below.
 
 # %%
-wall = human_ventricle(8, 16, 2)
+wall = em.generators.human_ventricle(8, 16, 2)
 x, y, z = wall.nodes.T
 along = (z - z.max()) / (z.min() - z.max())  # 0 at the base, 1 at the apex
 bent = np.stack([x + 15.0 * along**2, y, z], axis=1)  # mm
@@ -78,14 +73,14 @@ print("extent:", (high - low).round(2), "in a unit that the file does not name")
 # guessed. Read this list: a program cannot know your unit.
 
 # %%
-guess = draft("patient.msh", "guess.toml")
+guess = em.draft_scene("patient.msh", "guess.toml")
 print(*guess.notes, sep="\n")
 
 # %% [markdown]
 # The first line is wrong. A heart of 8.5 mm would be a mouse's. The unit is cm, and saying so writes the mesh again in mm.
 
 # %%
-made = draft("patient.msh", "patient.toml", unit="cm")
+made = em.draft_scene("patient.msh", "patient.toml", unit="cm")
 print(*made.notes, sep="\n")
 print()
 print(Path("patient.toml").read_text())
@@ -120,8 +115,8 @@ scene = em.find_scene("patient.toml")
 scene
 
 # %%
-cavity = Cavity(scene.mesh, "LV_endo")
-exact = HUMAN.cavity_volume / 1000.0
+cavity = em.Cavity(scene.mesh, "LV_endo")
+exact = em.generators.HUMAN.cavity_volume / 1000.0
 print(f"cavity {cavity.rest:.1f} mL, of the ellipsoid {exact:.1f} mL")
 assert 0.95 < cavity.rest / exact < 1.0
 
@@ -140,7 +135,7 @@ assert quality.min() > 0.1
 # of our own.
 
 # %%
-deep = depth(scene.mesh, ("LV_endo",), ("LV_epi",))  # 0 inside, 1 outside, and the normal
+deep = em.wall_depth(scene.mesh, ("LV_endo",), ("LV_epi",))  # 0 inside, 1 outside, and the normal
 around = np.cross([0.0, 0.0, 1.0], deep.normal)
 around /= np.linalg.norm(around, axis=-1, keepdims=True)
 upwards = np.cross(deep.normal, around)
@@ -248,7 +243,7 @@ print(f"force of the base {held.round(2)} mN; pressure times area {pressure * op
 assert np.abs(held - [0.0, 0.0, pressure * opening]).max() < 1e-5 * pressure * opening
 
 # %%
-half = boundary_facets(scene.mesh.elements[corners.mean(axis=1)[:, 1] > 0.0])[:, :3]
+half = em.boundary_facets(scene.mesh.elements[corners.mean(axis=1)[:, 1] > 0.0])[:, :3]
 size = np.linalg.norm(u, axis=1)
 figure = plt.figure(figsize=(7.2, 3.3), layout="constrained")
 both = np.concatenate([scene.mesh.nodes, moved])
@@ -276,9 +271,9 @@ plt.show()
 Path("linear.toml").write_text(Path("patient.toml").read_text().replace("order = 2", "order = 1"))
 stiff = em.find_scene("linear.toml")
 locked = em.Simulator(stiff).solve(theta).require_converged("linear elements").displacement
-plain = Cavity(stiff.mesh, "LV_endo")
+plain = em.Cavity(stiff.mesh, "LV_endo")
 mesh_error = em.mesh_error(simulator)
-finest = Cavity(mesh_error.finer.scene.mesh, "LV_endo")
+finest = em.Cavity(mesh_error.finer.scene.mesh, "LV_endo")
 of_mesh = mesh_error(theta)
 growth = {
     "linear": (stiff, float(plain(locked[plain.nodes])) - plain.rest),
