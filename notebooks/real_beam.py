@@ -35,7 +35,9 @@ import emulator as em
 # The force's amount is a parameter: 0 in the first experiment, 0.51 N in the second. They are two *load states* of one body.
 
 # %%
-mesh = em.generators.box((100.0, 30.0, 30.0), (8, 2, 2), 2, em.generators.toward_ends(8, 1.5, ("left",)))
+mesh = em.generators.box(
+    (100.0, 30.0, 30.0), (8, 2, 2), 2, em.generators.toward_ends(8, 1.5, ("left",))
+)
 edge = np.intersect1d(mesh.node_set("right"), mesh.node_set("top"))
 beam = em.Scene(
     name="silicone beam",

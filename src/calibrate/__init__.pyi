@@ -1,19 +1,26 @@
-from .analysis.identifiability import identify
-from .analysis.sbc import sbc
+from .analysis.identifiability import identify, in_words, stress_band
+from .analysis.sbc import LEVELS, sbc
 from .analysis.sensitivity import sensitivity
+from .arviz import array_stats
 from .certificate import Certificate, certify, reweight
+from .figures.sensitivity import body_figure, index_figure
 from .measurements import (
+    OBSERVATIONS,
     CavityVolume,
     Klotz,
     KlotzVolume,
     MeasuredParameter,
     Reaction,
+    Scalar,
     landmarks,
     length_between,
     nodal_displacements,
+    parse_observation,
     rigid_markers,
     segment_strains,
+    spread_landmarks,
     strains,
+    surface_distances,
     surface_points,
 )
 from .model_error import placement, rigid_motion
@@ -32,9 +39,24 @@ from .priors import (
     truncated,
     truncated_normal,
 )
-from .project import load
+from .project import by_fem, infer, load, read_posterior
 from .project.campaigns import campaign
-from .samplers import Density, NUTSOptions, density_of
+from .project.experiment import read_experiment
+from .report import write_report
+from .samplers import (
+    SAMPLERS,
+    BlackJAXNUTSOptions,
+    ChainOptions,
+    ChainSampler,
+    DelayedAcceptanceOptions,
+    Density,
+    Kernel,
+    LaplaceOptions,
+    MCLMCOptions,
+    NUTSOptions,
+    SMCOptions,
+    density_of,
+)
 from .statistical_model import Model
 from .statistical_model.errors import with_systematic
 from .statistical_model.model import model
@@ -43,31 +65,49 @@ from .um_bridge import serve
 __version__: str
 
 __all__ = [
+    "LEVELS",
+    "OBSERVATIONS",
+    "SAMPLERS",
+    "BlackJAXNUTSOptions",
     "CavityVolume",
     "Certificate",
+    "ChainOptions",
+    "ChainSampler",
     "CorrelatedNoise",
+    "DelayedAcceptanceOptions",
     "Density",
     "Dependence",
     "DiscrepancyNoise",
     "GaussianNoise",
     "Hierarchy",
     "JointPrior",
+    "Kernel",
     "Klotz",
     "KlotzVolume",
+    "LaplaceOptions",
+    "MCLMCOptions",
     "MeasuredParameter",
     "Model",
     "NUTSOptions",
     "Population",
     "Posterior",
     "Reaction",
+    "SMCOptions",
+    "Scalar",
     "StudentTNoise",
+    "array_stats",
+    "body_figure",
     "box_prior",
+    "by_fem",
     "campaign",
     "certify",
     "compare",
     "density_of",
     "hierarchy",
     "identify",
+    "in_words",
+    "index_figure",
+    "infer",
     "klotz_band",
     "landmarks",
     "length_between",
@@ -75,9 +115,12 @@ __all__ = [
     "log_normal",
     "model",
     "nodal_displacements",
+    "parse_observation",
     "placement",
     "population_of_fits",
+    "read_experiment",
     "read_hierarchy",
+    "read_posterior",
     "reweight",
     "rigid_markers",
     "rigid_motion",
@@ -86,9 +129,13 @@ __all__ = [
     "segment_strains",
     "sensitivity",
     "serve",
+    "spread_landmarks",
     "strains",
+    "stress_band",
+    "surface_distances",
     "surface_points",
     "truncated",
     "truncated_normal",
     "with_systematic",
+    "write_report",
 ]

@@ -6,15 +6,20 @@ from .core.errors import InputError, SolverError
 from .fem import NewtonOptions, Simulator, Solution, Status, run_campaign
 from .fem.campaign.designs import fem_reference
 from .fem.campaign.store import read_runs
-from .fem.energy import potential_energy, strain_energy
+from .fem.energy import displacement_gradient, potential_energy, strain_energy
 from .fem.fields import element_fields
 from .fem.unloading import Unloaded, Unloader, unload
+from .geometry import generators
+from .geometry.facets import Cavity
+from .geometry.fibres import wall_depth
 from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
-from .geometry.mesh import Mesh
+from .geometry.mesh import Mesh, boundary_facets
 from .geometry.side_by_side import Bodies, side_by_side
 from .geometry.two_surfaces import mesh_wall
+from .mechanics import laws
 from .mechanics.laws import find_law
-from .scenes import Parameter, Scene, Support
+from .scenes import Parameter, Scene, Support, loads, supports
+from .scenes.draft import draft_scene
 from .scenes.finer import finer
 from .surrogates import Emulator, load, save_emulator, shipped
 from .surrogates.corrected import corrected
@@ -29,6 +34,7 @@ __version__: str
 __all__ = [
     "Bodies",
     "Body",
+    "Cavity",
     "Emulator",
     "FEMForward",
     "ForwardMap",
@@ -47,7 +53,10 @@ __all__ = [
     "Support",
     "Unloaded",
     "Unloader",
+    "boundary_facets",
     "corrected",
+    "displacement_gradient",
+    "draft_scene",
     "element_fields",
     "evaluate",
     "fem",
@@ -57,7 +66,10 @@ __all__ = [
     "find_scene",
     "finer",
     "fit_reduced",
+    "generators",
+    "laws",
     "load",
+    "loads",
     "mesh_error",
     "mesh_wall",
     "potential_energy",
@@ -72,8 +84,10 @@ __all__ = [
     "shipped",
     "side_by_side",
     "strain_energy",
+    "supports",
     "train",
     "unload",
+    "wall_depth",
     "write_mesh",
     "write_solution",
 ]

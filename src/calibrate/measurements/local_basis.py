@@ -19,7 +19,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.facets import mean_normal
-from emulator.geometry.fibres import circumferential, depth, unit
+from emulator.geometry.fibres import circumferential, unit, wall_depth
 from emulator.scenes.cavities import ENDOCARDIUM
 from emulator.scenes.scene import Scene
 
@@ -84,7 +84,7 @@ def _basis(scene: Scene) -> dict[str, np.ndarray]:
                 f"strain in wall directions needs facet sets {ENDOCARDIUM} and {EPICARDIUM}; "
                 f"scene '{scene.name}' has {known}"
             )
-    normal = depth(scene.mesh, (ENDOCARDIUM,), (EPICARDIUM,)).normal
+    normal = wall_depth(scene.mesh, (ENDOCARDIUM,), (EPICARDIUM,)).normal
     n = normal.reshape((*scene.discretisation.weights.shape, 3))
     c = circumferential(n, _axis(scene))
     basis = {"circumferential": c, "longitudinal": np.cross(n, c), "radial": n}

@@ -182,7 +182,7 @@ def rule_based_directions(
     angles : helix angle in degrees on the endocardium and on the epicardium.
     axis : from apex to base, any length.
     """
-    return turned(depth(mesh, (endocardium,), (epicardium,)), angles, axis)
+    return turned(wall_depth(mesh, (endocardium,), (epicardium,)), angles, axis)
 
 
 def rule_based_fibres(
@@ -213,7 +213,7 @@ def biventricular_depth(mesh: Mesh) -> Depth:
     """
     surfaces = ("lv_endocardium", "rv_endocardium", "epicardium")
     left, right = (
-        depth(mesh, (name,), tuple(other for other in surfaces if other != name))
+        wall_depth(mesh, (name,), tuple(other for other in surfaces if other != name))
         for name in surfaces[:2]
     )
     touch_left, touch_right = 1.0 - left.value, 1.0 - right.value
@@ -225,7 +225,7 @@ def biventricular_depth(mesh: Mesh) -> Depth:
     )
 
 
-def depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Depth:
+def wall_depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Depth:
     """Harmonic depth, 0 on the facet sets ``inside`` and 1 on ``outside``."""
     low, high = _nodes(mesh, inside), _nodes(mesh, outside)
     if np.isin(low, high).any():

@@ -1,5 +1,6 @@
 """Scenes: what can be simulated, emulated and calibrated."""
 
+from emulator.scenes import loads, supports
 from emulator.scenes.beams import once_clamped_beam, turned_beam, twice_clamped_beam
 from emulator.scenes.biventricle import biventricle
 from emulator.scenes.left_ventricle import left_ventricle
@@ -23,7 +24,9 @@ __all__ = [
     "left_ventricle_neo_hookean",
     "left_ventricle_segments",
     "liver",
+    "loads",
     "once_clamped_beam",
+    "supports",
     "traction_beam_guccione",
     "traction_beam_holzapfel_ogden",
     "turned_beam",

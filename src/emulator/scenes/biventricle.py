@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulator.geometry.generators import biventricle as geometry
+from emulator.geometry import generators
 from emulator.mechanics.laws import find_law
 from emulator.scenes.fibre_rules import Biventricle
 from emulator.scenes.left_ventricle import HELIX, MYOCARDIUM, PRESSURE
@@ -46,7 +46,7 @@ def biventricle(
     order : of the elements; 1, linear, as published.
     """
     made = resolved(SIZES, order, rings=rings, around=around, layers=layers, grading=grading)
-    mesh = geometry.biventricle(**made)
+    mesh = generators.biventricle(**made)
     rule = Biventricle(angles)
     return Scene(
         name="biventricle",

@@ -62,7 +62,7 @@ class Draft:
     notes: tuple[str, ...]
 
 
-def draft(
+def draft_scene(
     mesh_path: str | Path, out: str | Path, *, unit: str | None = None, law: str | None = None
 ) -> Draft:
     """Write a scene file for a mesh file.

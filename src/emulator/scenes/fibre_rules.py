@@ -12,7 +12,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.fibres import Axis, Depth, biventricular_depth, depth, turned
+from emulator.geometry.fibres import Axis, Depth, biventricular_depth, turned, wall_depth
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.fibre_angles import FibreAngles, across_wall, without_parameters
 
@@ -67,7 +67,7 @@ class Helix:
         return _turning(self, self._wall(mesh))
 
     def _wall(self, mesh: Mesh) -> Depth:
-        return depth(mesh, (self.endocardium,), (self.epicardium,))
+        return wall_depth(mesh, (self.endocardium,), (self.epicardium,))
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from emulator.geometry.discretisation import discretise
 from emulator.geometry.fibres import (
     Depth,
     biventricular_directions,
-    depth,
     nodal_depth,
     of_elements,
     rule_based_directions,
     rule_based_fibres,
     turned,
+    wall_depth,
 )
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.box import box
@@ -61,7 +61,7 @@ def test_depth_in_a_sphere_is_harmonic():
     errors = []
     for n in (2, 4):
         mesh = sphere_octant(1.0, 2.0, (3 * n, 2 * n))
-        found = depth(mesh, ("inner",), ("outer",))
+        found = wall_depth(mesh, ("inner",), ("outer",))
         radii = np.linalg.norm(centroids(mesh), axis=1)
         errors.append(np.sqrt(np.mean((found.value - (2.0 - 2.0 / radii)) ** 2)))
         away = degrees_between(found.normal, centroids(mesh) / radii[:, None])
@@ -74,7 +74,7 @@ def test_a_quadratic_depth_is_an_order_better():
     errors, away = [], []
     for n in (1, 2):
         mesh = sphere_octant(1.0, 2.0, (3 * n, 2 * n), order=2)
-        found, points = depth(mesh, ("inner",), ("outer",)), quadrature_points_of(mesh)
+        found, points = wall_depth(mesh, ("inner",), ("outer",)), quadrature_points_of(mesh)
         assert found.value.shape == points.shape[:2]
         assert found.normal.shape == points.shape
         radii = np.linalg.norm(points, axis=-1)

@@ -12,7 +12,7 @@ from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.quality import FLAT, dihedral_angles, mesh_quality
 from emulator.geometry.refinement import to_quadratic
-from emulator.scenes.draft import draft
+from emulator.scenes.draft import draft_scene
 
 REGULAR = np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])
 
@@ -55,10 +55,10 @@ def test_a_flat_element_is_found_where_it_is(tmp_path):
     assert moved in mesh.elements[worst]
     assert f"below {FLAT:g}: remesh there" in found.sentence()
     write_mesh(tmp_path / "flat.vtu", mesh)
-    notes = draft(tmp_path / "flat.vtu", tmp_path / "flat.toml").notes
+    notes = draft_scene(tmp_path / "flat.vtu", tmp_path / "flat.toml").notes
     assert found.sentence() in notes
     write_mesh(tmp_path / "good.vtu", box((10.0, 10.0, 10.0), (2, 2, 2)))
-    assert "angle" not in " ".join(draft(tmp_path / "good.vtu", tmp_path / "good.toml").notes)
+    assert "angle" not in " ".join(draft_scene(tmp_path / "good.vtu", tmp_path / "good.toml").notes)
 
 
 def test_curved_elements_have_a_jacobian_that_varies():
@@ -83,7 +83,7 @@ def test_parts_are_counted():
 def test_from_the_command_line(tmp_path, capsys):
     mesh, _ = flattened(0.05)
     write_mesh(tmp_path / "flat.vtu", mesh)
-    draft(tmp_path / "flat.vtu", tmp_path / "flat.toml", law="neo_hookean")
+    draft_scene(tmp_path / "flat.vtu", tmp_path / "flat.toml", law="neo_hookean")
     capsys.readouterr()
     assert main(["check", "mesh", str(tmp_path / "flat.toml")]) == 0
     assert "below 3: remesh there" in capsys.readouterr().out

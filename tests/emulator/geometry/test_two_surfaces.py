@@ -17,7 +17,7 @@ from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import signed_volumes
 from emulator.geometry.surfaces import Surface, read_surface
 from emulator.geometry.two_surfaces import mesh_wall
-from emulator.scenes.draft import draft
+from emulator.scenes.draft import draft_scene
 from surface_support import INSIDE, OUTSIDE, ellipsoid, write
 
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
@@ -106,7 +106,7 @@ def test_fibres_by_rule_follow_the_axis_that_the_base_tells(made, tmp_path):
     fibres = []
     for name, mesh in (("upright", made.mesh), ("turned", turned)):
         write_mesh(tmp_path / f"{name}.vtu", mesh)
-        scene = draft(tmp_path / f"{name}.vtu", tmp_path / f"{name}.toml").scene
+        scene = draft_scene(tmp_path / f"{name}.vtu", tmp_path / f"{name}.toml").scene
         fibres.append(np.asarray(scene.fibres))
         assert scene.mesh.order == 2
     assert np.isfinite(fibres[0]).all()
@@ -133,7 +133,7 @@ def test_the_command_draws_and_what_it_wrote_is_solved(rough, tmp_path, capsys):
     assert code == 0
     assert told["cavity"]["mesh"] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.02)
     assert picture.stat().st_size > 10_000
-    scene = draft(out, tmp_path / "lv.toml").scene
+    scene = draft_scene(out, tmp_path / "lv.toml").scene
     assert Simulator(scene).solve(scene.centre).converged
 
 

@@ -13,7 +13,7 @@ from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.refinement import to_quadratic
-from emulator.scenes.draft import draft
+from emulator.scenes.draft import draft_scene
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity
 
 
@@ -24,7 +24,7 @@ def ventricle_file(tmp_path):
 
 
 def test_a_ventricle_of_named_groups(ventricle_file):
-    made = draft(ventricle_file, ventricle_file.with_suffix(".toml"))
+    made = draft_scene(ventricle_file, ventricle_file.with_suffix(".toml"))
     scene = made.scene
     assert scene.law.name == "holzapfel_ogden"
     assert scene.loads == (CavityPressure("endocardium"),)
@@ -41,15 +41,15 @@ def test_a_ventricle_of_named_groups(ventricle_file):
 def test_metres_are_seen_and_written_in_mm(tmp_path):
     mesh = human_ventricle(4, 8, 1)
     write_mesh(tmp_path / "lv.vtu", replace(mesh, nodes=0.001 * mesh.nodes))
-    made = draft(tmp_path / "lv.vtu", tmp_path / "new" / "lv.toml")
+    made = draft_scene(tmp_path / "lv.vtu", tmp_path / "new" / "lv.toml")
     assert "taken to be m" in made.notes[0]
     corners = made.scene.mesh.nodes[: len(mesh.nodes)]  # made quadratic, they come first
     np.testing.assert_allclose(corners, mesh.nodes, rtol=1e-6, atol=1e-9)
     assert (tmp_path / "new" / "lv_mm.vtu").is_file()
     write_mesh(tmp_path / "cm.vtu", replace(mesh, nodes=0.1 * mesh.nodes))
-    said = draft(tmp_path / "cm.vtu", tmp_path / "cm.toml")
+    said = draft_scene(tmp_path / "cm.vtu", tmp_path / "cm.toml")
     assert "if it is in cm, give --unit cm" in said.notes[0]
-    in_cm = draft(tmp_path / "cm.vtu", tmp_path / "cm2.toml", unit="cm")
+    in_cm = draft_scene(tmp_path / "cm.vtu", tmp_path / "cm2.toml", unit="cm")
     corners = in_cm.scene.mesh.nodes[: len(mesh.nodes)]
     np.testing.assert_allclose(corners, mesh.nodes, rtol=1e-6, atol=1e-9)
 
@@ -59,7 +59,7 @@ def test_a_rim_that_is_not_held_takes_a_follower_pressure(tmp_path):
     walls = {name: rows for name, rows in mesh.facet_sets.items() if name != "base"}
     sets = {"apex fixed": np.array([int(np.argmin(mesh.nodes[:, 2])), 0, 5, 20, 30])}
     write_mesh(tmp_path / "lv.vtu", replace(mesh, node_sets=sets, facet_sets=walls))
-    made = draft(tmp_path / "lv.vtu", tmp_path / "lv.toml")
+    made = draft_scene(tmp_path / "lv.vtu", tmp_path / "lv.toml")
     assert made.scene.loads == (FollowerPressure("endocardium"),)
     assert any("not the load 'cavity_pressure'" in note for note in made.notes)
 
@@ -67,21 +67,21 @@ def test_a_rim_that_is_not_held_takes_a_follower_pressure(tmp_path):
 def test_a_bare_block_hangs_by_its_end(tmp_path):
     mesh = replace(box((40.0, 10.0, 10.0), (4, 2, 2)), node_sets={}, facet_sets={})
     write_mesh(tmp_path / "block.vtu", mesh)
-    made = draft(tmp_path / "block.vtu", tmp_path / "block.toml")
+    made = draft_scene(tmp_path / "block.vtu", tmp_path / "block.toml")
     assert made.scene.law.name == "neo_hookean"
     assert isinstance(made.scene.loads[0], Gravity)
     assert any("held where x is least, 0 mm; change it" in note for note in made.notes)
     assert any("own weight along -z is the load" in note for note in made.notes)
     assert not any("not used" in note for note in made.notes)
     assert made.scene.held[:, 0].sum() == 25  # made quadratic
-    other = draft(tmp_path / "block.vtu", tmp_path / "other.toml", law="neo_hookean_E_nu")
+    other = draft_scene(tmp_path / "block.vtu", tmp_path / "other.toml", law="neo_hookean_E_nu")
     nu = other.scene.parameters[1]
     assert (nu.name, nu.low < nu.high < 0.5) == ("nu", True)
 
 
 def test_sets_that_are_not_used_are_named(tmp_path):
     write_mesh(tmp_path / "block.vtu", box((40.0, 10.0, 10.0), (4, 2, 2)))
-    made = draft(tmp_path / "block.vtu", tmp_path / "block.toml")
+    made = draft_scene(tmp_path / "block.vtu", tmp_path / "block.toml")
     (note,) = (note for note in made.notes if "not used" in note)
     assert "right, front, back, bottom, top; a force on one" in note
     assert 'kind = "traction"' in note
@@ -112,18 +112,18 @@ def test_command_and_bad_input(ventricle_file, capsys):
     assert not (folder / "b.toml").exists()
     assert not (folder / "c.toml").exists()
     with pytest.raises(InputError, match="unit 'ft'"):
-        draft(ventricle_file, folder / "d.toml", unit="ft")
+        draft_scene(ventricle_file, folder / "d.toml", unit="ft")
 
 
 def test_linear_tetrahedra_are_kept_from_locking(tmp_path, monkeypatch):
     mesh = human_ventricle(4, 8, 1)
     write_mesh(tmp_path / "lv.vtu", mesh)
-    made = draft(tmp_path / "lv.vtu", tmp_path / "lv.toml")
+    made = draft_scene(tmp_path / "lv.vtu", tmp_path / "lv.toml")
     assert made.scene.mesh.order == 2
     assert "linear tetrahedra, which lock" in " ".join(made.notes)
     monkeypatch.setattr("emulator.scenes.draft._MOST_QUADRATIC", 100)
-    large = draft(tmp_path / "lv.vtu", tmp_path / "large.toml").scene
+    large = draft_scene(tmp_path / "lv.vtu", tmp_path / "large.toml").scene
     assert (large.mesh.order, large.dilatation) == (1, "patch")
     write_mesh(tmp_path / "quadratic.vtu", to_quadratic(mesh))
-    said = draft(tmp_path / "quadratic.vtu", tmp_path / "quadratic.toml")
+    said = draft_scene(tmp_path / "quadratic.vtu", tmp_path / "quadratic.toml")
     assert "lock" not in " ".join(said.notes)

@@ -34,11 +34,11 @@ def add_init(commands: Any) -> None:
 
 def run_init(arguments: argparse.Namespace) -> int:
     """Write the scene file."""
-    from emulator.scenes.draft import draft
+    from emulator.scenes.draft import draft_scene
 
     beside = Path(arguments.mesh)
     out = arguments.out or beside.parent / f"{beside.stem or 'scene'}.toml"
-    made = draft(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
+    made = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
     mesh = made.scene.mesh
     sets = {name: len(nodes) for name, nodes in mesh.node_sets.items()}
     facets = {name: len(rows) for name, rows in mesh.facet_sets.items()}

@@ -11,7 +11,9 @@ import pkgutil
 from importlib import import_module
 
 from emulator.core.errors import look_up
-from emulator.mechanics.laws.law import Law
+from emulator.mechanics.kinematics import Strain
+from emulator.mechanics.laws.law import Law, Quantity, modulus, number
+from emulator.mechanics.laws.volumetric import logarithmic, quadratic, quadratic_logarithmic
 
 LAWS: dict[str, Law] = {
     law.name: law
@@ -25,4 +27,15 @@ def find_law(name: str) -> Law:
     return look_up(LAWS, name, "law")
 
 
-__all__ = ["LAWS", "Law", "find_law"]
+__all__ = [
+    "LAWS",
+    "Law",
+    "Quantity",
+    "Strain",
+    "find_law",
+    "logarithmic",
+    "modulus",
+    "number",
+    "quadratic",
+    "quadratic_logarithmic",
+]
