@@ -56,6 +56,29 @@ def test_no_line_of_prose_is_wider_than_100_characters():
         assert not wide, (path.name, wide[0])
 
 
+def test_docs_and_notebooks_import_from_the_two_packages_only():
+    """A user's code needs no module's path; a page shows files of the package with their docstring."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    code = {}
+    for path in pages:
+        blocks = re.findall(
+            r"```python\n(.*?)```", path.read_text(encoding="utf-8"), flags=re.DOTALL
+        )
+        code[path.name] = "\n".join(block for block in blocks if not block.startswith('"""'))
+    for path in (ROOT / "notebooks").glob("*.py"):
+        code[path.name] = path.read_text(encoding="utf-8")
+    deep = {
+        name: found
+        for name, text in code.items()
+        if (
+            found := re.findall(
+                r"^\s*(?:from|import) (?:emulator|calibrate)\..*", text, re.MULTILINE
+            )
+        )
+    }
+    assert not deep
+
+
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
 
