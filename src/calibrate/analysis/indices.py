@@ -40,7 +40,7 @@ from SALib.sample import sobol as sobol_design
 from scipy.stats import norm, qmc
 
 from calibrate.priors import Prior, bisect, bounds, dependence_of
-from emulator.core.errors import InputError, check_seed
+from emulator.core.errors import InputError, check_known, check_seed
 
 _EDGE = 1e-9  # of the unit interval; beyond, a distribution without ends has infinite quantiles
 
@@ -172,8 +172,7 @@ def analyse(
     InputError
         An unknown method, too few samples, no derivative, or outputs that are not finite.
     """
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown; known: {', '.join(METHODS)}")
+    check_known(method, METHODS, "method")
     check_seed(seed, "sensitivity")
     if samples < 2 or (method == "sobol" and samples & (samples - 1)):
         raise InputError(

@@ -12,17 +12,18 @@ falls below -1.92 (half the quantile 3.84 of chi-squared with one degree of free
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
 
 from calibrate.posterior import Posterior
 from calibrate.priors import bounds
 from calibrate.samplers import density_of
 from emulator.core.errors import InputError
+from emulator.core.minimise import minimise
 
 DROP_95 = 1.92
 _BOUND = 12.0  # of the unconstrained coordinate of an interval: within 1e-5 of its ends
@@ -92,37 +93,19 @@ def _profile(
     def objective(rest: jax.Array, value: jax.Array) -> jax.Array:
         return -log_likelihood(jnp.zeros(z.shape[1]).at[k].set(value).at[others].set(rest))
 
-    def safe(rest: np.ndarray, value: float) -> tuple[float, np.ndarray]:
-        optima, gradient = (np.asarray(part) for part in objective(jnp.asarray(rest), value))
-        fine = np.isfinite(optima) and np.isfinite(gradient).all()
-        return (float(optima), gradient) if fine else (1e10, np.zeros_like(rest))
-
     best, last = [], None
     for value in grid:
         starts = [z[int(np.argmin(np.abs(z[:, k] - value))), others]]
         starts += [] if last is None else [last]
         low, high = -limits[others], limits[others]
-        box = list(zip(low, high, strict=True))
         optima = [
-            minimize(safe, np.clip(s, low, high), (value,), jac=True, bounds=box)
-            if len(others)
-            else _nothing_to_fit(safe, value)
+            minimise(partial(objective, value=value), np.clip(s, low, high), low=low, high=high)
             for s in starts
         ]
-        lowest = min(optima, key=lambda result: result.fun)
-        best.append(-lowest.fun)
+        lowest = min(optima, key=lambda minimum: minimum.value)
+        best.append(-lowest.value)
         last = lowest.x
     return np.array(best)
-
-
-class _Found(NamedTuple):
-    fun: float
-    x: np.ndarray
-
-
-def _nothing_to_fit(safe: Callable, value: float) -> _Found:
-    """With a single unknown, the likelihood itself."""
-    return _Found(safe(np.zeros(0), value)[0], np.zeros(0))
 
 
 def _interval(values: np.ndarray, drop: np.ndarray) -> tuple[float, float]:

@@ -22,7 +22,7 @@ import numpy as np
 from calibrate.measurements.klotz import PRESSURE_SCATTER, Klotz
 from calibrate.measurements.pressure_volume import pressure_volume
 from calibrate.statistical_model import Model
-from emulator.core.errors import InputError, check_seed
+from emulator.core.errors import InputError, check_known, check_seed
 
 DRAWS = 200
 
@@ -97,7 +97,7 @@ def klotz_band(
 
 
 def _row(states: tuple[str, ...], state: str | None) -> int:
-    if state is not None and state not in states:
-        known = ", ".join(filter(None, states)) or "none"
-        raise InputError(f"klotz: load state '{state}' is unknown; known: {known}")
-    return -1 if state is None else states.index(state)
+    if state is None:
+        return -1
+    check_known(state, states, "klotz: load state")
+    return states.index(state)

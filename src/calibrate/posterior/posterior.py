@@ -26,7 +26,7 @@ from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.laplace import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, FEMLikelihood, Model
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, check_known
 from emulator.core.representation import TableRepr
 from emulator.core.store import write_netcdf
 from emulator.fem import Simulator
@@ -71,8 +71,8 @@ class Posterior(TableRepr):
         states = self.model.states.states
         if state is None and len(states) > 1:
             raise InputError(f"the posterior has several load states: {', '.join(states)}")
-        if state is not None and state not in states:
-            raise InputError(f"load state '{state}' is unknown; known: {', '.join(states)}")
+        if state is not None:
+            check_known(state, states, "load state")
         return self.model.states.thetas(self.draws())[:, states.index(state or states[0])]
 
     def predict(

@@ -20,8 +20,23 @@ def closest(name: object, known: Iterable[str]) -> str:
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
+def check_known(name: object, known: Iterable[str], noun: str) -> None:
+    """Raise :class:`InputError` unless ``name`` is ``known``: the one wording of an unknown name.
+
+    Parameters
+    ----------
+    name : the name that the user gave.
+    known : the names there are.
+    noun : the word for one of them, such as ``sampler``; it begins the message.
+    """
+    known = list(known)
+    if name not in known:
+        names = ", ".join(filter(None, known)) or "none"
+        raise InputError(f"{noun} '{name}' is unknown; known: {names}{closest(name, known)}")
+
+
 def look_up[T](entries: Mapping[str, T], name: object, noun: str) -> T:
-    """Return the entry called ``name``: the one wording of an unknown name.
+    """Return the entry called ``name``.
 
     Parameters
     ----------
@@ -34,10 +49,8 @@ def look_up[T](entries: Mapping[str, T], name: object, noun: str) -> T:
     InputError
         No entry is called ``name``; the message lists the known names.
     """
-    if not isinstance(name, str) or name not in entries:
-        known = ", ".join(entries) or "none"
-        raise InputError(f"{noun} '{name}' is unknown; known: {known}{closest(name, entries)}")
-    return entries[name]
+    check_known(name, entries, noun)
+    return entries[str(name)]
 
 
 def check_seed(seed: int, what: str) -> None:
