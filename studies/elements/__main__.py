@@ -25,7 +25,7 @@ from studies.elements.bodies import BEAM, BODIES, Body, Measured, measured
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
-from calibrate.measurements.landmarks import spread_landmarks
+from calibrate.measurements.displacements import spread_landmarks
 from emulator.scenes.scene import Scene
 
 HERE = Path(__file__).parent

@@ -32,7 +32,7 @@ from calibrate.certificate.predictive import (
 from calibrate.certificate.runs import Runs
 from calibrate.certificate.verdict import Figure, MeshChange
 from calibrate.measurements import Observations
-from calibrate.measurements.mesh_error import on_finer
+from calibrate.measurements.outputs import on_finer
 from calibrate.samplers.diagnostics import effective, normalised
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
 from emulator.core.errors import InputError, SolverError

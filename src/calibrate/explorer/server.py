@@ -17,7 +17,7 @@ from plotly.offline import get_plotlyjs
 
 from calibrate.local_server import Handler, Server, listen
 from calibrate.measurements.klotz import klotz_of
-from calibrate.measurements.pressure_volume import PressureVolume, pressure_volume
+from calibrate.measurements.volume import PressureVolume, pressure_volume
 from emulator.accuracy.estimate import error_bar
 from emulator.core.errors import InputError
 from emulator.fem import Simulator, Status

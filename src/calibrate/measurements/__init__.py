@@ -1,16 +1,27 @@
-"""Observation operators: what of a displacement field was measured, one kind a file.
+"""What of a displacement field was measured: observations, the files of their data, and units.
 
-Each stands for one measurement; :class:`Observations` holds those made at once, by name. The kinds
-are listed in :data:`OBSERVATIONS`.
+A kind of observation is a subclass of :class:`Observation`; the kinds are listed in
+:data:`OBSERVATIONS`. :class:`Observations` holds those made at once, by name.
 """
 
+from calibrate.measurements.collection import (
+    Observations,
+    leave_out_missing,
+    missing_values,
+    observations,
+)
+from calibrate.measurements.displacements import (
+    Landmarks,
+    landmarks,
+    length_between,
+    nodal_displacements,
+    spread_landmarks,
+    spread_nodes,
+)
 from calibrate.measurements.klotz import Klotz, KlotzVolume
-from calibrate.measurements.landmarks import Landmarks, landmarks, spread_landmarks
-from calibrate.measurements.length import Length, length_between
-from calibrate.measurements.nodes import NodalDisplacements, nodal_displacements, spread_nodes
+from calibrate.measurements.observation import Observation, Scalar
 from calibrate.measurements.parameter import MeasuredParameter
-from calibrate.measurements.points import DISPLACEMENT
-from calibrate.measurements.protocol import Field, Kind, Labels, Observation
+from calibrate.measurements.points import DISPLACEMENT, DisplacementPoints, PointObservation
 from calibrate.measurements.reaction import Reaction
 from calibrate.measurements.registry import (
     OBSERVATIONS,
@@ -18,13 +29,9 @@ from calibrate.measurements.registry import (
     observations_from_json,
     parse_observation,
 )
-from calibrate.measurements.rigid_markers import RigidMarkers, rigid_markers
-from calibrate.measurements.scalar import Scalar
-from calibrate.measurements.segment_strain import SegmentStrain, segment_strains
-from calibrate.measurements.several import Observations, observations
-from calibrate.measurements.strain import Strain, strains
+from calibrate.measurements.strain import segment_strains, strains
 from calibrate.measurements.surface import (
-    SurfacePoints,
+    rigid_markers,
     spread_on_surface,
     surface_distances,
     surface_points,
@@ -35,25 +42,20 @@ __all__ = [
     "DISPLACEMENT",
     "OBSERVATIONS",
     "CavityVolume",
-    "Field",
-    "Kind",
+    "DisplacementPoints",
     "Klotz",
     "KlotzVolume",
-    "Labels",
     "Landmarks",
-    "Length",
     "MeasuredParameter",
-    "NodalDisplacements",
     "Observation",
     "Observations",
+    "PointObservation",
     "Reaction",
-    "RigidMarkers",
     "Scalar",
-    "SegmentStrain",
-    "Strain",
-    "SurfacePoints",
     "landmarks",
+    "leave_out_missing",
     "length_between",
+    "missing_values",
     "nodal_displacements",
     "observation_from_json",
     "observations",

@@ -6,7 +6,7 @@ found that volumes in units of their own range follow one curve, with
 
 .. math:: P = A_n \left(\frac{V - V_0}{V_{30} - V_0}\right)^{B_n} .
 
-One volume :math:`V_m` at one pressure :math:`P_m` tells the two volumes,
+One volume :math:`V_m` at one pressure :math:`P_m` gives the two volumes,
 
 .. math::
     V_0 = V_m\,(0.6 - 0.006\, P_m / \mathrm{mmHg}), \qquad
@@ -18,10 +18,10 @@ and, put into the curve, :math:`A_n` cancels:
     P = P_m \left(\frac{V - V_0}{V_m - V_0}\right)^{B_n}, \qquad
     V = V_0 + (V_m - V_0) \left(\frac{P}{P_m}\right)^{1/B_n} = V_m\, k(P; P_m) .
 
-:math:`k` is a number that no volume enters. So the curves through all volumes at :math:`P_m` cover
-the plane once, and a body of volume V at the pressure P lies on that of :math:`V_m = V / k`: this
-is what :class:`KlotzVolume` predicts and a measured volume is compared with. Points of one curve
-have curves of their own: V_0 changes with the pressure that is measured.
+:math:`k` does not depend on any volume. So the curves through all volumes at :math:`P_m` cover the
+plane once, and a body of volume V at the pressure P lies on the curve through :math:`V_m = V / k`.
+:class:`KlotzVolume` predicts this V_m, which a measured volume is compared with. Another point of
+the curve gives another curve: V_0 changes with the pressure that is measured.
 
 Scatter: over 0 to 40 mmHg, pressures of the predicted curve were less than 3 mmHg (root mean
 square) from measured ones in every group of hearts of the 2006 paper. It holds for groups of hearts
@@ -30,30 +30,27 @@ more than for one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Self
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from calibrate.measurements.scalar import Scalar
+from calibrate.measurements.observation import Scalar
 from calibrate.measurements.volume import CavityVolume
-from calibrate.noise.protocol import Noise
 from emulator.core.errors import InputError
 from emulator.scenes.cavities import inflated_cavity
 from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.scenes.scene import Scene
 
 PRESSURE_SCATTER = 3.0 * KPA_PER_MMHG
-"""kPa: what the published root mean square errors of pressure stay below."""
+"""Upper bound of the published root mean square errors of pressure, kPa."""
 
 _A, _B = 27.78 * KPA_PER_MMHG, 2.76
 _UNLOADED, _SLOPE = 0.6, 0.006 / KPA_PER_MMHG  # V_0 / V_m at rest, and its fall with P_m in 1/kPa
-_LARGEST = 40.0 * KPA_PER_MMHG  # of the pressures the relation was compared at
+_LARGEST = 40.0 * KPA_PER_MMHG  # largest pressure at which the relation was compared
 
 
 class PowerLaw(NamedTuple):
@@ -77,13 +74,14 @@ class Klotz:
 
     Parameters
     ----------
-    measured_volume : V_m in mL.
-    measured_pressure : P_m in kPa, above 0 and up to 5.33 (40 mmHg).
+    measured_volume : the measured volume V_m, mL.
+    measured_pressure : the pressure P_m at which it was measured, kPa, above 0 and up to 5.33
+        (40 mmHg).
 
     Raises
     ------
     InputError
-        A number outside these ranges; numbers that JAX traces are not looked at.
+        A number outside these ranges; numbers that JAX traces are not checked.
     """
 
     measured_volume: ArrayLike
@@ -129,8 +127,8 @@ class Klotz:
     def power_law(self) -> PowerLaw:
         """The protocol's curve, through the point and V_30 at 30 mmHg, without V_0.
 
-        Above 22 mmHg, where these two are close, V_15 = V_0 + 0.8 (V_30 - V_0) at 15 mmHg is in the
-        place of V_30.
+        Above 22 mmHg, where these two points are close, V_15 = V_0 + 0.8 (V_30 - V_0) at 15 mmHg
+        replaces V_30.
         """
         measured, pressure = self._point
         mmhg = pressure / KPA_PER_MMHG
@@ -141,19 +139,19 @@ class Klotz:
         return PowerLaw(pressure * jnp.exp(-beta * jnp.log(measured)), beta)
 
     def sd(self, pressure: ArrayLike, scatter: float = PRESSURE_SCATTER) -> jax.Array:
-        """Sd (...) in mL of :class:`KlotzVolume` at ``pressure`` (...) in kPa, above 0.
+        """Return the sd (...) in mL of :class:`KlotzVolume` at ``pressure`` (...) in kPa, above 0.
 
-        What a ``scatter`` of pressure in kPa means for it, to first order:
-        scatter dV/dP / k, with dV/dP = (V - V_0) / (B_n P). The default is an upper bound.
+        It follows from the ``scatter`` of pressure in kPa to first order: scatter dV/dP / k, with
+        dV/dP = (V - V_0) / (B_n P). The default scatter is an upper bound.
         """
         slope = (self.volume(pressure) - self.unloaded) / (_B * jnp.asarray(pressure))
         return scatter * slope / _ratio(pressure, self._point[1])
 
 
 def _ratio(pressure: ArrayLike, measured: ArrayLike) -> jax.Array:
-    """k, the volume at ``pressure`` over that at ``measured``, both in kPa.
+    """Return k, the volume at ``pressure`` over the volume at ``measured``, both in kPa.
 
-    Its slope at no pressure is infinite, and 0 is given.
+    The slope of k at no pressure is infinite; derivatives are 0 there.
     """
     p, m = jnp.asarray(pressure, float), jnp.asarray(measured, float)
     rest, above = _UNLOADED - _SLOPE * m, p > 0.0
@@ -176,10 +174,13 @@ class KlotzVolume(Scalar):
 
     The body's point is the volume of its first cavity whose pressure is a parameter, at that
     pressure in the observation's load state. Where the two pressures agree, it is the volume.
+    The relation's scatter in mL depends on the pressure (:meth:`Klotz.sd`), so its noise is given.
 
     Parameters
     ----------
+    scene : the scene, with such a cavity.
     measured_pressure : P_m in kPa, at which the data were measured.
+    volume, column : the volume of the cavity and the column of its pressure in theta, derived.
 
     Raises
     ------
@@ -189,68 +190,47 @@ class KlotzVolume(Scalar):
 
     scene: Scene
     measured_pressure: float
+    volume: CavityVolume = field(init=False)
+    column: int = field(init=False)
 
-    kind: ClassVar[str] = "klotz"
-    usage: ClassVar[str] = "klotz:PRESSURE (kPa)"
-    quantity: ClassVar[str] = "volume"
-    unit: ClassVar[str] = CavityVolume.unit
-    other_units: ClassVar[Mapping[str, float]] = CavityVolume.other_units
+    kind = "klotz"
+    usage = "klotz:PRESSURE (kPa)"
+    hint = ", such as klotz:1.3"
+    quantity = "volume"
+    unit = CavityVolume.unit
+    other_units = CavityVolume.other_units
+    arguments = ("measured_pressure",)
 
     def __post_init__(self) -> None:
         _check_pressure(self.names[0], self.measured_pressure)
-        self._wall  # noqa: B018 - a scene without such a cavity is refused here
-
-    @cached_property
-    def _wall(self) -> tuple[CavityVolume, int]:
-        """The volume, and the column of its pressure in theta."""
-        found = inflated_cavity(self.scene)
-        if found is None:
+        inflated = inflated_cavity(self.scene)
+        if inflated is None:
             raise InputError(
                 f"{self.names[0]}: scene '{self.scene.name}' has no cavity whose pressure is a "
                 f"parameter; it has {', '.join(self.scene.parameter_names)}"
             )
-        column = self.scene.parameter_names.index(found[1])
-        return CavityVolume(self.scene, found[0]), column
-
-    @property
-    def default_noise(self) -> Noise:
-        """None: the relation's scatter in mL depends on the pressure (:meth:`Klotz.sd`)."""
-        raise InputError(
-            f"{self.names[0]} has no usual noise; give --noise {self.names[0]}=SD, in mL"
-        )
-
-    @property
-    def nodes(self) -> np.ndarray:
-        """Nodes of the cavity's wall, (k,)."""
-        return self._wall[0].nodes
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """``klotz:1.3`` and the like."""
-        return (f"{self.kind}:{self.measured_pressure!r}",)
-
-    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """V_m (...) in mL."""
-        volume, column = self._wall
-        return volume(displacement, theta) / _ratio(theta[..., column], self.measured_pressure)
+        volume = CavityVolume(self.scene, inflated[0])
+        column = self.scene.parameter_names.index(inflated[1])
+        self._derive(volume=volume, column=column, nodes=volume.nodes)
 
     @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """``klotz:1.3``."""
-        kind, _, text = word.partition(":")
-        if kind != cls.kind:
-            return None
-        try:
-            pressure = float(text)
-        except ValueError:
-            raise InputError(f"observe '{word}': give {cls.usage}, such as klotz:1.3") from None
-        return word, cls(scene, pressure)
+    def of(cls, scene: Scene, pressure: str) -> Self:
+        """Observe the volume at this pressure in kPa."""
+        return cls(scene, float(pressure))
+
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """V_m (...) in mL."""
+        pressure = theta[..., self.column]
+        return self.volume(displacement, theta) / _ratio(pressure, self.measured_pressure)
 
 
 def klotz_of(scene: Scene, volume: Any, pressure: Any) -> Klotz | None:
-    """The relation behind a scene's curve; None of muscle that may contract, or out of its range.
+    """Return the relation behind a scene's curve; None for muscle that may contract.
 
-    volume : mL, of the scene's cavity. pressure : kPa, there.
+    Parameters
+    ----------
+    volume : the volume of the scene's cavity, mL.
+    pressure : the pressure there, kPa. None is returned for numbers out of the relation's range.
     """
     if any(load.fibres for load in scene.loads):
         return None

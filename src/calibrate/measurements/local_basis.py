@@ -33,17 +33,17 @@ COMPONENTS = {
     "longitudinal": "E_long",
     "radial": "E_rad",
 }
-"""Directions of the basis, and the name of the strain along each in files."""
+"""Directions of the basis, with the name in files of the strain along each."""
 
 
 def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
-    """Unit vectors (m, q, c, 3) along ``components`` at the quadrature points.
+    """Return unit vectors (m, q, c, 3) along ``components`` at the quadrature points.
 
     Raises
     ------
     InputError
-        An unknown component or one that is given twice; fibre directions of a scene without
-        fibres; others of a scene without a wall.
+        An unknown component or one that is given twice; a fibre direction where the scene has no
+        fibres; another direction where it has no wall.
     """
     for name in components:
         if name not in COMPONENTS:
@@ -66,7 +66,7 @@ def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
 
 
 def _axis(scene: Scene) -> np.ndarray:
-    """From apex to base, (3,)."""
+    """Unit vector from apex to base, (3,)."""
     mesh = scene.mesh
     if (axis := getattr(scene.fibre_rule, "axis", None)) is not None:
         return unit(np.asarray(axis, dtype=float))
@@ -76,7 +76,7 @@ def _axis(scene: Scene) -> np.ndarray:
 
 
 def _basis(scene: Scene) -> dict[str, np.ndarray]:
-    """Every direction that the scene has, (m, q, 3) each."""
+    """All directions that the scene has, (m, q, 3) each."""
     for name in (ENDOCARDIUM, EPICARDIUM):
         if name not in scene.mesh.facet_sets:
             known = ", ".join(sorted(scene.mesh.facet_sets)) or "none"

@@ -1,15 +1,23 @@
-r"""The element a material point lies in, and the shape functions there.
+r"""Where a point lies: in which element of a body, and over which facet of a surface.
 
-scikit-fem finds the element of a point inside the body. A point outside, or inside a curved element
-but not inside its straight-edged one, is moved onto the nearest element, by inverting the element's
-map :math:`x(\xi) = \sum_a N_a(\xi)\, X_a` with Newton's method.
+**In the body.** scikit-fem finds the element of a point inside the body. A point outside, or inside
+a curved element but not inside its straight-edged one, is moved onto the nearest element, by
+inverting the element's map :math:`x(\xi) = \sum_a N_a(\xi)\, X_a` with Newton's method.
+
+**On a surface.** The closest point of a triangle is the foot of the perpendicular to its plane, or,
+where the foot lies outside, the closest point of the three edges. On curved facets
+:math:`x(\xi) = \sum_a N_a(\xi)\, X_a` that is the start of Gauss-Newton iterations on
+:math:`|x(\xi) - p|^2`.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from skfem import MeshTet
 
+from calibrate.measurements.observation import LENGTH_UNITS
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import shapes_at
 from emulator.geometry.mesh import Mesh
@@ -18,14 +26,15 @@ from emulator.geometry.mesh import Mesh
 # points rarely lie on the mesh to the last digit.
 _SLACK = 1e-3
 _SEVERAL, _LEAST, _MOST = 3, 0.003, 5.0  # points; their span as a share of the body's
-_UNITS = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
 _ON_THE_FACE = 1e-9  # round-off of a barycentric coordinate
-_CANDIDATES = 32  # nearest elements, by their straight-edged shape, in which a point is sought
+_ELEMENTS = 32  # nearest elements, by their straight-edged shape, in which a point is sought
+_FACETS = 16  # the same for the facets of a surface
 _NEWTON_STEPS = 12  # at most; an element with straight edges takes one
+_GAUSS_NEWTON_STEPS = 20  # the distance of a point on the surface converges quadratically
 
 
 def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Element (d,) of each point (d, 3), and the element's shape functions there (d, 4 or 10).
+    """Return the element (d,) of each point (d, 3), and its shape functions there (d, 4 or 10).
 
     Raises
     ------
@@ -37,9 +46,9 @@ def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def locate_gradients(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Element (d,) of each point (d, 3), its barycentric coordinates (d, 4), and gradients.
+    """Return the element (d,) of each point (d, 3), barycentric coordinates (d, 4) and gradients.
 
-    These are the shape functions' in the reference body, (d, 4 or 10, 3) in 1/mm.
+    The gradients are those of the shape functions in the reference body, (d, 4 or 10, 3) in 1/mm.
     """
     elements, inside = _find(mesh, points)
     _, slopes = shapes_at(mesh.order, inside)
@@ -56,26 +65,27 @@ def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     elements, coordinates = [], []
     for k, point in enumerate(points):
         try:
-            found = finder(*point[:, None])
+            element = finder(*point[:, None])
+            inside = _invert(nodes[element], point)[0]
+            is_inside = bool(inside.min() >= -_ON_THE_FACE)
         except ValueError:  # outside every straight-edged element
-            found = None
-        inside = None if found is None else _invert(nodes[found], point)[0]
-        if found is None or inside is None or not inside.min() >= -_ON_THE_FACE:
-            found, inside = _nearest(mesh, k, point)
-        elements.append(int(found[0]))
+            is_inside = False
+        if not is_inside:
+            element, inside = _nearest(mesh, k, point)
+        elements.append(int(element[0]))
         coordinates.append(inside[0])
     return np.array(elements), np.array(coordinates)
 
 
 def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
-    """Refuse several points that are together next to nothing of the body, or far more than it."""
+    """Refuse several points that span next to nothing of the body, or far more than the body."""
     if len(points) < _SEVERAL:
         return
     span, body = (float(np.ptp(x, axis=0).max()) for x in (points, mesh.nodes))
     if span == 0.0 or _LEAST * body <= span <= _MOST * body:
         return
-    # The unit whose points would span nearest to the body's size.
-    unit, factor = min(_UNITS.items(), key=lambda item: abs(np.log(item[1] * span / body)))
+    # The unit in which the points' span would be closest to the body's size.
+    unit, factor = min(LENGTH_UNITS.items(), key=lambda item: abs(np.log(item[1] * span / body)))
     raise InputError(
         f"{len(points)} points span {span:.3g} mm, the body {body:.3g} mm: {unit} instead of mm? "
         f"multiply their coordinates by {factor:g}"
@@ -85,8 +95,8 @@ def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
 def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Barycentric coordinates (c, 4) of ``point`` in elements with nodes ``X`` (c, a, 3).
 
-    They are not clipped: one below 0 says that the point lies beyond a face. Also their gradients
-    (c, 4, 3) in space, 1/mm.
+    They are not clipped: a coordinate below 0 says that the point lies beyond a face. Their
+    gradients (c, 4, 3) in space, 1/mm, are returned, too.
     """
     order = 1 if X.shape[1] == 4 else 2
     xi = np.full((len(X), 3), 0.25)
@@ -95,7 +105,7 @@ def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # d xi / d x, the inverse of the element map's Jacobian; NumPy, no batched LAPACK of JAX's.
         inverse = np.linalg.inv(np.einsum("cai,caj->cij", X, slopes))
         step = np.einsum("cji,ci->cj", inverse, point - np.einsum("ca,cai->ci", values, X))
-        # The map of a curved element folds far outside it; Newton is kept from going there.
+        # The map of a curved element folds far outside it; Newton's method must not go there.
         xi = xi + step if order == 1 else np.clip(xi + step, -0.5, 1.5)
         if np.abs(step).max() < 1e-13:
             break
@@ -110,22 +120,22 @@ def _nearest(mesh: Mesh, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndar
     """The element nearest to ``point``, and barycentric coordinates (1, 4) of the point on it."""
     every = mesh.nodes[mesh.elements]
     distances, _ = _onto(every[:, :4], point)
-    near = np.argsort(distances, kind="stable")[:_CANDIDATES]
-    distances, inside = _onto(every[near], point)
+    candidates = np.argsort(distances, kind="stable")[:_ELEMENTS]
+    distances, inside = _onto(every[candidates], point)
     best = int(np.argmin(distances))
     if not distances[best] <= _SLACK * mesh.size:
         raise InputError(
             f"landmark {k} at {point.tolist()} mm lies outside the body, "
             f"about {distances[best]:.2g} mm away"
         )
-    return near[[best]], inside[[best]]
+    return candidates[[best]], inside[[best]]
 
 
 def _onto(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (c,) of ``point`` to elements with nodes ``X`` (c, a, 3), and where it meets them.
+    """Distances (c,) of ``point`` to elements with nodes ``X`` (c, a, 3), and coordinates (c, 4).
 
-    Beyond a face, the point goes back onto it along the face's normal; coordinates that are still
-    below 0 are clipped.
+    The barycentric coordinates are those of the point moved onto the element: from beyond a face
+    along its normal; coordinates that are still below 0 are clipped.
     """
     coordinates, gradients = _invert(X, point)
     rows = np.arange(len(X))
@@ -136,5 +146,96 @@ def _onto(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     inside = np.maximum(inside, 0.0)
     inside /= inside.sum(axis=1, keepdims=True)
     shapes, _ = shapes_at(1 if X.shape[1] == 4 else 2, inside)
-    reached = np.einsum("ca,cai->ci", shapes, X)
-    return np.linalg.norm(reached - point, axis=1), inside
+    positions = np.einsum("ca,cai->ci", shapes, X)
+    return np.linalg.norm(positions - point, axis=1), inside
+
+
+class SurfacePoint(NamedTuple):
+    """A point of a surface.
+
+    facet : the row of its facet.
+    weights : shape functions of the facet there, (3,), or (6,) where it is quadratic.
+    position : the position, mm, (3,).
+    normal : the unit normal out of the tissue, (3,).
+    """
+
+    facet: int
+    weights: np.ndarray
+    position: np.ndarray
+    normal: np.ndarray
+
+
+def closest_point(facets: np.ndarray, point: np.ndarray) -> SurfacePoint:
+    """Return the point closest to ``point`` (3,) on ``facets`` (f, 3 or 6, 3), their nodes, mm."""
+    coordinates, distances = _onto_triangles(facets[:, :3], point)
+    if facets.shape[1] == 6:
+        candidates = np.argsort(distances, kind="stable")[:_FACETS]
+        inside, distances = _onto_curved(facets[candidates], coordinates[candidates], point)
+        best = int(np.argmin(distances))
+        return _surface_point(facets, int(candidates[best]), inside[best])
+    best = int(np.argmin(distances))
+    return _surface_point(facets, best, coordinates[best])
+
+
+def facet_shapes(barycentric: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    r"""Return shape functions (f, a) and derivatives (f, a, 2) at barycentric coordinates (f, 3).
+
+    Corners :math:`\lambda_i`, or :math:`\lambda_i(2\lambda_i - 1)` with :math:`4 \lambda_i
+    \lambda_j` at the middle of edges 01, 12 and 20; derivatives are in the last two coordinates.
+    """
+    along = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
+    if nodes == 3:
+        return barycentric, np.broadcast_to(along, (len(barycentric), 3, 2))
+    i, j = np.array([0, 1, 2]), np.array([1, 2, 0])
+    L = barycentric
+    values = np.concatenate([L * (2.0 * L - 1.0), 4.0 * L[:, i] * L[:, j]], axis=1)
+    corners = (4.0 * L - 1.0)[:, :, None] * along
+    middles = 4.0 * (L[:, i, None] * along[j] + L[:, j, None] * along[i])
+    return values, np.concatenate([corners, middles], axis=1)
+
+
+def _surface_point(facets: np.ndarray, facet: int, barycentric: np.ndarray) -> SurfacePoint:
+    values, slopes = facet_shapes(barycentric[None], facets.shape[1])
+    tangents = slopes[0].T @ facets[facet]
+    normal = np.cross(tangents[0], tangents[1])
+    position = values[0] @ facets[facet]
+    return SurfacePoint(facet, values[0], position, normal / np.linalg.norm(normal))
+
+
+def _onto_triangles(corners: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Barycentric coordinates (f, 3) of each triangle's closest point, and its distance (f,)."""
+    side = corners[:, 1:] - corners[:, :1]
+    gram = np.einsum("fai,fbi->fab", side, side)
+    right = np.einsum("fai,fi->fa", side, point - corners[:, 0])
+    last = np.linalg.solve(gram, right[..., None])[..., 0]
+    candidates = [np.column_stack([1.0 - last.sum(axis=1), last])]
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        edge = corners[:, j] - corners[:, i]
+        t = np.einsum("fi,fi->f", point - corners[:, i], edge) / np.sum(edge**2, axis=1)
+        on_edge = np.zeros((len(corners), 3))
+        on_edge[:, j] = np.clip(t, 0.0, 1.0)
+        on_edge[:, i] = 1.0 - on_edge[:, j]
+        candidates.append(on_edge)
+    points = np.stack(candidates)
+    distances = np.linalg.norm(np.einsum("efa,fai->efi", points, corners) - point, axis=-1)
+    distances[0, points[0].min(axis=1) < 0.0] = np.inf  # beyond an edge
+    best, rows = np.argmin(distances, axis=0), np.arange(len(corners))
+    return points[best, rows], distances[best, rows]
+
+
+def _onto_curved(
+    facets: np.ndarray, barycentric: np.ndarray, point: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`_onto_triangles`, on quadratic facets (f, 6, 3), from a start on straight ones."""
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        values, slopes = facet_shapes(barycentric, 6)
+        away = point - np.einsum("fa,fai->fi", values, facets)
+        tangents = np.einsum("fad,fai->fdi", slopes, facets)
+        gram = np.einsum("fdi,fei->fde", tangents, tangents)
+        right = np.einsum("fdi,fi->fd", tangents, away)
+        step = np.linalg.solve(gram, right[..., None])[..., 0]
+        clipped = np.maximum(barycentric + np.column_stack([-step.sum(axis=1), step]), 0.0)
+        barycentric = clipped / clipped.sum(axis=1, keepdims=True)
+    values, _ = facet_shapes(barycentric, 6)
+    positions = np.einsum("fa,fai->fi", values, facets)
+    return barycentric, np.linalg.norm(positions - point, axis=1)

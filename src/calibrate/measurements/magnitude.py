@@ -27,7 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from calibrate.measurements import Observation, Observations
+from calibrate.measurements.collection import Observations
+from calibrate.measurements.observation import Observation
 from emulator.core.errors import InputError
 
 _DRAWS = 32  # predictions at draws of the prior

@@ -1,4 +1,4 @@
-"""The kinds of observations there are: the one list of them."""
+"""The kinds of observations there are: the one list of them, and how words and JSON find theirs."""
 
 from __future__ import annotations
 
@@ -8,26 +8,21 @@ from typing import Any
 
 import numpy as np
 
+from calibrate.measurements.collection import Observations
+from calibrate.measurements.displacements import Landmarks, Length, NodalDisplacements
 from calibrate.measurements.klotz import KlotzVolume
-from calibrate.measurements.landmarks import Landmarks
-from calibrate.measurements.length import Length
-from calibrate.measurements.nodes import NodalDisplacements
+from calibrate.measurements.observation import ENTRIES, Observation
 from calibrate.measurements.parameter import MeasuredParameter
-from calibrate.measurements.present import ENTRIES, Present
-from calibrate.measurements.protocol import Kind, Observation
 from calibrate.measurements.reaction import Reaction
-from calibrate.measurements.rigid_markers import RigidMarkers
-from calibrate.measurements.segment_strain import SegmentStrain
-from calibrate.measurements.several import Observations
-from calibrate.measurements.strain import Strain
-from calibrate.measurements.surface import SurfacePoints
+from calibrate.measurements.strain import SegmentStrain, Strain
+from calibrate.measurements.surface import RigidMarkers, SurfacePoints
 from calibrate.measurements.volume import CavityVolume
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
 from emulator.scenes.scene import Scene
 
 # In this order they look for their columns in a file: `node` decides before `x,y,z`.
-OBSERVATIONS: dict[str, type[Kind]] = {
+OBSERVATIONS: dict[str, type[Observation]] = {
     kind.kind: kind
     for kind in (
         NodalDisplacements,
@@ -48,7 +43,7 @@ OBSERVATIONS: dict[str, type[Kind]] = {
 def parse_observation(
     scene: Scene, text: str, seed: int = 0, states: Sequence[str] = ("",)
 ) -> Observations:
-    """What the words joined by ``+`` ask for, e.g. ``landmarks:24+volume``.
+    """Return what the words joined by ``+`` ask for, e.g. ``landmarks:24+volume``.
 
     A word is asked for in each of ``states``; ``volume@diastole`` in that load state only.
 
@@ -59,9 +54,9 @@ def parse_observation(
     """
     parts: dict[str, Observation] = {}
     for word in text.split("+"):
-        bare, own = split(word)
+        bare, own_state = split(word)
         base, part = _parse_word(scene, bare, seed)
-        for state in (own,) if own else states:
+        for state in (own_state,) if own_state else states:
             if (name := in_state(base, state)) in parts:
                 raise InputError(f"observe '{text}': {name} is given twice; once is enough")
             parts[name] = part
@@ -72,9 +67,8 @@ def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
     """Name and observation; the word before a colon names the kind, others are tried in turn."""
     named = OBSERVATIONS.get(word.partition(":")[0])
     for kind in (named,) if named else OBSERVATIONS.values():
-        found = kind.parse(scene, word, seed)
-        if found is not None:
-            return found
+        if (observation := kind.parse(scene, word, seed)) is not None:
+            return observation
     raise InputError(
         f"observe '{word}': give {', '.join(kind.usage for kind in OBSERVATIONS.values())}; "
         f"node sets: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
@@ -82,16 +76,16 @@ def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
 
 
 def observation_from_json(scene: Scene, description: Mapping[str, Any]) -> Observation:
-    """The observation that :meth:`Observation.to_json` described."""
+    """Return the observation that :meth:`Observation.to_json` described."""
     kind = look_up(OBSERVATIONS, description.get("kind"), "observation kind")
     whole = kind.from_json(scene, description)
-    return Present(whole, np.asarray(description[ENTRIES])) if ENTRIES in description else whole
+    return whole.restricted(np.asarray(description[ENTRIES])) if ENTRIES in description else whole
 
 
 def observations_from_json(
     scene: Scene, description: Mapping[str, Mapping[str, Any]]
 ) -> Observations:
-    """What :meth:`Observations.to_json` described."""
-    made = {json.dumps(part): part for part in description.values()}
-    parts = {key: observation_from_json(scene, part) for key, part in made.items()}
-    return Observations({name: parts[json.dumps(part)] for name, part in description.items()})
+    """Return what :meth:`Observations.to_json` described; equal descriptions are one object."""
+    texts = {name: json.dumps(part) for name, part in description.items()}
+    distinct = {text: observation_from_json(scene, json.loads(text)) for text in texts.values()}
+    return Observations({name: distinct[text] for name, text in texts.items()})

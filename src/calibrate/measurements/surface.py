@@ -1,49 +1,86 @@
-r"""How far a surface has moved along its own normals.
+r"""What is seen of a surface: how far it moved along its normals, and markers that move with it.
 
-Of a surface in an image one sees where it is, not which point of it is which. Observed is the
-displacement along the reference normal :math:`n` of points :math:`X` of the reference surface,
+**Normal displacements.** An image shows where a surface is, not which of its points is which.
+Observed is the displacement along the reference normal :math:`n` of points :math:`X` of the
+reference surface,
 
 .. math:: s = u(X) \cdot n(X) .
 
-Points :math:`p` measured anywhere on the deformed surface become such data by their feet: with X
-the point of the reference surface closest to p, :math:`s = (p - X) \cdot n`
+Points :math:`p` measured anywhere on the deformed surface become such data by their closest points:
+with X the point of the reference surface closest to p, :math:`s = (p - X) \cdot n`
 (:func:`surface_distances`). This takes the deformed surface over X to be where X itself went. With
 the tangential displacement :math:`u_t`, the angle :math:`\alpha` by which the surface has turned
-and its curvature :math:`\kappa` the error is about :math:`|u_t| \tan\alpha + \kappa |u_t|^2 / 2`:
-fit for displacements that are small against the radius of the surface, or along its normals.
+and its curvature :math:`\kappa` the error is about :math:`|u_t| \tan\alpha + \kappa |u_t|^2 / 2`,
+which is small for displacements along the normals or small against the radius of the surface.
+
+**Rigid markers** stand on pins, and move with a surface as if it were rigid. The surface's facets,
+weighted by area, have the mean :math:`\bar X` at rest and :math:`\bar x` deformed. With
+:math:`e_1, e_2` the two principal directions in which the surface extends most, the mean deformed
+directions
+
+.. math:: t_i = \sum_a w_a\, (x_a - \bar x)\, (X_a - \bar X) \cdot e_i / s_i ,
+          \qquad T = [t_1\; t_2], \qquad Q = T\,(T^T T)^{-1/2}
+
+are made orthonormal in the way that changes them least (polar decomposition; a 2 x 2 matrix S has
+the root :math:`(S + \sqrt{\det S}\, I) / \sqrt{\operatorname{tr} S + 2 \sqrt{\det S}}`), and the
+third follows as a cross product. With the rotation R that takes :math:`e_i` there, a marker at p
+moves by
+
+.. math:: \bar x + R\,(p - \bar X) - p .
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.points import check_table, check_values, count_of
-from calibrate.measurements.protocol import LENGTH_UNITS, Field, Labels
-from calibrate.measurements.surface_location import facet_shapes, foot_on
-from calibrate.noise.gaussian import GaussianNoise
-from calibrate.noise.protocol import Sites
+from calibrate.measurements.location import closest_point, facet_shapes
+from calibrate.measurements.observation import LENGTH_UNITS, Field
+from calibrate.measurements.points import (
+    XYZ,
+    DisplacementPoints,
+    PointObservation,
+    as_points,
+    check_distinct,
+    gather,
+)
 from emulator.core.errors import InputError
+from emulator.geometry.discretisation import facet_rule
+from emulator.geometry.facets import nodal_areas
 from emulator.scenes.scene import Scene
 
 _SLACK = 1e-3  # of the body's size: how far from the surface its points may lie
-_COLUMN = "un:"
+_FARTHEST = 1.0  # of the body's size: how far from it a marker may stand
+
+
+class OfFacetSet(PointObservation):
+    """An observation of a facet set, whose name is part of the names of columns."""
+
+    arguments = ("facet_set", "points")
+
+    @classmethod
+    def selections(cls, words: Collection[str]) -> list[tuple[Any, ...]]:
+        """Facet sets that columns name; a placeholder where only the kind is named."""
+        (field,) = cls.value_fields
+        prefixes = [name.format("") for name in (field.variable, *field.columns)]
+        sets = {w.removeprefix(p): None for w in words for p in prefixes if w.startswith(p)}
+        return [(name,) for name in sets or (("FACETSET",) if cls.kind in words else ())]
 
 
 @dataclass(frozen=True, eq=False)
-class SurfacePoints:
+class SurfacePoints(OfFacetSet):
     """Normal displacements (d,) in mm of points of a facet set, positive out of the tissue.
 
     facet_set : the surface's name in the mesh.
-    nodes : (k,) of the points' facets.
-    points, normals : (d, 3), in the reference body; points in mm.
-    members : (d, 3 or 6) positions in ``nodes`` of each point's facet.
-    weights : (d, 3 or 6) shape functions of the facet at the point.
+    nodes : the nodes of the points' facets, (k,).
+    points, normals : the points, mm, and unit normals in the reference body, (d, 3).
+    members : positions in ``nodes`` of each point's facet, (d, 3 or 6).
+    weights : shape functions of the facet at the point, (d, 3 or 6).
     """
 
     facet_set: str
@@ -53,104 +90,39 @@ class SurfacePoints:
     members: np.ndarray
     weights: np.ndarray
 
-    kind: ClassVar[str] = "surface"
-    usage: ClassVar[str] = "surface:FACETSET:N"
-    quantity: ClassVar[str] = "normal displacement"
-    unit: ClassVar[str] = "mm"
-    other_units: ClassVar[Mapping[str, float]] = LENGTH_UNITS
-    default_noise: ClassVar[GaussianNoise] = GaussianNoise(sd=0.5)
+    kind = "surface"
+    usage = "surface:FACETSET:N"
+    quantity = "normal displacement"
+    unit = "mm"
+    other_units = LENGTH_UNITS
+    usual_sd = 0.5
+    name = "surface:{}"
+    place_field = Field("position_{}", XYZ, where=True)
+    value_fields = (Field("un:{}", ("un:{}",)),)
+    components = ()
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(d,)."""
-        return (len(self.points),)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """``surface:<facet set>``."""
-        return (f"{self.kind}:{self.facet_set}",)
-
-    @property
-    def sites(self) -> Sites:
-        """The points."""
-        return Sites.of(self.points, 1)
-
-    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Normal displacements (..., d)."""
         along = self.weights[:, :, None] * self.normals[:, None]
         return jnp.einsum("dai,...dai->...d", along, displacement[..., self.members, :])
 
-    def check(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` unless ``values`` is (d,), each finite or missing."""
-        check_values(name, values, self.shape, self.unit)
-
-    def labels(self, name: str) -> Labels:
-        """Points; their reference positions and normals as constants."""
-        point, constants = f"point_{name}", {f"position_{name}": self.points}
-        constants[f"normal_{name}"] = self.normals
-        return Labels(
-            dims={name: [point], **{constant: [point, "axis"] for constant in constants}},
-            coords={point: np.arange(len(self.points)), "axis": ["x", "y", "z"]},
-            constants=constants,
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Kind, facet set and reference positions."""
-        return {"kind": self.kind, "facet_set": self.facet_set, "points": self.points.tolist()}
-
     @classmethod
-    def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
-        """The observation that :meth:`to_json` described."""
-        return cls.of(scene, description["facet_set"], np.asarray(description["points"]))
+    def of(cls, scene: Scene, facet_set: str, points: Any, slack: float = _SLACK) -> Self:
+        """Observe the normal displacement of ``points`` (d, 3) mm of the reference surface.
 
-    @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """``surface:epicardium:40``: at 40 points, uniform over the surface at random."""
-        kind, _, rest = word.partition(":")
-        if kind != cls.kind:
-            return None
-        facet_set, _, count = rest.rpartition(":")
-        number = count_of(f"{kind}:{count}", kind) if facet_set else None
-        if number is None:
-            raise InputError(f"observe '{word}': give {cls.usage}")
-        found = cls.of(scene, facet_set, spread_on_surface(scene, facet_set, number, seed))
-        return found.names[0], found
+        Parameters
+        ----------
+        facet_set : the name of the surface.
+        slack : the largest distance of a point from the surface, as a share of the body's size.
 
-    @classmethod
-    def layouts(cls, words: Collection[str]) -> dict[str, tuple[Field, ...]]:
-        """Reference positions and the column ``un:<facet set>``."""
-        sets = [w.removeprefix(_COLUMN) for w in words if w.startswith(_COLUMN)]
-        return {
-            f"{cls.kind}:{name}": (
-                Field(f"position_{name}", ("x", "y", "z"), where=True),
-                Field(f"{_COLUMN}{name}", (f"{_COLUMN}{name}",)),
-            )
-            for name in sets or (("FACETSET",) if cls.kind in words else ())
-        }
-
-    @classmethod
-    def from_arrays(
-        cls, scene: Scene, name: str, arrays: Mapping[str, np.ndarray]
-    ) -> tuple[Self, np.ndarray]:
-        """Observation and data from positions (d, 3) and normal displacements (d,), mm."""
-        facet_set = name.partition(":")[2]
-        points, values = arrays[f"position_{facet_set}"], arrays[f"{_COLUMN}{facet_set}"]
-        check_table(points, values[:, None], cls.quantity)
-        return cls.of(scene, facet_set, points), values
-
-    def to_arrays(self, name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Reference positions and normal displacements."""
-        columns = f"position_{self.facet_set}", f"{_COLUMN}{self.facet_set}"
-        return dict(zip(columns, (self.points, np.asarray(values)), strict=True))
-
-    @classmethod
-    def of(cls, scene: Scene, facet_set: str, points: np.ndarray, slack: float = _SLACK) -> Self:
-        """See :func:`surface_points`; ``slack`` as a fraction of the body's size."""
-        points = np.atleast_2d(np.asarray(points, dtype=float))
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            raise InputError(f"surface points have shape {points.shape}; expected (d, 3), finite")
+        Raises
+        ------
+        InputError
+            An unknown facet set, or a point further from it than ``slack``.
+        """
+        points = as_points(points, "surface points have shape {}; expected (d, 3), finite")
         facets = scene.mesh.facet_set(facet_set)
-        feet = [foot_on(scene.mesh.nodes[facets], point) for point in points]
+        feet = [closest_point(scene.mesh.nodes[facets], point) for point in points]
         for k, (foot, point) in enumerate(zip(feet, points, strict=True)):
             away = float(np.linalg.norm(foot.position - point))
             if not away <= slack * scene.mesh.size:
@@ -158,32 +130,120 @@ class SurfacePoints:
                     f"surface point {k} at {point.tolist()} mm is {away:.2g} mm away from "
                     f"'{facet_set}' at rest; give points of the reference surface"
                 )
-        nodes, position = np.unique(facets[[foot.facet for foot in feet]], return_inverse=True)
-        return cls(
-            facet_set,
-            nodes,
-            np.stack([foot.position for foot in feet]),
-            np.stack([foot.normal for foot in feet]),
-            position.reshape(len(feet), -1),
-            np.stack([foot.weights for foot in feet]),
+        nodes, members = gather(facets[[foot.facet for foot in feet]])
+        positions, normals, weights = (
+            np.stack([getattr(foot, name) for foot in feet])
+            for name in ("position", "normal", "weights")
+        )
+        return cls(facet_set, nodes, positions, normals, members, weights)
+
+    @classmethod
+    def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
+        """Points uniform over the surface."""
+        return spread_on_surface(scene, selection, count, seed)
+
+    def constants(self) -> dict[str, np.ndarray]:
+        """Reference positions and normals."""
+        return {"position": self.points, "normal": self.normals}
+
+
+@dataclass(frozen=True, eq=False)
+class RigidMarkers(DisplacementPoints, OfFacetSet):
+    """Displacements (d, 3) in mm of markers that move rigidly with a facet set.
+
+    facet_set : the surface's name in the mesh.
+    points : the markers with the body at rest, mm, (d, 3); they need not lie in it.
+    nodes : the nodes of the surface, (k,).
+    weights : shares of the nodes in its area, (k,).
+    rest : positions of the nodes less their mean, mm, (k, 3).
+    mean : the mean of the nodes, mm, (3,).
+    axes : rows: the surface's two principal directions, and the normal of both, (3, 3).
+    variance : the surface's variance along the two, mm2, (2,).
+    """
+
+    facet_set: str
+    points: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+    rest: np.ndarray
+    mean: np.ndarray
+    axes: np.ndarray
+    variance: np.ndarray
+
+    kind = "markers"
+    usage = "markers:FACETSET (positions from a file)"
+    quantity = "marker displacement"
+    name = "markers:{}"
+    place_field = Field("position_markers_{}", XYZ, where=True)
+    value_fields = (Field("markers:{}", ("mx:{}", "my:{}", "mz:{}")),)
+
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """Displacements (..., d, 3) in mm."""
+        shift = jnp.einsum("k,...ki->...i", self.weights, displacement)
+        x = self.rest + displacement - shift[..., None, :]
+        along = self.weights[:, None] * (self.rest @ self.axes[:2].T) / self.variance
+        T = jnp.einsum("...ki,kj->...ij", x, along)
+        rotation = _orthonormal(T) @ self.axes
+        arms = self.points - self.mean
+        return shift[..., None, :] + jnp.einsum("...ij,dj->...di", rotation, arms) - arms
+
+    @classmethod
+    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
+        """Refuse ``markers:...``: pins cannot be drawn at random."""
+        if word.partition(":")[0] != cls.kind:
+            return None
+        raise InputError(
+            f"observe '{word}': markers stand where they were put; give their positions in a file, "
+            "columns x,y,z,mx:FACETSET,my:FACETSET,mz:FACETSET"
         )
 
+    @classmethod
+    def of(cls, scene: Scene, facet_set: str, points: Any) -> Self:
+        """Observe markers on pins that stand on a surface and turn with it.
 
-def surface_points(scene: Scene, facet_set: str, points: np.ndarray) -> SurfacePoints:
-    """Observe the normal displacement of ``points`` (d, 3) mm of the reference surface.
+        Parameters
+        ----------
+        facet_set : the surface, such as the free end of a beam.
+        points : the markers with the body at rest, in the frame of the mesh, mm, (d, 3).
 
-    Raises
-    ------
-    InputError
-        An unknown facet set, or a point further from it than a thousandth of the body's size.
-    """
-    return SurfacePoints.of(scene, facet_set, points)
+        Raises
+        ------
+        InputError
+            An unknown facet set, or one without extent; a marker given twice, or far from the body.
+        """
+        points = as_points(points, "markers have shape {}; expected (d, 3), finite, in mm")
+        check_distinct(points, "markers")
+        mesh, facets = scene.mesh, scene.mesh.facet_set(facet_set)
+        low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+        away = np.linalg.norm(points - np.clip(points, low, high), axis=1)
+        far = int(np.argmax(away))
+        if away[far] > _FARTHEST * mesh.size:
+            raise InputError(
+                f"marker {far} at {points[far].tolist()} mm stands {away[far]:.3g} mm away from a "
+                f"body of {mesh.size:.3g} mm; give positions in the mesh's frame, in mm"
+            )
+        areas = nodal_areas(mesh.nodes[facets], facet_rule(mesh.order, 2 * mesh.order))
+        nodes, row = np.unique(facets, return_inverse=True)
+        weights = np.bincount(row.ravel(), areas.ravel(), minlength=len(nodes))
+        weights = weights / weights.sum()
+        mean = weights @ mesh.nodes[nodes]
+        rest = mesh.nodes[nodes] - mean
+        variances, vectors = np.linalg.eigh((weights[:, None] * rest).T @ rest)
+        if not variances[1] > 1e-6 * variances[2]:
+            raise InputError(f"facet set '{facet_set}' is too thin to turn markers with it")
+        first, second = vectors[:, 2], vectors[:, 1]
+        axes = np.stack([first, second, np.cross(first, second)])
+        return cls(facet_set, points, nodes, weights, rest, mean, axes, variances[[2, 1]])
+
+
+surface_points = SurfacePoints.of
+rigid_markers = RigidMarkers.of
 
 
 def surface_distances(
     scene: Scene, facet_set: str, measured: np.ndarray
 ) -> tuple[SurfacePoints, np.ndarray]:
-    """Observation and data (d,) in mm from points (d, 3) mm of the deformed surface.
+    """Return observation and data (d,) in mm from points (d, 3) mm of the deformed surface.
 
     Which point of the surface each of them was is not known; see the module's docstring for the
     approximation.
@@ -194,7 +254,7 @@ def surface_distances(
 
 
 def spread_on_surface(scene: Scene, facet_set: str, count: int, seed: int) -> np.ndarray:
-    """``count`` points (count, 3) mm, uniform over the facets of a set, edges taken as straight."""
+    """Return ``count`` points (count, 3) mm, uniform over the facets of a set as if flat."""
     rng = np.random.default_rng(seed)
     facets = scene.mesh.nodes[scene.mesh.facet_set(facet_set)]
     side = facets[:, 1:3] - facets[:, :1]
@@ -202,3 +262,17 @@ def spread_on_surface(scene: Scene, facet_set: str, count: int, seed: int) -> np
     chosen = rng.choice(len(facets), count, p=area / area.sum())
     values, _ = facet_shapes(rng.dirichlet(np.ones(3), count), facets.shape[1])
     return np.einsum("da,dai->di", values, facets[chosen])
+
+
+def _orthonormal(T: jax.Array) -> jax.Array:
+    """Right-handed axes (..., 3, 3) in columns, of which two are closest to ``T`` (..., 3, 2)."""
+    first, second = T[..., 0], T[..., 1]
+    a, b = jnp.sum(first**2, axis=-1), jnp.sum(second**2, axis=-1)
+    c = jnp.sum(first * second, axis=-1)
+    root = jnp.sqrt(a * b - c**2)
+    size = jnp.sqrt(a + b + 2.0 * root)
+    # The inverse of the root of [[a, c], [c, b]]; ``root`` is the determinant of that root.
+    inverse = 1.0 / (size * root)
+    one = ((b + root) * inverse)[..., None] * first - (c * inverse)[..., None] * second
+    two = ((a + root) * inverse)[..., None] * second - (c * inverse)[..., None] * first
+    return jnp.stack([one, two, jnp.cross(one, two)], axis=-1)

@@ -1,20 +1,24 @@
-"""The volume of a cavity."""
+"""The volume of a cavity, and its curve over the range of the pressure in it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from typing import ClassVar, Self
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple, Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.scalar import Scalar
-from calibrate.noise.gaussian import GaussianNoise
+from calibrate.measurements.observation import Scalar
 from emulator.geometry.facets import Cavity
-from emulator.scenes.cavities import find_cavity
+from emulator.scenes.cavities import find_cavity, inflated_cavity
+from emulator.scenes.loads import KPA_PER_MMHG
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
+from emulator.surrogates.protocol import ForwardMap
+
+_PRESSURES = 12  # points of a curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +27,9 @@ class CavityVolume(Scalar):
 
     Parameters
     ----------
-    scene : with the cavity in its mesh.
-    facet_set : its wall; needed where the scene has several cavities.
+    scene : the scene, with the cavity in its mesh.
+    facet_set : the cavity's wall; needed where the scene has several cavities.
+    cavity : the volume as a function of the wall's displacement, derived.
 
     Raises
     ------
@@ -34,38 +39,73 @@ class CavityVolume(Scalar):
 
     scene: Scene
     facet_set: str | None = None
+    cavity: Cavity = field(init=False)
 
-    kind: ClassVar[str] = "volume"
-    usage: ClassVar[str] = "volume, volume:FACETSET"
-    quantity: ClassVar[str] = "volume"
-    unit: ClassVar[str] = "mL"
-    other_units: ClassVar[Mapping[str, float]] = {"mm3": 1e-3, "L": 1e3, "m3": 1e6}
-    default_noise: ClassVar[GaussianNoise] = GaussianNoise(sd=1.0)
+    kind = "volume"
+    usage = "volume, volume:FACETSET"
+    quantity = "volume"
+    unit = "mL"
+    other_units = {"mm3": 1e-3, "L": 1e3, "m3": 1e6}
+    usual_sd = 1.0
+    arguments = ("facet_set",)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "facet_set", self.cavity.facet_set)
+        cavity = find_cavity(self.scene, self.facet_set)
+        self._derive(cavity=cavity, facet_set=cavity.facet_set, nodes=cavity.nodes)
 
-    @cached_property
-    def cavity(self) -> Cavity:
-        """The volume as a function of the wall's displacement."""
-        return find_cavity(self.scene, self.facet_set)
-
-    @property
-    def nodes(self) -> np.ndarray:
-        """Nodes of the cavity's wall, (k,)."""
-        return self.cavity.nodes
+    @classmethod
+    def of(cls, scene: Scene, facet_set: str = "") -> Self:
+        """Observe the cavity of this wall, or the only one."""
+        return cls(scene, facet_set or None)
 
     @property
     def names(self) -> tuple[str, ...]:
         """``volume`` and ``volume:<facet set>``."""
-        return self.kind, f"{self.kind}:{self.facet_set}"
+        return self.kind, *super().names
 
-    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Volume (...) in mL."""
         return self.cavity(displacement)
 
-    @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """``volume`` of the only cavity, or ``volume:<facet set>``."""
-        kind, _, facet_set = word.partition(":")
-        return (word, cls(scene, facet_set or None)) if kind == cls.kind else None
+
+class PressureVolume(NamedTuple):
+    """A pressure-volume curve as a function of theta.
+
+    volume : the volume of the cavity.
+    parameter : the pressure in the cavity.
+    rest : the volume of the unloaded body, mL.
+    pressures : the pressures of the curve, in the parameter's unit, (k,).
+    volumes : maps theta (p,), with any pressure, to volumes (k,) in mL.
+    """
+
+    volume: CavityVolume
+    parameter: Parameter
+    rest: float
+    pressures: np.ndarray
+    volumes: Callable[[jax.Array], jax.Array]
+
+
+def pressure_volume(forward: ForwardMap) -> PressureVolume | None:
+    """Return the curve of the first cavity whose pressure is a parameter; None without any."""
+    scene = forward.scene
+    inflated = inflated_cavity(scene)
+    if inflated is None:
+        return None
+    volume, column = CavityVolume(scene, inflated[0]), scene.parameter_names.index(inflated[1])
+    parameter = scene.parameters[column]
+    pressures = np.linspace(parameter.low, parameter.high, _PRESSURES)
+    wall = forward.at(volume.nodes)
+
+    def volumes(theta: jax.Array) -> jax.Array:
+        def one(pressure: jax.Array) -> jax.Array:
+            return volume.cavity(wall(theta.at[column].set(pressure)))
+
+        return jax.lax.map(one, jnp.asarray(pressures))
+
+    rest = float(volume.cavity.rest)
+    return PressureVolume(volume, parameter, rest, pressures, volumes)
+
+
+def in_mmhg(kpa: float) -> str:
+    """Return a pressure of so many kPa in words, in kPa and mmHg."""
+    return f"{kpa:.3g} kPa ({kpa / KPA_PER_MMHG:.3g} mmHg)"

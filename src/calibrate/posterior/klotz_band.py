@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements.klotz import PRESSURE_SCATTER, Klotz
-from calibrate.measurements.pressure_volume import pressure_volume
+from calibrate.measurements.volume import pressure_volume
 from calibrate.statistical_model import Model
 from emulator.core.errors import InputError, check_known, check_seed
 

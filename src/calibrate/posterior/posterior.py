@@ -14,8 +14,7 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
-from calibrate.measurements import Observation
-from calibrate.measurements.present import missing_values
+from calibrate.measurements import Observation, missing_values
 from calibrate.posterior.diagnosis import diagnose, summary_of
 from calibrate.posterior.fit import misfits
 from calibrate.posterior.predictions import predicted

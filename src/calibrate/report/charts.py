@@ -16,7 +16,7 @@ from calibrate.analysis.identifiability import stress_band
 from calibrate.figures.drawing import BLUE, COLOURS, VERMILION
 from calibrate.measurements import Observation
 from calibrate.measurements.klotz import klotz_of
-from calibrate.measurements.pressure_volume import PressureVolume, in_mmhg, pressure_volume
+from calibrate.measurements.volume import PressureVolume, in_mmhg, pressure_volume
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
 from emulator.scenes.loads import KPA_PER_MMHG

@@ -25,9 +25,8 @@ import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 
-from calibrate.measurements import Observation, Observations, observations
+from calibrate.measurements import Observation, Observations, leave_out_missing, observations
 from calibrate.measurements.magnitude import PRIOR_DRAWS, check_magnitudes
-from calibrate.measurements.present import leave_out_missing
 from calibrate.model_error import ModelError
 from calibrate.noise import Noise
 from calibrate.priors import Dependence, Prior, dependence_of

@@ -1,7 +1,6 @@
 """A new kind of observation is one class and one line of the registry, and then works everywhere."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import arviz_base
 import jax.numpy as jnp
@@ -21,32 +20,27 @@ from linear_support import linear_forward
 class Area(Scalar):
     """Area in mm2 between three nodes, asked for as ``area:3,14,20``."""
 
+    corners: str
     nodes: np.ndarray
     points: np.ndarray
 
-    kind: ClassVar = "area"
-    usage: ClassVar = "area:NODE,NODE,NODE"
-    quantity: ClassVar = "area"
-    unit: ClassVar = "mm2"
-    other_units: ClassVar = {"m2": 1e6, "cm2": 100.0}
-    default_noise: ClassVar = cal.GaussianNoise(sd=0.1)
+    kind = "area"
+    usage = "area:NODE,NODE,NODE"
+    quantity = "area"
+    unit = "mm2"
+    other_units = {"m2": 1e6, "cm2": 100.0}  # noqa: RUF012
+    usual_sd = 0.1
+    arguments = ("corners",)
 
-    def __call__(self, displacement, theta):
+    @classmethod
+    def of(cls, scene, corners):
+        nodes = cal.nodal_displacements(scene, [int(n) for n in corners.split(",")])
+        return cls(corners, nodes.nodes, nodes.points)
+
+    def evaluate(self, displacement, theta):
         x = self.points + displacement
         sides = x[..., 1:, :] - x[..., :1, :]
         return 0.5 * jnp.linalg.norm(jnp.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
-
-    @property
-    def names(self):
-        return (f"area:{','.join(map(str, self.nodes))}",)
-
-    @classmethod
-    def parse(cls, scene, word, seed):
-        kind, _, text = word.partition(":")
-        if kind != cls.kind:
-            return None
-        nodes = cal.nodal_displacements(scene, [int(n) for n in text.split(",")])
-        return word, cls(nodes.nodes, nodes.points)
 
 
 @pytest.fixture(autouse=True)
@@ -108,3 +102,5 @@ def test_in_a_run(beam):
     assert data["area:3,14,20"].shape == ()
     with pytest.raises(InputError, match="observe 'areas': give nodes:N.*area:NODE,NODE,NODE"):
         parse_observation(beam, "areas")
+    with pytest.raises(InputError, match="observe 'area:3,x': give area:NODE,NODE,NODE"):
+        parse_observation(beam, "area:3,x")

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from calibrate.measurements.pressure_volume import pressure_volume
-from calibrate.measurements.volume import CavityVolume
+from calibrate.measurements.volume import CavityVolume, pressure_volume
 from linear_support import linear_forward
 
 

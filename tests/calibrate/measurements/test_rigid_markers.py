@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from scipy.linalg import polar
 
-from calibrate.measurements import observations, observations_from_json, parse_observation
+from calibrate.measurements import (
+    observations,
+    observations_from_json,
+    parse_observation,
+    rigid_markers,
+)
 from calibrate.measurements.data import read_data, write_data
-from calibrate.measurements.rigid_markers import rigid_markers
 from emulator.core.errors import InputError
 from emulator.scenes.supports import Support
 from scene_support import between_plates, block, rotation

@@ -182,7 +182,7 @@ def test_at_sites_of_segments_are_inside_them(ventricle):
         ventricle.mesh.nodes[ventricle.mesh.elements].mean(axis=1),
         aha_segments(ventricle.mesh),
     )
-    for s, centre in zip(observe.segments, observe.centres, strict=True):
+    for s, centre in zip(observe.segments, observe.points, strict=True):
         nearest = labels[np.argsort(np.linalg.norm(X - centre, axis=1))[:3]]
         assert s in nearest
 

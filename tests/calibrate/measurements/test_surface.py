@@ -17,7 +17,7 @@ from calibrate.measurements import (
     surface_points,
 )
 from calibrate.measurements.data import read_data, write_data
-from calibrate.measurements.surface_location import facet_shapes, foot_on
+from calibrate.measurements.location import closest_point, facet_shapes
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import human_ventricle
 
@@ -43,7 +43,7 @@ def test_the_foot_is_the_closest_point(scene, facet_set):
     facets = scene.mesh.nodes[scene.mesh.facet_set(facet_set)]
     rng = np.random.default_rng(0)
     for point in spread_on_surface(scene, facet_set, 3, seed=1) + rng.normal(0.0, 2.0, (3, 3)):
-        foot = foot_on(facets, point)
+        foot = closest_point(facets, point)
 
         def distance(y, facet, point=point):
             L = np.abs(y) / np.abs(y).sum()

@@ -83,7 +83,7 @@ def run_mesh(arguments: argparse.Namespace) -> int:
     """The error of the mesh at one theta: displacements, observations, and a picture."""
     import numpy as np
 
-    from calibrate.measurements.mesh_error import errors_of
+    from calibrate.measurements.outputs import mesh_errors
     from emulator.accuracy.mesh_error import mesh_error
     from emulator.geometry.quality import mesh_quality
 
@@ -93,7 +93,7 @@ def run_mesh(arguments: argparse.Namespace) -> int:
     quality = mesh_quality(scene.mesh)
     found = mesh_error(scene)
     told = found(theta)
-    rows = errors_of(found, told, arguments.observe, arguments.seed)
+    rows = mesh_errors(found, told, arguments.observe, arguments.seed)
     length = np.linalg.norm(told.coarse, axis=1)
     result: dict[str, Any] = {
         "scene": scene.name,
@@ -181,7 +181,7 @@ def run_prior(arguments: argparse.Namespace) -> int:
 
     from calibrate.cli.run_words import problem_of
     from calibrate.figures.sensitivity import draw_prior_predictive
-    from calibrate.measurements.pressure_volume import in_mmhg
+    from calibrate.measurements.volume import in_mmhg
     from calibrate.posterior.predictions import prior_replicates
     from calibrate.project import model_before_data
     from emulator.core.store import save_arrays
@@ -217,7 +217,7 @@ def _klotz(model: Model, seed: int) -> KlotzBand | None:
     Nor where the forward map solves: it would be some thousand solves.
     """
     from calibrate.measurements.klotz import klotz_of
-    from calibrate.measurements.pressure_volume import pressure_volume
+    from calibrate.measurements.volume import pressure_volume
     from calibrate.posterior.klotz_band import klotz_band
     from emulator.surrogates.protocol import SolvingMap
 

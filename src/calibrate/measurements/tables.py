@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from calibrate.measurements import Field
+from calibrate.measurements.observation import Block, Field
 from calibrate.state_names import in_state, split, states_of
 from emulator.core import store
 from emulator.core.errors import InputError
@@ -39,29 +39,31 @@ _SPREADSHEETS = (".xlsx", ".xls", ".ods")
 _MISSING = ("", "na", "n/a", "nan")
 
 
-class DataFile(ABC):
-    """Named arrays of a file.
+class DataTable(ABC):
+    """Named arrays of a file, of all its load states or of one.
 
-    words : names of its columns or variables.
+    path : the file.
+    words : the names of its columns or variables.
     what : ``column`` or ``variable``, for errors.
     """
 
+    path: Path
     words: Sequence[str]
     what: str
 
     @abstractmethod
-    def states(self) -> Mapping[str, DataFile]:
-        """What it holds of each load state, by the state's name; one empty name if it names none.
+    def states(self) -> Mapping[str, DataTable]:
+        """Return the table of each load state by its name; one empty name if the file names none.
 
         Raises
         ------
         InputError
-            Some of it belongs to a state and some to none.
+            Some of the file belongs to a state and some to none.
         """
 
     @abstractmethod
     def known(self) -> dict[str, float]:
-        """Values of the parameters that are known, of one load state.
+        """Return the values of the parameters that are known in this load state.
 
         Raises
         ------
@@ -70,96 +72,65 @@ class DataFile(ABC):
         """
 
     @abstractmethod
-    def needs(self, field: Field) -> tuple[str, ...]:
-        """Words that hold ``field`` in a file of this kind."""
+    def words_of(self, field: Field) -> tuple[str, ...]:
+        """Return the words that hold ``field`` in a file of this format."""
 
     @abstractmethod
     def arrays(
         self, fields: Sequence[Field], others: Collection[str] = ()
     ) -> dict[str, np.ndarray]:
-        """Arrays of numbers by variable, NaN where a measured value is missing.
+        """Return arrays of numbers by variable, NaN where a measured value is missing.
 
-        ``fields`` are an observation's, and the file has every word that they need. ``others`` are
-        what other observations measured at the same places: rows with a value there are theirs.
+        Parameters
+        ----------
+        fields : the fields of an observation; the file has every word of theirs.
+        others : columns of what other observations measured at the same places; a row without
+            values of ``fields`` that has values there is theirs.
         """
 
 
-def open_data(path: Path) -> DataFile:
-    """The file at ``path``: CSV by its suffix, else netCDF; :class:`InputError` for others."""
+def open_data(path: Path) -> DataTable:
+    """Read the file at ``path``: CSV by its suffix, else netCDF; :class:`InputError` for others."""
     if not path.is_file():
         raise InputError(f"data file {path} does not exist")
     if path.suffix.lower() in _SPREADSHEETS:
         raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
-    return CSVFile(path) if path.suffix.lower() in _TEXT else NetCDFFile(path)
+    return CSVTable(path) if path.suffix.lower() in _TEXT else NetCDFTable(path)
 
 
-class CSVFile(DataFile):
-    """Columns of a CSV file; rows are counted from 1 after the header."""
+class CSVTable(DataTable):
+    """Columns of a CSV file.
+
+    rows : the text of each cell by column, by the row's number, from 1 after the header.
+    """
 
     what = "column"
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         lines = _lines(path)
         delimiter = _delimiter(lines[0]) if lines else ","
+        self.decimal_comma = delimiter != ","
         try:
-            table = list(
-                csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
-            )
+            table = csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
+            self.words, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
         except csv.Error as error:
             raise InputError(f"data file {path} is not a CSV file: {error}") from error
-        cells = [[cell.strip() for cell in row] for row in table]
-        self.path, self.decimal_comma = path, delimiter != ","
-        self.words = cells[0] if cells else []
-        if self.words and all(map(_is_number, self.words)):
-            raise InputError(
-                f"data file {path}: its first line, '{lines[0].strip()[:40]}', has no names of "
-                "columns; put them above it, e.g. node,ux,uy,uz"
-            )
-        twice = [w for w in self.words if w and self.words.count(w) > 1]
-        if twice:
-            raise InputError(f"data file {path}: column '{twice[0]}' is there twice")
-        self.rows = {
-            k: self._row(k, row) for k, row in enumerate(cells[1:], 1) if any(row) or len(row) > 1
-        }
+        self._check_header(lines)
+        filled = {k: row for k, row in enumerate(cells, 1) if any(row) or len(row) > 1}
+        self.rows = {k: self._row(k, row) for k, row in filled.items()}
         if self.words and not self.rows:
             raise InputError(f"data file {path}: names of columns, and no row below them")
 
-    def states(self) -> dict[str, CSVFile]:
-        """Rows of each state, by the word in the column ``state``; each row of a loading curve."""
-        known = any(word.startswith(KNOWN) for word in self.words)
-        curve = STATE not in self.words and known and not _PLACES & set(self.words)
-        if STATE not in self.words and not curve:
-            return {"": self}
-        found: dict[str, CSVFile] = {}
-        for number, row in self.rows.items():
-            state = str(number) if curve else row[STATE]
-            if not state or "@" in state or "/" in state:
-                raise InputError(
-                    f"data file {self.path}: row {number}, column '{STATE}' is '{state}'; "
-                    "give every row the name of its load state, without @ and /"
-                )
-            if state not in found:
-                part = found[state] = copy(self)
-                part.words, part.rows = [w for w in self.words if w != STATE], {}
-            found[state].rows[number] = row
-        # A column that is empty in a state was not measured there.
-        for part in found.values():
-            part.words = [w for w in part.words if any(row[w] for row in part.rows.values())]
-        return found
-
-    def known(self) -> dict[str, float]:
-        """Numbers of columns ``known:NAME``; empty cells say nothing."""
-        found: dict[str, float] = {}
-        for word in (w for w in self.words if w.startswith(KNOWN)):
-            name, field = word.removeprefix(KNOWN), Field(word, (word,), where=True)
-            for number, row in self.rows.items():
-                value = self._number(number, row, word, field) if row[word] else None
-                if value is not None and found.setdefault(name, value) != value:
-                    raise InputError(
-                        f"data file {self.path}: row {number}, column '{word}' is {value}, and "
-                        f"{found[name]} before it in the same load state"
-                    )
-        return found
+    def _check_header(self, lines: Sequence[str]) -> None:
+        if self.words and all(map(_is_number, self.words)):
+            raise InputError(
+                f"data file {self.path}: its first line, '{lines[0].strip()[:40]}', has no names "
+                "of columns; put them above it, e.g. node,ux,uy,uz"
+            )
+        for word in self.words:
+            if word and self.words.count(word) > 1:
+                raise InputError(f"data file {self.path}: column '{word}' is there twice")
 
     def _row(self, number: int, cells: list[str]) -> dict[str, str]:
         if any(cells[len(self.words) :]):
@@ -171,7 +142,46 @@ class CSVFile(DataFile):
         padded = cells + [""] * (len(self.words) - len(cells))
         return dict(zip(self.words, padded, strict=False))
 
-    def needs(self, field: Field) -> tuple[str, ...]:
+    def states(self) -> dict[str, CSVTable]:
+        """Rows of each state, by the word in the column ``state``; each row of a loading curve."""
+        known = any(word.startswith(KNOWN) for word in self.words)
+        curve = STATE not in self.words and known and not _PLACES & set(self.words)
+        if STATE not in self.words and not curve:
+            return {"": self}
+        tables: dict[str, CSVTable] = {}
+        for number, row in self.rows.items():
+            state = str(number) if curve else row[STATE]
+            if not state or "@" in state or "/" in state:
+                raise InputError(
+                    f"data file {self.path}: row {number}, column '{STATE}' is '{state}'; "
+                    "give every row the name of its load state, without @ and /"
+                )
+            if state not in tables:
+                tables[state] = copy(self)
+                tables[state].rows = {}
+            tables[state].rows[number] = row
+        for table in tables.values():
+            # A column that is empty in a state was not measured there.
+            table.words = [
+                w for w in self.words if w != STATE and any(row[w] for row in table.rows.values())
+            ]
+        return tables
+
+    def known(self) -> dict[str, float]:
+        """Numbers of columns ``known:NAME``; empty cells say nothing."""
+        values: dict[str, float] = {}
+        for word in (w for w in self.words if w.startswith(KNOWN)):
+            name, field = word.removeprefix(KNOWN), Field(word, (word,), where=True)
+            for number, row in self.rows.items():
+                value = self._number(number, row, word, field) if row[word] else None
+                if value is not None and values.setdefault(name, value) != value:
+                    raise InputError(
+                        f"data file {self.path}: row {number}, column '{word}' is {value}, and "
+                        f"{values[name]} before it in the same load state"
+                    )
+        return values
+
+    def words_of(self, field: Field) -> tuple[str, ...]:
         """The field's columns."""
         return field.columns
 
@@ -181,18 +191,20 @@ class CSVFile(DataFile):
         """Rows in which any of the fields has a value, less those of other observations."""
         measured = [word for field in fields if not field.where for word in field.columns]
         places = [word for field in fields if field.where for word in field.columns]
-        filled = [
-            (k, row)
+        rows = {
+            k: row
             for k, row in self.rows.items()
             if any(row[w] for w in measured)
             or (any(row[w] for w in places) and not any(row[w] for w in others))
-        ]
-        found = {}
+        }
+        arrays = {}
         for field in fields:
-            numbers = [[self._number(k, row, w, field) for w in field.columns] for k, row in filled]
-            array = np.array(numbers, dtype=float).reshape(len(filled), len(field.columns))
-            found[field.variable] = array[:, 0] if len(field.columns) == 1 else array
-        return found
+            numbers = [
+                [self._number(k, row, w, field) for w in field.columns] for k, row in rows.items()
+            ]
+            array = np.array(numbers, dtype=float).reshape(len(rows), len(field.columns))
+            arrays[field.variable] = array[:, 0] if len(field.columns) == 1 else array
+        return arrays
 
     def _number(self, number: int, row: Mapping[str, str], word: str, field: Field) -> float:
         text = row[word]
@@ -203,9 +215,9 @@ class CSVFile(DataFile):
         try:
             return float(text)
         except ValueError as error:
-            found = f"'{row[word]}', not a number" if row[word] else "empty"
+            fault = f"'{row[word]}', not a number" if row[word] else "empty"
             raise InputError(
-                f"data file {self.path}: row {number}, column '{word}' is {found}"
+                f"data file {self.path}: row {number}, column '{word}' is {fault}"
             ) from error
 
 
@@ -218,7 +230,7 @@ def _is_number(word: str) -> bool:
 
 
 def _lines(path: Path) -> list[str]:
-    """Lines that say something, the header first."""
+    """Lines that are neither empty nor comments, the header first."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -230,13 +242,17 @@ def _lines(path: Path) -> list[str]:
 
 
 def _delimiter(header: str) -> str:
-    """What separates the words of the header; what is quoted does not count."""
+    """The separator of the header's words; quoted text does not count."""
     bare = re.sub(r'"[^"]*"', "", header)
     return next((mark for mark in ";\t" if mark in bare), ",")
 
 
-class NetCDFFile(DataFile):
-    """Variables and coordinates of a netCDF file."""
+class NetCDFTable(DataTable):
+    """Variables and coordinates of a netCDF file.
+
+    data : the dataset.
+    state : the load state whose variables these are, or an empty word.
+    """
 
     what = "variable"
 
@@ -251,16 +267,16 @@ class NetCDFFile(DataFile):
         self.path, self.state = path, ""
         self.words = list(map(str, self.data.variables))
 
-    def states(self) -> dict[str, NetCDFFile]:
+    def states(self) -> dict[str, NetCDFTable]:
         """Variables of each state, by what follows ``@`` in their names."""
-        found: dict[str, NetCDFFile] = {}
+        tables: dict[str, NetCDFTable] = {}
         # Coordinates without values of their own belong to no state.
         own = [w for w in self.words if w not in self.data.dims]
         for state in states_of(own, f"data file {self.path}"):
-            part = found[state] = copy(self)
-            part.state = state
-            part.words = [base for base, its in map(split, own) if its == state]
-        return found
+            table = tables[state] = copy(self)
+            table.state = state
+            table.words = [base for base, word_state in map(split, own) if word_state == state]
+        return tables
 
     def known(self) -> dict[str, float]:
         """Numbers of variables ``known:NAME``."""
@@ -271,7 +287,7 @@ class NetCDFFile(DataFile):
                 raise InputError(f"data file {self.path}: variable '{word}' is not a number")
         return {word.removeprefix(KNOWN): float(array) for word, array in arrays.items()}
 
-    def needs(self, field: Field) -> tuple[str, ...]:
+    def words_of(self, field: Field) -> tuple[str, ...]:
         """The field's variable."""
         return (field.variable,)
 
@@ -279,29 +295,25 @@ class NetCDFFile(DataFile):
         self, fields: Sequence[Field], others: Collection[str] = ()
     ) -> dict[str, np.ndarray]:
         """The variables as numbers."""
-        found = {}
+        arrays = {}
         for name in (field.variable for field in fields):
             try:
-                found[name] = np.asarray(self.data[in_state(name, self.state)], dtype=float)
+                arrays[name] = np.asarray(self.data[in_state(name, self.state)], dtype=float)
             except (TypeError, ValueError) as error:
                 raise InputError(
                     f"data file {self.path}: variable '{name}' does not hold numbers"
                 ) from error
-        return found
-
-
-Block = Sequence[tuple[Field, np.ndarray]]
-"""The fields of one observation with their arrays."""
+        return arrays
 
 
 def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
-    """Columns of every block side by side, load state after load state.
+    """Write the columns of every block side by side, load state after load state.
 
     Blocks of one number share a row of their own, the last of their state. A block that shares a
     column with an earlier one, such as ``x``, has rows of its own below.
     """
-    every = [field for blocks in states.values() for block in blocks for field, _ in block]
-    header = list(dict.fromkeys(word for field in every for word in field.columns))
+    fields = [field for blocks in states.values() for block in blocks for field, _ in block]
+    header = list(dict.fromkeys(word for field in fields for word in field.columns))
     named = "" not in states
     text = io.StringIO()
     writer = csv.DictWriter(text, [STATE] * named + header, lineterminator="\n")
@@ -314,7 +326,7 @@ def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
 def _rows(blocks: Sequence[Block]) -> list[dict[str, str]]:
     """Rows of one load state: cells by column."""
     rows: list[dict[str, str]] = []
-    single: dict[str, str] = {}
+    numbers: dict[str, str] = {}
     used: set[str] = set()
     for block in blocks:
         words = [word for field, _ in block for word in field.columns]
@@ -322,13 +334,13 @@ def _rows(blocks: Sequence[Block]) -> list[dict[str, str]]:
         used.update(words)
         for field, array in block:
             if not np.ndim(array):
-                single[field.columns[0]] = _cell(float(array))
+                numbers[field.columns[0]] = _cell(float(array))
                 continue
             cells = np.asarray(array).reshape(-1, len(field.columns)).tolist()
             rows += [{} for _ in range(start + len(cells) - len(rows))]
             for row, values in zip(rows[start:], cells, strict=False):
                 row.update(zip(field.columns, map(_cell, values), strict=True))
-    return [*rows, single] if single else rows
+    return [*rows, numbers] if numbers else rows
 
 
 def _cell(value: float) -> str:
@@ -336,13 +348,13 @@ def _cell(value: float) -> str:
 
 
 def write_netcdf(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
-    """Every array a variable; arrays of as many rows as the block's first share a dimension.
+    """Write every array as a variable; arrays of one block share the dimension of their rows.
 
     In several load states, variables are called ``name@state``.
     """
     variables = {}
-    every = [(state, block) for state, blocks in states.items() for block in blocks]
-    for k, (state, block) in enumerate(every):
+    blocks = [(state, block) for state, blocks in states.items() for block in blocks]
+    for k, (state, block) in enumerate(blocks):
         for field, array in block:
             dims = [f"point_{k}", *(f"component_{n}" for n in np.shape(array)[1:])]
             variables[in_state(field.variable, state)] = (dims[: np.ndim(array)], np.asarray(array))

@@ -1,9 +1,9 @@
-"""Several observations of one body, by name: in one load state, or in several."""
+"""Observations of one body by name, in one load state or in several, and their missing values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.protocol import Observation
+from calibrate.measurements.observation import Observation
 from calibrate.state_names import split, states_of
 from emulator.core.errors import InputError
 
@@ -38,7 +38,7 @@ class Observations:
 
     @cached_property
     def states(self) -> tuple[str, ...]:
-        """The load states, (S,); one empty name where no observation names any."""
+        """Names of the load states, (S,); one empty name where no observation names any."""
         return states_of(self.parts)
 
     @property
@@ -76,38 +76,37 @@ class Observations:
         return {name: part.shape for name, part in self.parts.items()}
 
     def __call__(self, displacement: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
-        """Data of each part without noise.
+        """Return the data of each part without noise.
 
         Parameters
         ----------
-        displacement : (..., S, k, 3) mm, of ``nodes`` in every load state.
-        thetas : (..., S, p), theta in every load state.
+        displacement : the displacement of ``nodes`` in every load state, mm, (..., S, k, 3).
+        thetas : theta in every load state, (..., S, p).
         """
-        found: dict[str, jax.Array] = {}
-        for names in self._alike:
+        data: dict[str, jax.Array] = {}
+        for names in self._groups:
             part, rows = self.parts[names[0]], self._rows[names[0]]
-            where = [self.states.index(split(name)[1]) for name in names]
-            if len(where) == 1:  # without a gather
-                found[names[0]] = part(
-                    displacement[..., where[0], rows, :], thetas[..., where[0], :]
-                )
+            states = [self.states.index(split(name)[1]) for name in names]
+            if len(states) == 1:  # without a gather
+                state = states[0]
+                data[names[0]] = part(displacement[..., state, rows, :], thetas[..., state, :])
                 continue
-            at = np.array(where)
-            values = part(displacement[..., at, :, :][..., rows, :], thetas[..., at, :])
-            each = jnp.moveaxis(values, values.ndim - 1 - len(part.shape), 0)
-            found |= dict(zip(names, each, strict=True))
-        return {name: found[name] for name in self.parts}
+            index = np.array(states)
+            values = part(displacement[..., index, :, :][..., rows, :], thetas[..., index, :])
+            by_state = jnp.moveaxis(values, values.ndim - 1 - len(part.shape), 0)
+            data |= dict(zip(names, by_state, strict=True))
+        return {name: data[name] for name in self.parts}
 
     @cached_property
-    def _alike(self) -> list[list[str]]:
-        """Names of one and the same observation together: points of a curve are one program."""
-        found: dict[int, list[str]] = {}
+    def _groups(self) -> list[list[str]]:
+        """Names by their observation: one in several load states, as of a curve, is one program."""
+        groups: dict[int, list[str]] = {}
         for name, part in self.parts.items():
-            found.setdefault(id(part), []).append(name)
-        return list(found.values())
+            groups.setdefault(id(part), []).append(name)
+        return list(groups.values())
 
     def expand[T](self, values: Mapping[str, T], what: str) -> dict[str, tuple[str, T]]:
-        """Values of the parts' names, from values by name or by name without its state.
+        """Return values by the parts' names, from values by name, with or without its load state.
 
         ``{"volume": v}`` gives ``v`` to the volume of every load state. Each value comes with the
         name it was given under; a part that ``values`` does not mention has none.
@@ -121,15 +120,11 @@ class Observations:
         for name in values:
             if name not in known:
                 raise InputError(f"{what}: '{name}' is not observed; observed: {', '.join(known)}")
-        found = {}
-        for name in self.parts:
-            source = name if name in values else split(name)[0]
-            if source in values:
-                found[name] = source, values[source]
-        return found
+        sources = {name: name if name in values else split(name)[0] for name in self.parts}
+        return {n: (source, values[source]) for n, source in sources.items() if source in values}
 
     def name[T](self, values: T | Mapping[str, T], what: str) -> dict[str, T]:
-        """``values`` by the parts' names, in their order; a bare value belongs to a single part.
+        """Return ``values`` by the parts' names, in their order; a bare value is a single part's.
 
         Raises
         ------
@@ -149,12 +144,44 @@ class Observations:
         return {name: values[name] for name in self.parts}
 
     def to_json(self) -> dict[str, Any]:
-        """The description of each part, by name."""
+        """Return the description of each part, by name."""
         return {name: part.to_json() for name, part in self.parts.items()}
 
 
 def observations(observe: Observation | Mapping[str, Observation] | Observations) -> Observations:
-    """Observations by name; a single one without a name gets its usual one."""
+    """Return observations by name; a single one without a name gets its usual name."""
     if isinstance(observe, Observations):
         return observe
     return Observations(observe if isinstance(observe, Mapping) else {observe.names[0]: observe})
+
+
+def leave_out_missing(
+    observe: Observations, data: Mapping[str, np.ndarray]
+) -> tuple[Observations, dict[str, np.ndarray]]:
+    """Return observations and data without the entries that are NaN.
+
+    Raises
+    ------
+    InputError
+        An observation of which every value is missing.
+    """
+    parts, present = dict(observe.parts), dict(data)
+    for name, values in data.items():
+        check_some(name, values)
+        rows = np.flatnonzero(~np.isnan(values))
+        if len(rows) < np.size(values):
+            entries = parts[name].entries
+            parts[name] = parts[name].restricted(rows if entries is None else entries[rows])
+            present[name] = np.ravel(values)[rows]
+    return replace(observe, parts=parts), present
+
+
+def check_some(name: str, values: np.ndarray) -> None:
+    """Raise :class:`InputError` where every one of ``values`` is missing."""
+    if np.isnan(values).all():
+        raise InputError(f"data: every value of {name} is missing; give one, or leave {name} out")
+
+
+def missing_values(observe: Observations) -> dict[str, int]:
+    """Return the number of missing values by the observation's name, where there are any."""
+    return {name: part.missing for name, part in observe.parts.items() if part.missing}

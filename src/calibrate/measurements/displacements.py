@@ -1,0 +1,272 @@
+r"""Displacements of nodes and of material points, and lengths between them.
+
+A material point at X moves by the displacements of its element's nodes, weighted by the element's
+shape functions. The distance between two landmarks, such as base and apex, is
+
+.. math:: \ell = |x_B - x_A|, \qquad x_A = \sum_a w_a\, (X_a + u_a) ,
+
+where a landmark is a weighted mean of nodes: one node, a material point (the weights are shape
+functions), or the mean of a node set, to which each node counts the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.measurements.location import locate
+from calibrate.measurements.observation import LENGTH_UNITS, Field, Scalar
+from calibrate.measurements.points import (
+    DISPLACEMENT,
+    XYZ,
+    DisplacementPoints,
+    as_points,
+    check_distinct,
+    gather,
+)
+from emulator.core.errors import InputError
+from emulator.geometry.discretisation import shapes_at
+from emulator.scenes.nodes import all_nodes, check_nodes
+from emulator.scenes.scene import Scene
+
+_SHORTEST = 1e-6  # of the body's size; the direction of a shorter length is round-off
+
+
+@dataclass(frozen=True, eq=False)
+class NodalDisplacements(DisplacementPoints):
+    """Displacements of the nodes ``nodes`` (d,), at ``points`` (d, 3) in the reference body, mm."""
+
+    nodes: np.ndarray
+    points: np.ndarray
+
+    kind = "nodes"
+    usage = "nodes:N, all, a node set, node numbers like 3,14,15"
+    arguments = ("nodes",)
+    place_field = Field("node", ("node",), where=True)
+
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """The displacements themselves."""
+        return displacement
+
+    @classmethod
+    def of(cls, scene: Scene, nodes: str | np.ndarray | list[int] = "all") -> Self:
+        """Observe ``nodes``: ``all``, the name of a node set, or indices.
+
+        Raises
+        ------
+        InputError
+            Unknown node or node set, or a node given twice.
+        """
+        if isinstance(nodes, str):
+            index = all_nodes(scene) if nodes == "all" else scene.mesh.node_set(nodes)
+        else:
+            index = check_nodes(scene, np.asarray(nodes))
+        numbers, counts = np.unique(index, return_counts=True)
+        if (counts > 1).any():
+            raise InputError(
+                f"node {numbers[counts > 1][0]} is observed twice; give each node once, repeated "
+                "measurements as their mean, with less noise"
+            )
+        return cls(index, scene.mesh.nodes[index])
+
+    @classmethod
+    def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
+        """Nodes with a free component."""
+        return spread_nodes(scene, count, seed)
+
+    @classmethod
+    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
+        """``nodes:N`` (N free ones at random), ``all``, a node set, or node numbers."""
+        if word == "all" or word in scene.mesh.node_sets:
+            return DISPLACEMENT, cls.of(scene, word)
+        if word.partition(":")[0] == cls.kind:
+            return super().parse(scene, word, seed)
+        try:
+            numbers = [int(text) for text in word.split(",")]
+        except ValueError:
+            return None
+        return DISPLACEMENT, cls.of(scene, numbers)
+
+    @classmethod
+    def located(
+        cls, scene: Scene, selection: tuple[Any, ...], places: np.ndarray, values: np.ndarray
+    ) -> Self:
+        """Return the observation of the nodes that a file numbers."""
+        if (places != np.round(places)).any():
+            raise InputError("nodes must be whole numbers")
+        return cls.of(scene, places.astype(int))
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks(DisplacementPoints):
+    """Displacements of material points, interpolated by the shape functions of their element.
+
+    nodes : the nodes of the points' elements, (k,).
+    points : positions in the reference body, mm, (d, 3).
+    members : positions in ``nodes`` of each point's element, (d, 4 or 10).
+    weights : shape functions of the element at the point, (d, 4 or 10).
+    """
+
+    nodes: np.ndarray
+    points: np.ndarray
+    members: np.ndarray
+    weights: np.ndarray
+
+    kind = "landmarks"
+    usage = "landmarks:N"
+    arguments = ("points",)
+    place_field = Field("position", XYZ, where=True)
+
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """Interpolated displacements (..., d, 3)."""
+        values = displacement[..., self.members, :]
+        return jnp.sum(values * self.weights[:, :, None], axis=-2)
+
+    @classmethod
+    def of(cls, scene: Scene, points: Any) -> Self:
+        """Observe material points given by reference positions ``points`` (d, 3) in mm.
+
+        Raises
+        ------
+        InputError
+            A point that lies neither in an element nor just beside one, or is given twice.
+        """
+        points = as_points(points, "landmarks have shape {}; expected (d, 3), finite, in mm")
+        check_distinct(points, "landmarks")
+        elements, weights = locate(scene.mesh, points)
+        nodes, members = gather(scene.mesh.elements[elements])
+        return cls(nodes, points, members, weights)
+
+    @classmethod
+    def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
+        """Points uniform over the volume."""
+        return spread_landmarks(scene, count, seed)
+
+    @classmethod
+    def located(
+        cls, scene: Scene, selection: tuple[Any, ...], places: np.ndarray, values: np.ndarray
+    ) -> Self:
+        """Return the observation at the positions of a file, which must be those at rest."""
+        try:
+            return cls.of(scene, places)
+        except InputError as error:
+            if _are_deformed(scene, places, values):
+                raise InputError(
+                    f"{error}; less their displacements all points lie inside: give positions at "
+                    "rest"
+                ) from error
+            raise
+
+
+@dataclass(frozen=True, eq=False)
+class Length(Scalar):
+    """The distance between two landmarks, one number in mm.
+
+    first, second : the landmarks in words.
+    nodes : the nodes that either landmark is made of, (k,).
+    weights : weights of the nodes in each landmark, (2, k); rows sum to 1.
+    ends : the landmarks in the reference body, mm, (2, 3).
+    """
+
+    first: str
+    second: str
+    nodes: np.ndarray
+    weights: np.ndarray
+    ends: np.ndarray
+
+    kind = "length"
+    usage = "length:A:B (each a node, a node set or x,y,z)"
+    quantity = "length"
+    unit = "mm"
+    other_units = LENGTH_UNITS
+    usual_sd = 0.5
+    arguments = ("first", "second")
+
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """Length (...) in mm."""
+        x = self.ends + jnp.einsum("ek,...ki->...ei", self.weights, displacement)
+        return jnp.linalg.norm(x[..., 1, :] - x[..., 0, :], axis=-1)
+
+    @classmethod
+    def of(cls, scene: Scene, first: str, second: str) -> Self:
+        """Observe the distance between two landmarks.
+
+        Parameters
+        ----------
+        first, second : the number of a node, the name of a node set, or ``x,y,z`` in mm, as text.
+
+        Raises
+        ------
+        InputError
+            An unknown node or set, a point outside the body, or two landmarks at one place.
+        """
+        landmarks = [_landmark(scene, text) for text in (first, second)]
+        nodes = np.unique(np.concatenate([members for members, _ in landmarks]))
+        weights = np.zeros((2, len(nodes)))
+        for row, (members, shares) in zip(weights, landmarks, strict=True):
+            row[np.searchsorted(nodes, members)] = shares
+        ends = weights @ scene.mesh.nodes[nodes]
+        part = cls(first, second, nodes, weights, ends)
+        if not np.linalg.norm(ends[1] - ends[0]) > _SHORTEST * scene.mesh.size:
+            raise InputError(
+                f"observe '{part.names[0]}': both landmarks are at {ends[0].tolist()} mm"
+            )
+        return part
+
+
+nodal_displacements = NodalDisplacements.of
+landmarks = Landmarks.of
+length_between = Length.of
+
+
+def spread_nodes(scene: Scene, count: int, seed: int) -> np.ndarray:
+    """Return ``count`` nodes drawn without replacement from those with a free component, sorted."""
+    candidates = np.flatnonzero(~scene.held.all(axis=1))
+    if not 0 < count <= len(candidates):
+        raise InputError(
+            f"cannot observe {count} nodes; scene '{scene.name}' has {len(candidates)} free"
+        )
+    return np.sort(np.random.default_rng(seed).choice(candidates, count, replace=False))
+
+
+def spread_landmarks(scene: Scene, count: int, seed: int) -> np.ndarray:
+    """Return ``count`` points (count, 3) mm, uniform over the volume of the reference body."""
+    rng = np.random.default_rng(seed)
+    volumes = scene.discretisation.weights.sum(axis=1)
+    elements = rng.choice(len(volumes), count, p=volumes / volumes.sum())
+    # Uniform in the reference element: uniform in an element with straight edges.
+    barycentric = rng.dirichlet(np.ones(4), count)
+    weights, _ = shapes_at(scene.mesh.order, barycentric)
+    return np.einsum("da,dai->di", weights, scene.mesh.nodes[scene.mesh.elements[elements]])
+
+
+def _are_deformed(scene: Scene, points: np.ndarray, values: np.ndarray) -> bool:
+    """Whether points (d, 3) less their displacements, and not as they are, lie in the body."""
+    measured = np.isfinite(values).all(axis=1)
+    try:
+        locate(scene.mesh, points[measured] - values[measured])
+    except InputError:
+        return False
+    return bool(measured.any())
+
+
+def _landmark(scene: Scene, text: str) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of a landmark."""
+    if text in scene.mesh.node_sets:
+        nodes = scene.mesh.node_set(text)
+        return nodes, np.full(len(nodes), 1.0 / len(nodes))
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 3 and np.isfinite(numbers).all():
+        elements, shapes = locate(scene.mesh, np.array([numbers]))
+        return scene.mesh.elements[elements[0]], shapes[0]
+    if len(numbers) == 1 and text.isdigit():
+        return check_nodes(scene, np.array([int(text)])), np.ones(1)
+    known = ", ".join(sorted(scene.mesh.node_sets)) or "none here"
+    raise InputError(f"landmark '{text}' is neither a node, a node set ({known}) nor x,y,z")
