@@ -39,8 +39,8 @@ from calibrate.measurements.points import (
     gather,
 )
 from emulator.core.errors import InputError
-from emulator.geometry.fibres import unit
 from emulator.geometry.discretisation import from_quadrature_points
+from emulator.geometry.fibres import unit
 from emulator.geometry.heart_wall import SEGMENTS, aha_segments
 from emulator.scenes.scene import Scene
 
