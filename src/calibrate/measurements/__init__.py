@@ -1,7 +1,7 @@
-"""What of a displacement field was measured: observations, the files of their data, and units.
+"""Observations: what of a displacement field was measured, files of its data, and their units.
 
 A kind of observation is a subclass of :class:`Observation`; the kinds are listed in
-:data:`OBSERVATIONS`. :class:`Observations` holds those made at once, by name.
+:data:`OBSERVATIONS`. :class:`Observations` holds several of one body by name.
 """
 
 from calibrate.measurements.collection import (

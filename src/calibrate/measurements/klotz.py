@@ -31,7 +31,7 @@ more than for one.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -51,21 +51,6 @@ PRESSURE_SCATTER = 3.0 * KPA_PER_MMHG
 _A, _B = 27.78 * KPA_PER_MMHG, 2.76
 _UNLOADED, _SLOPE = 0.6, 0.006 / KPA_PER_MMHG  # V_0 / V_m at rest, and its fall with P_m in 1/kPa
 _LARGEST = 40.0 * KPA_PER_MMHG  # largest pressure at which the relation was compared
-
-
-class PowerLaw(NamedTuple):
-    """``P = alpha V**beta``: alpha in kPa / mL**beta, beta without unit, V in mL."""
-
-    alpha: jax.Array
-    beta: jax.Array
-
-    def pressure(self, volume: ArrayLike) -> jax.Array:
-        """Pressure (...) in kPa at ``volume`` (...) in mL."""
-        return self.alpha * jnp.asarray(volume) ** self.beta
-
-    def volume(self, pressure: ArrayLike) -> jax.Array:
-        """Volume (...) in mL at ``pressure`` (...) in kPa."""
-        return (jnp.asarray(pressure) / self.alpha) ** (1.0 / self.beta)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,41 +87,26 @@ class Klotz:
 
     @property
     def unloaded(self) -> jax.Array:
-        """V_0 in mL, without pressure."""
+        """V_0 in mL, the volume without pressure."""
         volume, pressure = self._point
         return volume * (_UNLOADED - _SLOPE * pressure)
 
     @property
     def at_30_mmhg(self) -> jax.Array:
-        """V_30 in mL: where the normalised curve reaches 27.78 mmHg and the power law 30."""
+        """V_30 in mL, where the normalised curve reaches A_n = 27.78 mmHg."""
         volume, pressure = self._point
         return self.unloaded + (volume - self.unloaded) * (pressure / _A) ** (-1.0 / _B)
 
     def volume(self, pressure: ArrayLike) -> jax.Array:
-        """Volume (...) in mL at ``pressure`` (...) in kPa; V_0 where that is 0 or less."""
+        """Return the volume (...) in mL at ``pressure`` (...) in kPa; V_0 at 0 kPa or less."""
         volume, measured = self._point
         return volume * _ratio(pressure, measured)
 
     def pressure(self, volume: ArrayLike) -> jax.Array:
-        """Pressure (...) in kPa at ``volume`` (...) in mL; 0 below V_0."""
+        """Return the pressure (...) in kPa at ``volume`` (...) in mL; 0 below V_0."""
         measured, pressure = self._point
         filled = jnp.maximum(jnp.asarray(volume) - self.unloaded, 0.0)
         return pressure * (filled / (measured - self.unloaded)) ** _B
-
-    @property
-    def power_law(self) -> PowerLaw:
-        """The protocol's curve, through the point and V_30 at 30 mmHg, without V_0.
-
-        Above 22 mmHg, where these two points are close, V_15 = V_0 + 0.8 (V_30 - V_0) at 15 mmHg
-        replaces V_30.
-        """
-        measured, pressure = self._point
-        mmhg = pressure / KPA_PER_MMHG
-        low = mmhg <= 22.0
-        at_15 = self.unloaded + 0.8 * (self.at_30_mmhg - self.unloaded)
-        other, volume = jnp.where(low, 30.0, 15.0), jnp.where(low, self.at_30_mmhg, at_15)
-        beta = jnp.log(mmhg / other) / jnp.log(measured / volume)
-        return PowerLaw(pressure * jnp.exp(-beta * jnp.log(measured)), beta)
 
     def sd(self, pressure: ArrayLike, scatter: float = PRESSURE_SCATTER) -> jax.Array:
         """Return the sd (...) in mL of :class:`KlotzVolume` at ``pressure`` (...) in kPa, above 0.

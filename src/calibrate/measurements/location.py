@@ -229,10 +229,10 @@ def _onto_curved(
     """As :func:`_onto_triangles`, on quadratic facets (f, 6, 3), from a start on straight ones."""
     for _ in range(_GAUSS_NEWTON_STEPS):
         values, slopes = facet_shapes(barycentric, 6)
-        away = point - np.einsum("fa,fai->fi", values, facets)
+        offset = point - np.einsum("fa,fai->fi", values, facets)
         tangents = np.einsum("fad,fai->fdi", slopes, facets)
         gram = np.einsum("fdi,fei->fde", tangents, tangents)
-        right = np.einsum("fdi,fi->fd", tangents, away)
+        right = np.einsum("fdi,fi->fd", tangents, offset)
         step = np.linalg.solve(gram, right[..., None])[..., 0]
         clipped = np.maximum(barycentric + np.column_stack([-step.sum(axis=1), step]), 0.0)
         barycentric = clipped / clipped.sum(axis=1, keepdims=True)

@@ -13,8 +13,9 @@ and as too large when
 with the noise's standard deviation :math:`\sigma` (the largest plausible one where it is inferred)
 and n numbers. The second conditions keep noisy data: however large the noise, data made at
 :math:`g_s` meets one of them with a probability below 4e-6. The first conditions keep data from a
-corner of the prior that no draw came near. Before data is refused it is looked for: at more draws,
-and by descents of :math:`\|y - g(x)\|` from the nearest, as a second mode may be small.
+corner of the prior that no draw came near. Before data is refused, predictions like it are sought
+at more draws, and by descents of :math:`\|y - g(x)\|` from the nearest of them, as a second mode
+may be small.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
 
 from calibrate.measurements.collection import Observations
 from calibrate.measurements.observation import Observation
 from emulator.core.errors import InputError
+from emulator.core.minimise import minimise
 
 _DRAWS = 32  # predictions at draws of the prior
 PRIOR_DRAWS = 4096  # whose extremes stand for the ends of a parameter's prior
@@ -54,57 +55,25 @@ def check_magnitudes(
 
     Parameters
     ----------
-    sd : largest plausible one of each observation's noise and other errors, in its unit.
-    draws : (c, q) of the unknowns' prior, ``PRIOR_DRAWS`` of them or so.
+    predict : predictions without noise, and whether they are valid.
+    observe : the observations.
+    sd : the largest plausible sd of each observation's noise and other errors, in its unit.
+    draws : draws of the unknowns' prior, (c, q), ``PRIOR_DRAWS`` of them or so.
+    data : the data by observation.
     """
     predictions = predict_over_prior(predict, observe, draws)
     for name, part in observe.parts.items():
-        about = name, part, data[name]
-        if complaint(*about, predictions[name], sd[name]) is None:
+        if complaint(name, part, data[name], predictions[name], sd[name]) is None:
             continue
-        more = _nearer(predict, name, data[name], draws)
-        known = np.concatenate([predictions[name], more])
-        found = complaint(*about, known, sd[name])
-        if found is not None:
-            raise InputError(found)
-
-
-def _nearer(predict: Predict, name: str, data: np.ndarray, draws: np.ndarray) -> np.ndarray:
-    """Predictions (s, ...) at more draws, and at the ends of descents towards the data."""
-
-    def gap(x: jax.Array) -> jax.Array:
-        means, valid = predict(x)
-        return jnp.where(valid, jnp.log1p(jnp.sum((means[name] - data) ** 2)), jnp.inf)
-
-    rows = draws[:_MORE_DRAWS]
-    means, valid = jax.jit(partial(jax.lax.map, predict))(jnp.asarray(rows))
-    known, valid = np.asarray(means[name]), np.asarray(valid)
-    gaps = np.where(valid, [_norm(row - data) for row in known], np.inf)
-    both = jax.jit(jax.value_and_grad(gap))
-    ends = [draws.min(axis=0), draws.max(axis=0)]
-    width = np.where(ends[1] > ends[0], ends[1] - ends[0], 1.0)
-
-    def scaled(z: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = both(jnp.asarray(ends[0] + width * z))
-        return float(value), np.nan_to_num(np.asarray(slope) * width)
-
-    reached = [
-        ends[0] + width * minimize(
-            scaled, (rows[k] - ends[0]) / width, jac=True, method="L-BFGS-B",
-            bounds=[(0.0, 1.0)] * len(width), options={"maxiter": _STEPS},
-        ).x
-        for k in np.argsort(gaps)[:_DESCENTS]
-        if np.isfinite(gaps[k])
-    ]  # fmt: skip
-    one = jax.jit(predict)
-    ended = [one(jnp.asarray(x)) for x in reached]
-    return np.stack([*known[valid], *(np.asarray(m[name]) for m, fine in ended if bool(fine))])
+        more = np.concatenate([predictions[name], _closest(predict, name, data[name], draws)])
+        if (line := complaint(name, part, data[name], more, sd[name])) is not None:
+            raise InputError(line)
 
 
 def predict_over_prior(
     predict: Predict, observe: Observations, draws: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Predictions (s, ...) without noise at draws of the prior and at its ends, by observation.
+    """Return predictions (s, ...) without noise at draws of the prior and at its ends.
 
     The ends are taken one unknown at a time, and then together where each makes the prediction
     smaller, or larger.
@@ -115,69 +84,83 @@ def predict_over_prior(
         The forward map has no valid answer at any of them.
     """
     one = jax.jit(predict)
-    found: dict[str, list[np.ndarray]] = {name: [] for name in observe.parts}
+    predictions: dict[str, list[np.ndarray]] = {name: [] for name in observe.parts}
 
     def sizes(values: np.ndarray) -> dict[str, float]:
         means, valid = one(jnp.asarray(values))
         if not bool(valid):
-            return dict.fromkeys(found, np.nan)
+            return dict.fromkeys(predictions, np.nan)
         for name, mean in means.items():
-            found[name].append(np.asarray(mean))
+            predictions[name].append(np.asarray(mean))
         return {name: _norm(np.asarray(mean)) for name, mean in means.items()}
 
     middle, ends = np.median(draws, axis=0), np.stack([draws.min(axis=0), draws.max(axis=0)])
     for values in draws[:_DRAWS]:
         sizes(values)
-    reached = {name: np.empty(ends.shape) for name in found}
+    at_ends = {name: np.empty(ends.shape) for name in predictions}
     for end, k in np.ndindex(ends.shape):
         values = middle.copy()
         values[k] = ends[end, k]
         for name, size in sizes(values).items():
-            reached[name][end, k] = size
+            at_ends[name][end, k] = size
     columns = np.arange(ends.shape[1])
-    for by_end in reached.values():
-        smaller = (by_end[1] < by_end[0]).astype(int)
+    for low, high in at_ends.values():
+        smaller = (high < low).astype(int)
         sizes(ends[smaller, columns])
         sizes(ends[1 - smaller, columns])
-    if not all(found.values()):
+    if not all(predictions.values()):
         raise InputError(
             f"the forward map has no valid answer at any of {_DRAWS} draws of the prior; "
             "give a prior inside the range in which it answers"
         )
-    return {name: np.stack(values) for name, values in found.items()}
+    return {name: np.stack(values) for name, values in predictions.items()}
+
+
+def _closest(predict: Predict, name: str, data: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    """Predictions (s, ...) at more draws, and at the ends of descents towards the data."""
+    low, high = draws.min(axis=0), draws.max(axis=0)
+    width = np.where(high > low, high - low, 1.0)
+
+    def gap(z: jax.Array) -> jax.Array:
+        means, valid = predict(low + width * z)
+        return jnp.where(valid, jnp.log1p(jnp.sum((means[name] - data) ** 2)), jnp.inf)
+
+    rows = draws[:_MORE_DRAWS]
+    means, valid = jax.jit(partial(jax.lax.map, predict))(jnp.asarray(rows))
+    at_draws = np.asarray(means[name])[valid := np.asarray(valid)]
+    nearest = np.argsort([_norm(row - data) for row in at_draws])[:_DESCENTS]
+    both, one = jax.jit(jax.value_and_grad(gap)), jax.jit(predict)
+    starts = (rows[valid][nearest] - low) / width
+    ends = [minimise(both, z, low=0.0, high=1.0, iterations=_STEPS).x for z in starts]
+    answers = [one(jnp.asarray(low + width * z)) for z in ends]
+    return np.stack([*at_draws, *(np.asarray(m[name]) for m, fine in answers if bool(fine))])
 
 
 def complaint(
     name: str, part: Observation, data: np.ndarray, predictions: np.ndarray, sd: float
 ) -> str | None:
-    """A line where data (...) is far from all of ``predictions`` (s, ...), else None."""
+    """Return a line where data (...) is far from all of ``predictions`` (s, ...), else None."""
     y, g = np.ravel(data), predictions.reshape(len(predictions), -1)
     norms = np.array([_norm(row) for row in g])
     if not norms.min() > 0.0:
         return None  # a body that may be at rest explains data of any size
-    size, count = _norm(y), y.size
+    size = _norm(y)
     along = np.array([row @ y for row in g / norms[:, None]])
     small = (size < norms / _FACTOR) & (norms - along > _NOISE_SD * sd)
-    apart = np.array([_norm(y - row) for row in g])
-    large = (size > _FACTOR * norms) & (apart > sd * (np.sqrt(count) + _NOISE_SD))
-    return _complaint(name, part, y, g, norms) if small.all() or large.all() else None
-
-
-def _complaint(
-    name: str, part: Observation, y: np.ndarray, g: np.ndarray, norms: np.ndarray
-) -> str:
-    """What the data looks like, in one line."""
+    distances = np.array([_norm(y - row) for row in g])
+    large = (size > _FACTOR * norms) & (distances > sd * (np.sqrt(y.size) + _NOISE_SD))
+    if not (small.all() or large.all()):
+        return None
     largest = np.abs(g).max(axis=1)
     predicted = f"{largest.min():.3g} to {largest.max():.3g} {part.unit}"
-    size = _norm(y)
     if size == 0.0:
         return f"{name} data are all zero; predictions reach {predicted} ({_OVERRULE})"
     ratio = float(np.sqrt(norms.min() * norms.max())) / size
     word, times = ("smaller", ratio) if ratio > 1.0 else ("larger", 1.0 / ratio)
-    guess = _guess(part, size, norms, ratio)
     return (
-        f"{name} data are about {float(f'{times:.1g}'):g} times {word} than predicted "
-        f"(largest {np.abs(y).max():.3g} against {predicted}): {guess} ({_OVERRULE})"
+        f"{name} data are about {float(f'{times:.1g}'):g} times {word} than predicted (largest "
+        f"{np.abs(y).max():.3g} against {predicted}): {_guess(part, size, norms, ratio)} "
+        f"({_OVERRULE})"
     )
 
 

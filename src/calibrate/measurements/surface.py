@@ -1,4 +1,4 @@
-r"""What is seen of a surface: how far it moved along its normals, and markers that move with it.
+r"""Measurements of a surface: displacements along its normals, and markers that move with it.
 
 **Normal displacements.** An image shows where a surface is, not which of its points is which.
 Observed is the displacement along the reference normal :math:`n` of points :math:`X` of the
@@ -122,17 +122,17 @@ class SurfacePoints(OfFacetSet):
         """
         points = as_points(points, "surface points have shape {}; expected (d, 3), finite")
         facets = scene.mesh.facet_set(facet_set)
-        feet = [closest_point(scene.mesh.nodes[facets], point) for point in points]
-        for k, (foot, point) in enumerate(zip(feet, points, strict=True)):
-            away = float(np.linalg.norm(foot.position - point))
-            if not away <= slack * scene.mesh.size:
+        closest = [closest_point(scene.mesh.nodes[facets], point) for point in points]
+        for k, (foot, point) in enumerate(zip(closest, points, strict=True)):
+            distance = float(np.linalg.norm(foot.position - point))
+            if not distance <= slack * scene.mesh.size:
                 raise InputError(
-                    f"surface point {k} at {point.tolist()} mm is {away:.2g} mm away from "
+                    f"surface point {k} at {point.tolist()} mm is {distance:.2g} mm away from "
                     f"'{facet_set}' at rest; give points of the reference surface"
                 )
-        nodes, members = gather(facets[[foot.facet for foot in feet]])
+        nodes, members = gather(facets[[each.facet for each in closest]])
         positions, normals, weights = (
-            np.stack([getattr(foot, name) for foot in feet])
+            np.stack([getattr(each, name) for each in closest])
             for name in ("position", "normal", "weights")
         )
         return cls(facet_set, nodes, positions, normals, members, weights)
@@ -215,11 +215,11 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
         check_distinct(points, "markers")
         mesh, facets = scene.mesh, scene.mesh.facet_set(facet_set)
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-        away = np.linalg.norm(points - np.clip(points, low, high), axis=1)
-        far = int(np.argmax(away))
-        if away[far] > _FARTHEST * mesh.size:
+        distances = np.linalg.norm(points - np.clip(points, low, high), axis=1)
+        k = int(np.argmax(distances))
+        if distances[k] > _FARTHEST * mesh.size:
             raise InputError(
-                f"marker {far} at {points[far].tolist()} mm stands {away[far]:.3g} mm away from a "
+                f"marker {k} at {points[k].tolist()} mm stands {distances[k]:.3g} mm away from a "
                 f"body of {mesh.size:.3g} mm; give positions in the mesh's frame, in mm"
             )
         areas = nodal_areas(mesh.nodes[facets], facet_rule(mesh.order, 2 * mesh.order))
@@ -249,8 +249,8 @@ def surface_distances(
     approximation.
     """
     observe = SurfacePoints.of(scene, facet_set, measured, slack=np.inf)
-    away = np.atleast_2d(np.asarray(measured, dtype=float)) - observe.points
-    return observe, np.sum(away * observe.normals, axis=1)
+    offsets = np.atleast_2d(np.asarray(measured, dtype=float)) - observe.points
+    return observe, np.sum(offsets * observe.normals, axis=1)
 
 
 def spread_on_surface(scene: Scene, facet_set: str, count: int, seed: int) -> np.ndarray:

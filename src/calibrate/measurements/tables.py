@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import io
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from pathlib import Path
@@ -39,83 +38,26 @@ _SPREADSHEETS = (".xlsx", ".xls", ".ods")
 _MISSING = ("", "na", "n/a", "nan")
 
 
-class DataTable(ABC):
-    """Named arrays of a file, of all its load states or of one.
+class CSVTable:
+    """Columns of a CSV file, of all its load states or of one.
 
-    path : the file.
-    words : the names of its columns or variables.
-    what : ``column`` or ``variable``, for errors.
-    """
-
-    path: Path
-    words: Sequence[str]
-    what: str
-
-    @abstractmethod
-    def states(self) -> Mapping[str, DataTable]:
-        """Return the table of each load state by its name; one empty name if the file names none.
-
-        Raises
-        ------
-        InputError
-            Some of the file belongs to a state and some to none.
-        """
-
-    @abstractmethod
-    def known(self) -> dict[str, float]:
-        """Return the values of the parameters that are known in this load state.
-
-        Raises
-        ------
-        InputError
-            A value that is no number, or several that differ.
-        """
-
-    @abstractmethod
-    def words_of(self, field: Field) -> tuple[str, ...]:
-        """Return the words that hold ``field`` in a file of this format."""
-
-    @abstractmethod
-    def arrays(
-        self, fields: Sequence[Field], others: Collection[str] = ()
-    ) -> dict[str, np.ndarray]:
-        """Return arrays of numbers by variable, NaN where a measured value is missing.
-
-        Parameters
-        ----------
-        fields : the fields of an observation; the file has every word of theirs.
-        others : columns of what other observations measured at the same places; a row without
-            values of ``fields`` that has values there is theirs.
-        """
-
-
-def open_data(path: Path) -> DataTable:
-    """Read the file at ``path``: CSV by its suffix, else netCDF; :class:`InputError` for others."""
-    if not path.is_file():
-        raise InputError(f"data file {path} does not exist")
-    if path.suffix.lower() in _SPREADSHEETS:
-        raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
-    return CSVTable(path) if path.suffix.lower() in _TEXT else NetCDFTable(path)
-
-
-class CSVTable(DataTable):
-    """Columns of a CSV file.
-
+    words : the names of the columns.
+    what : the word for one of them, for errors.
     rows : the text of each cell by column, by the row's number, from 1 after the header.
     """
 
     what = "column"
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        lines = _lines(path)
+        self.path, lines = path, _lines(path)
         delimiter = _delimiter(lines[0]) if lines else ","
         self.decimal_comma = delimiter != ","
         try:
             table = csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
-            self.words, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
+            header, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
         except csv.Error as error:
             raise InputError(f"data file {path} is not a CSV file: {error}") from error
+        self.words: Sequence[str] = header
         self._check_header(lines)
         filled = {k: row for k, row in enumerate(cells, 1) if any(row) or len(row) > 1}
         self.rows = {k: self._row(k, row) for k, row in filled.items()}
@@ -143,7 +85,10 @@ class CSVTable(DataTable):
         return dict(zip(self.words, padded, strict=False))
 
     def states(self) -> dict[str, CSVTable]:
-        """Rows of each state, by the word in the column ``state``; each row of a loading curve."""
+        """Return the table of each load state, by the column ``state`` or a loading curve's rows.
+
+        One empty name where the file names no state.
+        """
         known = any(word.startswith(KNOWN) for word in self.words)
         curve = STATE not in self.words and known and not _PLACES & set(self.words)
         if STATE not in self.words and not curve:
@@ -168,7 +113,13 @@ class CSVTable(DataTable):
         return tables
 
     def known(self) -> dict[str, float]:
-        """Numbers of columns ``known:NAME``; empty cells say nothing."""
+        """Return the parameters that are known in this load state, from columns ``known:NAME``.
+
+        Raises
+        ------
+        InputError
+            A value that is no number, or several that differ.
+        """
         values: dict[str, float] = {}
         for word in (w for w in self.words if w.startswith(KNOWN)):
             name, field = word.removeprefix(KNOWN), Field(word, (word,), where=True)
@@ -182,13 +133,20 @@ class CSVTable(DataTable):
         return values
 
     def words_of(self, field: Field) -> tuple[str, ...]:
-        """The field's columns."""
+        """Return the words that hold ``field`` in a file of this format."""
         return field.columns
 
     def arrays(
         self, fields: Sequence[Field], others: Collection[str] = ()
     ) -> dict[str, np.ndarray]:
-        """Rows in which any of the fields has a value, less those of other observations."""
+        """Return arrays of numbers by variable, NaN where a measured value is missing.
+
+        Parameters
+        ----------
+        fields : the fields of an observation; the file has every word of theirs.
+        others : columns of what other observations measured at the same places; a row without
+            measured values of ``fields`` that has values there is theirs.
+        """
         measured = [word for field in fields if not field.where for word in field.columns]
         places = [word for field in fields if field.where for word in field.columns]
         rows = {
@@ -247,8 +205,8 @@ def _delimiter(header: str) -> str:
     return next((mark for mark in ";\t" if mark in bare), ",")
 
 
-class NetCDFTable(DataTable):
-    """Variables and coordinates of a netCDF file.
+class NetCDFTable:
+    """Variables and coordinates of a netCDF file, with the methods of :class:`CSVTable`.
 
     data : the dataset.
     state : the load state whose variables these are, or an empty word.
@@ -265,7 +223,7 @@ class NetCDFTable(DataTable):
                 f"data file {path} is neither CSV ({', '.join(_TEXT)}) nor readable netCDF"
             ) from error
         self.path, self.state = path, ""
-        self.words = list(map(str, self.data.variables))
+        self.words: Sequence[str] = list(map(str, self.data.variables))
 
     def states(self) -> dict[str, NetCDFTable]:
         """Variables of each state, by what follows ``@`` in their names."""
@@ -304,6 +262,19 @@ class NetCDFTable(DataTable):
                     f"data file {self.path}: variable '{name}' does not hold numbers"
                 ) from error
         return arrays
+
+
+DataTable = CSVTable | NetCDFTable
+"""Named arrays of a file."""
+
+
+def open_data(path: Path) -> DataTable:
+    """Read the file at ``path``: CSV by its suffix, else netCDF; :class:`InputError` for others."""
+    if not path.is_file():
+        raise InputError(f"data file {path} does not exist")
+    if path.suffix.lower() in _SPREADSHEETS:
+        raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
+    return CSVTable(path) if path.suffix.lower() in _TEXT else NetCDFTable(path)
 
 
 def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
