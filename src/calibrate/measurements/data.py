@@ -42,21 +42,32 @@ Files = str | Path | Mapping[str, str]
 
 
 def read_data(scene: Scene, files: Files) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Return the observations of a file and their data, by the same names.
+    """Return the observations of a file and their data; see :func:`read_measurements`."""
+    observe, data, _ = read_measurements(scene, files)
+    return observe, data
+
+
+def read_measurements(
+    scene: Scene, files: Files
+) -> tuple[Observations, dict[str, np.ndarray], dict[str, float]]:
+    """Return the observations of a file, their data by the same names, and known parameters.
 
     Of several files, by load state, each has the data of its state. A file with states of its own,
-    such as a loading curve ``pull``, has those of ``pull.1``, ``pull.2`` and so on.
+    such as a loading curve ``pull``, has those of ``pull.1``, ``pull.2`` and so on. Parameters are
+    known from columns ``known:NAME``, and returned by ``parameter@state``.
 
     Raises
     ------
     InputError
         Missing or malformed file, a place that is not finite, an infinite value, an unknown node, a
-        point outside, an unknown cavity.
+        point outside, an unknown cavity, a known value that differs within one load state.
     """
     parts: dict[str, Observation] = {}
     data: dict[str, np.ndarray] = {}
+    known: dict[str, float] = {}
     distinct: dict[str, Observation] = {}
     for path, state, file in _states(files):
+        known |= {in_state(parameter, state): value for parameter, value in file.known().items()}
         tables = _tables(path, file)
         for base, (kind, table) in tables.items():
             name = in_state(base, state)
@@ -70,22 +81,7 @@ def read_data(scene: Scene, files: Files) -> tuple[Observations, dict[str, np.nd
             except InputError as error:
                 where = f", state '{state}'" if state else ""
                 raise InputError(f"data file {path}{where}: {error}") from error
-    return Observations(parts), data
-
-
-def read_known(files: Files) -> dict[str, float]:
-    """Return the known parameters of a data file by ``parameter@state``, from ``known:NAME``.
-
-    Raises
-    ------
-    InputError
-        A value that is no number, or differs within one load state.
-    """
-    return {
-        in_state(parameter, state): value
-        for _, state, file in _states(files)
-        for parameter, value in file.known().items()
-    }
+    return Observations(parts), data, known
 
 
 def _states(files: Files) -> Iterator[tuple[Path, str, DataTable]]:

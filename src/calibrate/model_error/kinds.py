@@ -17,7 +17,6 @@ import numpy as np
 
 from calibrate.measurements import Observations
 from calibrate.measurements.points import DisplacementPoints
-from calibrate.measurements.present import Present
 from calibrate.model_error.systematic import (
     Systematic,
     check_curve,
@@ -56,7 +55,7 @@ class Measured:
     def whole(self, name: str) -> tuple[Any, np.ndarray]:
         """Return the observation with all its entries, and its data, NaN where missing."""
         part, data = self.observe.parts[name], np.asarray(self.data[name])
-        return (part.whole, part.filled(data)) if isinstance(part, Present) else (part, data)
+        return part.whole, part.filled(data)
 
     def points(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return points at rest and their displacements, 0 where missing, both (d, 3) mm."""
@@ -83,9 +82,9 @@ class Measured:
         def reduced(modes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             parts = self.observe.parts
             return {
-                name: each.reshape(len(each), -1)[:, part.entries]
-                if isinstance(part := parts[name], Present)
-                else each
+                name: each
+                if (entries := parts[name].entries) is None
+                else each.reshape(len(each), -1)[:, entries]
                 for name, each in modes.items()
             }
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from calibrate.certificate import Certificate, examine
 from calibrate.certificate.check import can_reweight, reweighted
-from calibrate.measurements.present import missing_values
+from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
 from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
 from calibrate.project.results import (

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from calibrate.measurements.mesh_error import on_finer
+from calibrate.measurements.outputs import on_finer
 from calibrate.model_error import learned
 from calibrate.model_error.kinds import Measured, read_systematic
 from calibrate.model_error.marginal import ModelError

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from calibrate.measurements.data import read_data, read_known
+from calibrate.measurements.data import read_data, read_measurements
 from emulator.core.errors import InputError
 
 CURVE = "known:lam,parameter:mu\n60,70\n62,71\n64,\n66,73\n"
+
+
+def known_in(scene, files):
+    return read_measurements(scene, files)[2]
 
 
 def write(folder, **files):
@@ -21,7 +25,7 @@ def test_rows_of_a_loading_curve_are_load_states(beam, tmp_path):
     observe, data = read_data(beam, path)
     assert list(observe.parts) == ["parameter:mu@1", "parameter:mu@2", "parameter:mu@3"]
     assert [float(v) for v in data.values()] == [70.0, 71.0, 73.0]
-    assert read_known(path) == {"lam@1": 60.0, "lam@2": 62.0, "lam@3": 66.0}
+    assert known_in(beam, path) == {"lam@1": 60.0, "lam@2": 62.0, "lam@3": 66.0}
     # One observation in all states is one object: its states are one program.
     assert len({id(part) for part in observe.parts.values()}) == 1
 
@@ -35,25 +39,25 @@ def test_a_file_for_each_state_and_a_curve_of_its_own_states(beam, tmp_path):
     observe, data = read_data(beam, files)
     assert list(data) == ["displacement@rest", "parameter:mu@pull.1", "parameter:mu@pull.2"]
     assert observe.states == ("rest", "pull.1", "pull.2")
-    assert read_known(files) == {"lam@rest": 61.0, "lam@pull.1": 60.0, "lam@pull.2": 62.0}
+    assert known_in(beam, files) == {"lam@rest": 61.0, "lam@pull.1": 60.0, "lam@pull.2": 62.0}
 
 
 def test_a_state_knows_one_value(beam, tmp_path):
     text = "state,known:lam,parameter:mu\na,60,70\na,61,\nb,62,72\n"
     path = write(tmp_path, d=text)["d"]
     with pytest.raises(InputError, match="row 2, column 'known:lam' is 61.0, and 60.0 before it"):
-        read_known(path)
+        known_in(beam, path)
     path = write(tmp_path, d=text.replace("a,61,", "a,,"))["d"]
-    assert read_known(path) == {"lam@a": 60.0, "lam@b": 62.0}
+    assert known_in(beam, path) == {"lam@a": 60.0, "lam@b": 62.0}
     path = write(tmp_path, d=text.replace("61", "much"))["d"]
     with pytest.raises(InputError, match="column 'known:lam' is 'much', not a number"):
-        read_known(path)
+        known_in(beam, path)
 
 
 def test_known_in_netcdf(beam, tmp_path):
     data = {"parameter:mu@a": 70.0, "known:lam@a": 60.0, "parameter:mu@b": 71.0}
     xr.Dataset(data).to_netcdf(tmp_path / "d.nc", engine="h5netcdf")
-    assert read_known(tmp_path / "d.nc") == {"lam@a": 60.0}
+    assert known_in(beam, tmp_path / "d.nc") == {"lam@a": 60.0}
     assert list(read_data(beam, tmp_path / "d.nc")[1]) == ["parameter:mu@a", "parameter:mu@b"]
 
 
