@@ -30,7 +30,6 @@ import xarray as xr
 
 from calibrate.measurements import Observations, leave_out_missing, observations_from_json
 from calibrate.measurements.data import write_data
-from calibrate.measurements import leave_out_missing
 from calibrate.model_error import ModelError
 from calibrate.posterior import Posterior, read_tree
 from calibrate.project.problem import Problem, model_of, restore_forward
