@@ -1,4 +1,4 @@
-"""HTTP to this machine: what the explorer's page and the UM-Bridge protocol share."""
+"""An HTTP server on this machine, for the explorer's page and for the UM-Bridge protocol."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ class Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def is_foreign(self) -> bool:
-        """Whether a page elsewhere asks that has its name resolved to this machine.
+        """Whether the request is from a page whose own name resolves to this machine.
 
-        It sends its own name. A server that listens to other machines expects other names.
+        Such a page sends its own name as the host. A server that other machines reach is known by
+        other names, and takes every one.
         """
         named = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
         return self.server.server_address[0] == LOOPBACK and named not in _OF_THIS_MACHINE
@@ -35,11 +36,11 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, *_: object) -> None:
-        """Say nothing of each request."""
+        """Log nothing."""
 
 
 class Server(ThreadingHTTPServer):
-    """Requests of several threads about one ``subject``."""
+    """A server of several threads that answer requests about one ``subject``."""
 
     daemon_threads = True
 
@@ -49,7 +50,7 @@ class Server(ThreadingHTTPServer):
 
 
 def listen(handler: type[Handler], subject: Any, port: int = 0, host: str = LOOPBACK) -> Server:
-    """A server, ready for ``serve_forever``; port 0 takes a free one.
+    """Return a server, ready for ``serve_forever``; port 0 takes a free one.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Names of what belongs to one load state of several.
+"""Names of quantities in one load state of several.
 
 ``volume@end-diastole`` is the volume measured in the state called ``end-diastole``, and
 ``pressure@end-diastole`` the pressure there. Without ``@`` there is one state, without a name.
@@ -14,18 +14,18 @@ _AT = "@"
 
 
 def split(name: str) -> tuple[str, str]:
-    """Name and state of ``name@state``; the state is empty where none is named."""
+    """Return name and state of ``name@state``; the state is empty where none is named."""
     base, _, state = name.partition(_AT)
     return base, state
 
 
 def in_state(name: str, state: str) -> str:
-    """``name@state``, or ``name`` itself in the only state."""
+    """Return ``name@state``, or ``name`` itself in the only state."""
     return f"{name}{_AT}{state}" if state else name
 
 
 def states_of(names: Iterable[str], what: str = "observations") -> tuple[str, ...]:
-    """The states that ``names`` speak of, each once.
+    """Return the states that ``names`` name, each once.
 
     Raises
     ------
@@ -36,10 +36,10 @@ def states_of(names: Iterable[str], what: str = "observations") -> tuple[str, ..
     for name in names:
         if name.count(_AT) > 1 or name.endswith(_AT) or name.startswith(_AT):
             raise InputError(f"'{name}': write name{_AT}state, as in volume{_AT}end-diastole")
-    found = tuple(dict.fromkeys(split(name)[1] for name in names))
-    if "" in found and len(found) > 1:
+    states = tuple(dict.fromkeys(split(name)[1] for name in names))
+    if "" in states and len(states) > 1:
         bare = next(name for name in names if not split(name)[1])
         raise InputError(
-            f"{what}: '{bare}' names no load state, others do: {', '.join(filter(None, found))}"
+            f"{what}: '{bare}' names no load state, others do: {', '.join(filter(None, states))}"
         )
-    return found
+    return states

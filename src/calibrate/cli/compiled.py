@@ -1,8 +1,8 @@
-"""Programs that commands compile are kept on disk for the next command.
+"""The folder in which the command line keeps compiled programs for the next command.
 
-Half of what a short command takes is compilation. JAX can keep what it compiled; the command line
-asks it to, in the user's cache folder, with a bound on its size. As a library the package changes
-nothing. Who sets ``JAX_COMPILATION_CACHE_DIR`` has chosen already and is left alone.
+Half of the time of a short command is compilation. JAX can write compiled programs to disk; the
+command line has it do so, in the user's cache folder, with a bound on its size. As a library the
+package configures nothing. ``JAX_COMPILATION_CACHE_DIR`` takes precedence where it is set.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _LEAST_SECONDS = 0.0  # of compilation that are worth a file: a hundred small pr
 
 
 def keep_programs(environment: Mapping[str, str] = os.environ) -> Path | None:
-    """Have JAX keep compiled programs; their folder, or ``None`` where none are kept.
+    """Have JAX write compiled programs to disk; return their folder, or ``None`` for nowhere.
 
-    ``CALIBRATE_CACHE`` names the folder; where it is empty, nothing is kept. A folder that cannot
-    be written costs a line, not the command.
+    ``CALIBRATE_CACHE`` names the folder; where it is empty, nothing is written. A folder that
+    cannot be written to is reported, and the command runs without it.
     """
     if jax.config.jax_compilation_cache_dir is not None:
         return None
@@ -46,7 +46,7 @@ def keep_programs(environment: Mapping[str, str] = os.environ) -> Path | None:
 
 
 def program_folder(environment: Mapping[str, str]) -> Path | None:
-    """Where programs of this machine and this JAX are kept; ``None`` for nowhere.
+    """Return the folder for programs of this machine and this JAX; ``None`` for nowhere.
 
     Programs use the instructions of the processor they were compiled on, so that a home directory
     on several machines holds a folder for each kind.

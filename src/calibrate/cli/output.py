@@ -103,7 +103,7 @@ def _cell(value: object) -> str:
 
 
 def posterior_summary(report: Mapping[str, Any]) -> str:
-    """The parameter table and the verdict as text."""
+    """Return the parameter table and the verdict as text."""
     from calibrate.certificate.verdict import shifts
 
     parameters = report["parameters"]
@@ -111,13 +111,13 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
     titles = ["mean", "sd", "5 %", "95 %", "R-hat", "ESS"]
     if any("truth" in row for row in parameters.values()):
         columns, titles = ["truth", *columns], ["truth", *titles]
-    moved = shifts(report.get("certificate", {}))
+    shifts_by_judge = shifts(report.get("certificate", {}))
     rows = []
     for name, row in parameters.items():
         cells: list[object] = [row.get(column) for column in columns]
-        rows.append((name, *cells, *(shift.get(name) for shift in moved.values())))
-    lines = [table(("parameter", *titles, *(f"{what}/sd" for what in moved)), rows)]
-    if moved:
+        rows.append((name, *cells, *(shift.get(name) for shift in shifts_by_judge.values())))
+    lines = [table(("parameter", *titles, *(f"{judge}/sd" for judge in shifts_by_judge)), rows)]
+    if shifts_by_judge:
         lines.append("FEM, mesh: how far FEM, and a finer mesh, would move each mean, in sd")
     lines.append(
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
@@ -130,8 +130,8 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
     lines += report.get("warnings", [])
     if "log_evidence" in report:
         error = report["log_evidence_error"]
-        known = "" if error is None else f" +- {error:.2g}"
-        lines.append(f"log evidence {report['log_evidence']:.2f}{known}")
+        spread = "" if error is None else f" +- {error:.2g}"
+        lines.append(f"log evidence {report['log_evidence']:.2f}{spread}")
     if "fem_solves" in report:
         lines.append(
             f"FEM decided on every draw, in {report['fem_solves']} solves: no certificate is needed"
@@ -150,7 +150,7 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
 
 
 def members_summary(report: Mapping[str, Any]) -> str:
-    """The population, its members alone and together, and a member not seen, as text."""
+    """Return the population, its members alone and together, and a member not seen as text."""
     columns = ("mean", "sd", "low", "high", "r_hat", "ess_bulk")
     titles = ("population", "mean", "sd", "5 %", "95 %", "R-hat", "ESS")
     rows = [
@@ -163,9 +163,9 @@ def members_summary(report: Mapping[str, Any]) -> str:
     for name in names:
         head += [f"{name} alone", "sd", "with the others", "sd"]
     members = []
-    for member, by in report["members"].items():
-        cells = [by[n][k] for n in names for k in ("alone_mean", "alone_sd", "mean", "sd")]
-        members.append((member, *cells, by["verdict"]))
+    for member, entry in report["members"].items():
+        cells = [entry[n][k] for n in names for k in ("alone_mean", "alone_sd", "mean", "sd")]
+        members.append((member, *cells, entry["verdict"]))
     lines = [table(titles, rows), "", table((*head, "FEM says"), members), ""]
     for name, row in report["new_member"].items():
         lines.append(
@@ -179,13 +179,13 @@ Volumes = dict[str, dict[str, float | None]]
 
 
 def volumes(scene: Scene, u: jax.Array, estimate: ErrorEstimate | None = None) -> Volumes:
-    """Of each cavity in mL: at rest, at ``u`` (n, 3) mm, and its estimated error, if any."""
+    """Return each cavity's volume in mL at rest, at ``u`` (n, 3) mm, and its estimated error."""
     import jax
 
     from emulator.geometry.facets import Cavity
     from emulator.scenes.cavities import cavity_sets
 
-    found: Volumes = {}
+    result: Volumes = {}
     for name in cavity_sets(scene):
         cavity = Cavity(scene.mesh, name)
 
@@ -194,14 +194,14 @@ def volumes(scene: Scene, u: jax.Array, estimate: ErrorEstimate | None = None) -
 
         error = None if estimate is None or not estimate.valid else float(estimate.of(volume))
         loaded = float(jax.jit(volume)(u))
-        found[name] = {"rest_ml": float(cavity.rest), "volume_ml": loaded, "error_ml": error}
-    return found
+        result[name] = {"rest_ml": float(cavity.rest), "volume_ml": loaded, "error_ml": error}
+    return result
 
 
-def volume_lines(found: Volumes) -> list[str]:
-    """A line for each cavity."""
+def volume_lines(volumes_by_cavity: Volumes) -> list[str]:
+    """Return a line for each cavity."""
     lines = []
-    for name, cavity in found.items():
+    for name, cavity in volumes_by_cavity.items():
         error = "" if cavity["error_ml"] is None else f", error {cavity['error_ml']:+.2g} mL"
         rest, loaded = cavity["rest_ml"], cavity["volume_ml"]
         lines.append(f"cavity '{name}': {loaded:.6g} mL, at rest {rest:.6g} mL{error}")

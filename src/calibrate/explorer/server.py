@@ -1,4 +1,4 @@
-"""What the page asks for, and the server that listens on the loopback address alone."""
+"""The answers that the explorer's page asks for, and its server on the loopback address."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from emulator.surrogates.additive import Emulator
 
 
 class Explorer:
-    """Answers of an emulator about its scene, by theta's position in the unit box.
+    """An emulator's answers about its scene, by the position of theta in the unit box.
 
     Calls may come from several threads; FEM and the error bar take one at a time.
     """
@@ -42,13 +42,13 @@ class Explorer:
 
     @cached_property
     def page(self) -> bytes:
-        """The page, with all that it needs."""
+        """The page with its drawing library and the description of the scene."""
         text = files("calibrate.explorer").joinpath("page.html").read_text(encoding="utf-8")
-        told = json.dumps(self.about()).replace("</", "<\\/")
-        return text.replace("{{plotly}}", get_plotlyjs()).replace("{{about}}", told).encode()
+        about = json.dumps(self.about()).replace("</", "<\\/")
+        return text.replace("{{plotly}}", get_plotlyjs()).replace("{{about}}", about).encode()
 
     def about(self) -> dict[str, Any]:
-        """The scene: parameters, the surface at rest, cavities."""
+        """Describe the scene: parameters, the surface at rest, cavities."""
         return {
             "name": self.scene.name,
             "parameters": [
@@ -63,7 +63,7 @@ class Explorer:
         }
 
     def theta(self, position: Mapping[str, str]) -> jax.Array:
-        """Theta (p,) from a position in [0, 1] of every parameter.
+        """Return theta (p,) from a position in [0, 1] of every parameter.
 
         Raises
         ------
@@ -74,7 +74,7 @@ class Explorer:
         unknown = set(position) - set(names)
         if unknown:
             raise InputError(f"'{min(unknown)}' is no parameter; there are {', '.join(names)}")
-        found = []
+        values = []
         for name in names:
             try:
                 value = float(position[name])
@@ -84,17 +84,17 @@ class Explorer:
                 raise InputError(f"{name} = '{position[name]}' is no number") from None
             if not 0.0 <= value <= 1.0:
                 raise InputError(f"{name} = {value:g} is not between 0 and 1")
-            found.append(value)
-        return self.scene.from_unit(jnp.array(found))
+            values.append(value)
+        return self.scene.from_unit(jnp.array(values))
 
     def at(self, position: Mapping[str, str]) -> bytes:
-        """Displacement of the surface, then the cavities' volumes in mL: little-endian float32."""
+        """Return the surface's displacement, then the cavities' volumes in mL, as float32."""
         u, volumes = self._fast(self.theta(position))
         both = np.concatenate([np.asarray(u, "<f4").ravel(), np.asarray(volumes, "<f4")])
         return both.tobytes()
 
     def curve(self, position: Mapping[str, str]) -> dict[str, Any]:
-        """Volume of a cavity over the range of its pressure, all else at ``position``.
+        """Return the volume of a cavity over the range of its pressure, other parameters fixed.
 
         ``klotz`` is the relation through the volume at ``position`` (:class:`Klotz`), or None.
         """
@@ -112,37 +112,37 @@ class Explorer:
         }
 
     def error(self, position: Mapping[str, str]) -> dict[str, Any]:
-        """The guard's verdict, and the estimated error in mm and mL."""
+        """Return the guard's verdict, and the estimated error in mm and mL."""
         theta = self.theta(position)
         with self._slow:
             estimate = self._bar.of_field(self._forward(theta), theta)
-        told: dict[str, Any] = {
+        result: dict[str, Any] = {
             "trusted": bool(estimate.guard.trusted),
             "guard": estimate.guard.sentence(self.scene),
             "valid": bool(estimate.valid),
         }
-        if told["valid"]:
-            told |= {"median_mm": float(estimate.median), "max_mm": float(estimate.max)}
+        if result["valid"]:
+            result |= {"median_mm": float(estimate.median), "max_mm": float(estimate.max)}
             for name, cavity in self._cavities.items():
-                told[f"{name} mL"] = float(estimate.of(lambda u, c=cavity: c(u[c.nodes])))
-        return told
+                result[f"{name} mL"] = float(estimate.of(lambda u, c=cavity: c(u[c.nodes])))
+        return result
 
     def compare(self, position: Mapping[str, str]) -> dict[str, Any]:
-        """FEM at the same theta: how far the emulator is from it."""
+        """Solve FEM at the same theta, and return the emulator's distance from it."""
         theta = self.theta(position)
         with self._slow:
             solution = self._simulator.solve(theta, self._forward(theta))
         status = Status(int(solution.status))
         if status is not Status.CONVERGED:
             return {"status": status.text}
-        wrong = np.linalg.norm(self._forward(theta) - solution.displacement, axis=1)
-        moved = np.linalg.norm(solution.displacement, axis=1)
+        error = np.linalg.norm(self._forward(theta) - solution.displacement, axis=1)
+        displacement = np.linalg.norm(solution.displacement, axis=1)
         volumes = {n: float(c(solution.displacement[c.nodes])) for n, c in self._cavities.items()}
         return {
             "status": status.text,
-            "median_mm": float(np.median(wrong)),
-            "max_mm": float(wrong.max()),
-            "moved_mm": float(moved.max()),
+            "median_mm": float(np.median(error)),
+            "max_mm": float(error.max()),
+            "moved_mm": float(displacement.max()),
             "volumes": volumes,
         }
 
@@ -174,10 +174,10 @@ class Explorer:
 
 
 class _Handler(Handler):
-    """Answers one request; the explorer is the server's subject."""
+    """Answers one request to the explorer, the server's subject."""
 
     def do_GET(self) -> None:
-        """The page, or an answer."""
+        """Answer with the page, or with what the page asks for."""
         address = urlsplit(self.path)
         if self.is_foreign():
             self.send(403, b"this page is for this machine only\n", "text/plain")
@@ -190,18 +190,18 @@ class _Handler(Handler):
             self.send(404, b"there are /, /at, /curve, /error and /compare\n", "text/plain")
             return
         try:
-            found = getattr(self.server.subject, name)(dict(parse_qsl(address.query)))
+            answer = getattr(self.server.subject, name)(dict(parse_qsl(address.query)))
         except InputError as fault:
             self.send(400, f"{fault}\n".encode(), "text/plain; charset=utf-8")
             return
-        if isinstance(found, bytes):
-            self.send(200, found, "application/octet-stream")
+        if isinstance(answer, bytes):
+            self.send(200, answer, "application/octet-stream")
         else:
-            self.send(200, json.dumps(found).encode(), "application/json")
+            self.send(200, json.dumps(answer).encode(), "application/json")
 
 
 def serve(explorer: Explorer, port: int = 0) -> Server:
-    """A server on the loopback address, ready for ``serve_forever``; port 0 takes a free one.
+    """Return a server on the loopback address, ready for ``serve_forever``; port 0 is a free one.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""FEM over a design of theta, as a dataset with named dimensions."""
+"""FEM at every theta of a design, as a dataset with named dimensions."""
 
 from __future__ import annotations
 
@@ -34,19 +34,22 @@ def campaign(
     options: NewtonOptions | None = None,
     progress: bool = False,
 ) -> xr.Dataset:
-    """FEM's displacement at every theta of a design.
+    """Solve FEM at every theta of a design.
 
-    Solves that fail are rows with that status and NaN. A campaign that was interrupted goes on
-    where it was when it is called again in the same way.
+    A solve that fails is a row with that status and NaN. A campaign that was interrupted continues
+    when it is called again in the same way.
 
     Parameters
     ----------
-    samples, design, seed : of the theta: ``sobol``, ``latin_hypercube``, or ``sobol_corners``,
-        which has the box's corners too, as emulators are trained on.
-    thetas : (c, p), instead of a design.
-    slopes : du/dtheta, too.
-    out : Zarr store to write to; otherwise the dataset is in memory.
-    scheduler : address of a Dask scheduler, whose workers solve; otherwise this process does.
+    scene : the scene that is solved.
+    samples : the number of theta of the design.
+    design : how theta are placed: ``sobol``, ``latin_hypercube``, or ``sobol_corners``, which adds
+        the box's corners, as emulators are trained on.
+    seed : the seed of the design.
+    thetas : the theta (c, p), in place of a design.
+    slopes : solve for du/dtheta, too.
+    out : the Zarr store to write; without it the dataset is in memory.
+    scheduler : the address of a Dask scheduler whose workers solve; without it this process does.
 
     Returns
     -------
@@ -56,19 +59,19 @@ def campaign(
     Raises
     ------
     InputError
-        No or unknown samples; a store of another campaign; a scheduler that does not answer.
+        No samples and no theta; a store of another campaign; a scheduler that does not answer.
     SolverError
         The cluster was lost; what was solved is in the store.
     """
-    asked = question(
+    plan = question(
         scene, samples, thetas=thetas, design=design, seed=seed, slopes=slopes, options=options
     )
     if out is not None:
-        fill(asked, out, scheduler=scheduler, progress=progress)
+        fill(plan, out, scheduler=scheduler, progress=progress)
         return xr.open_zarr(out, chunks=None)
     store = zarr.storage.MemoryStore()
     with executor(scheduler) as execute:
-        _solve_missing(ZarrRows(make_store(store, asked)), asked.solver, execute, progress)
+        _solve_missing(ZarrRows(make_store(store, plan)), plan.solver, execute, progress)
     return xr.open_zarr(store, chunks=None)
 
 
@@ -82,37 +85,37 @@ def question(
     slopes: bool = False,
     options: NewtonOptions | None = None,
 ) -> Campaign:
-    """What :func:`campaign` asks of FEM."""
+    """Return the solves that :func:`campaign` makes."""
     if (samples is None) == (thetas is None):
         raise InputError("campaign: give a number of samples or thetas, one of them")
-    about: dict[str, Any] = {"design": "given"}
+    design_record: dict[str, Any] = {"design": "given"}
     if thetas is None:
         assert samples is not None
         thetas = look_up(DESIGNS, design, "campaign: design")(scene, samples, seed)
-        about = {"design": design, "seed": seed}
-    chosen = np.asarray(thetas, dtype=float)
-    if chosen.ndim != 2 or chosen.shape[1] != len(scene.parameters) or not len(chosen):
+        design_record = {"design": design, "seed": seed}
+    points = np.asarray(thetas, dtype=float)
+    if points.ndim != 2 or points.shape[1] != len(scene.parameters) or not len(points):
         raise InputError(
-            f"campaign: thetas have shape {chosen.shape}; expected (count, "
+            f"campaign: thetas have shape {points.shape}; expected (count, "
             f"{len(scene.parameters)}) for {', '.join(scene.parameter_names)}"
         )
     has_energy = all(load.has_potential for load in scene.loads) and not scene.loaded_by
     simulator = Simulator(scene, NewtonOptions() if options is None else options)
     solver = Solver(simulator, sensitivities=slopes, energy=has_energy)
-    about = {**about, "samples": len(chosen)}
-    return Campaign(solver, chosen, {"design": about, "versions": versions()})
+    design_record = {**design_record, "samples": len(points)}
+    return Campaign(solver, points, {"design": design_record, "versions": versions()})
 
 
 def fill(
-    asked: Campaign,
+    plan: Campaign,
     out: str | Path,
     *,
     scheduler: str | None = None,
     progress: bool = False,
 ) -> int:
-    """Solve what the store at ``out`` lacks; the number of rows that were solved."""
-    with executor(scheduler) as execute, writing(out, asked) as rows:
-        return _solve_missing(rows, asked.solver, execute, progress)
+    """Solve what the store at ``out`` lacks, and return the number of rows that were solved."""
+    with executor(scheduler) as execute, writing(out, plan) as rows:
+        return _solve_missing(rows, plan.solver, execute, progress)
 
 
 def _solve_missing(rows: ZarrRows, solver: Solver, execute: Executor, progress: bool) -> int:

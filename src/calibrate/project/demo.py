@@ -70,15 +70,15 @@ def run_demo(
     """Run the demo of ``scene``, write its files to ``folder`` and return the report."""
     folder = check_folder(folder)
     pyplot()  # a missing plotting package is reported before the sampling
-    chosen = DEMOS[scene]
-    run = chosen.run
+    demo = DEMOS[scene]
+    run = demo.run
     posterior = infer(run, folder, force=True, progress=progress)
     certificate = certify_and_keep(posterior, folder, progress=progress)
     built = posterior.model.forward.scene
     truth = simulator_of(built)(built.theta(**run.truth))
-    chosen.figure(posterior, truth, run.truth, certificate, folder / chosen.picture)
+    demo.figure(posterior, truth, run.truth, certificate, folder / demo.picture)
     result = report(run, posterior, certificate)
-    result["picture"] = chosen.picture
-    if chosen.identify:
+    result["picture"] = demo.picture
+    if demo.identify:
         result["identifiability"] = identify(posterior)
     return result

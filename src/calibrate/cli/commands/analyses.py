@@ -39,7 +39,7 @@ def add_identify(commands: Any) -> None:
 
 
 def run_before(arguments: argparse.Namespace) -> int:
-    """What the observations would determine."""
+    """Print what the observations would determine."""
     from calibrate.analysis.expected import expected_precision
     from calibrate.analysis.identifiability import products_in_words
     from calibrate.cli.run_words import problem_of
@@ -48,16 +48,16 @@ def run_before(arguments: argparse.Namespace) -> int:
     problem = problem_of(arguments, ("seed",))
     # Errors that many numbers share are made for each data set, not at one draw of the prior.
     model = model_before_data(problem.change(systematic={}))
-    found = expected_precision(model, systematic=problem.run.systematic)
-    rows = [(name, f"{100 * ratio:.3g} %") for name, ratio in found["sd"].items()]
+    expected = expected_precision(model, systematic=problem.run.systematic)
+    rows = [(name, f"{100 * ratio:.3g} %") for name, ratio in expected["sd"].items()]
     lines = [table(("parameter", "expected sd / prior sd"), rows)]
-    lines += products_in_words(found["combinations"], len(rows))
-    emit(arguments, found, "\n".join(lines))
+    lines += products_in_words(expected["combinations"], len(rows))
+    emit(arguments, expected, "\n".join(lines))
     return DONE
 
 
 def run_after(arguments: argparse.Namespace) -> int:
-    """What a posterior's data determined, and what would add most."""
+    """Print what a posterior's data determined, and which measurement would add most."""
     from calibrate.analysis.identifiability import (
         identify,
         in_words,
@@ -69,22 +69,22 @@ def run_after(arguments: argparse.Namespace) -> int:
     from calibrate.project import read_posterior
 
     run, posterior = read_posterior(arguments.folder)
-    found = identify(posterior)
-    lines = [in_words(found)]
+    result = identify(posterior)
+    lines = [in_words(result)]
     for direction in ("fibre", "cross-fibre"):
         band = stress_band(posterior, direction, stretches=[1.1, 1.2])
-        known = ", ".join(
+        stresses = ", ".join(
             f"{m:.3g} kPa ({low:.3g} to {high:.3g}) at {s:g}"
             for s, low, m, high in zip(band.stretch, band.low, band.median, band.high, strict=True)
         )
-        lines.append(f"stress along a {direction} stretch: {known}")
-        found[f"stress {direction}"] = [a.tolist() for a in band[1:]]
+        lines.append(f"stress along a {direction} stretch: {stresses}")
+        result[f"stress {direction}"] = [a.tolist() for a in band[1:]]
     for name in arguments.profile:
         profile = profile_likelihood(posterior, name)
         lines.append(
             f"by likelihood alone, {name} is {profile.low:.4g} to {profile.high:.4g} (95 %)"
         )
-        found[f"profile {name}"] = [profile.low, profile.high]
+        result[f"profile {name}"] = [profile.low, profile.high]
     scene = posterior.model.forward.scene
     candidates = {}
     for word in [each for words in arguments.next for each in words.split("+")]:
@@ -99,8 +99,8 @@ def run_after(arguments: argparse.Namespace) -> int:
         names = next(iter(gains.values())).sd
         lines.append("expected information gain, and by how much each sd would fall:")
         lines.append(table(("measure next", "bits", *names), rows))
-        found["next"] = {name: c._asdict() for name, c in gains.items()}
-    emit(arguments, found, "\n".join(lines))
+        result["next"] = {name: c._asdict() for name, c in gains.items()}
+    emit(arguments, result, "\n".join(lines))
     return DONE
 
 
@@ -134,14 +134,14 @@ def add_effects(commands: Any) -> None:
 
 
 def run_effects(arguments: argparse.Namespace) -> int:
-    """Measure, and recommend."""
+    """Measure each effect, and recommend which to leave out."""
     from calibrate.analysis.effects import recommend, tolerances
     from calibrate.measurements import observations, parse_observation
 
     check_seed(arguments.seed, "effects")
     scene = scene_of(arguments)
     observe = observations(parse_observation(scene, arguments.observe, arguments.seed))
-    found = recommend(
+    recommendation = recommend(
         scene,
         observe,
         tolerances(arguments.tolerance, observe),
@@ -149,21 +149,22 @@ def run_effects(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         say=lambda what: None if arguments.json else print(what, "...", file=sys.stderr),
     )
-    emit(arguments, effects_report(found), effects_summary(found))
+    emit(arguments, effects_report(recommendation), effects_summary(recommendation))
     return DONE
 
 
-def effects_report(found: Recommendation) -> dict[str, Any]:
-    """Everything measured, as plain JSON."""
+def effects_report(recommendation: Recommendation) -> dict[str, Any]:
+    """Return all that was measured as plain JSON."""
     return {
         "leave_out": [
-            {"effect": name, "remedy": found.effects[name].remedy} for name in found.left_out
+            {"effect": name, "remedy": recommendation.effects[name].remedy}
+            for name in recommendation.left_out
         ],
-        "tolerance": dict(found.tolerance),
-        "units": dict(found.units),
-        "whole": _plain(found.whole),
-        "alone": [_plain(each) for each in found.alone],
-        "chosen": _plain(found.chosen),
+        "tolerance": dict(recommendation.tolerance),
+        "units": dict(recommendation.units),
+        "whole": _plain(recommendation.whole),
+        "alone": [_plain(each) for each in recommendation.alone],
+        "chosen": _plain(recommendation.chosen),
     }
 
 
@@ -172,40 +173,40 @@ def _plain(measured: Measured) -> dict[str, Any]:
     return plain | {"changes": dict(measured.changes)}
 
 
-def effects_summary(found: Recommendation) -> str:
-    """A table, and the recommendation in words."""
+def effects_summary(recommendation: Recommendation) -> str:
+    """Return a table of the effects, and the recommendation in words."""
     header = [
         "without",
-        *(f"{name}, {unit}" for name, unit in found.units.items()),
+        *(f"{name}, {unit}" for name, unit in recommendation.units.items()),
         "time",
         "unknowns",
     ]
     rows = [
         (
             ", ".join(each.left_out),
-            *(each.changes[name] for name in found.units),
+            *(each.changes[name] for name in recommendation.units),
             f"{each.ratio:.2f} x",
             each.unknowns,
         )
-        for each in found.alone
+        for each in recommendation.alone
     ]
-    whole = found.whole
+    whole = recommendation.whole
     lines = [
         f"the scene as it is: {whole.seconds:.3g} s a solve, {whole.unknowns} unknowns",
         "largest change where one effect is left out:",
         table(header, rows),
     ]
-    if not found.left_out:
+    if not recommendation.left_out:
         return "\n".join([*lines, "keep everything: no effect can go and save time"])
-    chosen = found.chosen
+    selection, tolerance = recommendation.chosen, recommendation.tolerance
     changes = ", ".join(
-        f"{name} by {chosen.changes[name]:.2g} of {found.tolerance[name]:g} {unit} allowed"
-        for name, unit in found.units.items()
+        f"{name} by {selection.changes[name]:.2g} of {tolerance[name]:g} {unit} allowed"
+        for name, unit in recommendation.units.items()
     )
-    lines.append(f"leave out {', '.join(found.left_out)}:")
-    lines += [f"  {found.effects[name].remedy}" for name in found.left_out]
+    lines.append(f"leave out {', '.join(recommendation.left_out)}:")
+    lines += [f"  {recommendation.effects[name].remedy}" for name in recommendation.left_out]
     lines.append(
         f"at theta that had no part in the choice this changes {changes}, and a solve takes "
-        f"{chosen.ratio:.2f} of the time"
+        f"{selection.ratio:.2f} of the time"
     )
     return "\n".join(lines)

@@ -80,7 +80,7 @@ def _add_mesh(kinds: Any) -> None:
 
 
 def run_mesh(arguments: argparse.Namespace) -> int:
-    """The error of the mesh at one theta: displacements, observations, and a picture."""
+    """Print the error of the mesh at one theta, in displacements and in observations."""
     import numpy as np
 
     from calibrate.measurements.outputs import mesh_errors
@@ -91,17 +91,17 @@ def run_mesh(arguments: argparse.Namespace) -> int:
     scene = scene_of(arguments)
     theta = theta_of(arguments, scene)
     quality = mesh_quality(scene.mesh)
-    found = mesh_error(scene)
-    told = found(theta)
-    rows = mesh_errors(found, told, arguments.observe, arguments.seed)
-    length = np.linalg.norm(told.coarse, axis=1)
+    error_of_mesh = mesh_error(scene)
+    error = error_of_mesh(theta)
+    rows = mesh_errors(error_of_mesh, error, arguments.observe, arguments.seed)
+    length = np.linalg.norm(error.coarse, axis=1)
     result: dict[str, Any] = {
         "scene": scene.name,
         "theta": theta_by_name(scene, theta),
         "nodes": len(scene.mesh.nodes),
         "quality": quality._asdict(),
-        "finer_nodes": len(found.finer.scene.mesh.nodes),
-        "err_u": {"median": float(np.median(told.err_u)), "max": float(np.max(told.err_u))},
+        "finer_nodes": len(error_of_mesh.finer.scene.mesh.nodes),
+        "err_u": {"median": float(np.median(error.err_u)), "max": float(np.max(error.err_u))},
         "displacement": {"median": float(np.median(length)), "max": float(length.max())},
         "observations": rows,
     }
@@ -124,15 +124,15 @@ def run_mesh(arguments: argparse.Namespace) -> int:
         write_json(folder / "mesh_error.json", result)
         title = f"{scene.name}: error of a mesh of {result['nodes']} nodes"
         label = "displacement less that on a finer mesh (mm)"
-        error = np.asarray(told.err_u)
-        save(surface_figure(scene.mesh, error, title, label), folder / "mesh_error.png")
+        figure = surface_figure(scene.mesh, np.asarray(error.err_u), title, label)
+        save(figure, folder / "mesh_error.png")
         text += f"\nwritten to {folder}"
     emit(arguments, result, text)
     return DONE
 
 
 def run_sbc(arguments: argparse.Namespace) -> int:
-    """Simulation-based calibration of the model."""
+    """Calibrate many synthetic data sets, and print how often intervals cover the truth."""
     from calibrate.analysis.sbc import sbc
     from calibrate.cli.run_words import noise_words, problem_of
     from calibrate.figures.sensitivity import draw_calibration
@@ -151,7 +151,7 @@ def run_sbc(arguments: argparse.Namespace) -> int:
     if arguments.fem_data:
         truth = by_fem(truth, run.load_steps)
     options = NUTSOptions(arguments.warmup, arguments.draws, arguments.chains, rounds=1)
-    found = sbc(
+    calibration = sbc(
         model,
         arguments.replicates,
         truth=truth,
@@ -160,22 +160,22 @@ def run_sbc(arguments: argparse.Namespace) -> int:
         progress=progress,
         scheduler=scheduler,
     )
-    result = found.to_json()
+    result = calibration.to_json()
     write_json(folder / "calibration.json", result)
-    draw_calibration(found, f"{run.scene}, {run.forward}", folder / "calibration.png")
+    draw_calibration(calibration, f"{run.scene}, {run.forward}", folder / "calibration.png")
     rows = [
-        (name, *(f"{100 * covered[0]:.0f}" for covered in by.values()), found.outside()[name])
-        for name, by in found.coverage().items()
+        (name, *(f"{100 * share[0]:.0f}" for share in levels.values()), calibration.outside()[name])
+        for name, levels in calibration.coverage().items()
     ]
     header = ("quantity", "50 %", "80 %", "90 %", "95 %", "outside band")
-    verdict = "calibrated" if found.passed else "NOT calibrated"
-    text = f"{table(header, rows)}\n{found.replicates} data sets: {verdict}\nwritten to {folder}"
-    emit(arguments, result, text)
-    return DONE if found.passed else FAILED
+    verdict = "calibrated" if calibration.passed else "NOT calibrated"
+    verdict = f"{calibration.replicates} data sets: {verdict}"
+    emit(arguments, result, f"{table(header, rows)}\n{verdict}\nwritten to {folder}")
+    return DONE if calibration.passed else FAILED
 
 
 def run_prior(arguments: argparse.Namespace) -> int:
-    """Data sets that the prior predicts, and their picture."""
+    """Draw data sets that the prior predicts, print their quantiles and write a picture."""
     import jax
     import numpy as np
 
@@ -189,16 +189,16 @@ def run_prior(arguments: argparse.Namespace) -> int:
     folder: Path = check_folder(arguments.out)
     problem = problem_of(arguments, ("seed",))
     run, model = problem.run, model_before_data(problem, progress=show_progress(arguments))
-    found = prior_replicates(model, jax.random.key(run.seed))
+    replicates = prior_replicates(model, jax.random.key(run.seed))
     units = {name: part.unit for name, part in model.observe.parts.items()}
-    save_arrays(folder / "prior_predictive.safetensors", {**found.draws, **found.data})
+    save_arrays(folder / "prior_predictive.safetensors", {**replicates.draws, **replicates.data})
     title = f"{run.scene}: what the prior predicts"
-    draw_prior_predictive(found.data, units, title, folder / "prior_predictive.png")
+    draw_prior_predictive(replicates.data, units, title, folder / "prior_predictive.png")
     result: dict[str, Any] = {
         name: dict(zip(("5 %", "50 %", "95 %"), np.quantile(v, [0.05, 0.5, 0.95]), strict=True))
-        for name, v in found.data.items()
+        for name, v in replicates.data.items()
     }
-    rows = [(f"{name} ({units[name]})", *by.values()) for name, by in result.items()]
+    rows = [(f"{name} ({units[name]})", *quantiles.values()) for name, quantiles in result.items()]
     text = table(("observation", "5 %", "50 %", "95 %"), rows)
     if (band := _klotz(model, run.seed)) is not None:
         result["klotz"] = {"fraction": band.fraction, "band_kpa": band.band}
@@ -212,9 +212,9 @@ def run_prior(arguments: argparse.Namespace) -> int:
 
 
 def _klotz(model: Model, seed: int) -> KlotzBand | None:
-    """The prior's curves in Klotz's band; None without a resting cavity whose pressure varies.
+    """The share of the prior's pressure-volume curves in the band of Klotz's relation.
 
-    Nor where the forward map solves: it would be some thousand solves.
+    None without a resting cavity whose pressure varies, and where each prediction is a FEM solve.
     """
     from calibrate.measurements.klotz import klotz_of
     from calibrate.measurements.volume import pressure_volume

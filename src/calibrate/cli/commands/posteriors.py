@@ -194,34 +194,36 @@ def add_compare(commands: Any) -> None:
 
 
 def run_compare(arguments: argparse.Namespace) -> int:
-    """Compare the posteriors in several folders."""
+    """Compare the models of the posteriors in several folders."""
     from calibrate.posterior import read_tree
     from calibrate.posterior.comparison import compare
     from calibrate.project.results import POSTERIOR
 
     if len(set(arguments.folders)) < len(arguments.folders):
         raise InputError("compare: a folder is given twice; give each model once")
-    found = compare({folder: read_tree(Path(folder) / POSTERIOR) for folder in arguments.folders})
-    report = {**asdict(found), "verdict": found.verdict}
-    emit(arguments, report, comparison_summary(found))
+    comparison = compare(
+        {folder: read_tree(Path(folder) / POSTERIOR) for folder in arguments.folders}
+    )
+    report = {**asdict(comparison), "verdict": comparison.verdict}
+    emit(arguments, report, comparison_summary(comparison))
     return DONE
 
 
-def comparison_summary(found: Comparison) -> str:
-    """Table and verdict as text."""
+def comparison_summary(comparison: Comparison) -> str:
+    """Return table and verdict as text."""
     header = ["model", "elpd", "less the best", "+-", "weight", "parameters"]
-    evident = any(model.log_evidence is not None for model in found.models)
+    has_evidence = any(model.log_evidence is not None for model in comparison.models)
     rows = []
-    for model in found.models:
+    for model in comparison.models:
         row: list[object] = [
             model.name, model.elpd, model.difference, model.difference_se, model.weight,
             model.parameters,
         ]  # fmt: skip
-        if evident:
+        if has_evidence:
             row += [model.log_evidence, model.log_evidence_error]
         rows.append(row)
-    lines = [table((*header, *(("log evidence", "+-") if evident else ())), rows)]
-    lines.append(f"leave-one-out over {found.data} data: {found.verdict}")
+    lines = [table((*header, *(("log evidence", "+-") if has_evidence else ())), rows)]
+    lines.append(f"leave-one-out over {comparison.data} data: {comparison.verdict}")
     return "\n".join(lines)
 
 
@@ -243,12 +245,12 @@ def add_demo(commands: Any) -> None:
 
 
 def run_demo(arguments: argparse.Namespace) -> int:
-    """Run the demo and show the report."""
+    """Run the demo and print its report."""
     from calibrate.project.demo import run_demo
 
-    started = time.perf_counter()
+    start = time.perf_counter()
     report = run_demo(arguments.out, arguments.scene, progress=show_progress(arguments))
-    report["seconds"] = round(time.perf_counter() - started, 1)
+    report["seconds"] = round(time.perf_counter() - start, 1)
     report["files"] = [
         f"{arguments.out}/{name}"
         for name in ("posterior.nc", "certificate.json", report.pop("picture"))
@@ -259,6 +261,5 @@ def run_demo(arguments: argparse.Namespace) -> int:
 
         lines.append(in_words(report["identifiability"]))
     lines.append(f"written: {', '.join(report['files'])} ({report['seconds']:.0f} s)")
-    text = "\n".join(lines)
-    emit(arguments, report, text)
+    emit(arguments, report, "\n".join(lines))
     return DONE if report["verdict"] == "accepted" else FAILED

@@ -33,30 +33,31 @@ def add_init(commands: Any) -> None:
 
 
 def run_init(arguments: argparse.Namespace) -> int:
-    """Write the scene file."""
+    """Write the scene file, and print what the mesh has."""
     from emulator.scenes.draft import draft_scene
 
-    beside = Path(arguments.mesh)
-    out = arguments.out or beside.parent / f"{beside.stem or 'scene'}.toml"
-    made = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
-    mesh = made.scene.mesh
+    mesh_path = Path(arguments.mesh)
+    out = arguments.out or mesh_path.parent / f"{mesh_path.stem or 'scene'}.toml"
+    scene_file = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
+    path = scene_file.path
+    mesh = scene_file.scene.mesh
     sets = {name: len(nodes) for name, nodes in mesh.node_sets.items()}
     facets = {name: len(rows) for name, rows in mesh.facet_sets.items()}
     result = {
-        "out": str(made.path),
+        "out": str(path),
         "nodes": len(mesh.nodes),
         "elements": len(mesh.elements),
         "node_sets": sets,
         "facet_sets": facets,
-        "law": made.scene.law.name,
-        "parameters": list(made.scene.parameter_names),
-        "notes": list(made.notes),
+        "law": scene_file.scene.law.name,
+        "parameters": list(scene_file.scene.parameter_names),
+        "notes": list(scene_file.notes),
     }
     lines = [
         f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra",
         f"sets: {', '.join(f'{n} ({k} facets)' for n, k in facets.items()) or 'none'}",
-        *made.notes,
-        f"written to {made.path}; look for CHANGE in it, then: calibrate simulate {made.path}",
+        *scene_file.notes,
+        f"written to {path}; look for CHANGE in it, then: calibrate simulate {path}",
     ]
     emit(arguments, result, "\n".join(lines))
     return DONE
@@ -105,14 +106,14 @@ def add_mesh(commands: Any) -> None:
 
 
 def run_mesh(arguments: argparse.Namespace) -> int:
-    """Write the mesh, and the picture."""
+    """Mesh the wall, and write the mesh and its picture."""
     from emulator.geometry.io import write_mesh
     from emulator.geometry.two_surfaces import mesh_wall
 
     check_vtu(arguments.out)
     if arguments.picture is not None:
         check_folder(Path(arguments.picture).parent)
-    made = mesh_wall(
+    wall = mesh_wall(
         arguments.endocardium,
         arguments.epicardium,
         size=arguments.size,
@@ -123,28 +124,28 @@ def run_mesh(arguments: argparse.Namespace) -> int:
         smooth=arguments.smooth,
         unit=arguments.unit,
     )
-    write_mesh(arguments.out, made.mesh)
+    write_mesh(arguments.out, wall.mesh)
     result = {
         "out": arguments.out,
-        "nodes": len(made.mesh.nodes),
-        "elements": len(made.mesh.elements),
-        "size": made.size,
-        "axis": made.axis,
-        "base": made.base,
-        "thickness": made.thickness._asdict(),
-        "cavity": dict(zip(("mesh", "surface"), made.cavity, strict=True)),
-        "wall": dict(zip(("mesh", "surface"), made.wall, strict=True)),
-        "cut_off": made.cut_off,
-        "moved": made.moved,
-        "quality": made.quality._asdict(),
+        "nodes": len(wall.mesh.nodes),
+        "elements": len(wall.mesh.elements),
+        "size": wall.size,
+        "axis": wall.axis,
+        "base": wall.base,
+        "thickness": wall.thickness._asdict(),
+        "cavity": dict(zip(("mesh", "surface"), wall.cavity, strict=True)),
+        "wall": dict(zip(("mesh", "surface"), wall.wall, strict=True)),
+        "cut_off": wall.cut_off,
+        "moved": wall.moved,
+        "quality": wall.quality._asdict(),
     }
-    lines = [*made.sentences(), f"written to {arguments.out}, then: calibrate init {arguments.out}"]
+    lines = [*wall.sentences(), f"written to {arguments.out}, then: calibrate init {arguments.out}"]
     if arguments.picture is not None:
         from calibrate.figures.drawing import save
         from calibrate.figures.evaluation import surface_figure
 
         title = f"{Path(arguments.out).stem}: {result['nodes']} nodes"
-        figure = surface_figure(made.mesh, made.local_thickness(), title, "wall thickness (mm)")
+        figure = surface_figure(wall.mesh, wall.local_thickness(), title, "wall thickness (mm)")
         save(figure, arguments.picture)
         lines.append(f"picture: {arguments.picture}")
     emit(arguments, result, "\n".join(lines))
@@ -186,17 +187,17 @@ def run_scenes(arguments: argparse.Namespace) -> int:
 
 
 def _text(rows: list[dict[str, Any]]) -> str:
-    """A line a scene, and under it its parameters and the emulators shipped."""
+    """Return a line for each scene, and under it its parameters and shipped emulators."""
     head, *lines = table(
         ("scene", "nodes", "tetrahedra", "law"),
         [(r["name"], r["nodes"], r["elements"], r["law"]) for r in rows],
         _WIDTH,
     ).splitlines()
-    found = [head]
+    text_lines = [head]
     for line, row in zip(lines, rows, strict=True):
-        found += [line, *_wrapped("parameters", _parameters(row["parameters"]))]
-        found += _wrapped("emulators", row["emulators"] or ["none shipped; train one"])
-    return "\n".join(found)
+        text_lines += [line, *_wrapped("parameters", _parameters(row["parameters"]))]
+        text_lines += _wrapped("emulators", row["emulators"] or ["none shipped; train one"])
+    return "\n".join(text_lines)
 
 
 def _wrapped(name: str, entries: list[str]) -> list[str]:

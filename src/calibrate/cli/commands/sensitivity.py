@@ -196,21 +196,21 @@ def _active(data: xr.Dataset) -> str:
 def _plain(data: xr.Dataset) -> dict[str, Any]:
     """Indices of all numbers together, and of each where they are few, as plain JSON."""
     few = data.sizes["output"] <= 100
-    found: dict[str, Any] = {"unit": data.attrs["unit"], "evaluations": data.attrs["evaluations"]}
+    result: dict[str, Any] = {"unit": data.attrs["unit"], "evaluations": data.attrs["evaluations"]}
     for name, values in data.variables.items():
         if few or "output" not in values.dims:
-            found[str(name)] = values.values.tolist()
-    return found
+            result[str(name)] = values.values.tolist()
+    return result
 
 
 def _groups(words: list[str]) -> dict[str, list[str]]:
     """Read words ``NAME=A,B``: the parameters of each group by its name."""
-    found = {}
+    groups = {}
     for word in words:
         name, mark, members = word.partition("=")
         if not mark or not name or not all(members.split(",")):
             raise InputError(f"--group {word}: write NAME=A,B, e.g. matrix=a,b")
-        if name in found:
+        if name in groups:
             raise InputError(f"--group {name} is given twice")
-        found[name] = members.split(",")
-    return found
+        groups[name] = members.split(",")
+    return groups
