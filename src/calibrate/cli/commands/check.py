@@ -228,28 +228,15 @@ def _klotz(model: Model, seed: int) -> KlotzBand | None:
     return klotz_band(model, seed=seed)
 
 
-# Listed here too, so that --help needs no imports; a test compares them with verify.CASES.
-CASE_NAMES = (
-    "patch",
-    "invariance",
-    "derivatives",
-    "barriers",
-    "homogeneous",
-    "sphere",
-    "cook",
-    "land_beam",
-    "land_ventricle",
-    "land_contraction",
-)
-
-
 def add_verify(commands: Any) -> None:
     """Add the command."""
+    from emulator.verify import CASES
+
     parser = commands.add_parser(
         "verify",
         help="measured / reference / tolerance tables",
         description="Check the mechanics against closed forms, benchmarks and released solutions.",
-        epilog=f"Cases: {', '.join(CASE_NAMES)} (all of them by default); or 'published DIR', FEM "
+        epilog=f"Cases: {', '.join(CASES)} (all of them by default); or 'published DIR', FEM "
         "against the released FEniCS solutions in DIR.",
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases; 'published DIR'")
@@ -270,12 +257,14 @@ def run_verify(arguments: argparse.Namespace) -> int:
 
 
 def _rows(names: list[str]) -> list[Benchmark]:
+    """The rows of the cases called ``names``, or of all."""
+    from emulator.verify import CASES, verify_published
+
     if names and names[0] == "published":
         if len(names) != 2:
             raise InputError("verify published: give the folder of the released data, and only it")
         from emulator.released.files import models_in
         from emulator.released.scenes import MODELS
-        from emulator.verify import verify_published
 
         rows = verify_published(names[1])
         absent = sorted(set(MODELS) - set(models_in(names[1])))
@@ -283,15 +272,12 @@ def _rows(names: list[str]) -> list[Benchmark]:
             print(f"not in {names[1]}: {', '.join(absent)}", file=sys.stderr, flush=True)
         return rows
     for name in names:
-        if name not in CASE_NAMES:
-            raise InputError(
-                f"verify: case '{name}' is unknown; known: {', '.join(CASE_NAMES)}, published DIR"
-            )
-    from emulator.verify import CASES
-
+        if name not in CASES:
+            known = ", ".join([*CASES, "published DIR"])
+            raise InputError(f"verify: case '{name}' is unknown; known: {known}")
     rows = []
-    for name in names or CASE_NAMES:
-        begin = time.perf_counter()
+    for name in names or CASES:
+        start = time.perf_counter()
         rows += CASES[name]()
-        print(f"{name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
+        print(f"{name}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
     return rows
