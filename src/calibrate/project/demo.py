@@ -75,7 +75,7 @@ def run_demo(
     posterior = infer(run, folder, force=True, progress=progress)
     certificate = certify_and_keep(posterior, folder, progress=progress)
     built = posterior.model.forward.scene
-    truth = simulator_of(built)(built.theta(**run.truth))
+    truth = simulator_of(built, run.load_steps)(built.theta(**run.truth))
     demo.figure(posterior, truth, run.truth, certificate, folder / demo.picture)
     result = report(run, posterior, certificate)
     result["picture"] = demo.picture

@@ -68,7 +68,7 @@ def test_a_problem_is_read_once_and_changed_without_reading(count, tmp_path):
 
 def test_a_mistake_is_reported_before_the_forward_map_is_built(count, monkeypatch):
     monkeypatch.setattr("calibrate.project.problem.build_forward", None)
-    run = Run(BEAM, truth={"mu": 73.0, "lam": 61.0}, noise={"volume": 1.0})
+    run = Run(BEAM, truth={"mu": 73.0, "lam": 61.0}, observe="nodes:4", noise={"volume": 1.0})
     with pytest.raises(em.InputError, match="noise: 'volume' is not observed"):
         infer(run)
 
