@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import NamedTuple
 
@@ -52,13 +53,14 @@ def journey(owner: object, name: str, call: Callable[[], object]) -> list[Frame]
         frames.extend([*stack(sys._getframe(1)), Frame(file, original.__qualname__)])
         raise Reached
 
-    object.__setattr__(owner, name, arrive)
+    replace = type.__setattr__ if isinstance(owner, type) else object.__setattr__
+    replace(owner, name, arrive)
     try:
         call()
     except Reached:
         pass
     finally:
-        object.__setattr__(owner, name, original)
+        replace(owner, name, original)
     return frames
 
 
@@ -71,7 +73,39 @@ def solve() -> list[Frame]:
     return journey(scene.law, "energy", lambda: simulator.solve(scene.centre))
 
 
-JOURNEYS: dict[str, Callable[[], list[Frame]]] = {"Simulator.solve to law.energy": solve}
+NODES = "node,ux,uy,uz\n3,0.5,0.0,-9.0\n7,0.4,0.1,-5.0\n11,0.2,0.0,-2.0\n19,0.1,0.0,-7.0\n"
+
+
+def infer() -> None:
+    """Run ``calibrate infer`` on a data file, with the shipped emulator of the beam."""
+    from calibrate.cli import main
+
+    with TemporaryDirectory() as folder:
+        data = Path(folder) / "nodes.csv"
+        data.write_text(NODES)
+        words = ["once_clamped_beam", "--data", str(data), "--no-unit-check", "--no-certify"]
+        main(["--no-cache", "infer", *words, "--out", f"{folder}/run"])
+
+
+def parse() -> list[Frame]:
+    """Return the frames from ``calibrate infer`` to the reader of its CSV file."""
+    from calibrate.measurements.files import CSVFile
+
+    return journey(CSVFile, "__init__", infer)
+
+
+def likelihood() -> list[Frame]:
+    """Return the frames from ``calibrate infer`` to the distribution of the data."""
+    from calibrate.statistical_model import Model
+
+    return journey(Model, "distributions", infer)
+
+
+JOURNEYS: dict[str, Callable[[], list[Frame]]] = {
+    "Simulator.solve to law.energy": solve,
+    "calibrate infer to the data file": parse,
+    "calibrate infer to the likelihood": likelihood,
+}
 """Journeys by what they lead from and to."""
 
 

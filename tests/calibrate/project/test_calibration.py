@@ -6,6 +6,7 @@ import pytest
 
 import calibrate as cal
 import emulator as em
+import journeys
 from calibrate.cli import main
 from calibrate.measurements import data as reader
 from calibrate.project import Problem, Run, by_fem, infer, read_problem, simulator_of
@@ -53,6 +54,16 @@ def test_infer_reads_its_data_and_builds_its_scene_once(count, tmp_path, from_fi
     words += ["--no-unit-check", "--no-certify", "--out", str(tmp_path / "r")]
     assert main(["infer", *what, *words]) == 0
     assert count == {"scene": 1, "data": 1}
+
+
+def test_few_frames_lie_between_a_command_and_its_data_and_its_likelihood():
+    """There were 10 and 11 frames, and an experiment's data was parsed four times."""
+    parse, likelihood = journeys.parse(), journeys.likelihood()
+    assert len(parse) <= 8
+    assert len(likelihood) <= 9
+    assert len(dict.fromkeys([*parse, *likelihood])) <= 15
+    assert parse[-1].function == "CSVFile.__init__"
+    assert likelihood[-1].function == "Model.distributions"
 
 
 def test_a_problem_is_read_once_and_changed_without_reading(count, tmp_path):
