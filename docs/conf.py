@@ -49,7 +49,9 @@ def _public(package: object) -> list[str]:
         kind = "class" if inspect.isclass(thing) else "function" if callable(thing) else "data"
         lines += [f".. auto{kind}:: {path}"]
         lines += ["   :members:"] if kind == "class" else []
-        lines.append("")
+        # The fields of a class whose data are a class of their own, such as those of a scene.
+        bases = [base for base in getattr(thing, "__bases__", ()) if base.__name__ == f"{name}Data"]
+        lines += ["", *(f".. autoclass:: {base.__module__}.{base.__name__}" for base in bases), ""]
     return lines
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpyro.distributions as dist
 
 import calibrate as cal
-from emulator.scenes.nodes import all_nodes
+from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Prediction
 
 VOLUME, PRESSURE = 120.0, 1.3  # mL, kPa

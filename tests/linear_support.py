@@ -10,7 +10,7 @@ import numpyro.distributions as dist
 
 import calibrate as cal
 from emulator.fem.solution import Solution, Status
-from emulator.scenes.nodes import all_nodes
+from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Prediction, fingerprint_of
 
 

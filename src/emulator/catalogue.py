@@ -8,9 +8,9 @@ from typing import Any
 
 from emulator.core.errors import InputError
 from emulator.released.scenes import published_scene
+from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.file import read_scene
 from emulator.scenes.finer import FINER, Finer, finer
-from emulator.scenes.registry import BUILT_IN
 from emulator.scenes.scene import Scene
 
 _RELEASED = "published:"

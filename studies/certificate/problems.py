@@ -19,7 +19,7 @@ import numpy as np
 import emulator as em
 from calibrate.measurements import spread_nodes
 from emulator.fem.solution import Solution, Status
-from emulator.scenes.nodes import all_nodes
+from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Prediction, fingerprint_of
 
 

@@ -26,9 +26,9 @@ from calibrate.samplers import NUTSOptions
 from emulator.fem import run_campaign
 from emulator.fem.campaign.designs import design
 from emulator.scenes import Scene
+from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.effects import effects_of, leave_out
-from emulator.scenes.registry import BUILT_IN
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.taylor import expand
 from emulator.training.discrepancy_stage import add_discrepancy

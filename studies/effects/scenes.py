@@ -16,8 +16,8 @@ from emulator.geometry.generators.box import box
 from emulator.geometry.refinement import to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Scene, Support
+from emulator.scenes.built_in.ventricles import MYOCARDIUM, PRESSURE
 from emulator.scenes.cavities import cavity_sets
-from emulator.scenes.left_ventricle import MYOCARDIUM, PRESSURE
 from emulator.scenes.loads import CavityPressure, Gravity, PublishedPressure
 from emulator.scenes.supports import ElasticSupport
 

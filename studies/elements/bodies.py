@@ -22,7 +22,7 @@ from emulator.geometry.fibres import (
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_linear, to_quadratic
-from emulator.scenes.left_ventricle import HELIX
+from emulator.scenes.built_in.ventricles import HELIX
 from emulator.scenes.scene import Scene
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import emulator as em
 from emulator.geometry.mesh import Mesh
 from emulator.scenes import Scene
+from emulator.scenes.built_in.ventricles import MYOCARDIUM
 from emulator.scenes.fibre_rules import Helix
-from emulator.scenes.left_ventricle import MYOCARDIUM
 from emulator.scenes.loads import KPA_PER_MMHG, ActiveTension, CavityPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.supports import Support

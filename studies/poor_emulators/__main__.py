@@ -29,7 +29,7 @@ from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import FEMLikelihood, with_error
 from emulator.core.store import write_json
 from emulator.fem import Simulator, design, run_campaign, sobol
-from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.built_in.ventricles import left_ventricle
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.taylor import expand

@@ -26,7 +26,7 @@ from calibrate.measurements import parse_observation
 from calibrate.provenance import study_header
 from emulator.core.store import write_json
 from emulator.fem import Runs, Simulator, sobol
-from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.built_in.ventricles import left_ventricle
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, Load, PublishedPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene

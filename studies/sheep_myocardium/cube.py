@@ -30,8 +30,7 @@ from emulator.fem.energy import point_energy
 from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.fibre_angles import FibreAngles, turned
-from emulator.scenes.regions import Tissue
+from emulator.scenes.tissue import FibreAngles, Tissue, turned
 
 CELLS = 3
 """Along an edge, of six quadratic tetrahedra each: 343 nodes."""

@@ -42,7 +42,7 @@ from emulator.accuracy.comparison import quantiles
 from emulator.core.store import read_arrays, write_json
 from emulator.fem.campaign import run_campaign
 from emulator.fem.campaign.designs import sobol
-from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.built_in.ventricles import left_ventricle
 from emulator.scenes.ventricle_family import ventricles
 from emulator.surrogates import load, save_emulator
 from emulator.training.ventricles import PLAN, BodyRuns, train_family

@@ -14,9 +14,8 @@ from emulator.accuracy.comparison import case_errors, quantiles
 from emulator.core.store import save_arrays
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import design, sobol
-from emulator.scenes.left_ventricle import left_ventricle
-from emulator.scenes.nodes import all_nodes
-from emulator.scenes.scene import Scene
+from emulator.scenes.built_in.ventricles import left_ventricle
+from emulator.scenes.scene import Scene, all_nodes
 from emulator.surrogates import Emulator, load
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.taylor import constant, expand_at

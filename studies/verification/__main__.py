@@ -33,7 +33,7 @@ from emulator.fem import Simulator, run_campaign
 from emulator.geometry.fibres import rule_based_fibres
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene
-from emulator.scenes.left_ventricle import HELIX, PRESSURE
+from emulator.scenes.built_in.ventricles import HELIX, PRESSURE
 
 HERE = Path(__file__).parent
 SEED = 17

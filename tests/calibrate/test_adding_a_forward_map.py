@@ -12,7 +12,7 @@ from calibrate.cli import main
 from calibrate.posterior import read_tree
 from calibrate.project import simulator_of
 from emulator.scenes import registry
-from emulator.scenes.nodes import all_nodes
+from emulator.scenes.scene import all_nodes
 from emulator.surrogates import save_emulator
 from emulator.surrogates.kind import ForwardKind, Option
 from emulator.surrogates.protocol import fingerprint_of, inside_only

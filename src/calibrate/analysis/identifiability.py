@@ -46,8 +46,8 @@ from calibrate.posterior import Posterior
 from calibrate.statistical_model import Model
 from emulator.core.errors import InputError, look_up
 from emulator.fem.energy import point_energy
-from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue
 
 _PRIOR_DRAWS = 4096
 # Exponents are told rounded, to be readable; those that round to zero are left out.

@@ -30,8 +30,7 @@ from calibrate.measurements.points import (
 )
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import shapes_at
-from emulator.scenes.nodes import all_nodes, check_nodes
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, all_nodes, check_nodes
 
 _SHORTEST = 1e-6  # of the body's size; the direction of a shorter length is round-off
 

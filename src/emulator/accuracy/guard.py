@@ -15,8 +15,8 @@ import numpy as np
 from emulator.accuracy.step import ENDLESS
 from emulator.fem.energy import at_points, displacement_gradient
 from emulator.mechanics.kinematics import Barriers, Strain
-from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue
 
 
 class Guard(NamedTuple):

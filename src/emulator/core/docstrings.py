@@ -1,4 +1,7 @@
-"""What numpydoc docstrings say of a class and its parameters, for schemas and help."""
+"""The summary and the parameters of a numpydoc docstring, for schemas and help.
+
+Schemas and API pages then share one text of each field.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,17 @@ _ENTRY = re.compile(r"^(\w[\w, ]*?) : (.*?)(?=^\S|^\s*$|\Z)", re.MULTILINE | re.
 
 
 def summary(kind: type) -> str:
-    """First sentence of a docstring, on one line and without markup."""
+    """Return the first sentence of a docstring, on one line and without markup."""
     return _plain((kind.__doc__ or "").split("\n\n")[0])
 
 
 def documented(kind: type) -> dict[str, str]:
-    """What the docstrings of a class and its bases say of each parameter, by name."""
-    found: dict[str, str] = {}
+    """Return the text of each parameter in the docstrings of a class and its bases, by name."""
+    texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         for names, text in _ENTRY.findall(inspect.cleandoc(base.__doc__ or "")):
-            found |= dict.fromkeys(names.split(", "), _plain(text))
-    return found
+            texts |= dict.fromkeys(names.split(", "), _plain(text))
+    return texts
 
 
 def _plain(text: str) -> str:

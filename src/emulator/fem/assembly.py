@@ -57,7 +57,7 @@ from emulator.fem.linear import (
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.solve import attempt, solve
 from emulator.fem.material_point import stress_and_moduli
-from emulator.scenes.local_terms import LocalForce, LocalTerm
+from emulator.scenes.part import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
 _LAST_BITS = 1e-15  # of prescribed displacements, which two programs may round differently

@@ -48,8 +48,8 @@ from emulator.fem.energy import (
 )
 from emulator.fem.material_point import stress_and_moduli
 from emulator.mechanics.kinematics import Strain
-from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue
 
 
 class Volumes(NamedTuple):

@@ -32,9 +32,9 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Blocks
 from emulator.mechanics.kinematics import Barriers, Strain, determinant
-from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
-from emulator.scenes.regions import Tissue, factors
+from emulator.scenes.part import LocalForce, LocalTerm, Values
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue, factors
 
 Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -234,15 +234,14 @@ class DeadForce:
 
 def dead_force(scene: Scene) -> DeadForce | None:
     """Return the force of the dead loads; ``None`` when there are none."""
-    forces = [load.nodal_force(scene.discretisation) for load in scene.loads]
-    constant = [force for force in forces if force is not None]
-    per_unit: dict[str, np.ndarray] = {}
+    forces: dict[str | None, np.ndarray] = {}
     for load in scene.loads:
-        for name, force in load.nodal_force_per_unit(scene.discretisation).items():
-            per_unit[name] = per_unit.get(name, 0.0) + force
-    if not constant and not per_unit:
+        for name, force in load.dead_forces(scene.discretisation).items():
+            forces[name] = forces.get(name, 0.0) + force
+    if not forces:
         return None
-    return DeadForce(sum(constant, np.zeros(scene.held.shape)), per_unit)
+    constant = forces.pop(None, np.zeros(scene.held.shape))
+    return DeadForce(constant, {str(name): force for name, force in forces.items()})
 
 
 def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:

@@ -82,9 +82,9 @@ from emulator.fem.energy import (
 from emulator.fem.linear import Pattern, block_pattern, whole_blocks
 from emulator.fem.material_point import stress_and_moduli
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.scenes.local_terms import LocalForce, LocalTerm
-from emulator.scenes.regions import Tissue
+from emulator.scenes.part import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue
 
 PointState = Callable[..., tuple[jax.Array, jax.Array | None]]
 """The displacement gradient and directions that the law sees, of a point and its directions."""

@@ -19,9 +19,11 @@ The mesh x + w is a new one for every theta; one program loads all of them
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +37,6 @@ from emulator.fem.linear import Outcome
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Solution
 from emulator.fem.unloading import Unloaded, Unloader, system_at_rest
-from emulator.scenes.image import image_theta, unmarked
 from emulator.scenes.scene import Scene
 
 _RECENT = 16  # stress-free shapes that are kept for the derivatives asked for after a solve
@@ -57,7 +58,7 @@ class LoadedEquilibrium:
     @cached_property
     def _on_mesh(self) -> Scene:
         """The scene as if its mesh were at rest."""
-        return unmarked(self.scene)
+        return _without_image(self.scene)
 
     @cached_property
     def unloader(self) -> Unloader:
@@ -177,3 +178,21 @@ class LoadedEquilibrium:
             return w_slopes + jax.vmap(system.extend, 1)(-system.solve(tangent, forces.T))
 
         return total
+
+
+def image_theta(scene: Scene, theta: jax.Array) -> jax.Array:
+    """Return ``theta`` (p,) with the loads of the image, unchanged where the mesh is at rest."""
+    values, theta = scene.resolve(theta), jnp.asarray(theta)
+    for load, image in scene.loaded_by.items():
+        theta = theta.at[scene.parameter_names.index(load)].set(values[image])
+    return theta
+
+
+def _without_image(scene: Scene) -> Scene:
+    """Return the scene without ``loaded_by``, unchecked, because theta stays.
+
+    A parameter that only the image had is then nobody's, which a new scene would refuse.
+    """
+    plain = copy.copy(scene)
+    object.__setattr__(plain, "loaded_by", MappingProxyType({}))
+    return plain

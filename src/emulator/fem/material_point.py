@@ -18,8 +18,8 @@ import jax.numpy as jnp
 
 from emulator.fem.energy import parameters_at, point_energy
 from emulator.mechanics.measures import Measures, measures_read
-from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue
 
 _BISECTIONS = 7
 _REFINEMENTS = 3

@@ -47,7 +47,7 @@ from emulator.fem.energy import (
 )
 from emulator.geometry.discretisation import Blocks
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
+from emulator.scenes.part import LocalForce, LocalTerm, Values
 from emulator.scenes.scene import Scene
 
 

@@ -53,8 +53,8 @@ from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Solution, Status
 from emulator.geometry.discretisation import Blocks
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue
 
 # Of the fixed-point iteration.
 _MOST_CORRECTIONS = 100

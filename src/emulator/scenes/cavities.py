@@ -1,4 +1,4 @@
-"""The cavities of a scene."""
+"""Cavities of a scene: facet sets that enclose a volume."""
 
 from __future__ import annotations
 
@@ -10,18 +10,15 @@ ENDOCARDIUM = "endocardium"
 
 
 def cavity_sets(scene: Scene) -> tuple[str, ...]:
-    """Facet sets of the scene's cavities: sets under pressure, and the one named ``endocardium``.
-
-    Sets that enclose no volume, such as a plane patch, are left out.
-    """
+    """Return the facet sets that enclose a volume: sets under pressure, and ``endocardium``."""
     pressed = [load.pressed for load in scene.loads if load.pressed is not None]
-    named = [ENDOCARDIUM] if ENDOCARDIUM in scene.mesh.facet_sets else []
-    names = dict.fromkeys([*pressed, *named])
+    endocardium = [ENDOCARDIUM] if ENDOCARDIUM in scene.mesh.facet_sets else []
+    names = dict.fromkeys([*pressed, *endocardium])
     return tuple(name for name in names if encloses(scene.mesh, name))
 
 
 def inflated_cavity(scene: Scene) -> tuple[str, str] | None:
-    """Wall and pressure of the first cavity whose pressure is a parameter; None without any."""
+    """Return wall and pressure of the first cavity whose pressure is a parameter, or None."""
     closed = cavity_sets(scene)
     for load in scene.loads:
         if load.pressed in closed:
@@ -32,7 +29,7 @@ def inflated_cavity(scene: Scene) -> tuple[str, str] | None:
 
 
 def find_cavity(scene: Scene, facet_set: str | None = None) -> Cavity:
-    """The cavity whose wall is ``facet_set``; by default the only one the scene has.
+    """Return the cavity whose wall is ``facet_set``; by default the only one of the scene.
 
     Raises
     ------
@@ -43,8 +40,8 @@ def find_cavity(scene: Scene, facet_set: str | None = None) -> Cavity:
         return Cavity(scene.mesh, facet_set)
     names = cavity_sets(scene)
     if len(names) != 1:
-        found = ", ".join(names or sorted(scene.mesh.facet_sets)) or "none"
+        known = ", ".join(names or sorted(scene.mesh.facet_sets)) or "none"
         raise InputError(
-            f"scene '{scene.name}' has {len(names)} cavities; name a facet set: {found}"
+            f"scene '{scene.name}' has {len(names)} cavities; name a facet set: {known}"
         )
     return Cavity(scene.mesh, names[0])

@@ -1,8 +1,8 @@
-"""A first scene file for a mesh: what its names suggest, commented, and what was guessed.
+"""A first scene file for a mesh, with comments on its guesses.
 
-Sets are recognised by their names (base, fixed, endocardium, ...), the unit of length by the
-size of the body. The draft is a scene that can be simulated; what nothing in the mesh says, such as
-parameters' ranges, is a place to change and marked as one.
+Sets are recognised by their names (base, fixed, endocardium, ...), the unit of length by the size
+of the body. The draft is a scene that can be simulated. Entries that nothing in the mesh suggests,
+such as the ranges of parameters, are marked CHANGE.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from emulator.scenes.file import read_scene
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load
 from emulator.scenes.scene import Scene
 
-_METRES = 0.6  # a body smaller than this in all directions is not in mm
-_SMALL = 25.0  # one smaller than this might be in cm
-_HELD = ("base", "fix", "clamp", "held", "hold", "support", "ligament", "left", "bottom")
+_METRES = 0.6  # a body smaller than this in all directions is taken to be in m
+_SMALL = 25.0  # a body smaller than this might be in cm
+_SUPPORTS = ("base", "fix", "clamp", "held", "hold", "support", "ligament", "left", "bottom")
 _BASE = ("base",)
 _INSIDE = ("endo", "cavity", "lumen", "inner", "inside")
 _OUTSIDE = ("epi", "outer", "outside", "pericard")
@@ -54,7 +54,9 @@ _LINEAR = (
 class Draft:
     """A scene file that was written.
 
-    path : of the file. scene : it describes. notes : what was guessed, a sentence each.
+    path : the file.
+    scene : the scene that the file describes.
+    notes : sentences, one for each guess.
     """
 
     path: Path
@@ -69,16 +71,18 @@ def draft_scene(
 
     Parameters
     ----------
-    unit : of the file's coordinates, ``mm``, ``cm`` or ``m``; guessed from the size by default. A
-        mesh that is not in mm is written again in mm, beside the scene file.
-    law : its name; Holzapfel-Ogden where the mesh has fibres or names that fibres can be laid by,
-        else Neo-Hookean.
+    mesh_path : the mesh file.
+    out : the scene file, which must not exist yet.
+    unit : unit of the mesh file, ``mm``, ``cm`` or ``m``; guessed from the size by default. A mesh
+        that is not in mm is written again in mm, beside the scene file.
+    law : name of the law; by default Holzapfel-Ogden where the mesh has fibres, or walls between
+        which fibres can be computed, else Neo-Hookean.
 
     Raises
     ------
     InputError
-        A mesh that cannot be read, an unknown law or unit, a file that is there already, or a mesh
-        without anything to hold it by.
+        A mesh that cannot be read, an unknown law or unit, a file that exists already, or a mesh
+        that cannot be supported.
     """
     mesh_path, out = Path(mesh_path), Path(out)
     if out.suffix != ".toml":
@@ -100,12 +104,11 @@ def draft_scene(
     chosen = _law(body, law, notes)
     support = _support(body.mesh, notes)
     for load, lines, note in _loads(body.mesh):
-        told = [*notes, note]
-        told += _unused(body.mesh, _text(body, mesh_name, chosen, support, (load, lines), []))
-        text = _text(body, mesh_name, chosen, support, (load, lines), told)
-        out.write_text(text, encoding="utf-8")
+        entries = _entries(body, mesh_name, chosen, support, (load, lines))
+        all_notes = [*notes, note, *_unused(body.mesh, entries)]
+        out.write_text(_header(body.mesh, all_notes) + entries, encoding="utf-8")
         try:
-            return Draft(out, read_scene(out), tuple(told))
+            return Draft(out, read_scene(out), tuple(all_notes))
         except InputError as error:
             out.unlink()
             failure = error
@@ -116,15 +119,13 @@ def draft_scene(
 def _guessed_unit(mesh: Mesh, notes: list[str]) -> str:
     extent = float(np.ptp(mesh.nodes, axis=0).max())
     unit = "mm" if extent >= _METRES else "m"
-    said = f"the body is {extent:.4g} long: taken to be {unit}"
-    if unit == "mm" and extent < _SMALL:
-        said += "; if it is in cm, give --unit cm"
-    notes.append(said)
+    hint = "; if it is in cm, give --unit cm" if unit == "mm" and extent < _SMALL else ""
+    notes.append(f"the body is {extent:.4g} long: taken to be {unit}{hint}")
     return unit
 
 
 def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tuple[Body, str]:
-    """The body in mm and the name of its file, seen from the scene file."""
+    """Return the body in mm, and the path of its file relative to the scene file."""
     if unit == "mm":
         folder = out.resolve().parent
         inside = path.resolve().is_relative_to(folder)
@@ -140,12 +141,8 @@ def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tu
 
 
 def _named(sets: Mapping[str, np.ndarray], words: tuple[str, ...]) -> str | None:
-    """The first set whose name has one of ``words`` in it, the likeliest word first."""
-    for word in words:
-        for name in sets:
-            if word in name.lower():
-                return name
-    return None
+    """Return the first set whose name contains one of ``words``, the likeliest word first."""
+    return next((name for word in words for name in sets if word in name.lower()), None)
 
 
 def _law(body: Body, name: str | None, notes: list[str]) -> Law:
@@ -159,37 +156,37 @@ def _law(body: Body, name: str | None, notes: list[str]) -> Law:
 
 
 def _helix(mesh: Mesh) -> tuple[str, str] | None:
-    """Facet sets between which fibres can be laid."""
+    """Return the facet sets between which fibres can be computed, or None."""
     inner, outer = (_named(mesh.facet_sets, words) for words in (_INSIDE, _OUTSIDE))
     return (inner, outer) if inner and outer else None
 
 
 def _axis(mesh: Mesh) -> str:
-    """The line of the long axis: the base's normal, where there is a base."""
+    """Return the line of the long axis: the normal of the base, where there is a base."""
     base = _named(mesh.facet_sets, _BASE)
     if base is None:
         return "axis = [0.0, 0.0, 1.0]   # CHANGE: from apex to base"
-    # Rounded, so that a base which is level to round-off gives a level axis; no -0.
+    # Rounded, so that a base that is level to round-off gives a level axis, without -0.
     normal = (np.round(mean_normal(mesh.nodes[mesh.facet_set(base)]), 6) + 0.0).tolist()
     return f"axis = {normal}   # from apex to base, across '{base}'"
 
 
 def _loads(mesh: Mesh) -> list[tuple[Load, str, str]]:
-    """Loads to try, each with its lines and a note on it."""
-    found: list[tuple[Load, str, str]] = []
+    """Return the loads to try, each with its lines and a note."""
+    loads: list[tuple[Load, str, str]] = []
     wall = _named(mesh.facet_sets, _INSIDE)
     if wall is not None:
         for kind in (CavityPressure, FollowerPressure):
             lines = f'[[loads]]\nkind = "{kind.kind}"\nfacet_set = "{wall}"\n'
             lines += "# pressure = 0.8   # kPa; without it, a parameter\n"
-            found.append((kind(wall), lines, f"pressure on '{wall}'"))
+            loads.append((kind(wall), lines, f"pressure on '{wall}'"))
     gravity = f'[[loads]]   # CHANGE\nkind = "{Gravity.kind}"\ndensity = 1.06   # g/cm3\n'
     note = "its own weight along -z is the load; change it if you know another"
-    return [*found, (Gravity(), gravity + "direction = [0.0, 0.0, -1.0]\n", note)]
+    return [*loads, (Gravity(), gravity + "direction = [0.0, 0.0, -1.0]\n", note)]
 
 
 def _unused(mesh: Mesh, text: str) -> list[str]:
-    """A note on the facet sets that the scene file does not use, and what could be done there."""
+    """Return a note on facet sets that the scene file does not use, and a load for them."""
     names = [name for name in mesh.facet_sets if f'"{name}"' not in text]
     if not names:
         return []
@@ -200,8 +197,8 @@ def _unused(mesh: Mesh, text: str) -> list[str]:
 
 
 def _support(mesh: Mesh, notes: list[str]) -> str:
-    """Lines of what holds the body."""
-    name = _named(mesh.node_sets, _HELD)
+    """Return the lines of the support."""
+    name = _named(mesh.node_sets, _SUPPORTS)
     if name is not None:
         notes.append(f"held at '{name}'")
         return f'[[supports]]\nnode_set = "{name}"   # all components; see components = "z"\n'
@@ -219,70 +216,67 @@ def _support(mesh: Mesh, notes: list[str]) -> str:
     )
 
 
-def _text(
-    body: Body, mesh_name: str, law: Law, support: str, load: tuple[Load, str], notes: list[str]
-) -> str:
-    """The scene file; ``support`` and the load's second entry are lines of it."""
-    mesh = body.mesh
-    quantities = [*law.quantities, *load[0].quantities]
-    parts = [
+def _header(mesh: Mesh, notes: list[str]) -> str:
+    """Return the comments above the entries: the notes, and the sets of the mesh."""
+    sets = [f"#   {name}: {len(nodes)} nodes" for name, nodes in mesh.node_sets.items()]
+    sets += [f"#   {name}: {len(rows)} facets" for name, rows in mesh.facet_sets.items()]
+    lines = [
         "# A first scene file; lengths in mm, stresses in kPa. What is marked CHANGE was guessed.",
         *(f"# - {note}" for note in notes),
         "# Sets of the mesh:",
-        *_sets(mesh),
-        "",
+        *(sets or ["#   none"]),
+    ]
+    return "\n".join([*lines, "", ""])
+
+
+def _entries(body: Body, mesh_name: str, law: Law, support: str, load: tuple[Load, str]) -> str:
+    """Return the entries of the scene file; ``support`` and the load's second item are lines."""
+    mesh = body.mesh
+    parts = [
         f'law = "{law.name}"   # see docs/extending.md for others',
         f'mesh = "{mesh_name}"',
         *_elements(mesh),
         "",
+        *(_fibres(mesh) if law.fibres and body.fibres is None else ()),
+        support,
+        load[1],
     ]
-    walls = _helix(mesh)
-    if law.fibres and body.fibres is None:
-        if walls is None:
-            parts += ["[fibres]   # CHANGE", 'rule = "uniform"', "direction = [1.0, 0.0, 0.0]", ""]
-        else:
-            parts += [
-                "[fibres]",
-                'rule = "helix"',
-                "angles = [60.0, -60.0]   # degrees, inside and outside",
-                f'endocardium = "{walls[0]}"',
-                f'epicardium = "{walls[1]}"',
-                _axis(mesh),
-                "",
-            ]
-    parts += [support, load[1]]
+    quantities = [*law.quantities, *load[0].quantities]
     for quantity in quantities:
         if quantity.name not in _CONSTANTS:
             parts += _parameter(quantity)
-    fixed = [q for q in quantities if q.name in _CONSTANTS]
-    if fixed:
-        parts += ["[constants]", *(f"{q.name} = {_CONSTANTS[q.name]}" for q in fixed), ""]
-    return "\n".join(parts)
+    constants = [f"{q.name} = {_CONSTANTS[q.name]}" for q in quantities if q.name in _CONSTANTS]
+    return "\n".join([*parts, *(["[constants]", *constants, ""] if constants else ())])
 
 
-def _elements(mesh: Mesh) -> list[str]:
-    """Lines that keep linear tetrahedra from locking."""
-    if mesh.order == 2:
-        return []
-    count = _quadratic_nodes(mesh)
-    if count <= _MOST_QUADRATIC:
-        return [f"order = 2   # quadratic elements, {count} nodes"]
+def _fibres(mesh: Mesh) -> list[str]:
+    """Return the lines of the fibre rule."""
+    walls = _helix(mesh)
+    if walls is None:
+        return ["[fibres]   # CHANGE", 'rule = "uniform"', "direction = [1.0, 0.0, 0.0]", ""]
     return [
-        'dilatation = "patch"   # linear elements share their volume changes, lest they lock',
-        f"# order = 2: quadratic elements are better, but {count} nodes; mesh the body coarser",
+        "[fibres]",
+        'rule = "helix"',
+        "angles = [60.0, -60.0]   # degrees, inside and outside",
+        f'endocardium = "{walls[0]}"',
+        f'epicardium = "{walls[1]}"',
+        _axis(mesh),
+        "",
     ]
 
 
-def _quadratic_nodes(mesh: Mesh) -> int:
-    """Nodes of a linear mesh made quadratic: one on every edge more."""
+def _elements(mesh: Mesh) -> list[str]:
+    """Return the lines that keep linear tetrahedra from locking."""
+    if mesh.order == 2:
+        return []
     edges = np.sort(mesh.elements[:, EDGES], axis=2).reshape(-1, 2)
-    return len(mesh.nodes) + len(np.unique(edges, axis=0))
-
-
-def _sets(mesh: Mesh) -> list[str]:
-    lines = [f"#   {name}: {len(nodes)} nodes" for name, nodes in mesh.node_sets.items()]
-    lines += [f"#   {name}: {len(rows)} facets" for name, rows in mesh.facet_sets.items()]
-    return lines or ["#   none"]
+    count = len(mesh.nodes) + len(np.unique(edges, axis=0))
+    if count <= _MOST_QUADRATIC:
+        return [f"order = 2   # quadratic elements, {count} nodes"]
+    return [
+        'dilatation = "patch"   # elements share volume changes, so that they do not lock',
+        f"# order = 2: quadratic elements are better, but {count} nodes; mesh the body coarser",
+    ]
 
 
 def _parameter(quantity: Quantity) -> list[str]:

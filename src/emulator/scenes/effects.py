@@ -1,9 +1,8 @@
-"""The effects of a scene that it can do without, and the scene without each.
+"""The effects that a scene can do without, and the scene without each of them.
 
-Laws, loads and supports say which effect of theirs can be left out, and what stands in its place;
-the rest is the scene's: the elements' order, their mean or patch dilatation, and regions of
-different stiffness. A simpler scene takes some of the scene's parameters and lives on some of its
-nodes.
+Laws, loads and supports say which of their effects can be left out, and what stands in its place.
+The scene adds the order of the elements, mean or patch dilatation, and regions of different
+stiffness. A simpler scene takes some of the scene's parameters and has some of its nodes.
 """
 
 from __future__ import annotations
@@ -18,16 +17,18 @@ import jax.numpy as jnp
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import of_elements
 from emulator.geometry.refinement import corner_parents, to_linear
-from emulator.scenes.fibre_angles import that_turn
-from emulator.scenes.owners import directions_read
+from emulator.scenes.checks import directions_read
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import effective_angles
 
 
 @dataclass(frozen=True, eq=False)
 class Effect:
     """An effect that a scene can do without.
 
-    name : of the effect. without : the scene without it. remedy : what to write in a scene file.
+    name : the name of the effect.
+    without : the scene without the effect.
+    remedy : the change that takes the effect out of a scene file.
     """
 
     name: str
@@ -36,17 +37,17 @@ class Effect:
 
 
 def effects_of(scene: Scene) -> dict[str, Effect]:
-    """The effects that ``scene`` can do without, by name."""
-    found: dict[str, Effect] = {}
+    """Return the effects that ``scene`` can do without, by name."""
+    effects: dict[str, Effect] = {}
     for name, changes, remedy in _changes(scene):
         without = _changed(scene, **changes)
         if without is not None:
-            found.setdefault(name, Effect(name, without, remedy))
-    return found
+            effects.setdefault(name, Effect(name, without, remedy))
+    return effects
 
 
 def leave_out(scene: Scene, names: Iterable[str]) -> Scene:
-    """``scene`` without the effects of these names; one that went with another is left out too.
+    """Return ``scene`` without the effects of these names, and without those that go with them.
 
     Raises
     ------
@@ -66,32 +67,33 @@ def leave_out(scene: Scene, names: Iterable[str]) -> Scene:
 
 
 def _without(scene: Scene, wanted: str) -> Scene | None:
-    """``scene`` without the effect; None where it has none of that name, or needs it."""
-    for name, changes, _ in _changes(scene):
-        if name == wanted:
-            return _changed(scene, **changes)
-    return None
+    """Return ``scene`` without the effect; None where it has none of that name, or needs it."""
+    changes = next((changes for name, changes, _ in _changes(scene) if name == wanted), None)
+    return None if changes is None else _changed(scene, **changes)
 
 
 @dataclass(frozen=True, eq=False)
 class Onto:
-    """Takes theta to a simpler scene, and its displacement back to the nodes of the whole one.
+    """The projection of theta onto a simpler scene, and of its displacement back.
 
-    The simpler scene has the whole one's nodes, or the corners of its quadratic elements; between
-    two corners the displacement is their mean, as on linear elements.
+    The simpler scene has the nodes of the whole scene, or the corners of its quadratic elements;
+    between two corners the displacement is their mean, as on linear elements.
+
+    whole : the scene with all effects.
+    simpler : the scene without some of them.
     """
 
     whole: Scene
     simpler: Scene
 
     def theta(self, theta: jax.Array) -> jax.Array:
-        """Theta (..., q) of the simpler scene from the whole one's (..., p)."""
+        """Return theta (..., q) of the simpler scene from that of the whole scene, (..., p)."""
         names = self.whole.parameter_names
-        kept = [names.index(name) for name in self.simpler.parameter_names]
-        return jnp.asarray(theta)[..., jnp.asarray(kept)]
+        entries = [names.index(name) for name in self.simpler.parameter_names]
+        return jnp.asarray(theta)[..., jnp.asarray(entries)]
 
     def field(self, u: jax.Array) -> jax.Array:
-        """Displacement (n, 3) at all nodes of the whole scene from the simpler one's."""
+        """Return the displacement (n, 3) at all nodes of the whole scene from the simpler one."""
         if self.whole.mesh.order == self.simpler.mesh.order:
             return u
         return jnp.mean(u[corner_parents(self.whole.mesh)], axis=1)
@@ -101,7 +103,7 @@ _Change = tuple[str, dict[str, Any], str]
 
 
 def _changes(scene: Scene) -> Iterator[_Change]:
-    """Name of each effect, the scene's fields without it, and what to write in its file."""
+    """Yield each effect's name, the fields of the scene without it, and the change of its file."""
     for name, law in scene.law.simpler:
         yield name, {"law": law}, f'law = "{law.name}"'
     for field, table in (("loads", "[[loads]]"), ("supports", "[[supports]]")):
@@ -110,9 +112,9 @@ def _changes(scene: Scene) -> Iterator[_Change]:
             if part.simpler is None:
                 continue
             name, other = part.simpler
-            kept = (*parts[:k], *((other,) if other is not None else ()), *parts[k + 1 :])
+            remaining = (*parts[:k], *((other,) if other is not None else ()), *parts[k + 1 :])
             remedy = f"in {table} write '{other.kind}' for '{part.kind}'" if other else ""
-            yield name, {field: kept}, remedy or f"leave out '{part.kind}' in {table}"
+            yield name, {field: remaining}, remedy or f"leave out '{part.kind}' in {table}"
     if scene.regions is not None:
         yield "regional stiffness", {"regions": None}, "leave out regions"
     if scene.dilatation != "pointwise":
@@ -127,7 +129,10 @@ def _changes(scene: Scene) -> Iterator[_Change]:
 
 
 def _changed(scene: Scene, **changes: Any) -> Scene | None:
-    """``scene`` with other fields and what they need; None where nothing would be left to do."""
+    """Return ``scene`` with other fields; None where it would be at rest or invalid.
+
+    Directions, rotations, parameters and constants that nothing reads any more are left out.
+    """
     law = changes.get("law", scene.law)
     loads = changes.get("loads", scene.loads)
     regions = changes.get("regions", scene.regions)
@@ -136,18 +141,18 @@ def _changed(scene: Scene, **changes: Any) -> Scene | None:
     for kind, reader in directions_read(law, loads).items():
         changes.setdefault(kind, getattr(scene, kind))
         changes[kind] = None if reader is None else changes[kind]
-    changes["angles"] = that_turn(scene.angles, changes["fibres"], changes["sheets"])
+    changes["angles"] = effective_angles(scene.angles, changes["fibres"], changes["sheets"])
     parts = (*loads, *changes.get("supports", scene.supports))
-    takers = set(law.parameters) | {q.name for part in parts for q in part.quantities}
-    takers |= {q.name for angles in changes["angles"] for q in angles.quantities}
+    read = set(law.parameters)
+    read |= {q.name for part in (*parts, *changes["angles"]) for q in part.quantities}
     if regions is not None:
-        takers |= {name for name in scene.quantities if name.startswith("stiffness_")}
+        read |= {name for name in scene.quantities if name.startswith("stiffness_")}
     try:
         return replace(
             scene,
             **changes,
-            parameters=tuple(p for p in scene.parameters if p.name in takers),
-            constants={name: v for name, v in scene.constants.items() if name in takers},
+            parameters=tuple(p for p in scene.parameters if p.name in read),
+            constants={name: v for name, v in scene.constants.items() if name in read},
             origin={},
         )
     except InputError:

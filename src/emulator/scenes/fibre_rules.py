@@ -1,24 +1,25 @@
 """Fibre and sheet rules for scene files; ``FIBRE_RULES`` is their registry.
 
-A new rule is a frozen dataclass with a method ``directions``; its fields are the keys of the table
-``[fibres]``.
+A new rule is a frozen dataclass with the methods of :class:`FibreRule`; its fields are the keys of
+the table ``[fibres]``.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, override
 
 import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import Axis, Depth, biventricular_depth, turned, wall_depth
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.fibre_angles import FibreAngles, across_wall, without_parameters
+from emulator.scenes.tissue import FibreAngles
 
 Directions = tuple[np.ndarray, np.ndarray | None]
 Angles = tuple[float | str, float | str]
-"""Degrees, or names of parameters."""
+"""Angles on endocardium and epicardium, each in degrees or the name of a parameter."""
 
 
 class FibreRule(Protocol):
@@ -27,73 +28,81 @@ class FibreRule(Protocol):
     rule: ClassVar[str]
 
     def directions(self, mesh: Mesh) -> Directions:
-        """Unit fibres (m, 3), and unit sheets (m, 3) if the rule gives any.
+        """Return unit fibres (m, 3), and unit sheets (m, 3) if the rule gives any.
 
         Angles that are parameters are zero.
         """
         ...
 
     def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
-        """The rotations of these directions by parameters; none where the rule names none."""
+        """Return the rotations of these directions by parameters."""
         ...
 
 
 @dataclass(frozen=True)
-class Helix:
-    """Helix angle that varies across the wall of one ventricle.
+class WallRule:
+    """Fibres whose helix angle varies across a wall, and sheets along the wall's normal.
 
     Parameters
     ----------
     angles : degrees at endocardium and epicardium, or names of parameters.
     axis : from apex to base.
     sheet_angles : by which sheets are turned from the wall's normal about the fibres, likewise.
-    endocardium, epicardium : facet sets.
+    """
+
+    angles: Angles
+    axis: Axis = (0.0, 0.0, 1.0)
+    sheet_angles: Angles = (0.0, 0.0)
+
+    @abstractmethod
+    def _wall(self, mesh: Mesh) -> Depth:
+        """Return the relative depth in the wall, and its normal."""
+
+    def directions(self, mesh: Mesh) -> Directions:
+        """Return fibres and sheets."""
+        return self._directions(self._wall(mesh))
+
+    def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
+        """Return the rotations by parameters: of sheets about the fibres, then of both."""
+        wall = self._wall(mesh)
+        fibres = self._directions(wall)[0]
+        return _rotation(wall.value, fibres, self.sheet_angles) + _rotation(*wall, self.angles)
+
+    def _directions(self, wall: Depth) -> Directions:
+        angles, sheet_angles = (
+            (_degrees(inner), _degrees(outer)) for inner, outer in (self.angles, self.sheet_angles)
+        )
+        return turned(wall, angles, self.axis, sheet_angles)
+
+
+@dataclass(frozen=True)
+class Helix(WallRule):
+    """Helix angle that varies across the wall of one ventricle.
+
+    Parameters
+    ----------
+    endocardium, epicardium : facet sets of the wall.
     """
 
     rule: ClassVar[str] = "helix"
 
-    angles: Angles
-    axis: Axis = (0.0, 0.0, 1.0)
     endocardium: str = "endocardium"
     epicardium: str = "epicardium"
-    sheet_angles: Angles = (0.0, 0.0)
 
-    def directions(self, mesh: Mesh) -> Directions:
-        """Fibres and sheets."""
-        return _laid(self, self._wall(mesh))
-
-    def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
-        """The sheet angles and the helix angles that are parameters."""
-        return _turning(self, self._wall(mesh))
-
+    @override
     def _wall(self, mesh: Mesh) -> Depth:
         return wall_depth(mesh, (self.endocardium,), (self.epicardium,))
 
 
 @dataclass(frozen=True)
-class Biventricle:
-    """Helix angle in both ventricles.
-
-    Parameters
-    ----------
-    angles : degrees at endocardium and epicardium, or names of parameters.
-    axis : from apex to base.
-    sheet_angles : by which sheets are turned from the wall's normal about the fibres, likewise.
-    """
+class Biventricle(WallRule):
+    """Helix angle in both ventricles; facet sets lv_endocardium, rv_endocardium, epicardium."""
 
     rule: ClassVar[str] = "biventricle"
 
-    angles: Angles
-    axis: Axis = (0.0, 0.0, 1.0)
-    sheet_angles: Angles = (0.0, 0.0)
-
-    def directions(self, mesh: Mesh) -> Directions:
-        """Fibres and sheets."""
-        return _laid(self, biventricular_depth(mesh))
-
-    def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
-        """The sheet angles and the helix angles that are parameters."""
-        return _turning(self, biventricular_depth(mesh))
+    @override
+    def _wall(self, mesh: Mesh) -> Depth:
+        return biventricular_depth(mesh)
 
 
 @dataclass(frozen=True)
@@ -123,32 +132,40 @@ class Uniform:
                 raise InputError(f"{name} is zero; expected any length above 0")
 
     def directions(self, mesh: Mesh) -> Directions:
-        """The directions, made unit length."""
+        """Return the directions, made unit length."""
         sheets = None if self.sheets is None else _everywhere(mesh, self.sheets)
         return _everywhere(mesh, self.direction), sheets
 
     def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
-        """The angle, if it is a parameter."""
+        """Return the rotation by the angle, where it is a parameter."""
         if self.angle is None or self.about is None:
             return ()
         share = np.ones(len(mesh.elements))
         return (FibreAngles(_everywhere(mesh, self.about), {self.angle: share}),)
 
 
-def _laid(rule: Helix | Biventricle, wall: Depth) -> Directions:
-    """Directions in a wall; angles that are parameters are zero."""
-    angles, sheet_angles = map(without_parameters, (rule.angles, rule.sheet_angles))
-    return turned(wall, angles, rule.axis, sheet_angles)
+def _degrees(angle: float | str) -> float:
+    return 0.0 if isinstance(angle, str) else float(angle)
 
 
-def _turning(rule: Helix | Biventricle, wall: Depth) -> tuple[FibreAngles, ...]:
-    """Rotations of these directions: of sheets about the fibres, then of both."""
-    fibres = _laid(rule, wall)[0]
-    return across_wall(wall.value, fibres, rule.sheet_angles) + across_wall(*wall, rule.angles)
+def _rotation(depth: np.ndarray, axis: np.ndarray, angles: Angles) -> tuple[FibreAngles, ...]:
+    """Return the rotation about ``axis`` by parameters; none if both angles are numbers.
+
+    Parameters
+    ----------
+    depth : relative depth in the wall (m,) or (m, q), 0 on the endocardium, 1 on the epicardium.
+    axis : unit axes with a last axis of 3.
+    angles : on endocardium and epicardium.
+    """
+    shares: dict[str, np.ndarray] = {}
+    for angle, share in zip(angles, (1.0 - depth, depth), strict=True):
+        if isinstance(angle, str):
+            shares[angle] = shares.get(angle, 0.0) + share
+    return (FibreAngles(axis, shares),) if shares else ()
 
 
 def _everywhere(mesh: Mesh, vector: Axis) -> np.ndarray:
-    """The unit vector along ``vector`` for every element (m, 3)."""
+    """Return the unit vector along ``vector`` for every element, (m, 3)."""
     return np.tile(np.asarray(vector) / np.linalg.norm(vector), (len(mesh.elements), 1))
 
 

@@ -1,156 +1,4 @@
-"""Scenes from TOML files, lengths in mm and stresses in kPa.
-
-A block that bends under its own weight:
-
-.. code-block:: toml
-
-    law = "neo_hookean"
-    mesh = "block.vtu"                       # any format meshio reads, beside this file
-
-    [node_sets.left]                         # nodes on a plane; likewise [facet_sets.<name>]
-    axis = "x"
-    at = 0.0
-
-    [[supports]]
-    node_set = "left"                        # clamped
-
-    [[loads]]
-    kind = "gravity"
-    density = 1.0                            # g/cm3
-    direction = [0.0, 0.0, -1.0]             # or, as parameters, kind "gravity_vector"
-
-    [parameters.mu]                          # what varies
-    unit = "kPa"
-    range = [50.0, 100.0]
-    scale = "log"                            # or "uniform", as without it
-
-    [constants]                              # what does not
-    lam = 80.0
-
-A ventricle, whose mesh file has groups named base, endocardium and epicardium:
-
-.. code-block:: toml
-
-    law = "guccione"
-    mesh = "ventricle.vtu"
-    order = 2                                # quadratic elements, from linear ones if need be
-    dilatation = "mean"                      # their way not to lock; or "pointwise";
-                                             # "patch" helps linear ones (order = 1)
-
-    [fibres]                                 # without it, they come from the mesh file
-    rule = "helix"
-    angles = [60.0, -60.0]    # degrees, endocardium and epicardium, or parameters' names
-    endocardium = "endocardium"              # facet sets; these are the defaults
-    epicardium = "epicardium"
-    axis = [0.0, 0.0, 1.0]                   # from apex to base
-
-    [[supports]]
-    node_set = "base"
-    components = "z"                         # x and y stay free
-    displacement = [0.0, 0.0, 0.5]           # mm
-
-    [[supports]]
-    kind = "elastic"
-    facet_set = "epicardium"
-    stiffness = 0.2                          # kPa/mm; without it, it is a parameter
-    direction = "normal"                     # or "all", as without it
-
-    [[loads]]
-    kind = "follower_pressure"               # or "cavity_pressure", if its rim is held
-    facet_set = "endocardium"
-    pressure = 0.8                           # kPa; without it, it is a parameter
-
-    [[loads]]
-    kind = "traction"
-    facet_set = "base"
-    traction = [0.0, 0.1, 0.0]               # kPa, dead
-
-    [parameters.C]
-    unit = "kPa"
-    range = [1.0, 4.0]
-
-    [constants]
-    b_f = 8.0
-    b_t = 2.0
-    b_fs = 4.0
-    kappa = 50.0
-
-A test that is controlled by displacement: a cube of 10 mm, glued to a plate at the bottom and to
-one that moves, with a weight on one edge:
-
-.. code-block:: toml
-
-    law = "neo_hookean"
-    mesh = "cube.vtu"                        # with node sets bottom, top and front
-
-    [[supports]]
-    node_set = "bottom"
-
-    [[supports]]
-    node_set = "top"
-    displacement = [10.0, 0.0, 0.0]          # mm, times the parameter
-    amount = "shear"                         # that each load state has for itself
-
-    [node_sets.edge]
-    axis = "x"
-    at = 10.0
-    within = "front"                         # only what of that set is on the plane
-
-    [[loads]]
-    kind = "force"                           # on a point, or evenly along an edge
-    node_set = "edge"
-    resultant = [0.0, 0.0, -0.5]             # N; also times a parameter, with amount
-
-    [parameters.shear]
-    range = [-0.4, 0.4]
-
-    [parameters.mu]
-    unit = "kPa"
-    range = [1.0, 10.0]
-    scale = "log"
-
-    [constants]
-    lam = 80.0
-
-Other rules for fibres are ``biventricle`` (``angles``, ``axis``; facet sets lv_endocardium,
-rv_endocardium, epicardium) and ``uniform`` (``direction``). They also give the sheets, for a law
-that takes any, as the transmural direction, turned about the fibres by ``sheet_angles`` where these
-are given, as ``angles`` are; ``uniform`` has a key ``sheets`` for them. Gravity also takes
-``acceleration`` in m/s2. A pressure that is a parameter is called ``pressure``, or what its key
-``parameter`` says. ``published_pressure`` is the pressure work of the released code, on linear
-tetrahedra only.
-
-Muscle contracts by a load of the kind ``active_tension``, along the fibres of the file or of a
-rule, whatever the law: ``tension`` in kPa, or a parameter of that name; ``transverse`` is the share
-of it across the fibre.
-
-Several bodies of one material (:mod:`emulator.geometry.side_by_side`), as two cubes of one liver:
-
-.. code-block:: toml
-
-    [[bodies]]                               # in place of mesh = ...
-    name = "cube1"
-    mesh = "cube1.vtu"                       # its set top is called cube1.top
-
-    [[bodies]]
-    name = "cube2"
-    mesh = "cube2.vtu"
-    shift = [20.0, 0.0, 0.0]                 # mm; no nodes of two bodies may coincide
-
-    [node_sets."cube2.edge"]
-    axis = "x"
-    at = 30.0
-    within = "cube2"                         # the surface of a body
-
-``loaded_by = {pressure = "imaged"}`` says that the mesh is the body under load, as in an image: the
-parameter or constant ``imaged``, in the unit of the pressure, is what ``pressure`` was then. FEM
-unloads the body before it loads it; displacements are those from the mesh (docs/unloading.md).
-
-``regions = "segment"`` names cell data of the mesh file, a whole number for each tetrahedron, such
-as gmsh's own ``gmsh:physical``. In region 3 the law's energy is then multiplied by the parameter or
-constant ``stiffness_3``, its resistance to volume change excepted. ``regions = "body"`` numbers
-several bodies from 1.
-"""
+"""Scenes from TOML files, lengths in mm and stresses in kPa (``docs/scene_files.md``)."""
 
 from __future__ import annotations
 
@@ -163,27 +11,31 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, look_up
 from emulator.core.line_index import toml_lines
+from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
+from emulator.geometry.refinement import to_quadratic
+from emulator.geometry.side_by_side import Bodies, check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law, find_law
-from emulator.scenes.file_bodies import one_body, several_bodies
+from emulator.scenes.checks import directions_read
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
     from emulator.core.schema import Source
-    from emulator.scenes.file_models import Plane, SceneFile
+    from emulator.scenes.file_schema import Plane, SceneFile
 
-Parts = tuple[Mesh, np.ndarray | None, np.ndarray | None, np.ndarray | None]
+Regions = np.ndarray | None
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 # A node this far from a plane, as a fraction of the body's size, is on it.
 _ON_PLANE = 1e-8
+_BODY = "body"  # the word for regions that are the bodies, where there are several
 
 
 def read_scene(path: str | Path) -> Scene:
-    """The scene described by a TOML file; the mesh's path is relative to it.
+    """Return the scene that a TOML file describes; the path of the mesh is relative to the file.
 
     Raises
     ------
@@ -191,7 +43,7 @@ def read_scene(path: str | Path) -> Scene:
         One line naming the file, its line and key, what was found and what would be right.
     """
     from emulator.core.schema import Source, parse
-    from emulator.scenes.file_models import SceneFile
+    from emulator.scenes.file_schema import SceneFile
 
     path = Path(path)
     if not path.is_file():
@@ -208,8 +60,11 @@ def read_scene(path: str | Path) -> Scene:
 def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
     with source.at("law"):
         law = find_law(file.law)
-    mesh, fibres, sheets, regions = _body(path.parent, file, law, source)
-    angles = file.fibres.angles_in(mesh) if file.fibres is not None else ()
+    body, regions = (_several_bodies if file.bodies else _one_body)(path.parent, file, law, source)
+    mesh, fibres, sheets = _with_planes(body.mesh, file, source), body.fibres, body.sheets
+    if file.fibres is not None:
+        with source.at("fibres", table=("fibres",)):
+            fibres, sheets = file.fibres.directions(mesh)
     parameters = _parameters(file, source)
     _check_sets(mesh, source)
     try:
@@ -220,8 +75,8 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
             origin={"scene": "file", "path": str(path.resolve())},
             fibres=fibres,
             fibre_rule=file.fibres,
-            angles=angles,
-            sheets=sheets,
+            angles=file.fibres.angles_in(mesh) if file.fibres is not None else (),
+            sheets=sheets if law.sheets else None,
             regions=regions,
             parameters=parameters,
             loads=file.loads,
@@ -234,45 +89,77 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
 
 
-def _parameters(file: SceneFile, source: Source) -> tuple[Parameter, ...]:
-    parameters = []
-    for name, entry in file.parameters.items():
-        with source.at("parameters", name):
-            parameters.append(Parameter(name, entry.unit, *entry.range, entry.scale))
-    return tuple(parameters)
+def _one_body(folder: Path, file: SceneFile, law: Law, source: Source) -> tuple[Body, Regions]:
+    """Return the body of ``mesh``, and its regions."""
+    if file.mesh is None:
+        raise source.error("key 'mesh' is missing; give a mesh file, or tables [[bodies]]")
+    path = folder / file.mesh
+    with source.at("mesh"):
+        body = _read_body(path, file, law)
+    _check_order(path, body.mesh, file, source)
+    with source.at("regions"):
+        return body, None if file.regions is None else read_regions(path, file.regions)
 
 
-def _check_sets(mesh: Mesh, source: Source) -> None:
-    """Refuse loads and supports on sets that the mesh does not have."""
-    for array in ("supports", "loads"):
-        for k, entries in enumerate(source.data.get(array, ())):
-            for key, find in (("node_set", mesh.node_set), ("facet_set", mesh.facet_set)):
-                with source.at(array, k, key, table=(array, k)):
-                    if key in entries:
-                        find(entries[key])
+def _several_bodies(
+    folder: Path, file: SceneFile, law: Law, source: Source
+) -> tuple[Body, Regions]:
+    """Return the bodies of ``[[bodies]]`` as one, and their regions."""
+    if file.mesh is not None:
+        raise source.error("there are tables [[bodies]], too; give either", ("mesh",))
+    members: dict[str, Body] = {}
+    regions: dict[str, np.ndarray] = {}
+    for k, entry in enumerate(file.bodies):
+        path = folder / entry.mesh
+        with source.at("bodies", k, "name", table=("bodies", k)):
+            check_name(entry.name)
+            if entry.name in members:
+                raise InputError(f"there is a body '{entry.name}' before; give each a name")
+        with source.at("bodies", k, "mesh", table=("bodies", k)):
+            body = _read_body(path, file, law)
+            members[entry.name] = replace(body, mesh=shifted(body.mesh, entry.shift))
+        _check_order(path, body.mesh, file, source)
+        with source.at("regions"):
+            if file.regions == _BODY:
+                regions[entry.name] = np.full(len(body.mesh.elements), k + 1)
+            elif file.regions is not None:
+                regions[entry.name] = read_regions(path, file.regions)
+    with source.at("bodies"):
+        bodies = side_by_side({name: body.mesh for name, body in members.items()})
+        fibres, sheets = (_stacked(bodies, members, kind) for kind in ("fibres", "sheets"))
+    return Body(bodies.mesh, fibres, sheets), bodies.stacked(regions) if regions else None
 
 
-def _quantity_in(message: str, file: SceneFile) -> tuple[str, ...]:
-    """Path of the first parameter or constant that a message quotes, if it quotes one."""
-    for name in re.findall(r"'([^']+)'", message):
-        for table in ("parameters", "constants"):
-            if name in getattr(file, table):
-                return table, name
-    return ()
+def _stacked(bodies: Bodies, members: Mapping[str, Body], kind: str) -> np.ndarray | None:
+    """Return the directions of all bodies; none where one of them has none."""
+    values = {name: getattr(body, kind) for name, body in members.items()}
+    return None if any(v is None for v in values.values()) else bodies.stacked(values)
 
 
-def _body(folder: Path, file: SceneFile, law: Law, source: Source) -> Parts:
-    """The mesh with the sets the file adds, directions and regions if anything wants them."""
-    body, regions = (several_bodies if file.bodies else one_body)(folder, file, law, source)
-    mesh = _with_planes(body.mesh, file, source)
-    fibres, sheets = body.fibres, body.sheets
-    if file.fibres is not None:
-        with source.at("fibres", table=("fibres",)):
-            fibres, sheets = file.fibres.directions(mesh)
-    return mesh, fibres, sheets if law.sheets else None, regions
+def _check_order(path: Path, mesh: Mesh, file: SceneFile, source: Source) -> None:
+    if file.order is not None and file.order < mesh.order:
+        problem = f"order = 1; mesh file {path.name} has quadratic tetrahedra, expected 2"
+        raise source.error(problem, ("order",))
+
+
+def _read_body(mesh_path: Path, file: SceneFile, law: Law) -> Body:
+    """Return a mesh file's body, with directions that law and loads need and no rule gives."""
+    readers = directions_read(law, file.loads)
+    if readers["fibres"] is None or file.fibres is not None:
+        mesh = read_mesh(mesh_path)
+        return Body(to_quadratic(mesh) if file.order == 2 and mesh.order == 1 else mesh)
+    body = read_body(mesh_path, quadratic=file.order == 2)
+    for kind, directions in (("fibres", body.fibres), ("sheets", body.sheets)):
+        if readers[kind] is not None and directions is None:
+            raise InputError(
+                f"{readers[kind]} needs {kind}, and mesh file {mesh_path.name} has none; give it "
+                f"cell or point data '{kind}' of 3 components, or this file a table [fibres]"
+            )
+    return body
 
 
 def _with_planes(mesh: Mesh, file: SceneFile, source: Source) -> Mesh:
+    """Return the mesh with the sets that the file defines by planes."""
     node_sets, facet_sets = dict(mesh.node_sets), dict(mesh.facet_sets)
     for name, plane in file.node_sets.items():
         with source.at("node_sets", name, "at", table=("node_sets", name)):
@@ -287,18 +174,17 @@ def _with_planes(mesh: Mesh, file: SceneFile, source: Source) -> Mesh:
 def _on_plane(
     mesh: Mesh, node_sets: Mapping[str, np.ndarray], plane: Plane, wanted: str
 ) -> np.ndarray:
-    """Which nodes (n,) lie on the plane; some of what is ``wanted`` must."""
+    """Return whether each node (n,) lies on the plane; refuse a plane without any ``wanted``.
+
+    wanted : what the plane must contain, "node" or "surface triangle".
+    """
     coordinate = mesh.nodes[:, _AXES[plane.axis]]
     on_plane = np.abs(coordinate - plane.at) <= _ON_PLANE * mesh.size
     if plane.within is not None:
-        if plane.within not in node_sets:
-            raise InputError(
-                f"no node set '{plane.within}' to take a part of; there are "
-                f"{', '.join(sorted(node_sets)) or 'none'}"
-            )
-        on_plane &= np.isin(np.arange(len(mesh.nodes)), node_sets[plane.within])
-    there = on_plane if wanted == "node" else on_plane[mesh.surface].all(axis=1)
-    if not there.any():
+        whole = look_up(node_sets, plane.within, "node set")
+        on_plane &= np.isin(np.arange(len(mesh.nodes)), whole)
+    hits = on_plane if wanted == "node" else on_plane[mesh.surface].all(axis=1)
+    if not hits.any():
         low, high = coordinate.min(), coordinate.max()
         inside = f" in '{plane.within}'" if plane.within else ""
         raise InputError(
@@ -306,3 +192,30 @@ def _on_plane(
             f"and {high:g}"
         )
     return on_plane
+
+
+def _parameters(file: SceneFile, source: Source) -> tuple[Parameter, ...]:
+    parameters = []
+    for name, entry in file.parameters.items():
+        with source.at("parameters", name):
+            parameters.append(Parameter(name, entry.unit, *entry.range, entry.scale))
+    return tuple(parameters)
+
+
+def _check_sets(mesh: Mesh, source: Source) -> None:
+    """Refuse loads and supports on sets that the mesh does not have, by the line of the set."""
+    for array in ("supports", "loads"):
+        for k, entries in enumerate(source.data.get(array, ())):
+            for key, find in (("node_set", mesh.node_set), ("facet_set", mesh.facet_set)):
+                with source.at(array, k, key, table=(array, k)):
+                    if key in entries:
+                        find(entries[key])
+
+
+def _quantity_in(message: str, file: SceneFile) -> tuple[str, ...]:
+    """Return the path of the first parameter or constant that a message quotes, or ()."""
+    for name in re.findall(r"'([^']+)'", message):
+        for table in ("parameters", "constants"):
+            if name in getattr(file, table):
+                return table, name
+    return ()

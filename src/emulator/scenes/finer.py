@@ -9,17 +9,22 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import across
 from emulator.geometry.refinement import Refinement, refined
-from emulator.scenes.fibre_angles import FibreAngles
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import FibreAngles
 
 FINER = "finer"
-"""What the origin of such a scene calls itself."""
+"""The name under which the origin of a scene says that its mesh was refined."""
 
 
 @dataclass(frozen=True, eq=False)
 class Finer:
-    """``scene`` on a finer mesh than ``coarse`` has; ``refinement`` carries fields to it."""
+    """A scene on a finer mesh.
+
+    coarse : the scene on its own mesh.
+    scene : the same scene on the finer mesh.
+    refinement : takes fields from the mesh of ``coarse`` to the finer one.
+    """
 
     coarse: Scene
     scene: Scene
@@ -27,12 +32,12 @@ class Finer:
 
 
 def finer(scene: Scene) -> Finer:
-    """``scene`` with quadratic elements for linear ones, or eight quadratic ones for each.
+    """Return ``scene`` with quadratic elements for linear ones, or eight for each quadratic one.
 
-    Fibres and sheets are the rule's that made them, where it is known, else continued linearly:
-    what a coarse mesh makes of a rule may be most of its error (docs/experiments.md, "Fibres of the
-    finer mesh"). The body is the mesh's own: what its elements miss of a curved surface is not put
-    right.
+    Fibres and sheets are evaluated by the rule that made them, where it is known, else continued
+    linearly: most of the error of a coarse mesh may lie in its fibres (docs/experiments.md, "Fibres
+    of the finer mesh"). The body stays that of the coarse mesh: the gap between its elements and a
+    curved surface remains.
 
     Raises
     ------
@@ -43,8 +48,9 @@ def finer(scene: Scene) -> Finer:
     children = refinement.children
     fibres, sheets = _directions(scene, refinement)
     angles = _angles(scene, refinement) if scene.angles else ()
-    moved: dict[str | None, np.ndarray] = {None: refinement.carry(scene.held_displacement)}
-    moved |= {n: refinement.carry(per_unit) for n, per_unit in scene.prescribed.per_unit.items()}
+    _, fixed, per_unit = scene.prescribed
+    displacements: dict[str | None, np.ndarray] = {None: refinement.carry(fixed)}
+    displacements |= {name: refinement.carry(each) for name, each in per_unit.items()}
     fine = replace(
         scene,
         mesh=refinement.mesh,
@@ -54,18 +60,20 @@ def finer(scene: Scene) -> Finer:
         # A finer mesh is quadratic, and patches are for linear elements.
         dilatation="mean" if scene.dilatation == "patch" else scene.dilatation,
         regions=None if scene.regions is None else np.repeat(scene.regions, children),
-        supports=tuple(support.on_finer(refinement.mesh, moved) for support in scene.supports),
+        supports=tuple(
+            support.on_finer(refinement.mesh, displacements) for support in scene.supports
+        ),
         origin={"scene": FINER, "of": dict(scene.origin)} if scene.origin else {},
     )
     return Finer(scene, fine, refinement)
 
 
 def _directions(scene: Scene, refinement: Refinement) -> tuple[np.ndarray | None, ...]:
-    """Fibres and sheets on the finer mesh, None where the scene has none."""
+    """Return fibres and sheets on the finer mesh, None where the scene has none."""
     rule = scene.fibre_rule
     if rule is not None and _made_by(rule, scene):
-        made, across_them = rule.directions(refinement.mesh)
-        return made, None if scene.sheets is None else across_them
+        by_rule, sheets_by_rule = rule.directions(refinement.mesh)
+        return by_rule, None if scene.sheets is None else sheets_by_rule
     fibres = None if scene.fibres is None else refinement.directions(scene.fibres)
     sheets = None if scene.sheets is None else refinement.directions(scene.sheets)
     if fibres is not None and sheets is not None:
@@ -74,7 +82,7 @@ def _directions(scene: Scene, refinement: Refinement) -> tuple[np.ndarray | None
 
 
 def _angles(scene: Scene, refinement: Refinement) -> tuple[FibreAngles, ...]:
-    """Fibre angles on the finer mesh, by the rule that made them."""
+    """Return the fibre angles on the finer mesh, by the rule that made them."""
     rule = scene.fibre_rule
     angles = rule.angles_in(refinement.mesh) if rule is not None and _made_by(rule, scene) else ()
     if len(angles) != len(scene.angles):
@@ -85,11 +93,11 @@ def _angles(scene: Scene, refinement: Refinement) -> tuple[FibreAngles, ...]:
 
 
 def _made_by(rule: FibreRule, scene: Scene) -> bool:
-    """Whether the scene's fibres are the rule's: they may have been replaced since."""
+    """Return whether ``rule`` gives the fibres of ``scene``, which may have been replaced since."""
     if scene.fibres is None:
         return False
     try:
-        made = rule.directions(scene.mesh)[0]
+        fibres = rule.directions(scene.mesh)[0]
     except InputError:  # another mesh, without the rule's facet sets
         return False
-    return made.shape == scene.fibres.shape and np.allclose(made, scene.fibres, atol=1e-9)
+    return fibres.shape == scene.fibres.shape and np.allclose(fibres, scene.fibres, atol=1e-9)

@@ -10,15 +10,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh
+from emulator.mechanics.laws.law import law_identity
 from emulator.scenes.parameter_space import ParameterSpace
+from emulator.scenes.scene_data import SceneData
+from emulator.scenes.supports.dirichlet import Prescribed
 
 # Decimals of lengths in mm that the fingerprint hashes: 1 nm, so that round-off, which differs
 # between machines, hardly ever decides on one.
@@ -33,9 +36,9 @@ class Identity:
     """Everything the solutions of a scene depend on, apart from theta.
 
     lengths : arrays in mm by name: nodes, prescribed displacements.
-    directions : unit vectors by name: fibres and sheets, if the scene has them.
-    indices : arrays of whole numbers by name: tetrahedra, held, regions, facet sets under a load
-        or a support.
+    directions : unit vectors by name: fibres, sheets and their rotations, if the scene has them.
+    indices : arrays of whole numbers by name: tetrahedra, prescribed components, regions, facet
+        sets under a load or a support.
     description : law, constants, loads, springs and the names of the parameters, plain JSON.
     """
 
@@ -45,7 +48,7 @@ class Identity:
     description: Mapping[str, Any]
 
     def agrees(self, other: Identity) -> bool:
-        """Whether both scenes have equal solutions; the order of nodes must match."""
+        """Return whether both scenes have equal solutions; the order of nodes must match."""
         size = float(np.linalg.norm(np.ptp(self.lengths["nodes"], axis=0)))
         return (
             _close(self.lengths, other.lengths, _TOLERANCE * size)
@@ -55,72 +58,68 @@ class Identity:
         )
 
     def parts(self) -> list[bytes]:
-        """The identity as bytes to hash, lengths and directions rounded."""
-        found = [_text(dict(self.description))]
+        """Return the identity as bytes to hash, lengths and directions rounded."""
+        content = [_text(dict(self.description))]
         rounded = {name: np.round(v, _LENGTH_DIGITS) for name, v in self.lengths.items()}
         rounded |= {name: np.round(v, _DIRECTION_DIGITS) for name, v in self.directions.items()}
         for name, values in sorted(rounded.items()):
             # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
-            found += [name.encode(), (values + 0.0).tobytes()]
+            content += [name.encode(), (values + 0.0).tobytes()]
         for name, values in sorted(self.indices.items()):
-            found += [name.encode(), values.astype(np.int64).tobytes()]
-        return found
+            content += [name.encode(), values.astype(np.int64).tobytes()]
+        return content
 
 
-def identity_of(
-    mesh: Mesh,
-    held: np.ndarray,
-    moved: Mapping[str, np.ndarray],
-    directions: Mapping[str, np.ndarray | None],
-    regions: np.ndarray | None,
-    facet_sets: Collection[str],
-    description: Mapping[str, Any],
-) -> Identity:
-    """The identity of a scene made of these parts, elements put in a fixed order.
-
-    Parameters
-    ----------
-    held : where the displacement is known, (n, 3) bool.
-    moved : what is known of it, (n, 3) mm by name.
-    directions : (m, 3) or (m, q, 3) unit vectors by name, or None.
-    regions : (m,) labels, or None.
-    facet_sets : names of the sets under a load or a support.
-    """
+def identity_of(scene: SceneData, prescribed: Prescribed) -> Identity:
+    """Return the identity of ``scene``, its elements and facets in a fixed order."""
+    mesh = scene.mesh
     elements = np.sort(mesh.elements, axis=1)
     order = np.lexsort(elements.T)
+    held, fixed, per_unit = prescribed
+    facet_sets = sorted({n for part in (*scene.loads, *scene.supports) for n in part.facet_sets})
     indices = {"elements": elements[order], "held": held}
     indices |= {f"facets {name}": _as_set(mesh.facet_set(name)) for name in facet_sets}
-    if regions is not None:
-        indices["regions"] = regions[order]
+    if scene.regions is not None:
+        indices["regions"] = scene.regions[order]
+    displacements = {f"displacement per unit of {name}": d for name, d in per_unit.items()}
     return Identity(
-        lengths={"nodes": mesh.nodes, **moved},
+        lengths={"nodes": mesh.nodes, "displacement": fixed, **displacements},
         directions={
-            name: _points_in_order(mesh, v)[order]
-            for name, v in directions.items()
-            if v is not None
+            name: _points_in_order(mesh, values)[order]
+            for name, values in _directions(scene).items()
         },
         indices=indices,
-        description=description,
+        description=_description(scene),
     )
 
 
-def plain_fields(part: Any, unused: Collection[str] = ()) -> list[Any]:
-    """Kind and every field of a load or support, a frozen dataclass, as plain JSON.
+def _directions(scene: SceneData) -> dict[str, np.ndarray]:
+    """Return arrays (m, 3), (m, q, 3) or (m, q, 1) by name: fibres, sheets and their rotations."""
+    directions = {"fibres": scene.fibres, "sheets": scene.sheets}
+    for k, rotation in enumerate(scene.angles):
+        directions[f"axis of rotation {k}"] = rotation.axis
+        for name, share in rotation.shares.items():
+            directions[f"share of {name} in rotation {k}"] = share[..., None]
+    return {name: values for name, values in directions.items() if values is not None}
 
-    Numbers are floats, and -0.0 is 0.0; entries of a tuple stand one by one. A field that is
-    ``unused`` is None.
-    """
-    found: list[Any] = [part.kind]
-    for each in fields(part):
-        value = None if each.name in unused else getattr(part, each.name)
-        for entry in value if isinstance(value, tuple) else (value,):
-            number = isinstance(entry, int | float) and not isinstance(entry, bool)
-            found.append(float(entry) + 0.0 if number else entry)
-    return found
+
+def _description(scene: SceneData) -> dict[str, Any]:
+    """Return plain JSON of everything but arrays."""
+    springs = [support.to_json() for support in scene.supports]
+    description = {
+        "law": law_identity(scene.law),
+        "constants": {name: float(value) for name, value in scene.constants.items()},
+        "parameters": sorted(parameter.name for parameter in scene.parameters),
+        "loads": sorted(json.dumps(load.to_json()) for load in scene.loads),
+        "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
+        "dilatation": scene.dilatation,
+    }
+    # Scenes at rest keep the fingerprint of earlier versions, so that saved emulators load.
+    return description | ({"loaded_by": dict(scene.loaded_by)} if scene.loaded_by else {})
 
 
 def fingerprint(identity: Identity, space: ParameterSpace) -> str:
-    """Short hash of an identity and of theta's order and box."""
+    """Return a short hash of an identity and of the order and the box of theta."""
     box = [[p.name, float(p.low), float(p.high), p.scale] for p in space.parameters]
     digest = hashlib.sha256()
     for part in [*identity.parts(), _text(box)]:
@@ -138,7 +137,7 @@ def _close(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray], tolerance: 
 
 
 def _points_in_order(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
-    """Directions (m, 3) or (m, q, 3), points in an order that does not depend on the corners'."""
+    """Return directions (m, 3) or (m, q, 3), points independent of the order of the corners."""
     if directions.ndim == 2:
         return directions
     ranks = np.argsort(mesh.corners, axis=1)
@@ -148,7 +147,7 @@ def _points_in_order(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
 
 
 def _as_set(facets: np.ndarray) -> np.ndarray:
-    """Facets (k, 3 or 6) without regard to order: nodes sorted in each, then whole rows."""
+    """Return facets (k, 3 or 6) in a fixed order: nodes sorted in each, then whole rows."""
     return np.unique(np.sort(facets, axis=1), axis=0)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.built_in.ventricles import left_ventricle
 from emulator.scenes.scene import Scene
 
 SHAPES = {

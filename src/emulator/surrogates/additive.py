@@ -27,8 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.representation import TableRepr
-from emulator.scenes.nodes import all_nodes, check_nodes
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network.family import FamilyNetwork

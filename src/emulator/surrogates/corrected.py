@@ -22,8 +22,7 @@ from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.energy import volume_ratio
 from emulator.fem.simulator import Simulator
-from emulator.scenes.nodes import all_nodes, check_nodes
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.files import EMULATOR
 from emulator.surrogates.kind import ForwardKind, Ingredients, Option, Options
 from emulator.surrogates.protocol import ForwardMap, Prediction, fingerprint_of

@@ -12,8 +12,7 @@ import numpy as np
 from emulator.core.store import to_json
 from emulator.fem.campaign import Executor, Row, Solver, in_process, solve_rows
 from emulator.fem.simulator import Simulator
-from emulator.scenes.nodes import all_nodes, check_nodes
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.kind import ForwardKind
 from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, fingerprint_of
 

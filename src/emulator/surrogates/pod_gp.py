@@ -25,8 +25,7 @@ from emulator.core.gaussian_process import squared_exponential
 from emulator.core.precision import require_float64
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import sobol
-from emulator.scenes.nodes import all_nodes
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, all_nodes
 from emulator.surrogates.kind import Arrays, ForwardKind, Ingredients, Option, Options
 from emulator.surrogates.protocol import (
     ForwardMap,

@@ -14,8 +14,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.campaign import Executor
-from emulator.scenes.nodes import check_nodes
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, check_nodes
 
 
 class Prediction(NamedTuple):

@@ -15,8 +15,7 @@ from emulator.core.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Predictor, Runs, StoredRuns, run_campaign
 from emulator.fem.campaign.designs import design, sobol
-from emulator.scenes.nodes import all_nodes
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, all_nodes
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.pignn import Architecture

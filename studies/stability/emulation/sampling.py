@@ -20,7 +20,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.samplers import find_sampler
 from emulator.scenes import Scene
-from emulator.scenes.nodes import all_nodes
+from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Prediction, fingerprint_of
 
 SAMPLERS = ("nuts", "blackjax_nuts", "mclmc", "smc", "laplace")

@@ -18,7 +18,7 @@ from calibrate.priors.priors import Conditional
 from calibrate.project import Run
 from calibrate.samplers.density import density_of
 from emulator.core.errors import InputError
-from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.built_in.ventricles import left_ventricle
 from linear_support import linear_forward
 
 NOISE = cal.GaussianNoise(sd=0.1)

@@ -7,7 +7,7 @@ import sparsax
 import emulator as em
 from emulator.accuracy.estimate import error_bar
 from emulator.core.errors import InputError
-from emulator.scenes.nodes import all_nodes
+from emulator.scenes.scene import all_nodes
 from emulator.surrogates.corrected import newton_step
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.protocol import Prediction

@@ -11,9 +11,8 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.campaign.designs import design
-from emulator.fem.loaded import LoadedEquilibrium
+from emulator.fem.loaded import LoadedEquilibrium, image_theta
 from emulator.geometry.facets import Cavity
-from emulator.scenes.image import image_theta
 
 IMAGED = em.Parameter("imaged", "kPa", 0.3, 1.5)
 PART = jnp.array([0.3, -0.2, 0.5, 0.1, -0.4, 0.3])  # of theta, a direction

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from emulator.scenes.registry import BUILT_IN
+from emulator.scenes.built_in import BUILT_IN
 
 COARSE = {
     "once_clamped_beam": "cells=(4, 2, 2), order=1",

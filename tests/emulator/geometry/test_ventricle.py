@@ -10,7 +10,7 @@ from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import HUMAN, truncated_ellipsoid
 from emulator.geometry.heart_wall import Ventricle, ventricle
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.left_ventricle import left_ventricle
+from emulator.scenes.built_in.ventricles import left_ventricle
 
 
 def body(mesh: Mesh) -> Ventricle:

@@ -130,15 +130,14 @@ def test_a_dead_pressure_is_the_following_one_to_first_order(order):
     mesh = to_quadratic(mesh) if order == 2 else mesh
     scene = replace(block(loads=(Gravity(),)), mesh=mesh, loads=(DeadPressure("right", 0.7),))
     (load,) = scene.loads
-    force = load.nodal_force(scene.discretisation)
+    force = load.dead_forces(scene.discretisation)[None]
     # Its resultant is -p A N, and its virtual work the following pressure's at rest.
     np.testing.assert_allclose(force.sum(axis=0), [-0.7 * 12.0, 0.0, 0.0], atol=1e-12)
     follower = FollowerPressure("right", 0.7).force(scene.discretisation)
     at_rest = follower.total(jnp.zeros(scene.held.shape), {})
     np.testing.assert_allclose(force, at_rest, atol=1e-12)
-    by_name = DeadPressure("right", parameter="p").nodal_force_per_unit(scene.discretisation)
+    by_name = DeadPressure("right", parameter="p").dead_forces(scene.discretisation)
     np.testing.assert_allclose(0.7 * by_name["p"], force, atol=1e-14)
-    assert DeadPressure("right", parameter="p").nodal_force(scene.discretisation) is None
     assert load.pressed == "right"
 
 

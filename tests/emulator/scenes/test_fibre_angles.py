@@ -18,10 +18,10 @@ from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.effects import effects_of
-from emulator.scenes.fibre_angles import FibreAngles
 from emulator.scenes.fibre_rules import Helix, Uniform
 from emulator.scenes.finer import finer
 from emulator.scenes.loads import ActiveTension, CavityPressure
+from emulator.scenes.tissue import FibreAngles
 from scene_file_support import HEART
 
 KNOWN = {"a": 0.3, "b": 2.0, "a_f": 5.0, "b_f": 2.0, "pressure": 0.9}

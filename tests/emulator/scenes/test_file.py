@@ -1,7 +1,7 @@
 import re
 import subprocess
 import sys
-import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
-from emulator.scenes import Parameter, file
+from emulator.scenes import Parameter
 from emulator.scenes.loads import (
     ActiveTension,
     FollowerPressure,
@@ -219,10 +219,10 @@ def test_importing_the_package_does_not_import_pydantic():
 
 
 def test_the_examples_of_the_documentation(folder):
-    blocks = re.split(r"\.\. code-block:: toml\n", file.__doc__)[1:]
+    page = Path(__file__).resolve().parents[3] / "docs" / "scene_files.md"
+    blocks = re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     for name, text in zip(("block", "ventricle", "cube", "bodies"), blocks, strict=True):
-        kept = [line for line in text.splitlines() if not line or line.startswith("    ")]
-        (folder / f"{name}.toml").write_text(textwrap.dedent("\n".join(kept)))
+        (folder / f"{name}.toml").write_text(text)
     write_mesh(folder / "ventricle.vtu", human_ventricle(5, 12, 1))
     block = find_scene(str(folder / "block.toml"))
     assert block.loads == (Gravity(1.0, (0.0, 0.0, -1.0)),)

@@ -43,7 +43,7 @@ def test_facet_sets_on_a_plane_and_quadratic_elements(folder):
     (folder / "scene.toml").write_text(text)
     scene = find_scene(str(folder / "scene.toml"))
     assert scene.mesh.facet_set("end").shape == (2, 6)
-    force = scene.loads[1].nodal_force(scene.discretisation)
+    force = scene.loads[1].dead_forces(scene.discretisation)[None]
     np.testing.assert_allclose(force.sum(axis=0), [0.0, 0.0, 1.0], atol=1e-12)  # 1 mm2 of 1 kPa
     on_plane = np.flatnonzero(scene.mesh.nodes[:, 0] == 0.0)
     np.testing.assert_array_equal(scene.mesh.node_set("left"), on_plane)

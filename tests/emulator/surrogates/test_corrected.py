@@ -6,7 +6,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem import run_campaign, sobol
-from emulator.scenes.nodes import all_nodes
+from emulator.scenes.scene import all_nodes
 from emulator.surrogates.corrected import corrected
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.pod_gp import fit_reduced

@@ -43,8 +43,8 @@ from emulator.fem.line_search import largest_admissible
 from emulator.fem.linear import Outcome
 from emulator.fem.material_point import MaterialPoint
 from emulator.mechanics.measures import Measures, measures_read
-from emulator.scenes.regions import Tissue
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue
 
 _SHORTEST = 2.0**-4  # fraction of a step below which the schedule of loads has failed
 

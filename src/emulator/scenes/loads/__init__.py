@@ -1,17 +1,20 @@
-"""Loads, one kind a file; ``LOADS`` is their registry.
+"""Loads by kind; ``LOADS`` is their registry.
 
 A new kind is a frozen dataclass derived from :class:`Load` in a file of its own, named here.
 """
 
 from emulator.scenes.loads.active_tension import ActiveTension
-from emulator.scenes.loads.dead_pressure import DeadPressure
-from emulator.scenes.loads.follower import FollowerPressure
 from emulator.scenes.loads.force import Force
 from emulator.scenes.loads.gravity import Gravity, GravityVector
 from emulator.scenes.loads.load import Load
-from emulator.scenes.loads.pressure import CavityPressure
-from emulator.scenes.loads.published_pressure import PublishedPressure
-from emulator.scenes.loads.surface_pressure import KPA_PER_MMHG, SurfacePressure
+from emulator.scenes.loads.pressure import (
+    KPA_PER_MMHG,
+    CavityPressure,
+    DeadPressure,
+    FollowerPressure,
+    PublishedPressure,
+    SurfacePressure,
+)
 from emulator.scenes.loads.traction import Traction
 
 LOADS: dict[str, type[Load]] = {

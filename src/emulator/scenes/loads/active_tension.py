@@ -7,14 +7,15 @@ With the tension :math:`T_a` along the fibre :math:`f_0`, and a share :math:`\et
         \left[(I_{4f} - 1) + \eta\,(I_{4s} + I_{4n} - 2)\right] dX, \qquad
     I_{4f} = |F f_0|^2, \quad I_{4s} + I_{4n} = I_1 - I_{4f},
 
-so that :math:`S = T_a\,[f_0 \otimes f_0 + \eta\,(I - f_0 \otimes f_0)]` is what the second Piola
-stress gains, as in Land et al. (2015), problem 3, where :math:`\eta = 0`.
+so that the second Piola-Kirchhoff stress gains
+:math:`S = T_a\,[f_0 \otimes f_0 + \eta\,(I - f_0 \otimes f_0)]`, as in Land et al. (2015),
+problem 3, where :math:`\eta = 0`.
 
-The measures are those of F itself, also where the law reads isochoric ones or mean dilatation
-replaces J: the published stress is that of F. Isochoric measures would take the pressure
-:math:`\tfrac13 \operatorname{tr}(F S F^T) / J` off, which tissue that keeps its volume cannot feel.
+The measures are those of F itself, also where the law reads isochoric measures or mean dilatation
+replaces J, because the published stress is that of F. Isochoric measures would subtract the
+pressure :math:`\tfrac13 \operatorname{tr}(F S F^T) / J`, which incompressible tissue cannot feel.
 
-:math:`\Psi` is quadratic in the places :math:`x = X + u` of the nodes,
+:math:`\Psi` is quadratic in the positions :math:`x = X + u` of the nodes,
 
 .. math::
     \Psi = \frac{T_a}{2} \sum_{ab} k_{ab}\,(x_a \cdot x_b - X_a \cdot X_b), \qquad
@@ -22,7 +23,7 @@ replaces J: the published stress is that of F. Isochoric measures would take the
              + \eta\, \nabla N_a \cdot \nabla N_b \; dX .
 
 Shape functions add up to 1, so rows of k add up to 0, and :math:`\Psi` is the energy of linear
-springs of stiffness :math:`-T_a k_{ab}` between the nodes a < b of an element, pulling from rest:
+springs of stiffness :math:`-T_a k_{ab}` between the nodes a < b of an element:
 
 .. math:: \Psi = -T_a \sum_{a<b} k_{ab}\,\left(D \cdot \Delta + \tfrac12 \Delta \cdot \Delta\right),
           \qquad D = X_b - X_a, \quad \Delta = u_b - u_a .
@@ -55,10 +56,9 @@ from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh, parts
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.fibre_angles import Fibres
-from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
-from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
+from emulator.scenes.part import LocalForce, LocalTerm, Values
+from emulator.scenes.tissue import Fibres
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ActiveTension(Load):
 
     Parameters
     ----------
-    tension : T_a in kPa, 0 or more, or ``None`` to make it a parameter of the scene.
+    tension : T_a in kPa, 0 or more; without it, the tension is a parameter of the scene.
     parameter : name of that parameter. It belongs to a load state, so that end-diastole and
         end-systole are two states of one body that share its passive material.
     transverse : share eta of the tension that acts in every direction across the fibre, 0 to 1.
@@ -76,6 +76,7 @@ class ActiveTension(Load):
     """
 
     kind: ClassVar[str] = "active_tension"
+    magnitude: ClassVar[Quantity] = Quantity("tension", "kPa", low_admitted=True)
 
     tension: float | None = None
     parameter: str = "tension"
@@ -92,7 +93,7 @@ class ActiveTension(Load):
 
     @property
     def facet_sets(self) -> tuple[str, ...]:
-        """What bounds the body that contracts."""
+        """The facet set of the body that contracts."""
         return () if self.within is None else (self.within,)
 
     @property
@@ -101,56 +102,41 @@ class ActiveTension(Load):
         return True
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        """The tension, if it is a parameter; 0 is tissue at rest."""
-        if self.tension is not None:
-            return ()
-        return (Quantity(self.parameter, "kPa", low_admitted=True),)
-
-    @property
     def simpler(self) -> tuple[str, None]:
         """Passive tissue."""
         return "active tension", None
 
-    def to_json(self) -> list[Any]:
-        """Every field; a parameter's name says nothing where the tension is known."""
-        return plain_fields(self, () if self.tension is None else ("parameter",))
-
-    def value(self, values: Values) -> jax.Array | float:
-        """The tension in kPa, taken from the scene's resolved parameters if it is one."""
-        return values[self.parameter] if self.tension is None else self.tension
-
     def first_piola(self, F: jax.Array, mesh: Mesh, fibres: jax.Array, values: Values) -> jax.Array:
-        """``F S`` (m, q, 3, 3) in kPa."""
+        """Return ``F S`` (m, q, 3, 3) in kPa."""
         along = jnp.einsum("mqij,mqj,mqk->mqik", F, fibres, fibres)
         stress = self.value(values) * (along + self.transverse * (F - along))
         return stress * self._contracts(mesh)[:, None, None, None]
 
     def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
-        """The springs between nodes; where theta turns the fibres, the energy of each element."""
+        """Return springs between nodes, or element energies where theta turns the fibres."""
         grid, fibres = self._muscle(grid, fibres)
         if fibres.angles:
             return self._of_elements(grid, fibres)
-        pairs, stiffness = _springs(grid, fibres.given, self.transverse)
+        pairs, stiffness = _springs(grid, fibres.directions, self.transverse)
         X = grid.mesh.nodes
 
         def energy(u: jax.Array, spring: Any, values: Values) -> jax.Array:
-            stiffness, at_rest = spring
-            longer = u[1] - u[0]
-            work = jnp.vdot(at_rest, longer) + 0.5 * jnp.vdot(longer, longer)
+            stiffness, D = spring
+            delta = u[1] - u[0]
+            work = jnp.vdot(D, delta) + 0.5 * jnp.vdot(delta, delta)
             return self.value(values) * stiffness * work
 
         return LocalTerm(pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), energy, convex=True)
 
     def _contracts(self, mesh: Mesh) -> np.ndarray:
-        """Whether each element does, (m,)."""
+        """Return whether each element contracts, (m,) bool."""
         if self.within is None:
             return np.ones(len(mesh.elements), bool)
         part = parts(mesh.elements, len(mesh.nodes))
         return np.isin(part[mesh.elements[:, 0]], part[mesh.facet_set(self.within)])
 
     def _muscle(self, grid: Discretisation, fibres: Fibres | None) -> tuple[Discretisation, Fibres]:
-        """Elements that contract, and their fibres."""
+        """Return the elements that contract, and their fibres."""
         assert fibres is not None, "a scene with this load has fibres"
         if self.within is None:
             return grid, fibres
@@ -161,24 +147,24 @@ class ActiveTension(Load):
         return replace(grid, **muscle), fibres.some(chosen)
 
     def _of_elements(self, grid: Discretisation, fibres: Fibres) -> LocalTerm:
-        def longer(h: jax.Array, weight: jax.Array, f: jax.Array) -> jax.Array:
-            """What the measures gain on 1, on their mean: exact where h is small."""
-            pull = h @ f
-            along = 2.0 * jnp.vdot(f, pull) + jnp.vdot(pull, pull)
+        def growth(h: jax.Array, weight: jax.Array, f: jax.Array) -> jax.Array:
+            """Return the growth of the measures from rest, without cancellation for small h."""
+            hf = h @ f
+            along = 2.0 * jnp.vdot(f, hf) + jnp.vdot(hf, hf)
             everywhere = 2.0 * jnp.trace(h) + jnp.vdot(h, h)
             return weight * ((1.0 - self.transverse) * along + self.transverse * everywhere)
 
         def energy(u: jax.Array, element: Any, values: Values) -> jax.Array:
             gradients, weights, row = element
             h = jnp.einsum("ai,qaj->qij", u, gradients)
-            work = jax.vmap(longer)(h, weights, Fibres.of_element(row, values))
+            work = jax.vmap(growth)(h, weights, Fibres.of_element(row, values))
             return 0.5 * self.value(values) * work.sum()
 
         data = grid.gradients, grid.weights, fibres.rows
         return LocalTerm(grid.connectivity, data, energy, convex=True)
 
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        """The force of the stress on each element's nodes."""
+        """Return the force of the stress on the nodes of each element."""
         grid, fibres = self._muscle(grid, fibres)
 
         def at_point(
@@ -195,16 +181,16 @@ class ActiveTension(Load):
         def force(w: jax.Array, element: Any, values: Values) -> jax.Array:
             gradients, weights, row = element
             m = Fibres.of_element(row, values)
-            found = jax.vmap(at_point, (None, 0, 0, 0))(w, gradients, weights, m)
-            return self.value(values) * found.sum(0)
+            forces = jax.vmap(at_point, (None, 0, 0, 0))(w, gradients, weights, m)
+            return self.value(values) * forces.sum(0)
 
         return LocalForce(grid.connectivity, (grid.gradients, grid.weights, fibres.rows), force)
 
 
 def _springs(grid: Discretisation, fibres: Any, transverse: float) -> tuple[np.ndarray, Any]:
-    """Nodes (k, 2) and stiffness ``-k_ab`` (k,) in mm of each spring, for a tension of 1.
+    """Return nodes (k, 2) and stiffness ``-k_ab`` (k,) in mm of each spring, for a tension of 1.
 
-    The stiffness is traced where the grid is, and NumPy's where it is not.
+    The stiffness is a traced array where the grid is traced, else a NumPy array.
     """
     gradients, weights = grid.gradients, grid.weights
     traced = any(isinstance(a, jax.core.Tracer) for a in (gradients, weights, fibres))

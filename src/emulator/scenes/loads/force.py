@@ -8,8 +8,9 @@ mesh is refined; resultants and displacements elsewhere do not.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, override
 
 import jax
 import numpy as np
@@ -17,11 +18,9 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import EDGES, Mesh
-from emulator.mechanics.laws.law import Quantity, number
-from emulator.scenes.fibre_angles import Fibres
-from emulator.scenes.identity import plain_fields
 from emulator.scenes.loads.load import Load
-from emulator.scenes.local_terms import LocalForce, Values
+from emulator.scenes.part import LocalForce, Values
+from emulator.scenes.tissue import Fibres
 
 MN_PER_N = 1e3
 
@@ -34,8 +33,8 @@ class Force(Load):
     ----------
     node_set : one node, the nodes of an edge, or any others.
     resultant : three components in N; with ``amount``, per unit of that parameter.
-    amount : name of a parameter that multiplies the force, ``None`` where it is known. With a
-        range around 1 it is a force known to some percent.
+    amount : name of a parameter that multiplies the force; without it, the force is known. A range
+        around 1 makes it a force known to some percent.
     """
 
     kind: ClassVar[str] = "force"
@@ -51,31 +50,21 @@ class Force(Load):
             )
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        """The amount, where it is a parameter; either sign."""
-        return () if self.amount is None else (number(self.amount, -np.inf),)
-
-    @property
     def simpler(self) -> tuple[str, None]:
         """No force."""
         return f"force on '{self.node_set}'", None
 
+    @override
     def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
-        """Raise :class:`InputError` where the set is not in the mesh."""
-        del held, displacement
+        """Refuse a node set that the mesh does not have."""
         mesh.node_set(self.node_set)
 
-    def nodal_force(self, grid: Discretisation) -> np.ndarray | None:
-        """Nodal forces (n, 3) in mN, where the force is known."""
-        return self._spread(grid.mesh) if self.amount is None else None
+    @override
+    def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
+        return {self.amount: self._spread(grid.mesh)}
 
-    def nodal_force_per_unit(self, grid: Discretisation) -> dict[str, np.ndarray]:
-        """Nodal forces (n, 3) in mN per unit of the amount."""
-        return {} if self.amount is None else {self.amount: self._spread(grid.mesh)}
-
+    @override
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        """The force, wherever its nodes are."""
-        del fibres
         mesh, amount = grid.mesh, self.amount
         nodes = mesh.node_set(self.node_set)
         if len(edges_between(mesh, nodes)):
@@ -85,8 +74,7 @@ class Force(Load):
             )
         share = self._spread(mesh)[nodes][:, None]
 
-        def force(w: jax.Array, share: jax.Array, values: Values) -> jax.Array:
-            del w
+        def force(_: jax.Array, share: jax.Array, values: Values) -> jax.Array:
             return share if amount is None else values[amount] * share
 
         return LocalForce(nodes[:, None], share, force)
@@ -96,13 +84,9 @@ class Force(Load):
             MN_PER_N * np.asarray(self.resultant, dtype=float)
         )
 
-    def to_json(self) -> list[Any]:
-        """Every field."""
-        return plain_fields(self)
-
 
 def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
-    """Edges (e, 2) of the mesh whose nodes are all among ``nodes`` (k,); (e, 3) quadratic."""
+    """Return the edges (e, 2), quadratic (e, 3), whose nodes are all among ``nodes`` (k,)."""
     among = np.zeros(len(mesh.nodes), dtype=bool)
     among[nodes] = True
     quadratic = mesh.order == 2
@@ -114,17 +98,17 @@ def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
 
 
 def shares(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
-    """Weights (n,) of sum 1 on ``nodes`` (k,), by the length of mesh edges between them.
+    """Return weights (n,) of sum 1 on ``nodes`` (k,), by the length of mesh edges between them.
 
-    Of a quadratic edge, Simpson's: a sixth at each end and two thirds in the middle.
+    Weights of a quadratic edge are Simpson's: a sixth at each end and two thirds in the middle.
     """
     edges = edges_between(mesh, nodes)
-    found = np.zeros(len(mesh.nodes))
+    weights = np.zeros(len(mesh.nodes))
     if not len(edges):
-        found[nodes] = 1.0 / len(nodes)
-        return found
+        weights[nodes] = 1.0 / len(nodes)
+        return weights
     length = np.linalg.norm(mesh.nodes[edges[:, 1]] - mesh.nodes[edges[:, 0]], axis=1)
-    weights = (1 / 6, 1 / 6, 2 / 3) if mesh.order == 2 else (0.5, 0.5)
-    for column, weight in zip(edges.T, weights, strict=True):
-        np.add.at(found, column, weight * length)
-    return found / found.sum()
+    simpson = (1 / 6, 1 / 6, 2 / 3) if mesh.order == 2 else (0.5, 0.5)
+    for column, weight in zip(edges.T, simpson, strict=True):
+        np.add.at(weights, column, weight * length)
+    return weights / weights.sum()

@@ -6,9 +6,9 @@ in :math:`g`, so a body that is turned between measurements needs one force fiel
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, override
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,9 @@ from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.mechanics.kinematics import determinant
 from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.load import Load, nodal_sums
-from emulator.scenes.local_terms import LocalForce, Values
+from emulator.scenes.part import LocalForce, Values
+from emulator.scenes.tissue import Fibres
 
 # (1 g/cm3)(1 m/s2) = 1e-6 kg/mm3 m/s2 = 1e-6 N/mm3 = 1e-3 mN/mm3, and 1 mN/mm2 = 1 kPa.
 _KPA_PER_MM = 1.0e-3
@@ -28,7 +28,9 @@ _KPA_PER_MM = 1.0e-3
 
 @dataclass(frozen=True)
 class Gravity(Load):
-    r"""Dead weight, potential :math:`-\int_\Omega b \cdot u\, dX` with :math:`b = \rho g d`.
+    r"""Dead weight in one direction.
+
+    Its potential is :math:`-\int_\Omega b \cdot u\, dX` with :math:`b = \rho g d`.
 
     Parameters
     ----------
@@ -55,8 +57,9 @@ class Gravity(Load):
         """No weight."""
         return "gravity", None
 
+    @override
     def to_json(self) -> list[Any]:
-        """Kind and body force, the product of density, acceleration and direction."""
+        """Return kind and body force, the product of density, acceleration and direction."""
         return [self.kind, *(float(x) + 0.0 for x in np.round(self.body_force, 12))]
 
     @property
@@ -66,14 +69,13 @@ class Gravity(Load):
         weight = self.density * self.acceleration * _KPA_PER_MM
         return weight * direction / np.linalg.norm(direction)
 
-    def nodal_force(self, grid: Discretisation) -> np.ndarray:
-        """Consistent nodal forces, (n, 3) in mN."""
-        return _nodal_volumes(grid)[:, None] * self.body_force
+    @override
+    def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
+        return {None: _nodal_volumes(grid)[:, None] * self.body_force}
 
+    @override
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        """The weight of the volume at rest."""
-        del fibres
-        return _weight_at_rest(grid, lambda _: self.body_force)
+        return _weight_on_loaded(grid, lambda _: self.body_force)
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class GravityVector(Load):
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """Its three components."""
+        """The three components."""
         return tuple(Quantity(f"{self.parameter}_{axis}", "m/s2", -np.inf) for axis in "xyz")
 
     @property
@@ -104,23 +106,22 @@ class GravityVector(Load):
         """No weight."""
         return "gravity", None
 
-    def nodal_force_per_unit(self, grid: Discretisation) -> dict[str, np.ndarray]:
-        """Consistent nodal forces (n, 3) in mN for 1 m/s2 along each axis."""
+    @override
+    def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
         weight = self.density * _KPA_PER_MM * _nodal_volumes(grid)[:, None]
         return {
             quantity.name: weight * axis
             for quantity, axis in zip(self.quantities, np.eye(3), strict=True)
         }
 
+    @override
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        """The weight of the volume at rest."""
-        del fibres
         weight = self.density * _KPA_PER_MM
 
         def body_force(values: Values) -> jax.Array:
             return weight * jnp.stack([values[quantity.name] for quantity in self.quantities])
 
-        return _weight_at_rest(grid, body_force)
+        return _weight_on_loaded(grid, body_force)
 
 
 def _check_density(kind: str, density: float) -> None:
@@ -128,10 +129,10 @@ def _check_density(kind: str, density: float) -> None:
         raise InputError(f"{kind}: density is {density} g/cm3; it must be 0 or more")
 
 
-def _weight_at_rest(
+def _weight_on_loaded(
     grid: Discretisation, body_force: Callable[[Values], jax.Array | np.ndarray]
 ) -> LocalForce:
-    r"""``body_force`` in kPa/mm of the volume at rest, :math:`\int N_a b \det f\, dx`."""
+    r"""Return ``body_force`` in kPa/mm of the volume at rest, :math:`\int N_a b \det f\, dx`."""
 
     def force(w: jax.Array, data: tuple[jax.Array, jax.Array], values: Values) -> jax.Array:
         gradients, weights = data
@@ -143,5 +144,4 @@ def _weight_at_rest(
 
 
 def _nodal_volumes(grid: Discretisation) -> np.ndarray:
-    volume = grid.weights @ grid.values
-    return nodal_sums(grid.mesh, grid.connectivity, volume)
+    return nodal_sums(grid.mesh, grid.connectivity, grid.weights @ grid.values)

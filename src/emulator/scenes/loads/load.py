@@ -1,9 +1,9 @@
-"""The interface every load implements."""
+"""The interface of loads."""
 
 from __future__ import annotations
 
-from abc import ABC
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -11,27 +11,17 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh
-from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.fibre_angles import Fibres
-from emulator.scenes.identity import plain_fields
-from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
+from emulator.scenes.part import LocalForce, LocalTerm, Part
+from emulator.scenes.tissue import Fibres
 
 
-class Load(ABC):
-    """What deforms a body; a concrete one is a frozen dataclass whose fields a scene file can give.
+@dataclass(frozen=True, eq=False)
+class Load(Part):
+    """A part that deforms the body.
 
-    A load contributes in one of four ways, and overrides the method for it: a dead nodal force, one
-    in proportion to parameters, a potential, or a force that has no potential.
-
-    kind : name in scene files and in :data:`~emulator.scenes.loads.LOADS`.
+    A load contributes in one of three ways, and overrides the method for it: dead nodal forces, a
+    potential, or a force that follows the deformation and has no potential.
     """
-
-    kind: ClassVar[str]
-
-    @property
-    def facet_sets(self) -> tuple[str, ...]:
-        """Facet sets the load acts on; they must be in the mesh."""
-        return ()
 
     @property
     def fibres(self) -> bool:
@@ -39,18 +29,8 @@ class Load(ABC):
         return False
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        """Parameters the load takes from theta or from the scene's constants."""
-        return ()
-
-    @property
     def pressed(self) -> str | None:
-        """Facet set a pressure acts on: a cavity's wall if it encloses a volume; else None."""
-        return None
-
-    @property
-    def simpler(self) -> tuple[str, Load | None] | None:
-        """An effect that can be left out: its name, and the load without it, None for no load."""
+        """The facet set that a pressure acts on, or None."""
         return None
 
     @property
@@ -60,9 +40,9 @@ class Load(ABC):
 
     @property
     def at_held_nodes(self) -> Load:
-        """The load whose force is that of this one where nodes are held, too.
+        """The load whose force is right at prescribed nodes, too.
 
-        A potential is only meant for nodes that move.
+        A potential only has to be right for nodes that are free.
         """
         return self
 
@@ -71,56 +51,61 @@ class Load(ABC):
 
         Parameters
         ----------
-        held, displacement : (n, 3) where the displacement is prescribed, and its value in mm.
+        mesh : the body.
+        held : (n, 3) bool, where the displacement is prescribed.
+        displacement : (n, 3) mm, its prescribed value, for parameters their size per unit.
         """
 
-    def nodal_force(self, grid: Discretisation) -> np.ndarray | None:
-        """Dead nodal force (n, 3) in mN, or None."""
-        return None
+    def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
+        """Return nodal forces (n, 3) that do not follow the deformation.
 
-    def nodal_force_per_unit(self, grid: Discretisation) -> dict[str, np.ndarray]:
-        """Dead nodal force (n, 3) in mN per unit of each parameter that scales one."""
+        The force under a parameter's name is in mN per unit of it, the one under None in mN.
+        """
         return {}
 
     def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm | None:
-        """Potential of a load that follows the deformation, or None.
+        """Return the potential of a load that follows the deformation, or None.
 
-        fibres : of the tissue, None in a scene without. They and the grid's arrays are traced
-        where the body is at rest on a shape that is sought.
+        Parameters
+        ----------
+        grid : the discretised body. Its arrays are traced in unloading, where the stress-free shape
+            is an unknown.
+        fibres : fibres of the tissue, likewise; None in a scene without.
         """
         return None
 
     def force(self, grid: Discretisation) -> LocalForce | None:
-        """Force of a load that follows the deformation and has no potential, or None."""
+        """Return the force of a load that follows the deformation without a potential, or None."""
         return None
 
     def first_piola(
-        self, F: jax.Array, mesh: Mesh, fibres: jax.Array, values: Values
+        self, F: jax.Array, mesh: Mesh, fibres: jax.Array, values: Mapping[str, jax.Array]
     ) -> jax.Array | None:
-        """Stress (m, q, 3, 3) in kPa that it adds to the law's, where F (m, q, 3, 3); or None."""
+        """Return the stress (m, q, 3, 3) in kPa added to the law's at F (m, q, 3, 3), or None."""
         return None
 
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        """Its force on the body whose *loaded* shape is the mesh, of w from there to rest.
+        """Return the force on a body whose *loaded* shape is the mesh, in the inverse problem.
 
-        What is given per volume or area at rest depends on w; what follows the surface does not.
-        Its local displacements are those of w (:mod:`emulator.fem.inverse_motion`). fibres : of the
-        loaded tissue, None in a scene without.
+        The local displacements of the force are those of w, from the loaded to the stress-free
+        shape (:mod:`emulator.fem.inverse_motion`). A force per volume or area of the stress-free
+        body depends on w; one that follows the surface does not.
+
+        Parameters
+        ----------
+        grid : the discretised loaded body.
+        fibres : fibres of the loaded tissue, None in a scene without.
 
         Raises
         ------
         InputError
-            A kind, or a case of it, that bodies cannot be unloaded from.
+            Bodies cannot be unloaded from this load.
         """
         raise InputError(f"a body cannot be unloaded from a load of kind '{self.kind}'")
 
-    def to_json(self) -> list[Any]:
-        """Plain JSON that differs between loads with different effects: every field."""
-        return plain_fields(self)
-
 
 def nodal_sums[A: (jax.Array, np.ndarray)](mesh: Mesh, nodes: np.ndarray, amounts: A) -> A:
-    """Sum of ``amounts`` (k, a) at each of their ``nodes`` (k, a), shape (n,)."""
+    """Return the sum (n,) of ``amounts`` (k, a) at each of their ``nodes`` (k, a)."""
     if isinstance(amounts, np.ndarray):
         return np.bincount(nodes.ravel(), amounts.ravel(), minlength=len(mesh.nodes))
     return jax.ops.segment_sum(amounts.ravel(), nodes.ravel(), len(mesh.nodes))

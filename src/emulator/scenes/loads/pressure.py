@@ -1,33 +1,161 @@
-r"""Pressure on a surface; positive pushes into the tissue.
+r"""Pressures on a surface; positive ones push into the tissue.
 
-Exact for a cavity closed at a rim that does not move: the pressure does work on the volume alone,
+With the normals of the facets pointing out of the tissue and :math:`x = X + u`:
 
-.. math:: \Pi_p = -p\,[V(u) - V(0)], \qquad
-          V = -\frac{1}{3} \int x \cdot n \, da + \text{lid}
+* :class:`CavityPressure`: exact for a cavity that is closed at a rim which does not move. The
+  pressure does work on the volume alone,
 
-with the normals of the facets pointing out of the tissue, into the cavity. The lid is fixed and
-drops out. A rim may also slide in a plane of symmetry through the origin: the cone over the
-opening, from the origin, then has no volume. Elsewhere a pressure that follows the surface has no
-potential: see :mod:`emulator.scenes.loads.follower`.
+  .. math:: \Pi_p = -p\,[V(u) - V(0)], \qquad
+            V = -\frac{1}{3} \int x \cdot n \, da + \text{lid} .
+
+  The lid is fixed and drops out. A rim may also slide in a plane of symmetry through the origin:
+  the cone over the opening, from the origin, then has no volume.
+
+* :class:`FollowerPressure`: on an open patch, by its virtual work,
+
+  .. math::
+      f_a = -p \int N_a(\xi) \,
+          \frac{\partial x}{\partial \xi} \times \frac{\partial x}{\partial \eta} \; d\xi\, d\eta .
+
+  Unless the rim of the patch is fixed, no potential has this force: its tangent is not symmetric,
+  and a scene with it can be simulated but has no energy to train on.
+
+* :class:`DeadPressure`: keeps the direction and the area of the stress-free surface,
+  :math:`\Pi_p = p \int u \cdot N \, dA`: the pressure to first order in the displacement.
+
+* :class:`PublishedPressure`: the work of the released code, for reproducing it,
+
+  .. math:: \Pi_p = p \int u \cdot \text{cof}(F) N \, dA ,
+
+  differentiated through :math:`\text{cof}(F)` too. It is no follower pressure: on the released
+  ventricle it acts like a pressure 1.39 times larger.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, override
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.discretisation import Discretisation
-from emulator.geometry.facets import cone_volume, rim
+from emulator.geometry.discretisation import Discretisation, FacetRule, facet_rule
+from emulator.geometry.facets import area_vectors, cone_volume, nodal_area_vectors, rim
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.fibre_angles import Fibres
-from emulator.scenes.loads.dead_pressure import DeadPressure, at_rest
-from emulator.scenes.loads.follower import FollowerPressure
-from emulator.scenes.loads.surface_pressure import SurfacePressure
-from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
+from emulator.mechanics.kinematics import cofactor
+from emulator.mechanics.laws.law import Quantity
+from emulator.scenes.loads.load import Load, nodal_sums
+from emulator.scenes.part import LocalForce, LocalTerm, Values
+from emulator.scenes.tissue import Fibres
+
+KPA_PER_MMHG = 0.133322
+
+
+@dataclass(frozen=True)
+class SurfacePressure(Load):
+    """A pressure on a facet set; subclasses define its virtual work.
+
+    Parameters
+    ----------
+    facet_set : the surface it acts on.
+    pressure : kPa; without it, the pressure is a parameter of the scene.
+    parameter : name of that parameter; give each of several pressures its own.
+    """
+
+    magnitude: ClassVar[Quantity] = Quantity(
+        "pressure", "kPa", -np.inf, hint=f"1 mmHg = {KPA_PER_MMHG} kPa"
+    )
+
+    facet_set: str
+    pressure: float | None = None
+    parameter: str = "pressure"
+
+    def __post_init__(self) -> None:
+        if self.pressure is not None and not np.isfinite(self.pressure):
+            raise InputError(f"pressure on '{self.facet_set}' is {self.pressure} kPa")
+
+    @property
+    def pressed(self) -> str:
+        """The facet set it acts on."""
+        return self.facet_set
+
+    def _dead(self) -> tuple[str, DeadPressure]:
+        """Return the effect that the pressure follows the surface, and the pressure without it."""
+        dead = DeadPressure(self.facet_set, self.pressure, self.parameter)
+        return f"pressure that follows '{self.facet_set}'", dead
+
+    def _facets(self, grid: Discretisation) -> tuple[np.ndarray, np.ndarray, FacetRule]:
+        """Return facets (k, a), their nodes (k, a, 3), and a rule for N_a times an area vector."""
+        mesh = grid.mesh
+        facets = mesh.facet_set(self.facet_set)
+        degree = 1 if mesh.order == 1 else 4
+        return facets, mesh.nodes[facets], facet_rule(mesh.order, degree)
+
+
+@dataclass(frozen=True)
+class DeadPressure(SurfacePressure):
+    """Pressure on the surface at rest; positive pushes into the tissue."""
+
+    kind: ClassVar[str] = "dead_pressure"
+
+    @override
+    def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
+        facets, corners, rule = self._facets(grid)
+        areas = -nodal_area_vectors(corners, rule)
+        xp = areas.__array_namespace__()
+        per_kpa = xp.stack([nodal_sums(grid.mesh, facets, areas[..., i]) for i in range(3)], axis=1)
+        known = self.pressure
+        return {self.parameter: per_kpa} if known is None else {None: known * per_kpa}
+
+    @override
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+        facets, corners, rule = self._facets(grid)
+
+        def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
+            return -self.value(values) * nodal_area_vectors(corners + w, rule)
+
+        return LocalForce(facets, corners, force)
+
+
+@dataclass(frozen=True)
+class FollowerPressure(SurfacePressure):
+    """Pressure on a patch whose rim may move; positive pushes into the tissue."""
+
+    kind: ClassVar[str] = "follower_pressure"
+
+    @property
+    def simpler(self) -> tuple[str, DeadPressure]:
+        """The pressure on the patch as it is at rest."""
+        return self._dead()
+
+    @property
+    def has_potential(self) -> bool:
+        """No: the tangent of the force is not symmetric."""
+        return False
+
+    @override
+    def force(self, grid: Discretisation) -> LocalForce:
+        facets, corners, rule = self._facets(grid)
+
+        def force(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
+            normals = area_vectors(corners + u, rule)
+            return -self.value(values) * jnp.einsum(
+                "q,qa,qi->ai", rule.weights, rule.values, normals
+            )
+
+        return LocalForce(facets, corners, force)
+
+    @override
+    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+        following = self.force(grid)
+
+        def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
+            return following.force(jnp.zeros_like(w), corners, values)
+
+        return LocalForce(following.nodes, following.data, force)
 
 
 @dataclass(frozen=True)
@@ -39,29 +167,29 @@ class CavityPressure(SurfacePressure):
     @property
     def simpler(self) -> tuple[str, DeadPressure]:
         """The pressure on the wall as it is at rest."""
-        return at_rest(self)
+        return self._dead()
 
     @property
     def at_held_nodes(self) -> FollowerPressure:
-        """The pressure on the wall alone: the lid's part in ``V`` acts on the held rim."""
+        """The pressure on the wall alone: the part of the lid in ``V`` acts on the fixed rim."""
         return FollowerPressure(self.facet_set, self.pressure, self.parameter)
 
+    @override
     def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
-        """Refuse a cavity whose rim is neither held nor slides in a plane through the origin."""
+        """Refuse a cavity whose rim is neither fixed nor slides in a plane through the origin."""
         edges = rim(mesh.facet_set(self.facet_set))
-        stays = held[edges]  # (e, 2 or 3, 3)
-        there = np.where(stays, mesh.nodes[edges] + displacement[edges], np.nan)
-        in_symmetry_plane = (np.abs(there) <= 1e-9 * mesh.size).all(axis=1).any(axis=1)
-        loose = np.unique(edges[~(stays.all(axis=(1, 2)) | in_symmetry_plane)])
+        fixed = held[edges]  # (e, 2 or 3, 3)
+        place = np.where(fixed, mesh.nodes[edges] + displacement[edges], np.nan)
+        in_symmetry_plane = (np.abs(place) <= 1e-9 * mesh.size).all(axis=1).any(axis=1)
+        loose = np.unique(edges[~(fixed.all(axis=(1, 2)) | in_symmetry_plane)])
         if loose.size:
             raise InputError(
                 f"cavity '{self.facet_set}': rim node {loose[0]} ({loose.size} such) is not held, "
                 "so -p V is not the potential of its pressure; hold the rim or use FollowerPressure"
             )
 
+    @override
     def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
-        """The potential ``-p [V(u) - V(0)]``."""
-        del fibres
         facets = grid.mesh.facet_set(self.facet_set)
 
         def energy(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
@@ -69,7 +197,40 @@ class CavityPressure(SurfacePressure):
 
         return LocalTerm(facets, grid.mesh.nodes[facets], energy)
 
+    @override
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        """The force on the known wall, whatever the shape at rest."""
-        del fibres
         return self.at_held_nodes.on_loaded(grid)
+
+
+@dataclass(frozen=True)
+class PublishedPressure(SurfacePressure):
+    """The released pressure work; ``F`` of each facet is that of the element behind it."""
+
+    kind: ClassVar[str] = "published_pressure"
+
+    @override
+    def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
+        """Refuse quadratic tetrahedra, on which the released work is not defined."""
+        if mesh.order != 1:
+            raise InputError(
+                f"pressure on '{self.facet_set}': the published work is defined on linear "
+                "tetrahedra; use CavityPressure on quadratic ones"
+            )
+
+    @override
+    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
+        mesh = grid.mesh
+        facets = mesh.facet_set(self.facet_set)
+        behind = mesh.elements_behind(facets)
+        corner = mesh.nodes[facets]
+        area = 0.5 * np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        nodes = mesh.elements[behind]
+        on_facet = (nodes[:, :, None] == facets[:, None, :]).any(axis=2)
+        data = (area, on_facet / 3.0, grid.gradients[behind, 0])
+
+        def energy(u: jax.Array, data: Any, values: Values) -> jax.Array:
+            area, mean, gradients = data
+            F = jnp.eye(3, dtype=u.dtype) + u.T @ gradients
+            return self.value(values) * jnp.vdot(mean @ u, cofactor(F) @ area)
+
+        return LocalTerm(nodes, data, energy)

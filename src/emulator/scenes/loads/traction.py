@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, override
 
 import jax
 import numpy as np
@@ -11,19 +12,21 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import nodal_areas
-from emulator.scenes.fibre_angles import Fibres
 from emulator.scenes.loads.load import Load, nodal_sums
-from emulator.scenes.local_terms import LocalForce, Values
+from emulator.scenes.part import LocalForce, Values
+from emulator.scenes.tissue import Fibres
 
 
 @dataclass(frozen=True)
 class Traction(Load):
-    r"""Dead traction, potential :math:`-\int t \cdot u\, dA` over the reference surface.
+    r"""Dead traction, a force per reference area that keeps its direction.
+
+    Its potential is :math:`-\int t \cdot u\, dA` over the reference surface.
 
     Parameters
     ----------
     facet_set : the surface it acts on.
-    traction : force per reference area in kPa, three components; it keeps its direction.
+    traction : three components in kPa.
     """
 
     kind: ClassVar[str] = "traction"
@@ -37,27 +40,19 @@ class Traction(Load):
                 f"traction on '{self.facet_set}' is {self.traction}; give 3 finite numbers in kPa"
             )
 
-    @property
-    def facet_sets(self) -> tuple[str, ...]:
-        """The facet set it acts on."""
-        return (self.facet_set,)
-
-    def nodal_force(self, grid: Discretisation) -> np.ndarray:
-        """Consistent nodal forces, (n, 3) in mN."""
+    @override
+    def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
         mesh = grid.mesh
         facets = mesh.facet_set(self.facet_set)
-        rule = facet_rule(mesh.order, 4)
-        area = nodal_areas(mesh.nodes[facets], rule)
-        return nodal_sums(mesh, facets, area)[:, None] * np.asarray(self.traction, dtype=float)
+        area = nodal_sums(mesh, facets, nodal_areas(mesh.nodes[facets], facet_rule(mesh.order, 4)))
+        return {None: area[:, None] * np.asarray(self.traction, dtype=float)}
 
+    @override
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        """The force by the surface at rest, ``x + w``."""
-        del fibres
         mesh = grid.mesh
         facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 4)
 
-        def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
-            del values
+        def force(w: jax.Array, corners: jax.Array, _: Values) -> jax.Array:
             return nodal_areas(corners + w, rule)[:, None] * np.asarray(self.traction, dtype=float)
 
         return LocalForce(facets, mesh.nodes[facets], force)

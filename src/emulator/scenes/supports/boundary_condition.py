@@ -1,24 +1,29 @@
-"""The interface every support implements."""
+"""The interface of supports, and the rigid motions that they leave to a body."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
-from emulator.geometry.mesh import Mesh
-from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.local_terms import LocalForce, LocalTerm
+from emulator.geometry.mesh import Mesh, parts
+from emulator.scenes.part import LocalForce, LocalTerm, Part
 
 
 class Held(NamedTuple):
-    """Prescribed displacements.
+    """Prescribed displacements of one support.
 
-    where : name for error messages. nodes : (k,). displacement : (k, 3) mm. axes : held ones.
-    amount : parameter that the displacement is multiplied by, or None.
+    where : name of the node set, for error messages.
+    nodes : their nodes (k,).
+    displacement : (k, 3) in mm; with ``amount``, per unit of that parameter.
+    axes : numbers of the components that are prescribed.
+    amount : name of the parameter that multiplies the displacement, or None.
     """
 
     where: str
@@ -35,57 +40,79 @@ class Resisted(NamedTuple):
     directions: np.ndarray
 
 
-class BoundaryCondition(ABC):
-    """A support: it prescribes displacements, or resists them with springs.
-
-    kind : name in scene files and in :data:`~emulator.scenes.supports.SUPPORTS`.
-    """
-
-    kind: ClassVar[str]
-
-    @property
-    def facet_sets(self) -> tuple[str, ...]:
-        """Facet sets the support acts on; they must be in the mesh."""
-        return ()
-
-    @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        """Parameters the support takes from theta or from the scene's constants."""
-        return ()
-
-    @property
-    def simpler(self) -> tuple[str, BoundaryCondition | None] | None:
-        """An effect that can be left out: its name, and the support without it, None for none."""
-        return None
+@dataclass(frozen=True, eq=False)
+class BoundaryCondition(Part):
+    """A part that prescribes displacements, or resists them with springs."""
 
     def held(self, mesh: Mesh) -> Held | None:
-        """Prescribed displacements, or None."""
+        """Return prescribed displacements, or None."""
         return None
 
     def term(self, grid: Discretisation) -> LocalTerm | None:
-        """Potential of its springs, or None."""
+        """Return the potential of the springs, or None."""
         return None
 
     def on_loaded(self, grid: Discretisation) -> LocalForce | None:
-        """Force of its springs on the body whose *loaded* shape is the mesh, of w to rest; or None.
+        """Return the force of the springs on a body whose *loaded* shape is the mesh, or None.
 
         See :meth:`emulator.scenes.loads.load.Load.on_loaded`.
         """
         return None
 
-    def on_finer(self, mesh: Mesh, moved: Mapping[str | None, np.ndarray]) -> BoundaryCondition:
-        """The support on a finer ``mesh``.
+    def on_finer(
+        self, mesh: Mesh, displacements: Mapping[str | None, np.ndarray]
+    ) -> BoundaryCondition:
+        """Return the support on a finer mesh.
 
-        ``moved`` : displacement (f, 3) mm of its held nodes, the fixed one under None, and per unit
-        of each amount under the amount's name.
+        Parameters
+        ----------
+        mesh : the finer mesh.
+        displacements : (f, 3) mm at its nodes, the fixed one under None, and one per unit of each
+            parameter under the parameter's name.
         """
-        del mesh, moved
         return self
 
     @abstractmethod
     def resisted(self, mesh: Mesh) -> Resisted:
-        """Points, and directions at them, in which a rigid motion of the body is resisted."""
+        """Return points, and directions in which a rigid motion of the body is resisted there."""
 
-    def to_json(self) -> list[Any] | None:
-        """Plain JSON that identifies the springs; None where :meth:`held` describes the support."""
-        return None
+
+def check_motions(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> None:
+    """Refuse supports that let a connected part of the body move or turn."""
+    resisted = [support.resisted(mesh) for support in supports]
+    points = np.concatenate([each.points for each in resisted])
+    directions = np.concatenate([each.directions for each in resisted])
+    part = parts(mesh.elements, len(mesh.nodes))
+    owner = part[cKDTree(mesh.nodes).query(points)[1]]
+    for k in range(part.max() + 1):
+        free = _free_motions(points[owner == k], directions[owner == k])
+        if free:
+            which = _named(mesh.nodes, part, k) if part.any() else "its supports leave"
+            raise InputError(
+                f"{which} {free} of the 6 rigid motions free, the body could move "
+                "or turn; hold more nodes or components"
+            )
+
+
+def _named(nodes: np.ndarray, part: np.ndarray, k: int) -> str:
+    inside = nodes[part == k]
+    x, y, z = inside.mean(axis=0)
+    return (
+        f"the mesh has {part.max() + 1} parts, and supports leave the one of {len(inside)} nodes "
+        f"about ({x:.3g}, {y:.3g}, {z:.3g}) mm"
+    )
+
+
+def _free_motions(points: np.ndarray, directions: np.ndarray) -> int:
+    """Return how many rigid motions ``points`` (k, 3), fixed along ``directions`` (k, 3), leave.
+
+    A small rigid motion ``a + w x X`` moves a point along its direction by ``a . d + w . (X x d)``;
+    the rank of these rows is the number of motions that are resisted.
+    """
+    if not len(points):
+        return 6
+    centred = points - points.mean(axis=0)
+    size = np.linalg.norm(np.ptp(points, axis=0))
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    rows = np.hstack([unit, np.cross(centred, unit) / (size if size > 0.0 else 1.0)])
+    return 6 - int(np.linalg.matrix_rank(rows.T @ rows, tol=1e-12 * len(rows), hermitian=True))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, override
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,7 @@ from emulator.geometry.discretisation import Discretisation, FacetRule, facet_ru
 from emulator.geometry.facets import area_vectors
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.identity import plain_fields
-from emulator.scenes.local_terms import LocalForce, LocalTerm, Values
+from emulator.scenes.part import LocalForce, LocalTerm, Values
 from emulator.scenes.supports.boundary_condition import BoundaryCondition, Resisted
 
 
@@ -34,12 +33,13 @@ class ElasticSupport(BoundaryCondition):
     Parameters
     ----------
     facet_set : the surface they act on.
-    stiffness : k in kPa/mm, above 0, or ``None`` to make it a parameter of the scene.
+    stiffness : k in kPa/mm, above 0; without it, the stiffness is a parameter of the scene.
     direction : ``all``, or ``normal`` to let the surface slide along itself.
     parameter : name of that parameter; give each of several supports its own.
     """
 
     kind: ClassVar[str] = "elastic"
+    magnitude: ClassVar[Quantity] = Quantity("stiffness", "kPa/mm")
 
     facet_set: str
     stiffness: float | None = None
@@ -59,36 +59,29 @@ class ElasticSupport(BoundaryCondition):
             )
 
     @property
-    def facet_sets(self) -> tuple[str, ...]:
-        """The facet set it acts on."""
-        return (self.facet_set,)
-
-    @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        """The stiffness, where it is a parameter."""
-        return () if self.stiffness is not None else (Quantity(self.parameter, "kPa/mm"),)
-
-    @property
     def simpler(self) -> tuple[str, None]:
         """No springs."""
         way = "springs on" if self.direction == "all" else "normal springs on"
         return f"{way} '{self.facet_set}'", None
 
-    def to_json(self) -> list[Any]:
-        """Every field; without the parameter's name, the last, where the stiffness is known."""
-        every = plain_fields(self)
+    @override
+    def to_json(self) -> list[Any] | None:
+        """Return kind and fields, without ``parameter`` where the stiffness is known."""
+        every = super().to_json() or []
         return every if self.stiffness is None else every[:-1]
 
+    @override
     def term(self, grid: Discretisation) -> LocalTerm:
-        """Energy of the springs, facet by facet."""
+        """Return the energy of the springs, facet by facet."""
         mesh = grid.mesh
         facets = mesh.facet_set(self.facet_set)
         rule = facet_rule(mesh.order, 2 * mesh.order)  # the degree of |u|^2
         normals = area_vectors(mesh.nodes[facets], rule)  # (k, q, 3)
         return LocalTerm(facets, normals, self._energy(rule))
 
+    @override
     def on_loaded(self, grid: Discretisation) -> LocalForce:
-        """Force of springs that are at rest with the body, by the surface at rest, ``x + w``."""
+        """Return the force of springs at rest with the body, on the surface at rest, ``x + w``."""
         mesh = grid.mesh
         facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 2 * mesh.order)
         energy = self._energy(rule)
@@ -99,7 +92,7 @@ class ElasticSupport(BoundaryCondition):
         return LocalForce(facets, mesh.nodes[facets], force)
 
     def _energy(self, rule: FacetRule) -> Callable[[jax.Array, jax.Array, Values], jax.Array]:
-        """Energy () in mN mm of a facet with area vectors (q, 3) at rest."""
+        """Return the energy () in mN mm of a facet with area vectors (q, 3) at rest."""
 
         def energy(u: jax.Array, normals: jax.Array, values: Values) -> jax.Array:
             areas = jnp.sqrt(jnp.sum(normals**2, axis=1))
@@ -108,13 +101,13 @@ class ElasticSupport(BoundaryCondition):
                 squared = (jnp.sum(at_points * normals, axis=1) / areas) ** 2
             else:
                 squared = jnp.sum(at_points**2, axis=1)
-            k = values[self.parameter] if self.stiffness is None else self.stiffness
-            return 0.5 * k * jnp.sum(rule.weights * areas * squared)
+            return 0.5 * self.value(values) * jnp.sum(rule.weights * areas * squared)
 
         return energy
 
+    @override
     def resisted(self, mesh: Mesh) -> Resisted:
-        """The corners of every facet, along all axes or along its normal."""
+        """Return the corners of every facet, along all axes or along the facet's normal."""
         points = mesh.nodes[mesh.facet_set(self.facet_set)][:, :3]
         normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
         if self.direction == "normal":

@@ -240,7 +240,7 @@ def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNet
 
 def physics_of(scene: Scene) -> dict[str, Any]:
     """What a network can only know one of: law, constants, kinds of loads and supports."""
-    loads = sorted(load.to_json()[0] for load in scene.loads)
+    loads = sorted(load.kind for load in scene.loads)
     regions = scene.regions is not None
     return {**scene.identity.description, "loads": loads, "regions": regions}
 

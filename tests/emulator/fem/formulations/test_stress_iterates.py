@@ -17,8 +17,8 @@ from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Law, modulus
 from emulator.scenes import Scene, Support
-from emulator.scenes.left_ventricle import MYOCARDIUM
-from emulator.scenes.regions import Tissue
+from emulator.scenes.built_in.ventricles import MYOCARDIUM
+from emulator.scenes.tissue import Tissue
 from scene_support import block
 
 

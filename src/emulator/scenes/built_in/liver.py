@@ -6,13 +6,13 @@ from typing import Any
 
 from emulator.geometry.generators.organ import organ
 from emulator.mechanics.laws import find_law
+from emulator.scenes.built_in.resolution import resolved
 from emulator.scenes.loads import Gravity
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.resolution import resolved
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import ElasticSupport, Support
 
-SIZES: dict[int, dict[str, Any]] = {
+_SIZES: dict[int, dict[str, Any]] = {
     1: {"shells": 6, "clustering": 0.0, "ligament_shells": 6, "ligament": None},
     2: {"shells": 5, "clustering": 0.5, "ligament_shells": 5, "ligament": 2.0},
 }
@@ -43,7 +43,7 @@ def liver(
         (six shells of quadratic elements are 0.5 mm off).
     """
     sizes = {"shells": shells, "clustering": clustering, "ligament_shells": ligament_shells}
-    made = resolved(SIZES, order, **sizes, ligament=ligament)
+    made = resolved(_SIZES, order, **sizes, ligament=ligament)
     stiffness = made.pop("ligament")
     held = Support("ligament") if stiffness is None else ElasticSupport("ligament", stiffness)
     return Scene(

@@ -6,24 +6,12 @@ import numpy as np
 
 from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
+from emulator.scenes.built_in.resolution import resolved
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.resolution import resolved
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports import Support
 
-
-def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
-    """Displacement (k, 3) that turns ``points`` (k, 3) about the x axis through ``centre`` (3,)."""
-    angle = np.deg2rad(degrees)
-    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    displacement = np.zeros_like(points)
-    arm = points[:, 1:] - centre[1:]
-    displacement[:, 1:] = arm @ rotation.T - arm
-    return displacement
-
-
-SIZES = {1: {"cells": 6}, 2: {"cells": 4}}
-"""Cells along each edge by default."""
+_SIZES = {1: {"cells": 6}, 2: {"cells": 4}}  # cells along each edge by default
 
 
 def twisting_cube(
@@ -41,7 +29,7 @@ def twisting_cube(
     degrees : angle of the rotation whose half chord is prescribed.
     order : of the elements; 1 as published.
     """
-    count = resolved(SIZES, order, cells=cells)["cells"]
+    count = resolved(_SIZES, order, cells=cells)["cells"]
     mesh = box((edge,) * 3, (count,) * 3, order)
     right = mesh.nodes[mesh.node_set("right")]
     displacement = 0.5 * twist(right, np.full(3, edge / 2.0), degrees)
@@ -62,3 +50,20 @@ def twisting_cube(
             "order": order,
         },
     )
+
+
+def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
+    """Return the displacement (k, 3) of a rigid rotation of ``points`` (k, 3).
+
+    Parameters
+    ----------
+    points : coordinates in mm.
+    centre : a point (3,) on the axis of rotation, which is parallel to x.
+    degrees : angle of rotation.
+    """
+    angle = np.deg2rad(degrees)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    displacement = np.zeros_like(points)
+    arm = points[:, 1:] - centre[1:]
+    displacement[:, 1:] = arm @ rotation.T - arm
+    return displacement
