@@ -33,7 +33,7 @@ from calibrate.certificate.estimates import Tests, evidence_of
 from calibrate.certificate.mesh import MOST_RUNS, mesh_change
 from calibrate.certificate.pool import MOST_TEMPERED, Kernels, Pool, key_from, tempered
 from calibrate.certificate.predictive import Correction, Predictive
-from calibrate.certificate.runs import Ends, Runs, Solver, correction_from, descend
+from calibrate.certificate.runs import Exploration, Runs, Solver, correction_from, descend
 from calibrate.certificate.verdict import Certificate, judge
 from calibrate.posterior import Posterior
 from calibrate.posterior.tree import make_tree
@@ -114,15 +114,8 @@ def examine(
         it, the sampler has solved FEM at the draws already, or the scheduler does not answer.
     """
     _refuse_fem_draws(posterior)
-    count = _FEM_RUNS if draws is None else draws
-    if count < _FEWEST:
-        raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
-    if mesh is not None and not 0 <= mesh <= MOST_RUNS:
-        raise InputError(f"certify: {mesh} solves on the finer mesh; give 0 to {MOST_RUNS}")
+    count, most = _checked_counts(draws, at_most, mesh)
     predictive = Predictive(posterior.model, posterior.data)
-    most = count if at_most is None else at_most
-    if most < count:
-        raise InputError(f"certify: at most {most} FEM runs, but {count} to begin with")
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
     # More threads than one for small matrices oversubscribe the cores: twice the time.
@@ -135,11 +128,12 @@ def examine(
         at_draws, first = _first_runs(solver, z, count, rng)
         training, total = first.runs, count
         while True:
-            training, pool = _train(solver, z, Ends(training, first.ends), count, most, rng)
+            explored = first._replace(runs=training)
+            training, pool = _train(solver, z, explored, count, most, rng)
             rows, log_drawn = pool.tests(total - len(training.z), rng)
             tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
             runs = Runs.joined([training, tests.runs])
-            evidence = evidence_of(posterior, at_draws, training, tests, len(first.ends), rng)
+            evidence = evidence_of(posterior, at_draws, training, tests, len(first.modes), rng)
             count = _further_runs(total, most)
             if judge(evidence).verdict != "undecided" or not count:
                 break
@@ -181,6 +175,19 @@ def certify(
     return check.certificate
 
 
+def _checked_counts(draws: int | None, at_most: int | None, mesh: int | None) -> tuple[int, int]:
+    """Return the numbers of FEM runs, to begin with and at most."""
+    count = _FEM_RUNS if draws is None else draws
+    if count < _FEWEST:
+        raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
+    if mesh is not None and not 0 <= mesh <= MOST_RUNS:
+        raise InputError(f"certify: {mesh} solves on the finer mesh; give 0 to {MOST_RUNS}")
+    most = count if at_most is None else at_most
+    if most < count:
+        raise InputError(f"certify: at most {most} FEM runs, but {count} to begin with")
+    return count, most
+
+
 def _refuse_fem_draws(posterior: Posterior) -> None:
     sampler = posterior.tree.attrs.get("sampler")
     if sampler in SAMPLERS and SAMPLERS[sampler].solves_fem:
@@ -191,8 +198,8 @@ def _refuse_fem_draws(posterior: Posterior) -> None:
 
 def _first_runs(
     solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[Runs, Ends]:
-    """Return FEM at draws, and all runs that any correction needs with the ends of descents.
+) -> tuple[Runs, Exploration]:
+    """Return FEM at draws, and all runs that any correction needs with further modes of FEM.
 
     The numbers of runs are in proportion to ``count``.
     """
@@ -209,23 +216,29 @@ def _first_runs(
     most = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
     descents = descend(solver, at_prior, at_draws, z, most, rng)
     runs = Runs.joined([at_draws, around, at_prior, descents.runs])
-    return at_draws, Ends(runs, descents.ends)
+    return at_draws, descents._replace(runs=runs)
 
 
 def _train(
-    solver: Solver, z: np.ndarray, first: Ends, count: int, most: int, rng: np.random.Generator
+    solver: Solver,
+    z: np.ndarray,
+    explored: Exploration,
+    count: int,
+    most: int,
+    rng: np.random.Generator,
 ) -> tuple[Runs, Pool]:
     """Return all training runs, and the pool under the correction fitted to them.
 
     Parameters
     ----------
-    z : the draws (s, p). first : the runs to begin with, and points around further modes of FEM.
+    z : the draws (s, p).
+    explored : the earlier runs, and points around further modes of FEM.
     count : the number of runs, of which adaptive ones are a share.
     most : the largest number of runs of the whole check.
     """
-    predictive, runs = solver.predictive, first.runs
+    predictive, runs = solver.predictive, explored.runs
     correction = correction_from(runs, predictive, most)
-    pool = Pool.search(predictive, correction, z, first.ends, rng)
+    pool = Pool.search(predictive, correction, z, explored.modes, rng)
     for size in _rounds(max(round(_ADAPTIVE * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():

@@ -120,7 +120,7 @@ def evidence_of(
     at_draws: Runs,
     training: Runs,
     tests: Tests,
-    ends: int,
+    modes: int,
     rng: np.random.Generator,
 ) -> Evidence:
     """Return all figures but those of a finer mesh.
@@ -129,7 +129,7 @@ def evidence_of(
     ----------
     at_draws : FEM at draws of the posterior, a part of ``training``.
     training : the runs that the correction of the pool was fitted to.
-    ends : the number of further modes of FEM that descents have found.
+    modes : the number of further modes of FEM that descents have found.
     """
     pool, figures = tests.pool, figures_of(posterior, tests)
     missed = missed_by(tests, Runs.joined([training, tests.runs]))
@@ -138,7 +138,7 @@ def evidence_of(
         *figures,
         sampling_of(posterior),
         physics_of(at_draws, training, tests),
-        tail_of(tests, missed, ends),
+        tail_of(tests, missed, modes),
         misfits(pool.predictive, pool.correction, z, key_from(rng)),
     )
 
@@ -287,14 +287,14 @@ def missed_by(tests: Tests, runs: Runs) -> int:
     return int(np.sum(unforeseen & ~(log_expected >= np.log(-np.log1p(-_MET)))))
 
 
-def tail_of(tests: Tests, missed: int, ends: int = 0) -> Tail:
+def tail_of(tests: Tests, missed: int, modes: int = 0) -> Tail:
     """Return the tail of FEM's weights, and the spread of their log ratios to the map's."""
     log_fem, log_map = tests.log_fem, tests.log_corrected
     threshold = float(min(1.0 - 1.0 / np.log10(len(log_fem)), 0.7))  # Vehtari et al. 2024, Eq. 13
     points = effective(tests.pool.corrected)
     both = np.isfinite(log_fem) & np.isfinite(log_map)
     if not both.any():
-        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, points, missed, ends)
+        return Tail(np.inf, threshold, 0.0, np.inf, np.inf, points, missed, modes)
     weights = normalised(log_fem)
     share = normalised(np.where(both, log_map, -np.inf))[both]
     ratio = (log_fem - log_map)[both]
@@ -306,7 +306,7 @@ def tail_of(tests: Tests, missed: int, ends: int = 0) -> Tail:
         float(np.sqrt(share @ (ratio - share @ ratio) ** 2)),
         points,
         missed,
-        ends,
+        modes,
     )
 
 

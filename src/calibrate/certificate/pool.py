@@ -149,12 +149,12 @@ class Pool:
         predictive: Predictive,
         correction: Correction,
         draws: np.ndarray,
-        ends: tuple[np.ndarray, ...],
+        modes: tuple[np.ndarray, ...],
         rng: np.random.Generator,
     ) -> Pool:
         """Return a pool that covers the draws (s, p) of z, and where the prior leads to.
 
-        ends : points around each further mode of FEM.
+        modes : points around each further mode of FEM.
         """
         z = predictive.prior_draws(key_from(rng), _PRIOR)
         at = predictive.evaluate(z, correction)
@@ -166,7 +166,7 @@ class Pool:
         pool = replace(pool, near=len(pool.proposals))
         pool = pool.extended(Kernels.following(draws, rng), _NEAR, rng)
         pool = pool.extended(Kernels.surrounding(draws, rng), _WIDE, rng)
-        for points in ends:
+        for points in modes:
             pool = pool.extended(Kernels.following(points, rng), _STEP, rng)
         return pool.polished(rng)
 

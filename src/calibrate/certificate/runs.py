@@ -148,11 +148,11 @@ def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction
     return fit_correction(x[usable], errors, predictive.scales, rows, likely)
 
 
-class Ends(NamedTuple):
-    """The FEM runs of descents, and points (_, p) around each end that FEM finds likely."""
+class Exploration(NamedTuple):
+    """FEM runs away from the draws, and points (_, p) around each further mode of FEM."""
 
     runs: Runs
-    ends: tuple[np.ndarray, ...]
+    modes: tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +203,7 @@ def descend(
     draws: np.ndarray,
     count: int,
     rng: np.random.Generator,
-) -> Ends:
+) -> Exploration:
     """Search modes of FEM's posterior away from the draws, with at most ``count`` FEM runs.
 
     starts : runs with slopes, at which descents begin.
@@ -232,7 +232,7 @@ def descend(
     points = {k: d.z for k, d in descents.items() if d.log_posterior > least}
     ends = [descents[k] for k in known.outside(points)]
     runs = Runs.joined(parts) if parts else starts.first(0)
-    return Ends(runs, _points_around(ends, predictive.prior_sd, rng))
+    return Exploration(runs, _points_around(ends, predictive.prior_sd, rng))
 
 
 def _points_around(

@@ -59,8 +59,8 @@ def test_descents_end_at_the_mode_that_the_map_hides(fem, posterior):
         starts = z[:1] + np.array([[0.0, 2.2], [1.0, 1.9], [-0.5, 3.0]])  # lam, mu
         found = descend(solver, solver(starts, slopes=True), solver(z[:1]), z, 12, rng)
     assert len(found.runs.z) <= 12
-    assert len(found.ends) == 1
-    ends = predictive.constrain(found.ends[0])
+    assert len(found.modes) == 1
+    ends = predictive.constrain(found.modes[0])
     mean = {name: values.mean() for name, values in posterior.draws().items()}
     assert abs(ends["mu"].mean() - (150.0 - mean["mu"])) < 1.0
     assert abs(ends["lam"].mean() - mean["lam"]) < 1.0
