@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,14 @@ PACKAGES = (
     "sparsax",
     "arviz",
 )
+
+
+def as_attributes(values: Mapping[str, Any]) -> dict[str, str | int | float]:
+    """Return the attributes of a netCDF file: text and numbers as they are, all else as JSON."""
+    return {
+        name: value if isinstance(value, str | int | float) else json.dumps(value)
+        for name, value in values.items()
+    }
 
 
 def versions() -> dict[str, str]:

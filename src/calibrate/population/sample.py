@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -20,9 +18,9 @@ from calibrate.population.model import PopulationModel, population_model, to_sca
 from calibrate.population.posterior import ALONE, Hierarchy, make_tree, tree_of_alone
 from calibrate.posterior import sample
 from calibrate.posterior.posterior import describe_distribution
-from calibrate.provenance import versions
+from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import NUTSOptions, check_options
-from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.samplers.checkpoint import Checkpoint, identity_of
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
@@ -115,7 +113,13 @@ def sample_population(
     information = _information(model, by_member, data)
     density = density_of_population(model)
     provenance = _provenance(model, options, sampler, seed)
-    state = Checkpoint(checkpoint, _identity(provenance, data, by_member))
+    arrays = {
+        f"{kind} {member} {name}": values
+        for kind, members in (("data", data), ("alone", by_member))
+        for member, named in members.items()
+        for name, values in named.items()
+    }
+    state = Checkpoint(checkpoint, identity_of(provenance, arrays))
     conditions = Conditions(dict(data), information)
     draws = NUTS.sample(density, conditions, options, seed, Context(progress, state))
     key = jax.random.fold_in(jax.random.key(seed), _NEW)
@@ -123,23 +127,9 @@ def sample_population(
     values = density.constrain(flat, information)
     tree = make_tree(model, values, draws.z.shape[:2], draws.statistics, key)
     tree[ALONE] = tree_of_alone(by_member)
-    for name, value in provenance.items():
-        tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
+    tree.attrs.update(as_attributes(provenance))
     state.remove()
     return Hierarchy(tree)
-
-
-def _identity(
-    provenance: Mapping[str, Any], data: Mapping[str, Data], alone: Alone
-) -> dict[str, str]:
-    """Return what a run depends on: its provenance, and a hash of data and members' draws."""
-    digest = hashlib.sha256()
-    for member in sorted(alone):
-        for values in (data.get(member, {}), alone[member]):
-            for name in sorted(values):
-                digest.update(f"{member} {name}".encode() + np.asarray(values[name]).tobytes())
-    described = {name: json.dumps(value) for name, value in provenance.items()}
-    return {**described, "data": digest.hexdigest()[:16]}
 
 
 def _alone(

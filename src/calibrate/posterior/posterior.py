@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,9 +17,9 @@ from calibrate.posterior.diagnosis import diagnose, summary_of
 from calibrate.posterior.fit import misfits
 from calibrate.posterior.predictions import predicted
 from calibrate.posterior.tree import make_tree
-from calibrate.provenance import versions
+from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws
-from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.samplers.checkpoint import Checkpoint, identity_of
 from calibrate.samplers.laplace import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, FEMLikelihood, Model
@@ -236,8 +234,7 @@ def sample(
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
     draws = named_draws(model, run.z)
     tree = make_tree(model, checked, draws, run.statistics, rng_key, run.means)
-    for name, value in {**record, **attributes}.items():
-        tree.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value)
+    tree.attrs.update(as_attributes(record | attributes))
     state.remove()
     return Posterior(tree, model, checked)
 
@@ -258,11 +255,7 @@ def _fem_likelihood(
 
 
 def _identity(record: Mapping[str, Any], data: Data) -> dict[str, str]:
-    """What a run is of, by name: provenance without places, and a hash of the data."""
-    digest = hashlib.sha256()
-    for name in sorted(data):
-        digest.update(name.encode() + np.asarray(data[name]).tobytes())
-    described = {name: json.dumps(value) for name, value in record.items() if name != "scene"}
-    # What a user changes most comes first: the first difference is named.
-    first = {name: described.pop(name) for name in ("sampler", "seed", "sampler_options")}
-    return {**first, **described, "data": digest.hexdigest()[:16]}
+    """Return what a run depends on: its record without the scene's place, and its data."""
+    # Messages name the first difference, so what a user changes most comes first.
+    first = {name: record[name] for name in ("sampler", "seed", "sampler_options")}
+    return identity_of(first | {n: v for n, v in record.items() if n != "scene"}, data)

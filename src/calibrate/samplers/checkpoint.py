@@ -7,6 +7,7 @@ resumed run gives the draws of an uninterrupted one, bit for bit.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -93,6 +94,17 @@ class Checkpoint:
                     + (f"{in_file}, not {here}" if short else "another")
                     + "; repeat that run, or remove the file"
                 )
+
+
+def identity_of(
+    provenance: Mapping[str, Any], arrays: Mapping[str, np.ndarray | jax.Array]
+) -> dict[str, str]:
+    """Return what a run depends on, by name: its provenance as JSON, and a hash of its data."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(name.encode() + np.asarray(arrays[name]).tobytes())
+    as_json = {name: json.dumps(value) for name, value in provenance.items()}
+    return {**as_json, "data": digest.hexdigest()[:16]}
 
 
 def _is_key(dtype: Any) -> bool:
