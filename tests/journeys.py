@@ -89,9 +89,9 @@ def infer() -> None:
 
 def parse() -> list[Frame]:
     """Return the frames from ``calibrate infer`` to the reader of its CSV file."""
-    from calibrate.measurements.files import CSVFile
+    from calibrate.measurements.tables import CSVTable
 
-    return journey(CSVFile, "__init__", infer)
+    return journey(CSVTable, "__init__", infer)
 
 
 def likelihood() -> list[Frame]:

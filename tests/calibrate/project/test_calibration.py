@@ -62,7 +62,7 @@ def test_few_frames_lie_between_a_command_and_its_data_and_its_likelihood():
     assert len(parse) <= 8
     assert len(likelihood) <= 9
     assert len(dict.fromkeys([*parse, *likelihood])) <= 15
-    assert parse[-1].function == "CSVFile.__init__"
+    assert parse[-1].function == "CSVTable.__init__"
     assert likelihood[-1].function == "Model.distributions"
 
 
