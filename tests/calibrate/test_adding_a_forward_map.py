@@ -11,7 +11,7 @@ import emulator as em
 from calibrate.cli import main
 from calibrate.posterior import read_tree
 from calibrate.project import simulator_of
-from emulator.scenes import registry
+from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.scene import all_nodes
 from emulator.surrogates import save_emulator
 from emulator.surrogates.kind import ForwardKind, Option
@@ -71,7 +71,7 @@ def setting():
     scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(FORWARD_MAPS, KIND.name, KIND)
-        patch.setitem(registry.BUILT_IN, SCENE, lambda **_: scene)
+        patch.setitem(BUILT_IN, SCENE, lambda **_: scene)
         yield scene
 
 
@@ -104,7 +104,7 @@ def test_it_is_inferred_with_and_certified(tmp_path, capsys):
     run = json.loads((tmp_path / "run.json").read_text())
     assert (run["forward"], run["forward_options"]) == ("polynomial", {"order": 1})
     attributes = read_tree(tmp_path / "posterior.nc").attrs
-    scene = registry.BUILT_IN[SCENE]()
+    scene = BUILT_IN[SCENE]()
     made = build(SimpleIngredients(scene), {"order": 1})
     assert attributes["forward_fingerprint"] == made.fingerprint
     code, report = answer(capsys, "certify", tmp_path, "--draws", 25)

@@ -13,7 +13,7 @@ from calibrate.project import Problem, Run, by_fem, infer, read_problem, simulat
 from calibrate.project.problem import Simulators, with_data
 from calibrate.report import page
 from emulator.fem import NewtonOptions
-from emulator.scenes import registry
+from emulator.scenes.built_in import BUILT_IN
 from linear_support import linear_forward
 
 BEAM = "once_clamped_beam"
@@ -38,7 +38,7 @@ def count(monkeypatch):
         counts["data"] += 1
         return open_data(path)
 
-    monkeypatch.setitem(registry.BUILT_IN, BEAM, build)
+    monkeypatch.setitem(BUILT_IN, BEAM, build)
     monkeypatch.setattr(reader, "open_data", opened)
     return counts
 

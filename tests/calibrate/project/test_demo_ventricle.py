@@ -15,7 +15,7 @@ from calibrate.posterior import read_tree
 from calibrate.project import demo as demos
 from calibrate.project import read_posterior, simulator_of
 from emulator.geometry.facets import Cavity
-from emulator.scenes import registry
+from emulator.scenes.built_in import BUILT_IN
 
 # One scene for the whole module, so that its simulator is compiled once.
 COARSE = cache(partial(em.scenes.left_ventricle, rings=4, around=8, layers=1, order=1))
@@ -33,7 +33,7 @@ RUN = replace(
 def setting():
     """The coarse scene under the ventricle's name, and its short run as the demo."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry.BUILT_IN, "left_ventricle", COARSE)
+        patch.setitem(BUILT_IN, "left_ventricle", COARSE)
         short = replace(demos.DEMOS["left_ventricle"], run=RUN)
         patch.setitem(demos.DEMOS, "left_ventricle", short)
         yield

@@ -13,7 +13,7 @@ from calibrate.project.members import Members
 from cli_support import complaint, write_block
 from emulator.core.errors import InputError
 from emulator.core.store import read_arrays, save_arrays
-from emulator.scenes import registry
+from emulator.scenes.built_in import BUILT_IN
 
 BEAM = "once_clamped_beam"
 NODES = "node,ux,uy,uz\n3,0.5,0.0,-9.0\n7,0.4,0.1,-5.0\n11,0.2,0.0,-2.0\n19,0.1,0.0,-7.0\n"
@@ -41,7 +41,7 @@ def coarse():
     """A coarse beam under the built-in one's name."""
     scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry.BUILT_IN, BEAM, lambda **_: scene)
+        patch.setitem(BUILT_IN, BEAM, lambda **_: scene)
         yield scene
 
 

@@ -16,7 +16,7 @@ from calibrate.project import holds_population
 from calibrate.project.members import read_members
 from calibrate.report.population import shrinkage
 from cli_support import answer, complaint
-from emulator.scenes import registry
+from emulator.scenes.built_in import BUILT_IN
 
 BEAM = "once_clamped_beam"
 SCENE = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
@@ -37,7 +37,7 @@ known = {lam = 70.0}
 def coarse():
     """A coarse beam under the built-in one's name."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry.BUILT_IN, BEAM, lambda **_: SCENE)
+        patch.setitem(BUILT_IN, BEAM, lambda **_: SCENE)
         yield
 
 

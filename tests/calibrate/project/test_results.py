@@ -15,7 +15,7 @@ from calibrate.posterior import read_tree
 from calibrate.project import Run, infer, read_posterior
 from emulator.core.errors import InputError
 from emulator.core.store import exclusive, read_arrays, save_arrays
-from emulator.scenes import registry
+from emulator.scenes.built_in import BUILT_IN
 
 SCENE = "once_clamped_beam"
 RUN = Run(
@@ -35,7 +35,7 @@ def infer_once(tmp_path_factory):
     """A result with a reduced model, on a coarse beam under the built-in one's name."""
     scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry.BUILT_IN, SCENE, lambda **_: scene)
+        patch.setitem(BUILT_IN, SCENE, lambda **_: scene)
         folder = tmp_path_factory.mktemp("result")
         yield folder, infer(RUN, folder)
 

@@ -11,7 +11,7 @@ from cli_support import SCENE, write_block
 from emulator.core.errors import InputError
 from emulator.core.schema import expectation, parse, table_of
 from emulator.mechanics.laws import LAWS
-from emulator.scenes.draft import draft
+from emulator.scenes.draft import draft_scene
 from emulator.scenes.fibre_rules import FIBRE_RULES
 from emulator.scenes.file_schema import (
     BodyTable,
@@ -54,7 +54,7 @@ def test_what_the_reader_admits_the_schema_admits(validator, text):
 
 
 def test_what_init_drafts(validator, tmp_path):
-    draft(write_block(tmp_path).with_name("block.vtu"), tmp_path / "draft.toml")
+    draft_scene(write_block(tmp_path).with_name("block.vtu"), tmp_path / "draft.toml")
     text = (tmp_path / "draft.toml").read_text(encoding="utf-8")
     assert not [error.message for error in validator.iter_errors(tomllib.loads(text))]
 
