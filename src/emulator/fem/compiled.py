@@ -83,12 +83,13 @@ class _Program:
         self.own: Any = jax.jit(evaluate)
         self.shared: Any = None
         self.arrays = traced.consts
-        if not is_traced(self.arrays):
+        self.inside = is_traced(self.arrays)  # a larger trace
+        if not self.inside:
             with jax.ensure_compile_time_eval():  # as jnp.asarray, without a program a shape
                 self.arrays = jax.device_put(self.arrays)
 
     def __call__(self, leaves: list[jax.Array]) -> Any:
-        if is_traced(self.arrays, leaves):
+        if self.inside or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.own(self.arrays, leaves)
         if self.shared is None:
             text = self.own.lower(self.arrays, leaves).as_text()
