@@ -1,4 +1,4 @@
-"""From a name, a scene file or a scene's origin to the scene: built in, TOML or released."""
+"""Scenes by name, file or origin: built in, TOML or released."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FINER = f"{FINER}:"
 
 
 def find_scene(name: str, root: str | Path | None = None) -> Scene:
-    """The scene called ``name``.
+    """Return the scene called ``name``.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
 
 
 def scene_from_origin(origin: Mapping[str, Any]) -> Scene:
-    """The scene that ``origin``, plain JSON, says how to make: see :class:`Scene`."""
+    """Return the scene that ``origin``, plain JSON, describes; ``Scene.origin`` is one."""
     options = dict(origin)
     name = options.pop("scene", None)
     if name == FINER:
@@ -66,12 +66,12 @@ def scene_from_origin(origin: Mapping[str, Any]) -> Scene:
 
 
 def finer_of(scene: Scene) -> Finer:
-    """How ``scene`` was made from one on a coarser mesh, that scene included.
+    """Return the refinement that made ``scene``, with the scene on the coarser mesh.
 
     Raises
     ------
     InputError
-        It is not a scene on the next finer mesh of another.
+        ``scene`` was not made by :func:`~emulator.scenes.finer.finer`.
     """
     if scene.origin.get("scene") != FINER:
         raise InputError(

@@ -53,24 +53,24 @@ class Parameter:
             raise InputError(f"parameter '{self.name}': a log scale needs a lower bound above 0")
 
     def to_unit(self, value: jax.Array) -> jax.Array:
-        """Position of ``value`` in the range, 0 at ``low`` and 1 at ``high``, on the scale."""
+        """Return the position of ``value`` on the scale, 0 at ``low`` and 1 at ``high``."""
         if self.scale == "log":
             return jnp.log(value / self.low) / jnp.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
 
     def from_unit(self, position: jax.Array) -> jax.Array:
-        """Inverse of :meth:`to_unit`."""
+        """Return the inverse of :meth:`to_unit`."""
         if self.scale == "log":
             return self.low * (self.high / self.low) ** position
         return self.low + (self.high - self.low) * position
 
     def rate(self, value: jax.Array) -> jax.Array:
-        """Derivative of :meth:`from_unit` where it gives ``value``."""
+        """Return the derivative of :meth:`from_unit` at the position of ``value``."""
         span = self.high - self.low
         return value * math.log(self.high / self.low) if self.scale == "log" else 0.0 * value + span
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON, the constructor's arguments."""
+        """Return the arguments of the constructor as plain JSON."""
         return asdict(self)
 
 
@@ -103,24 +103,25 @@ class ParameterSpace:
             return self.from_unit(jnp.full(len(self.parameters), 0.5))
 
     def to_unit(self, theta: jax.Array) -> jax.Array:
-        """Position (..., p) in the box of ``theta`` (..., p), 0 to 1 inside."""
+        """Return the position (..., p) of ``theta`` (..., p) in the box, 0 to 1 inside."""
         columns = [p.to_unit(theta[..., k]) for k, p in enumerate(self.parameters)]
         return jnp.stack(columns, axis=-1)
 
     def from_unit(self, position: jax.Array) -> jax.Array:
-        """Inverse of :meth:`to_unit`."""
+        """Return the inverse of :meth:`to_unit`."""
         columns = [p.from_unit(position[..., k]) for k, p in enumerate(self.parameters)]
         return jnp.stack(columns, axis=-1)
 
     def unit_sensitivities(self, theta: jax.Array, du_dtheta: jax.Array) -> jax.Array:
-        r"""Sensitivities in the unit box, from sensitivities in the parameters' own units.
+        r"""Return sensitivities in the unit box from those in the units of the parameters.
 
         .. math:: \partial u / \partial x_k
             = (\partial u / \partial \theta_k)\, \mathrm{d}\theta_k / \mathrm{d}x_k
 
         Parameters
         ----------
-        theta : (c, p). du_dtheta : (c, p, n, 3) mm per unit of each parameter.
+        theta : parameters (c, p).
+        du_dtheta : sensitivities (c, p, n, 3) in mm per unit of each parameter.
 
         Returns
         -------
@@ -129,22 +130,22 @@ class ParameterSpace:
         return du_dtheta * self.rates(theta)[:, :, None, None]
 
     def rates(self, theta: jax.Array) -> jax.Array:
-        """Derivatives (c, p) of each entry of ``theta`` (c, p) in its position in the box."""
+        """Return the derivatives (c, p) of ``theta`` (c, p) in its position in the box."""
         columns = [p.rate(theta[:, k]) for k, p in enumerate(self.parameters)]
         return jnp.stack(columns, axis=1)
 
     def contains(self, theta: jax.Array) -> jax.Array:
-        """Whether ``theta`` (..., p) lies in the box, (...) bool; NaN does not."""
+        """Return whether ``theta`` (..., p) lies in the box, (...) bool; NaN does not."""
         position = self.to_unit(theta)
         return jnp.all((position >= -_SLACK) & (position <= 1.0 + _SLACK), axis=-1)
 
     def theta(self, values: Mapping[str, float], owner: str) -> jax.Array:
-        """Theta (p,) from named values in the parameters' units.
+        """Return theta (p,) from named values in the units of the parameters.
 
         Raises
         ------
         InputError
-            Unknown, missing or out-of-range value; ``owner`` is named.
+            An unknown, missing or out-of-range value; the message names ``owner``.
         """
         for name in values:
             if name not in self.names:

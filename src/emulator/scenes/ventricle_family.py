@@ -38,7 +38,7 @@ around, layers : of the mesh.
 
 
 def ventricles(count: int, seed: int) -> list[dict[str, Any]]:
-    """Arguments of :func:`~emulator.scenes.left_ventricle` for ``count`` ventricles."""
+    """Return the arguments of :func:`~emulator.scenes.left_ventricle` for ``count`` ventricles."""
     from scipy.stats import qmc  # half a second, which other scenes need not wait for
 
     points = qmc.Sobol(len(SHAPES), rng=seed).random_base2(max(count - 1, 1).bit_length())[:count]
