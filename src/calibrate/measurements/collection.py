@@ -21,8 +21,8 @@ from emulator.core.errors import InputError
 class Observations:
     """Observations by name; one forward map serves them all.
 
-    In a body with several load states each name says which one is meant, as in ``volume@diastole``
-    (:mod:`calibrate.statistical_model.load_states`).
+    parts : the observations by name. In a body with several load states each name says which one
+        is meant, as in ``volume@diastole`` (:mod:`calibrate.statistical_model.load_states`).
     """
 
     parts: Mapping[str, Observation]
@@ -60,6 +60,7 @@ class Observations:
 
     @cached_property
     def _rows(self) -> dict[str, np.ndarray | slice]:
+        """Positions in ``nodes`` of each part's nodes."""
         order = np.argsort(self.nodes)
         rows = {
             name: order[np.searchsorted(self.nodes, part.nodes, sorter=order)]
@@ -100,9 +101,9 @@ class Observations:
     @cached_property
     def _groups(self) -> list[list[str]]:
         """Names by their observation: one in several load states, as of a curve, is one program."""
-        groups: dict[int, list[str]] = {}
+        groups: dict[Observation, list[str]] = {}
         for name, part in self.parts.items():
-            groups.setdefault(id(part), []).append(name)
+            groups.setdefault(part, []).append(name)
         return list(groups.values())
 
     def expand[T](self, values: Mapping[str, T], what: str) -> dict[str, tuple[str, T]]:

@@ -30,7 +30,7 @@ import numpy as np
 from calibrate.measurements.displacements import spread_landmarks
 from calibrate.measurements.local_basis import COMPONENTS, local_directions
 from calibrate.measurements.location import locate_gradients
-from calibrate.measurements.observation import Field
+from calibrate.measurements.observation import Block, Field
 from calibrate.measurements.points import (
     XYZ,
     PointObservation,
@@ -116,6 +116,12 @@ class Strains(PointObservation):
         """Components that columns name; one as an example where there is none."""
         components = tuple(c for c, column in COMPONENTS.items() if cls.prefix + column in words)
         return [(components or ("circumferential",),)]
+
+    def block(self, name: str, values: np.ndarray) -> Block:
+        """Places, and the components in the order of the basis."""
+        place, *columns = super().block(name, values)
+        order = [self.prefix + column for column in COMPONENTS.values()]
+        return [place, *sorted(columns, key=lambda column: order.index(column[0].variable))]
 
     def check_values(self, name: str, values: np.ndarray) -> None:
         """Refuse infinite values, and those that no stretch has."""
