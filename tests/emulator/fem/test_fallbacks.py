@@ -68,7 +68,7 @@ def strategies(simulator, theta, start):
     """The strategies that the steps of the search belong to, and how they iterate."""
     search = EquilibriumSearch(simulator.system, simulator.options, theta)
     step = jax.jit(search.step)
-    state, seen = search.begin(start), []
+    state, seen = search.begin(search.load_stepping.begin(start)), []
     while bool(state.running):
         if not bool(state.begins):
             seen.append((int(state.strategy), "stress" if bool(state.by_stress) else "newton"))

@@ -173,14 +173,14 @@ def test_no_tangent_on_the_way_is_indefinite(ventricle, monkeypatch):
         "nan",
     ],
 )
-def test_where_it_fails_newton_climbs_from_rest(ventricle, monkeypatch, how):
+def test_where_it_fails_newton_steps_the_load_from_rest(ventricle, monkeypatch, how):
     simulator, theta = em.Simulator(ventricle), ventricle.centre
     expected = simulator(theta)
     step, begun = StressIterates.step, []
 
-    def fail(self, state, stiffening, geometric, again):
-        after = step(self, state, stiffening, geometric, again)
-        begun.append(float(self.level))
+    def fail(self, state, load_stiffness, geometric, again):
+        after = step(self, state, load_stiffness, geometric, again)
+        begun.append(float(self.load))
         if how == "crushed":
             return after._replace(fraction=jnp.array(0.0))
         if how == "refused":
@@ -190,7 +190,7 @@ def test_where_it_fails_newton_climbs_from_rest(ventricle, monkeypatch, how):
     monkeypatch.setattr(StressIterates, "step", fail)
     solution = by_python(simulator, theta)
     assert solution.converged
-    assert {0.02, 0.05, 0.25, 0.5} <= set(begun)  # every ramp
+    assert {0.02, 0.05, 0.25, 0.5} <= set(begun)  # every schedule
     np.testing.assert_allclose(solution.displacement, expected, atol=1e-8)
 
 
@@ -209,9 +209,9 @@ def test_a_good_start_keeps_its_load_and_a_poor_one_is_left(ventricle, monkeypat
     u = simulator(theta)
     step, levels = StressIterates.step, []
 
-    def noting(self, state, stiffening, geometric, again):
-        levels.append(float(self.level))
-        return step(self, state, stiffening, geometric, again)
+    def noting(self, state, load_stiffness, geometric, again):
+        levels.append(float(self.load))
+        return step(self, state, load_stiffness, geometric, again)
 
     monkeypatch.setattr(StressIterates, "step", noting)
     errors = {k: float(simulator.system.relative_residual(k * u, theta)) for k in (0.8, 0.01)}
