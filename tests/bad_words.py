@@ -338,7 +338,7 @@ INFERENCES = [
         "--truth mu=73 lam=61 --sampler laplace --draws 5 --chains 1",
         "Laplace: 5 draws of 1 chains; give 25 or more together",
     ),
-    ("--truth mu=73 lam=61 --noise nan", "noise 'gaussian': standard deviation is nan"),
+    ("--truth mu=73 lam=61 --noise nan", "noise 'gaussian': sd = NaN; expected a number"),
     (
         "--truth mu=73 lam=61 --forward reduced --emulator liver",
         "--emulator has no effect without --forward",
