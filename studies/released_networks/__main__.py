@@ -26,8 +26,7 @@ from calibrate.figures.drawing import pyplot
 from calibrate.measurements import parse_observation
 from calibrate.provenance import study_header
 from emulator.core.store import write_json
-from emulator.released.files import units
-from emulator.released.scenes import published_tests
+from emulator.released.scenes import published_tests, units
 from emulator.surrogates import Emulator
 from emulator.training import recipe, train
 

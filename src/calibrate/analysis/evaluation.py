@@ -10,11 +10,11 @@ from emulator.accuracy.comparison import Errors, case_errors
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign.designs import Reference, fem_reference, outside_reference
-from emulator.released.reference import published_reference
 from emulator.surrogates import load
 from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.protocol import ForwardMap
 from emulator.surrogates.registry import build_forward, full_options
+from emulator.verify.released import published_reference
 
 OUR_FEM = "fem"
 """What to evaluate against, unless it is the folder of a released model."""

@@ -27,11 +27,11 @@ UNITS = {
     "max_u": "mm",
     "mean_u": "mm",
 }
-_MOST = 20_000  # values that a density is estimated from; more do not change the curve visibly
+_VALUES = 20_000  # from which a density is estimated; more do not change the curve visibly
 
 
 def quantiles(errors: jax.Array | np.ndarray) -> dict[str, float]:
-    """Median, mean, 97.5 % quantile and maximum over all entries."""
+    """Return median, mean, 97.5 % quantile and maximum over all entries."""
     values = np.asarray(errors).ravel()
     return {
         "median": float(np.median(values)),
@@ -42,9 +42,9 @@ def quantiles(errors: jax.Array | np.ndarray) -> dict[str, float]:
 
 
 def log_density(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Errors (300,) and the density of ``log10(errors)`` there; ``None`` where all are alike."""
-    positive = errors[errors > 0.0]  # held nodes have zero error, without a logarithm
-    logs = np.log10(positive[:: max(1, len(positive) // _MOST)])
+    """Return errors (300,) and the density of ``log10(errors)`` there; None where all are equal."""
+    positive = errors[errors > 0.0]  # prescribed nodes have zero error, without a logarithm
+    logs = np.log10(positive[:: max(1, len(positive) // _VALUES)])
     if len(logs) < 2 or np.ptp(logs) < 1e-6:
         return None
     estimate = gaussian_kde(logs)
@@ -61,13 +61,13 @@ def field_errors(
     reference: jax.Array,
     cavities: Sequence[Cavity] = (),
 ) -> dict[str, jax.Array]:
-    """Errors of one field ``u`` (n, 3) against ``reference`` (n, 3).
+    """Return the errors of one field ``u`` (n, 3) against ``reference`` (n, 3).
 
     err_u : (n,) distance in mm at each node.
     err_F : (m, q) Frobenius norm of the error in the deformation gradient.
     err_I1 : (m, q) error in the first invariant.
-    err_Pi : () error in the potential energy, percent; absent where the mesh is known under load
-        (``Scene.loaded_by``): the energy is that of displacements from rest.
+    err_Pi : () error in the potential energy, percent; absent where the mesh is the loaded shape
+        (``Scene.loaded_by``), since the energy needs displacements from rest.
     err_V : (v,) error in the volume of each of the ``cavities``, percent; absent without any.
     """
     H, H_reference = displacement_gradient(scene, u), displacement_gradient(scene, reference)
@@ -96,8 +96,10 @@ def _percent(value: jax.Array, exact: jax.Array) -> jax.Array:
 class Errors:
     """Errors of each test case for which the forward map returns a valid prediction.
 
-    thetas : (c, p). fields : name -> (c, ...), as in :func:`field_errors`, with ``max_u`` and
-    ``mean_u`` (c,), the size of the reference. invalid : number of the other cases, left out.
+    thetas : (c, p).
+    fields : name -> (c, ...), as in :func:`field_errors`, with ``max_u`` and ``mean_u`` (c,), the
+        size of the reference.
+    invalid : the number of cases left out.
     """
 
     thetas: np.ndarray
@@ -105,14 +107,14 @@ class Errors:
     invalid: int
 
     def report(self) -> dict[str, Any]:
-        """Quantiles of every field, ``units``, ``cases`` and ``invalid``, as plain JSON."""
+        """Return quantiles of every field, ``units``, ``cases`` and ``invalid``, as plain JSON."""
         summary = {name: quantiles(values) for name, values in self.fields.items()}
         units = {name: unit for name, unit in UNITS.items() if name in self.fields}
         return {**summary, "units": units, "cases": len(self.thetas), "invalid": self.invalid}
 
 
 def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) -> Errors:
-    """Errors of ``forward`` in each of the test cases ``thetas`` (c, p), ``reference`` (c, n, 3).
+    """Return the errors of ``forward`` at ``thetas`` (c, p) against ``reference`` (c, n, 3).
 
     Raises
     ------
@@ -135,19 +137,19 @@ def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) ->
         finite = jnp.array([jnp.all(jnp.isfinite(value)) for value in errors.values()])
         return errors, prediction.valid & jnp.all(finite)
 
-    found = [one(theta, u) for theta, u in zip(thetas, reference, strict=True)]
-    valid = np.array([bool(sound) for _, sound in found])
+    cases = [one(theta, u) for theta, u in zip(thetas, reference, strict=True)]
+    valid = np.array([bool(ok) for _, ok in cases])
     if not valid.any():
         raise SolverError(
-            f"the {forward.kind} map has no valid answer for any of {len(found)} test cases"
+            f"the {forward.kind} map has no valid answer for any of {len(cases)} test cases"
         )
-    kept = [errors for errors, sound in found if sound]
-    fields = {name: np.stack([errors[name] for errors in kept]) for name in kept[0]}
+    errors = [errors for errors, ok in cases if ok]
+    fields = {name: np.stack([case[name] for case in errors]) for name in errors[0]}
     return Errors(np.asarray(thetas)[valid], fields, int((~valid).sum()))
 
 
 def evaluate(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) -> dict[str, Any]:
-    """Error quantiles of ``forward`` over test cases.
+    """Return error quantiles of ``forward`` over test cases.
 
     Parameters
     ----------

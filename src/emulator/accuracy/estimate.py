@@ -1,4 +1,6 @@
-r"""The error of a prediction, estimated from its residual: no solution needed.
+r"""The error of a prediction, estimated from its residual, and reasons not to trust it.
+
+No solution is needed.
 
 A prediction :math:`u = u^* + e` near the equilibrium :math:`u^*`, where :math:`r(u^*) = 0`, has
 the residual of the energy's expansion about :math:`u`,
@@ -15,26 +17,29 @@ the error of an observed quantity :math:`q` is :math:`dq(u)[\hat e]` to first.
 **Effectivity** :math:`|\hat e| / |e|` differs from 1 by
 :math:`\tfrac12 |K^{-1} K'[e, e]| / |e|`, which is proportional to the error: it tends to 1
 as predictions of any kind improve, and departs from 1 where the error is so large that the body's
-stiffness changes along it, as it does outside the box. One more back-substitution with the factors
-at hand measures the departure, by the *contraction*
+stiffness changes along it, as it does outside the box. One more back-substitution with the same
+factors measures the departure, by the *contraction*
 
 .. math:: \Theta = \frac{|K(u)^{-1} r(u - \hat e)|}{|\hat e|},
 
 about the relative error of :math:`\hat e`. If every further step shrinks by this factor,
 :math:`|\hat e - e| \le \Theta |\hat e| / (1 - \Theta)`, so :math:`\Theta \le 1/4`
 means an effectivity between 3/4 and 3/2.
-That takes a tangent like that at the equilibrium. Where half of all forces are out of balance the
-strains, and the stiffness they lend, are mostly error, and one step may be three times too short.
-Where :math:`\Theta` is larger, or the step would invert an element, or the tangent is indefinite,
-it may be ten times too long. Then FEM's guarded iteration starts from the prediction and runs until
-a step is less than a quarter of the way travelled so far; the error is the whole way.
-Where the prediction itself inverts elements, the iteration starts from the first sound state on the
-line to the solution at the centre of the box, and the way to that state is part of the error.
+This holds where the tangent resembles the equilibrium's. Where half of all forces are out of
+balance, the strains and their stiffness are mostly error, and one step may be three times too
+short. Where :math:`\Theta` is larger, or the step would invert an element, or the tangent is
+indefinite, one step may be ten times too long. Then FEM's guarded iteration starts from the
+prediction and runs until a step is less than a quarter of the way travelled so far; the error is
+the whole way. Where the prediction itself inverts elements, the iteration starts from the first
+valid state on the line to the solution at the centre of the box, and the way to that state is part
+of the error.
 
-The tangent at the prediction costs a factorisation. The tangent at the centre of the box is
-factorised once; as preconditioner of a few conjugate gradients on :math:`K(u)\, \hat e = r` it is
-cheaper and less accurate: good where the body turns little between the centre and :math:`u`, poor
-for a bending beam (docs/experiments.md, "An error bar from the forces out of balance").
+The tangent at the prediction costs a factorisation. The tangent at the centre of the box, as
+preconditioner of a few conjugate gradients, is cheaper and too inaccurate for a bending beam
+(docs/experiments.md, "An error bar from the forces out of balance"; ``studies/error_bar``).
+
+Inside ``jit`` a :class:`Guard` is flags and numbers; outside, :meth:`Guard.sentence` puts them in
+words.
 """
 
 from __future__ import annotations
@@ -42,28 +47,133 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.accuracy.guard import Guard, guard
-from emulator.accuracy.step import (
+from emulator.accuracy.distance import (
+    LARGEST_U,
     Distance,
-    gradients_distance,
     guarded_distance,
     newton_distance,
-    sound_state,
+    valid_state,
 )
 from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, cond
+from emulator.fem.energy import at_points, displacement_gradient
 from emulator.fem.simulator import Simulator
+from emulator.mechanics.kinematics import Barriers, Strain
 from emulator.scenes.scene import Scene
+from emulator.scenes.tissue import Tissue
 from emulator.surrogates.protocol import ForwardMap
 
-Tangent = Literal["present", "centre"]
+
+class Guard(NamedTuple):
+    """Reasons not to trust a prediction; every field gains leading axes under ``vmap``.
+
+    theta : (p,) where the prediction was made.
+    outside : (p,) bool, entries of theta outside the scene's box.
+    finite : () whether theta and the prediction are finite numbers.
+    least_J : () smallest volume ratio; not above 0 if an element is inverted.
+    barrier : () whether a training barrier on J, I1 or I4f would act somewhere, so that training
+        did not see the exact energy of this state (see :mod:`emulator.mechanics.kinematics`).
+    indefinite : () whether the tangent at the prediction is known to be indefinite.
+    unsettled : () whether no equilibrium was found near the prediction.
+    """
+
+    theta: jax.Array
+    outside: jax.Array
+    finite: jax.Array
+    least_J: jax.Array
+    barrier: jax.Array
+    indefinite: jax.Array
+    unsettled: jax.Array
+
+    @property
+    def trusted(self) -> jax.Array:
+        """Whether there is no reason to distrust the prediction, () bool."""
+        valid = self.finite & (self.least_J > 0.0) & ~self.barrier
+        return valid & ~jnp.any(self.outside, axis=-1) & ~self.indefinite & ~self.unsettled
+
+    def sentence(self, scene: Scene) -> str:
+        """Return all reasons not to trust the prediction, in words; empty when there are none."""
+        if not self.finite:
+            faults = [] if np.isfinite(self.theta).all() else ["theta is not finite"]
+            return "; ".join(
+                [*self._outside_range(scene), *faults, "the prediction is not finite"][:2]
+            )
+        faults = self._outside_range(scene)
+        if self.least_J <= 0.0:
+            faults.append(f"an element is inverted (least J = {float(self.least_J):.3g})")
+        elif self.barrier:
+            faults.append("an element is so deformed that the barriers of training act on it")
+        if self.indefinite:
+            faults.append("the tangent is indefinite there: far from a stable equilibrium")
+        if self.unsettled:
+            faults.append("no equilibrium was found near it")
+        return "; ".join(faults)
+
+    def _outside_range(self, scene: Scene) -> list[str]:
+        """Name each parameter outside its range, with its value and the range."""
+        return [
+            f"parameter '{p.name}' is {float(value):g} {p.unit}".rstrip()
+            + f", outside {p.low:g} to {p.high:g}"
+            for p, value, out in zip(scene.parameters, self.theta, self.outside, strict=True)
+            if out
+        ]
+
+
+def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
+    """Check theta (p,) and the prediction ``u`` (n, 3) mm alone; nothing is factorised."""
+    finite = jnp.all(jnp.abs(u) < LARGEST_U) & jnp.all(jnp.isfinite(theta))
+    J, I1, I4f = invariants(scene, jnp.where(finite, u, 0.0), theta)
+    limits = Barriers()
+    active = jnp.any(limits.J_start > J) | jnp.any(limits.I1_start < I1)
+    no = jnp.array(False)
+    return Guard(
+        theta=theta,
+        outside=outside_box(scene, theta),
+        finite=finite,
+        least_J=jnp.min(J),
+        barrier=active | jnp.any(I4f > limits.I4f_start),
+        indefinite=no,
+        unsettled=no,
+    )
+
+
+def outside_box(scene: Scene, theta: jax.Array) -> jax.Array:
+    """Return which entries of ``theta`` (p,) lie outside their range, (p,) bool; NaN does.
+
+    Each entry is tested with all other entries at the centre of the box.
+    """
+    each = jnp.where(jnp.eye(len(scene.parameters), dtype=bool), theta[None, :], scene.centre)
+    return ~scene.space.contains(each)
+
+
+def invariants(
+    scene: Scene, u: jax.Array, theta: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return ``J``, ``I1`` and ``I4f`` at every quadrature point, (m, q).
+
+    I1 and I4f are the larger of the invariant and its isochoric part, as laws use either. Isochoric
+    parts of inverted points are NaN and left out; without fibres I4f is 0.
+    """
+
+    def measures(H: jax.Array, tissue: Tissue) -> tuple[jax.Array, jax.Array, jax.Array]:
+        strain = Strain(H, directions=tissue.directions)
+        J = 1.0 + strain.J_minus_1
+        I1 = 3.0 + jnp.fmax(strain.I1_minus_3, strain.isochoric_I1_minus_3)
+        if tissue.directions is None:
+            return J, I1, jnp.zeros_like(J)
+        fibre = strain.fibre + H @ strain.fibre
+        isochoric = 1.0 + strain.isochoric_I4f_minus_1
+        return J, I1, jnp.fmax(jnp.vdot(fibre, fibre), isochoric)
+
+    J, I1, I4f = at_points(measures, scene.tissue_at(theta), displacement_gradient(scene, u))
+    return J, I1, I4f
 
 
 class ErrorEstimate(NamedTuple):
@@ -73,12 +183,11 @@ class ErrorEstimate(NamedTuple):
     field : (n, 3) mm, the prediction less the equilibrium.
     err_u : (n,) mm, length of ``field`` at each node. median, mean, max : () of ``err_u``.
     energy_gap : () mN mm, the prediction's potential energy less ``least_energy``. If the
-        prediction is inverted, its energy is infinite; the nearest sound state's is taken.
+        prediction is inverted, its energy is infinite; the first valid state's is taken.
     least_energy : () mN mm, potential energy of the equilibrium. Both energies are meaningless
         without a potential.
-    contraction : () about the relative error of ``field``; with the tangent of the centre, the
-        fraction of the residual that is left, which bounds nothing.
-    iterations : () of FEM that replaced the single step; 0 where that was accepted.
+    contraction : () about the relative error of ``field``.
+    iterations : () of FEM that replaced the single step; 0 where the step was accepted.
     valid : () whether ``field`` is reliable. It may be where the prediction itself is not.
     guard : reasons not to trust the prediction.
     """
@@ -97,9 +206,9 @@ class ErrorEstimate(NamedTuple):
     guard: Guard
 
     def of(self, quantity: Callable[[jax.Array], jax.Array]) -> jax.Array:
-        """Error of ``quantity(u)`` to first order, in its unit: its derivative along ``field``.
+        """Return the error of ``quantity(u)`` to first order: its derivative along ``field``.
 
-        ``quantity`` is any differentiable function of the displacement (n, 3) in mm.
+        quantity : any differentiable function of the displacement (n, 3) in mm.
         """
         return jax.jvp(quantity, (self.displacement,), (self.field,))[1]
 
@@ -113,8 +222,6 @@ class ErrorBar:
 
     forward: ForwardMap
     simulator: Simulator
-    tangent: Tangent
-    iterations: int
     centre: jax.Array
 
     @property
@@ -123,29 +230,27 @@ class ErrorBar:
         return self.forward.scene
 
     def __call__(self, theta: jax.Array) -> ErrorEstimate:
-        """Error of the forward map at ``theta`` (p,), inside the box or not."""
+        """Estimate the error of the forward map at ``theta`` (p,), inside the box or not."""
         theta = jnp.asarray(theta, dtype=float)
         self._check_shape("theta", theta, (len(self.scene.parameters),))
         traced = isinstance(theta, jax.core.Tracer)
         return self.of_field(self.forward(theta) if traced else self._forward(theta), theta)
 
     def of_field(self, u: jax.Array, theta: jax.Array) -> ErrorEstimate:
-        """Error of any displacement ``u`` (n, 3) mm as a prediction at ``theta`` (p,)."""
+        """Estimate the error of any displacement ``u`` (n, 3) mm as a prediction at ``theta``."""
         u, theta = jnp.asarray(u, dtype=float), jnp.asarray(theta, dtype=float)
         self._check_shape("theta", theta, (len(self.scene.parameters),))
         self._check_shape("displacement", u, self.scene.held.shape)
-        sound, safe_theta = self._prepare(u, theta)
-        return self._finish(u, theta, sound, self._distance(sound, safe_theta))
+        state, safe_theta = self._prepare(u, theta)
+        return self._finish(u, theta, state, self._distance(state, safe_theta))
 
-    def _distance(self, sound: jax.Array, theta: jax.Array) -> Distance:
-        """Distance of a state that can be linearised; FEM's iteration where one step is no good."""
-        if self.tangent == "centre":
-            return self._by_gradients(sound, theta)
-        step = self._step(sound, theta)
+    def _distance(self, state: jax.Array, theta: jax.Array) -> Distance:
+        """Return the distance of a valid state; by FEM's iteration where one step is rejected."""
+        step = self._step(state, theta)
         return cond(
-            step.settled,
+            step.accepted,
             lambda: step,
-            lambda: self._guarded(sound, theta)._replace(indefinite=step.indefinite),
+            lambda: self._guarded(state, theta)._replace(indefinite=step.indefinite),
         )
 
     def _check_shape(self, name: str, array: jax.Array, expected: tuple[int, ...]) -> None:
@@ -161,7 +266,7 @@ class ErrorBar:
 
     @cached_property
     def _prepare(self):  # noqa: ANN202
-        return compiled(partial(sound_state, self.scene, self.centre))
+        return compiled(partial(valid_state, self.scene, self.centre))
 
     @cached_property
     def _step(self):  # noqa: ANN202
@@ -172,13 +277,6 @@ class ErrorBar:
         return compiled(partial(guarded_distance, self.simulator))
 
     @cached_property
-    def _by_gradients(self):  # noqa: ANN202
-        system = self.simulator.system
-        with jax.ensure_compile_time_eval():
-            values = np.asarray(self.simulator.tangent(self.centre, self.scene.centre))
-        return compiled(partial(gradients_distance, system, values, self.iterations))
-
-    @cached_property
     def _finish(self):  # noqa: ANN202
         return compiled(partial(_report, self.simulator.system, self.centre))
 
@@ -186,22 +284,13 @@ class ErrorBar:
 def error_bar(
     forward: ForwardMap,
     simulator: Simulator,
-    tangent: Tangent = "present",
-    *,
-    iterations: int = 4,
 ) -> ErrorBar:
-    """Error estimates of ``forward``, a map over all nodes. Solves once, at the box's centre.
-
-    Parameters
-    ----------
-    tangent : ``present`` (at each prediction, factorised each time) or ``centre`` (of the box,
-        factorised once: cheaper, less accurate).
-    iterations : conjugate gradients with the tangent of the centre, 1 or more.
+    """Make error estimates of ``forward``, a map over all nodes; solve once, at the box's centre.
 
     Raises
     ------
     InputError
-        Bad choices, a map over some nodes only, or ``centre`` for loads without a potential.
+        A map over some nodes only, or of another scene than the simulator's.
     SolverError
         No solution at the centre of the box.
     """
@@ -213,16 +302,7 @@ def error_bar(
             f"error bar: the map is of scene '{scene.name}' ({scene.fingerprint}), the simulator "
             f"of '{simulator.scene.name}' ({simulator.scene.fingerprint})"
         )
-    if tangent not in ("present", "centre"):
-        raise InputError(f"error bar: tangent '{tangent}'; use present or centre")
-    if iterations < 1:
-        raise InputError(f"error bar: {iterations} conjugate gradients; give 1 or more")
-    if tangent == "centre" and simulator.system.forces:
-        raise InputError(
-            f"scene '{scene.name}': a follower pressure has no symmetric tangent; use "
-            "tangent='present'"
-        )
-    return ErrorBar(forward, simulator, tangent, iterations, simulator(scene.centre))
+    return ErrorBar(forward, simulator, simulator(scene.centre))
 
 
 def _report(
@@ -230,24 +310,24 @@ def _report(
     centre: jax.Array,
     u: jax.Array,
     theta: jax.Array,
-    sound: jax.Array,
-    step: Distance,
+    state: jax.Array,
+    distance: Distance,
 ) -> ErrorEstimate:
-    """The estimate, with finite numbers even where the step failed."""
-    against = guard(system.scene, theta, u)
-    given = jnp.where(against.finite, u, centre)
-    field = given - sound + step.move
-    known = against.finite & jnp.all(jnp.isfinite(field)) & jnp.isfinite(step.gap)
-    valid = known & step.settled
+    """Combine the distance of the valid ``state`` with the way to it; all numbers are finite."""
+    reasons = guard(system.scene, theta, u)
+    prediction = jnp.where(reasons.finite, u, centre)
+    field = prediction - state + distance.error
+    known = reasons.finite & jnp.all(jnp.isfinite(field)) & jnp.isfinite(distance.gap)
+    valid = known & distance.accepted
     # No estimate: take the distance to the centre's solution, or the whole displacement.
-    unknown = given - jnp.where(against.finite, centre, 0.0)
+    unknown = prediction - jnp.where(reasons.finite, centre, 0.0)
     field = jnp.where(known, field, unknown)
     err_u = jnp.sqrt(jnp.sum(field**2, axis=-1))
-    gap = jnp.where(known, step.gap, 0.0)
+    gap = jnp.where(known, distance.gap, 0.0)
     safe = jnp.where(jnp.isfinite(theta), theta, system.scene.centre)
-    energy = system.potential(sound, safe, 1.0, system.follower_force(sound, safe))[0] - gap
+    energy = system.potential(state, safe, 1.0, system.follower_force(state, safe))[0] - gap
     return ErrorEstimate(
-        displacement=given,
+        displacement=prediction,
         field=field,
         err_u=err_u,
         median=jnp.median(err_u),
@@ -255,8 +335,8 @@ def _report(
         max=jnp.max(err_u),
         energy_gap=gap,
         least_energy=jnp.where(jnp.isfinite(energy), energy, 0.0),
-        contraction=jnp.where(jnp.isfinite(step.contraction), step.contraction, 1.0),
-        iterations=step.iterations,
+        contraction=jnp.where(jnp.isfinite(distance.contraction), distance.contraction, 1.0),
+        iterations=distance.iterations,
         valid=valid,
-        guard=against._replace(indefinite=step.indefinite, unsettled=~valid & against.finite),
+        guard=reasons._replace(indefinite=distance.indefinite, unsettled=~valid & reasons.finite),
     )

@@ -1,20 +1,19 @@
-r"""The error of the mesh: how far a solution is from the same body's on a finer mesh.
+r"""The error of the mesh: the difference between solutions on the mesh and on a finer one.
 
 An equilibrium :math:`u_h` on a mesh of size h, and one on the next finer mesh
 (:mod:`emulator.scenes.finer`), differ by
 
 .. math:: u_h - u_{h/2} = (u_h - u)\,(1 - 2^{-k}), \qquad |u_h - u| \sim h^k ,
 
-most of the error: seven eighths at :math:`k = 3`, as quadratic elements have on smooth solutions, a
-half at :math:`k = 1`, as at the edge of a clamp; from linear to quadratic elements nearly all of
-it. So the difference has an effectivity of one half to one.
+most of the error: seven eighths at :math:`k = 3`, the rate of quadratic elements on smooth
+solutions, a half at :math:`k = 1`, as at the edge of a clamp; from linear to quadratic elements
+nearly all of it. So the difference has an effectivity of one half to one.
 
-It takes no solve from rest: from the prolonged solution, moved by what another theta needed, a
-Newton step on the finer mesh is checked by a second back-substitution
-(:func:`emulator.accuracy.step.newton_distance`), and another step follows if that is not much
-shorter.
-Where steps do not contract, as for locked elements far from any theta known, FEM's iteration takes
-over.
+No solve from rest is needed. The iteration on the finer mesh starts from the prolonged solution,
+plus the difference found at another theta. A Newton step is checked by a second back-substitution
+(:func:`emulator.accuracy.distance.newton_distance`), and another step follows if the second is not
+much shorter. Where steps do not contract, as for locked elements far from any known theta, FEM
+solves on the finer mesh.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.accuracy.step import Distance, newton_distance
+from emulator.accuracy.distance import Distance, newton_distance
 from emulator.core.errors import InputError
 from emulator.fem.compiled import compiled
 from emulator.fem.linear.suitesparse import FACTORS
@@ -38,20 +37,22 @@ from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene
 
 LARGEST = 60_000
-"""Nodes of a finer mesh that is still looked at; beyond, a factorisation takes a minute."""
+"""Nodes of the largest finer mesh that is solved on; beyond, a factorisation takes a minute."""
 
 _TOLERANCE = 1e-7  # of a solve on the finer mesh: far below the difference between the meshes
-_CONTRACTION = 0.1  # largest part of the last step that another one would correct
-_GOES_ON, _STEPS = 0.5, 3  # as much of a step before it, and steps at most
+_CONTRACTION = 0.1  # of the last step: larger ones ask for another step
+_DIVERGENCE = 0.5  # contraction of any step from which FEM solves instead
+_STEPS = 3  # at most
 
 Quantity = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 class MeshErrorEstimate(NamedTuple):
-    """The mesh's error at one theta.
+    """The error of the mesh at one theta.
 
-    theta : (p,). coarse : (n, 3) mm, the equilibrium on the mesh. fine : (f, 3) mm, on the finer
-    one, whose first n nodes are the mesh's. solved : whether FEM's iteration took over.
+    theta : (p,). coarse : (n, 3) mm, the equilibrium on the mesh.
+    fine : (f, 3) mm, the equilibrium on the finer mesh, whose first n nodes are the mesh's.
+    solved : whether FEM solved on the finer mesh because steps did not contract.
     """
 
     theta: jax.Array
@@ -61,7 +62,7 @@ class MeshErrorEstimate(NamedTuple):
 
     @property
     def field(self) -> jax.Array:
-        """The mesh's displacement less the finer one's at the mesh's nodes, (n, 3) mm."""
+        """Displacement on the mesh less displacement on the finer one, at the mesh's nodes, mm."""
         return self.coarse - self.fine[: len(self.coarse)]
 
     @property
@@ -70,7 +71,7 @@ class MeshErrorEstimate(NamedTuple):
         return jnp.linalg.norm(self.field, axis=1)
 
     def of(self, on_mesh: Quantity, on_finer: Quantity) -> jax.Array:
-        """Error of a quantity ``q(u, theta)`` that is defined on both meshes, in its unit."""
+        """Return the error of a quantity ``q(u, theta)`` defined on both meshes, in its unit."""
         return on_mesh(self.coarse, self.theta) - on_finer(self.fine, self.theta)
 
 
@@ -96,12 +97,12 @@ class MeshError:
         *,
         near: MeshErrorEstimate | None = None,
     ) -> MeshErrorEstimate:
-        """The error at ``theta`` (p,).
+        """Estimate the error at ``theta`` (p,).
 
         Parameters
         ----------
         start : (n, 3) mm, where the solve on the mesh begins; at rest by default.
-        near : the error at another theta, from which the finer mesh's iteration begins.
+        near : the estimate at a nearby theta, whose difference of meshes the iteration starts with.
 
         Raises
         ------
@@ -111,10 +112,10 @@ class MeshError:
         theta = jnp.asarray(theta, dtype=float)
         what = "the error of the mesh"
         coarse = self.simulator.solve(theta, start).require_converged(what).displacement
-        begin = self._carried(coarse)
+        begin = self._prolonged(coarse)
         if near is not None:
-            begin = begin + near.fine - self._carried(near.coarse)
-        # Steps are those of one set of equations; a mesh that is loaded has two.
+            begin = begin + near.fine - self._prolonged(near.coarse)
+        # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
         stepped = None if self.fine.scene.loaded_by else self._stepped(theta, begin)
         if stepped is not None:
             return MeshErrorEstimate(theta, coarse, stepped, solved=False)
@@ -129,7 +130,7 @@ class MeshError:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
         FACTORS.clear()
 
-    def _carried(self, u: jax.Array) -> jax.Array:
+    def _prolonged(self, u: jax.Array) -> jax.Array:
         return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))
 
     @cached_property
@@ -137,35 +138,35 @@ class MeshError:
         return compiled(partial(newton_distance, self.fine.system))
 
     def _stepped(self, theta: jax.Array, u: jax.Array) -> jax.Array | None:
-        """The finer mesh's displacement (f, 3) a few steps from ``u``; None if one is not sound."""
+        """Take a few steps from ``u`` (f, 3) on the finer mesh; None if they do not contract."""
         for _ in range(_STEPS):
             step = self._step(u, theta)
-            if not float(step.contraction) <= _GOES_ON:
+            if not float(step.contraction) <= _DIVERGENCE:
                 return None
-            u = u - step.move
-            if step.settled and float(step.contraction) <= _CONTRACTION:
+            u = u - step.error
+            if step.accepted and float(step.contraction) <= _CONTRACTION:
                 return u
         return None
 
 
 def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshError:
-    """Errors of the mesh of ``simulator``, or of FEM with its defaults for a scene.
+    """Make error estimates for the mesh of ``simulator``, or of a scene solved with the defaults.
 
     Parameters
     ----------
-    most : nodes of a finer mesh that is still looked at.
+    most : the largest number of nodes of the finer mesh.
 
     Raises
     ------
     InputError
         A finer mesh of more nodes, or a load that it cannot have.
     """
-    given = simulator if isinstance(simulator, Simulator) else Simulator(simulator)
-    found = finer(given.scene)
-    if (count := len(found.scene.mesh.nodes)) > most:
+    coarse = simulator if isinstance(simulator, Simulator) else Simulator(simulator)
+    refined = finer(coarse.scene)
+    if (count := len(refined.scene.mesh.nodes)) > most:
         raise InputError(
-            f"mesh error: the mesh finer than that of '{given.scene.name}' has {count} nodes, more "
-            f"than {most}; allow more with 'most', or check a coarser mesh of the same body"
+            f"mesh error: the mesh finer than that of '{coarse.scene.name}' has {count} nodes, "
+            f"more than {most}; allow more with 'most', or check a coarser mesh of the same body"
         )
-    options = replace(given.options, tolerance=max(given.options.tolerance, _TOLERANCE))
-    return MeshError(given, found, Simulator(found.scene, options, given.factorisation))
+    options = replace(coarse.options, tolerance=max(coarse.options.tolerance, _TOLERANCE))
+    return MeshError(coarse, refined, Simulator(refined.scene, options, coarse.factorisation))

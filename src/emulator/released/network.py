@@ -1,4 +1,4 @@
-"""Reader of the released networks: weights, inputs of the processor, statistics of theta.
+"""The released networks: weights, inputs of the processor, statistics of theta.
 
 A clone of the release has the weights of a model as a pickle. Unpickling runs what the file says,
 so this reader admits arrays of numbers and dictionaries and refuses all else. The same arrays in
@@ -16,11 +16,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.released.files import folder_of, read_array, units
+from emulator.released.scenes import folder_of, read_array, units
 
 _PICKLE = "emulationResults/trainedParameters/{model}/trainedNetworkParams.pkl"
 _FIRST = "params/"
-_DEEPEST = 8  # dictionaries within each other; the released ones have four
+_DEPTH = 8  # dictionaries within each other; the released ones have four
 
 
 class ReleasedNetwork(NamedTuple):
@@ -41,7 +41,7 @@ class ReleasedNetwork(NamedTuple):
 
 
 def read_network(root: str | Path, model: str) -> ReleasedNetwork:
-    """The released network of ``model``, from a clone of the release or from its folder ``data``.
+    """Read the network of ``model``, from a clone of the release or from its folder ``data``.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def read_network(root: str | Path, model: str) -> ReleasedNetwork:
 
 
 def _weights(root: str | Path, model: str) -> dict[str, np.ndarray]:
-    """Weights by name, from the first of the places where they may be."""
+    """Read weights by name, from the first file that exists."""
     plain = folder_of(root, model) / "trained" / "weights.npz"
     pickled = [Path(base) / _PICKLE.format(model=model) for base in (root, Path(root).parent)]
     path = next((path for path in (plain, *pickled) if path.is_file()), None)
@@ -110,10 +110,10 @@ def _from_pickle(path: Path) -> dict[str, np.ndarray]:
 
 
 def _leaves(tree: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, np.ndarray]]:
-    """Arrays of nested dictionaries, by their joined keys."""
+    """Yield the arrays of nested dictionaries, by their joined keys."""
     name = "/".join(names)
-    if len(names) > _DEEPEST:
-        raise InputError(f"nests more than {_DEEPEST} dictionaries, at '{name}'; it is not read")
+    if len(names) > _DEPTH:
+        raise InputError(f"nests more than {_DEPTH} dictionaries, at '{name}'; it is not read")
     if isinstance(tree, np.ndarray) and tree.dtype.kind == "f":
         yield name, tree
     elif isinstance(tree, dict) and all(isinstance(key, str) for key in tree):
@@ -128,7 +128,7 @@ class _Arrays(pickle.Unpickler):
     """An unpickler that can make arrays of numbers and containers, and call nothing else."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """What an array is pickled as; :class:`InputError` for any other name."""
+        """Return what arrays are pickled with; :class:`InputError` for any other name."""
         if (module, name) in (("numpy", "ndarray"), ("numpy", "dtype")):
             return getattr(np, name)
         if name == "_reconstruct" and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
@@ -145,7 +145,7 @@ class _Arrays(pickle.Unpickler):
 
 
 def _reconstruct(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray:
-    """NumPy's own start of an unpickled array; its state, with shape and numbers, follows."""
+    """Begin an array as NumPy does; its state, with shape and numbers, follows."""
     if kind is not np.ndarray or tuple(shape) != (0,) or code not in (b"b", "b"):
         raise InputError("makes something else of an array; it is not read")
     return np.ndarray((0,), np.int8)
@@ -154,14 +154,14 @@ def _reconstruct(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray:
 def _frombuffer(
     buffer: bytes, dtype: np.dtype, shape: tuple[int, ...], order: Literal["C", "F"]
 ) -> np.ndarray:
-    """An array as the newest pickles write it."""
+    """Return an array as the newest pickles write it."""
     if not isinstance(buffer, bytes | bytearray) or np.dtype(dtype).kind not in "fiub":
         raise InputError("makes something else of an array; it is not read")
     return np.frombuffer(buffer, dtype=dtype).reshape(shape, order=order)
 
 
 def _of_jax(make: Any, arguments: tuple, state: tuple, _aval: Any) -> np.ndarray:
-    """A JAX array, which is pickled as how to make a NumPy array, and that array's state."""
+    """Return a JAX array, which is pickled as a NumPy function, its arguments, and a state."""
     if make is not _reconstruct:
         raise InputError("makes something else of an array; it is not read")
     array = make(*arguments)
@@ -170,14 +170,14 @@ def _of_jax(make: Any, arguments: tuple, state: tuple, _aval: Any) -> np.ndarray
 
 
 def _dictionary(content: Any) -> dict:
-    """Flax's frozen dictionary, which is pickled as a plain one."""
+    """Return Flax's frozen dictionary, which is pickled as a plain one."""
     if not isinstance(content, dict):
         raise InputError("makes something else of a dictionary; it is not read")
     return content
 
 
 def _latin1(text: str, encoding: str) -> bytes:
-    """Bytes as old pickles write them."""
+    """Return bytes as old pickles write them."""
     if encoding != "latin1":
         raise InputError(f"asks for the encoding {encoding}; it is not read")
     return text.encode("latin1")

@@ -15,9 +15,8 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.fem.energy import potential_energy
 from emulator.geometry.mesh import frozen_array
-from emulator.released.files import units
 from emulator.released.network import ReleasedNetwork, read_network
-from emulator.released.scenes import published_scene, published_tests, theta_units
+from emulator.released.scenes import published_scene, published_tests, theta_units, units
 from emulator.scenes.scene import Scene
 from emulator.surrogates.additive import Emulator
 from emulator.surrogates.network.graph import AugmentedGraph

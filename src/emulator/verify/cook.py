@@ -15,8 +15,7 @@ from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import Traction
-from emulator.verify.benchmark import Benchmark
-from emulator.verify.sphere import order_of
+from emulator.verify.benchmark import Benchmark, order_of
 
 MU, TRACTION = 422.5, 62.5  # kPa
 POINT = (48.0, 52.0)  # mm, middle of the loaded edge
@@ -31,9 +30,8 @@ _INCOMPRESSIBLE = (
 
 
 def membrane(cells: int, form: Literal["P1", "P2", "mean"]) -> Scene:
-    """One layer of cells, held at its left edge and everywhere in z."""
-    # The thickness is a cell's width, for well-shaped tetrahedra.
-    thickness = 48.0 / cells
+    """One layer of cells, fixed at its left edge and everywhere in z."""
+    thickness = 48.0 / cells  # the width of a cell, for well-shaped tetrahedra
     if form == "P1":
         mesh = _parallel_diagonals(cells, thickness)
     else:
@@ -53,7 +51,7 @@ def membrane(cells: int, form: Literal["P1", "P2", "mean"]) -> Scene:
 
 
 def _parallel_diagonals(cells: int, thickness: float) -> Mesh:
-    """A linear mesh whose cells are all cut the same way, so that it locks.
+    """Return a linear mesh whose cells are all cut the same way, so that it locks.
 
     Cells cut by both diagonals hardly do (docs/experiments.md, "Linear tetrahedra do not always
     lock").
@@ -66,7 +64,7 @@ def _parallel_diagonals(cells: int, thickness: float) -> Mesh:
 
 
 def deflection(membrane: Simulator, nu: float) -> float:
-    """Vertical displacement of ``POINT`` in mm."""
+    """Return the vertical displacement of ``POINT`` in mm."""
     theta = jnp.array([MU, bulk_modulus(MU, nu)])
     solution = membrane.solve(theta).require_converged(membrane.scene.name)
     distance = np.linalg.norm(membrane.scene.mesh.nodes[:, :2] - POINT, axis=1)
@@ -74,11 +72,11 @@ def deflection(membrane: Simulator, nu: float) -> float:
 
 
 def verify_cook() -> list[Benchmark]:
-    """Deflections of the forms that do not lock and their order, and of P1, which does."""
+    """Check deflections and orders of the elements that do not lock, and of P1, which does."""
     mean = {cells: Simulator(membrane(cells, "mean")) for cells in (4, 8, 16)}
     finest = f"mean dilatation, {len(mean[16].scene.mesh.nodes)} nodes"
     quadratic, mixed = deflection(Simulator(membrane(8, "P2")), 0.3), deflection(mean[8], 0.3)
-    near, nearer = (deflection(mean[16], nu) for nu in (0.4999, 0.49999))
+    stiff, stiffer = (deflection(mean[16], nu) for nu in (0.4999, 0.49999))
     locked = deflection(Simulator(membrane(16, "P1")), 0.4999)
     orders = [
         Benchmark(
@@ -95,10 +93,10 @@ def verify_cook() -> list[Benchmark]:
         Benchmark(
             "Cook, nu 0.3, mean dilatation: deflection in mm", mixed, 14.73, 0.05, _COMPRESSIBLE
         ),
-        Benchmark(f"Cook, nu 0.4999, {finest}: in mm", near, 12.0, 0.12, _INCOMPRESSIBLE),
+        Benchmark(f"Cook, nu 0.4999, {finest}: in mm", stiff, 12.0, 0.12, _INCOMPRESSIBLE),
         Benchmark(
             "Cook, mean dilatation: nu 0.49999 over nu 0.4999",
-            nearer / near,
+            stiffer / stiff,
             1.0,
             1e-3,
             "does not lock: ten times the bulk modulus changes nothing",
@@ -106,7 +104,7 @@ def verify_cook() -> list[Benchmark]:
         *orders,
         Benchmark(
             "Cook, nu 0.4999, P1 with parallel diagonals: share of the deflection",
-            locked / near,
+            locked / stiff,
             0.36,
             0.1,
             "for warning, measured here: linear tetrahedra lock",

@@ -33,7 +33,7 @@ _BISECTIONS = 40
 
 
 def beam(cells: tuple[int, int, int]) -> Scene:
-    """Half of the 10 x 1 x 1 mm beam (it is symmetric in y), pressed from below."""
+    """Half of the 10 x 1 x 1 mm beam, which is symmetric in y, with a pressure from below."""
     return _scene(
         "Land's beam",
         to_quadratic(box((10.0, 0.5, 1.0), cells)),
@@ -44,7 +44,7 @@ def beam(cells: tuple[int, int, int]) -> Scene:
 
 
 def ventricle(rings: int, around: int, layers: int) -> Scene:
-    """The truncated ellipsoid at 10 kPa, its base held."""
+    """The truncated ellipsoid at a cavity pressure of 10 kPa, its base fixed."""
     return _scene(
         "Land's ventricle",
         land_ventricle(rings, around, layers, order=2),
@@ -55,7 +55,7 @@ def ventricle(rings: int, around: int, layers: int) -> Scene:
 
 
 def contraction(rings: int, around: int, layers: int) -> Scene:
-    """The ellipsoid with fibres, at 15 kPa and an active tension of 60 kPa, its base held."""
+    """The ellipsoid with fibres, at 15 kPa and an active tension of 60 kPa, its base fixed."""
     mesh = land_ventricle(rings, around, layers, order=2)
     return _scene(
         "Land's contracting ventricle",
@@ -68,7 +68,7 @@ def contraction(rings: int, around: int, layers: int) -> Scene:
 
 
 def fibres(mesh: Mesh) -> np.ndarray:
-    r"""The benchmark's fibres (m, q, 3) at the quadrature points.
+    r"""Return the benchmark's fibres (m, q, 3) at the quadrature points.
 
     At the depth t, 0 inside and 1 outside, :math:`x = (r_s \sin u \cos v, r_s \sin u \sin v,
     r_l \cos u)` with the semi-axes :math:`r_s = 7 + 3t`, :math:`r_l = 17 + 3t` mm, and
@@ -90,13 +90,13 @@ def fibres(mesh: Mesh) -> np.ndarray:
 
 
 def _semi_axes(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Short and long semi-axes in mm of the ellipsoid at the depth ``t``."""
+    """Return the short and long semi-axes in mm of the ellipsoid at the depth ``t``."""
     short = LAND.short_endocardium + t * (LAND.short_epicardium - LAND.short_endocardium)
     return short, LAND.long_endocardium + t * (LAND.long_epicardium - LAND.long_endocardium)
 
 
 def _depth(radius: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Depth at which the ellipsoid passes through points at ``radius`` from the axis; bisection."""
+    """Find, by bisection, the depth of the ellipsoid through points at ``radius`` from the axis."""
     low, high = np.full(radius.shape, -0.1), np.full(radius.shape, 1.1)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
@@ -129,14 +129,14 @@ def _scene(
 
 
 def beam_tip(scene: Scene) -> float:
-    """Deformed z in mm of the point (10, 0.5, 1)."""
+    """Return the deformed z in mm of the point (10, 0.5, 1)."""
     solution = Simulator(scene).solve(jnp.array([2.0])).require_converged(scene.name)
     tip = int(np.argmin(np.linalg.norm(scene.mesh.nodes - [10.0, 0.5, 1.0], axis=1)))
     return float(scene.mesh.nodes[tip, 2] + solution.displacement[tip, 2])
 
 
-def apexes(scene: Scene, C: float = 10.0) -> tuple[float, float]:
-    """Deformed z in mm of the apex, inside and outside; ``C`` in kPa."""
+def apexes(scene: Scene, C: float) -> tuple[float, float]:
+    """Return the deformed z in mm of the apex, inside and outside; ``C`` in kPa."""
     solution = Simulator(scene).solve(jnp.array([C])).require_converged(scene.name)
     z = scene.mesh.nodes[:, 2] + np.asarray(solution.displacement)[:, 2]
     inside, outside = (scene.mesh.node_set(f"apex_{s}") for s in ("endocardium", "epicardium"))
@@ -144,7 +144,7 @@ def apexes(scene: Scene, C: float = 10.0) -> tuple[float, float]:
 
 
 def verify_beam() -> list[Benchmark]:
-    """Problem 1.
+    """Check problem 1, the beam.
 
     The cells and the tolerance are from docs/experiments.md, "Land's beam and the pressure through
     its height".
@@ -155,30 +155,30 @@ def verify_beam() -> list[Benchmark]:
 
 
 def verify_ventricle() -> list[Benchmark]:
-    """Problem 2: both apexes."""
-    scene = ventricle(10, 20, 3)
-    nodes, (inside, outside) = len(scene.mesh.nodes), apexes(scene)
-    return [
-        Benchmark(f"Land 2, {nodes} nodes: {where} in mm", z, value, 0.005 * abs(value), source)
-        for where, z, value, source in (
-            ("apex, endocardium", inside, -26.61, _VENTRICLE.format(value="-26.611")),
-            ("apex, epicardium", outside, -28.28, _VENTRICLE.format(value="-28.278")),
-        )
-    ]
+    """Check problem 2, both apexes of the inflated ventricle."""
+    inside, outside = (-26.61, 0.005 * 26.61, "-26.611"), (-28.28, 0.005 * 28.28, "-28.278")
+    return _apex_rows("Land 2", ventricle(10, 20, 3), 10.0, _VENTRICLE, inside, outside)
 
 
 def verify_contraction() -> list[Benchmark]:
-    """Problem 3: both apexes.
+    """Check problem 3, both apexes of the contracting ventricle.
 
     Fibres have no direction on the axis, where the inner apex converges slowly: tolerances are
     from docs/experiments.md, "Land's contracting ventricle".
     """
-    scene = contraction(11, 24, 4)
-    nodes, (inside, outside) = len(scene.mesh.nodes), apexes(scene, C=2.0)
-    return [
-        Benchmark(f"Land 3, {nodes} nodes: {where} in mm", z, value, tolerance, source)
-        for where, z, value, tolerance, source in (
-            ("apex, endocardium", inside, -12.33, 0.25, _CONTRACTION.format(value="-12.33")),
-            ("apex, epicardium", outside, -15.47, 0.08, _CONTRACTION.format(value="-15.47")),
-        )
-    ]
+    inside, outside = (-12.33, 0.25, "-12.33"), (-15.47, 0.08, "-15.47")
+    return _apex_rows("Land 3", contraction(11, 24, 4), 2.0, _CONTRACTION, inside, outside)
+
+
+def _apex_rows(
+    problem: str, scene: Scene, C: float, source: str, *references: tuple[float, float, str]
+) -> list[Benchmark]:
+    """Compare the apexes with their z in mm, its tolerance, and the value by other elements."""
+    names = ("apex, endocardium", "apex, epicardium")
+    nodes = len(scene.mesh.nodes)
+    rows = []
+    for where, z, reference in zip(names, apexes(scene, C), references, strict=True):
+        value, tolerance, digits = reference
+        name = f"{problem}, {nodes} nodes: {where} in mm"
+        rows.append(Benchmark(name, z, value, tolerance, source.format(value=digits)))
+    return rows

@@ -1,4 +1,7 @@
-"""Our FEM against the FEniCS solutions released with Dalton et al. (2023)."""
+"""Our FEM against the FEniCS solutions released with Dalton et al. (2023).
+
+The comparison verifies the mechanics; the solutions are also references to evaluate emulators by.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,19 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign, solve_together
+from emulator.fem.campaign.designs import Reference
 from emulator.fem.energy import potential_energy
-from emulator.released.files import models_in, units
-from emulator.released.scenes import MODELS, published_scene, published_tests
+from emulator.released.scenes import (
+    MODELS,
+    models_in,
+    published_scene,
+    published_tests,
+    units,
+)
 from emulator.scenes.scene import Scene
 from emulator.verify.benchmark import Benchmark
 
@@ -28,9 +38,9 @@ BALANCE_TOLERANCE = 1e-6
 
 
 def verify_published(root: str | Path, *, most: int | None = None) -> list[Benchmark]:
-    """Largest relative errors over all test cases of every released model in ``root``.
+    """Return the largest relative errors over all test cases of every released model in ``root``.
 
-    The released solutions end where FEniCS stopped, some with a visible force out of balance. The
+    The released solutions end where FEniCS stopped, some with a visible residual force. The
     comparison therefore stops by the same rule, :func:`fenics_tolerance`; the residual of the
     stored fields is a row of its own.
 
@@ -54,20 +64,20 @@ def verify_published(root: str | Path, *, most: int | None = None) -> list[Bench
 
 
 def fenics_tolerance(scene: Scene, model: str) -> float:
-    r"""Residual norm in mN below which the released runs stopped.
+    r"""Return the norm of the residual in mN below which the released runs stopped.
 
     FEniCS' Newton solver stops at a fraction of its first residual, whose entries are the forces
-    where free and :math:`-\bar u` where held, in the model's own units. The fraction is not in the
-    release; 1e-8 is inferred from its fields: with it every stored field is one of our iterates to
-    round-off, while at FEniCS' default, 1e-9, most cubes would have taken one iteration more
-    (docs/experiments.md, "The stopping rule of the released solutions").
+    at free nodes and :math:`-\bar u` at prescribed ones, in the model's own units. The fraction is
+    not in the release; 1e-8 is inferred from its fields: with it every stored field is one of our
+    iterates to round-off, while at FEniCS' default, 1e-9, most cubes would have taken one iteration
+    more (docs/experiments.md, "The stopping rule of the released solutions").
     """
     unit = units(model)
     force = unit.stress * unit.length**2
     system = Simulator(scene).system
     free = system.restrict(system.dead_force(scene.centre)) / force
-    held = jnp.asarray(scene.held_displacement) / unit.length
-    return 1e-8 * float(jnp.sqrt(jnp.sum(free**2) + jnp.sum(held**2))) * force
+    prescribed = jnp.asarray(scene.held_displacement) / unit.length
+    return 1e-8 * float(jnp.sqrt(jnp.sum(free**2) + jnp.sum(prescribed**2))) * force
 
 
 def _verify_model(root: str | Path, model: str, most: int | None) -> list[Benchmark]:
@@ -96,11 +106,51 @@ def _verify_model(root: str | Path, model: str, most: int | None) -> list[Benchm
     energy = jax.jit(jax.vmap(potential_energy(scene)))(solution.displacement, thetas)
     add("relative energy error", jnp.abs(energy / energies - 1.0), ENERGY_TOLERANCE)
     balance = jax.jit(jax.vmap(simulator.system.relative_residual))
-    left = balance(reference, thetas)
-    add("force out of balance in the stored fields", left, BALANCE_TOLERANCE)
+    add("force out of balance in the stored fields", balance(reference, thetas), BALANCE_TOLERANCE)
     return rows
 
 
 def _norm(fields: jax.Array) -> jax.Array:
-    """Euclidean norm over nodes and components, (c,)."""
+    """Return the Euclidean norm over nodes and components, (c,)."""
     return jnp.sqrt(jnp.sum(fields**2, axis=(1, 2)))
+
+
+def published_reference(scene: Scene, folder: str | Path, *, progress: bool = False) -> Reference:
+    """Return the released test cases in ``folder``, for a scene that is the released model.
+
+    Where the release has no displacements, our FEM solves at the released theta, and its energies
+    must equal the released ones.
+
+    Raises
+    ------
+    InputError
+        Another scene, or an energy more than ``VENTRICLE_ENERGY_TOLERANCE`` away.
+    """
+    folder = Path(folder).resolve()
+    model = folder.name
+    released = published_scene(model, folder.parent)
+    if not released.identity.agrees(scene.identity):
+        raise InputError(
+            f"published model '{model}' is not the scene '{scene.name}' of the emulator "
+            "(mesh, supports, law, fibres, constants and loads must agree)"
+        )
+    thetas, tests = published_tests(model, folder.parent)
+    order = np.array([released.parameter_names.index(name) for name in scene.parameter_names])
+    if tests.displacement is not None:
+        return Reference(
+            thetas[:, order], jnp.asarray(tests.displacement), "released displacements"
+        )
+    runs = run_campaign(Simulator(released), thetas, progress=progress)
+    _check_energies(model, np.asarray(runs.energy), tests.energy)
+    return Reference(thetas[:, order], runs.displacement, "our FEM at the released theta")
+
+
+def _check_energies(model: str, ours: np.ndarray, released: np.ndarray) -> None:
+    error = np.abs(ours / released - 1.0)
+    worst = int(np.argmax(error))
+    if not error[worst] <= VENTRICLE_ENERGY_TOLERANCE:
+        raise InputError(
+            f"published model '{model}': our FEM's energy in case {worst} is {ours[worst]:.9g} "
+            f"mN mm, the released one {released[worst]:.9g} (relative difference "
+            f"{error[worst]:.2g}, at most {VENTRICLE_ENERGY_TOLERANCE:g})"
+        )

@@ -7,8 +7,7 @@ With the hoop stretch :math:`\lambda = r/R`, incompressibility gives
 .. math:: p = \mu\,[f(\lambda_b) - f(\lambda_a)], \qquad
           f(\lambda) = \frac{2}{\lambda} + \frac{1}{2\lambda^4} .
 
-The pressure has a maximum; the loads checked are below it. The order of convergence is that of
-three meshes of elements half as long each time, :math:`\log_2 |s_1 - s_0| / |s_2 - s_1|`.
+The pressure has a maximum; the loads checked are below it.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import CavityPressure, PublishedPressure
-from emulator.verify.benchmark import Benchmark
+from emulator.verify.benchmark import Benchmark, order_of
 
 INNER, OUTER, MU = 10.0, 15.0, 10.0
 NU = 0.4999
-STRETCH = 1.2  # of the meshes whose order of convergence is found
+STRETCH = 1.2  # at which the order of convergence is measured
 _SOURCE = "closed form of the incompressible sphere"
 _ORDER = "3.7 measured here; a pressure an element promises 2, quadratic displacements at most 4"
 _WORK = "p dV of the same polyhedron, lambda^2 times that at rest"
 
 
 def pressure_at(stretch: float) -> float:
-    """Pressure in kPa that stretches the inner surface by ``stretch``."""
+    """Return the pressure in kPa that stretches the inner surface by ``stretch``."""
 
     def f(value: float) -> float:
         return 2.0 / value + 0.5 / value**4
@@ -46,7 +45,7 @@ def pressure_at(stretch: float) -> float:
 
 
 def sphere_scene(cells: tuple[int, int], order: int = 2) -> Scene:
-    """One eighth of the sphere, its planes of symmetry held."""
+    """One eighth of the sphere, fixed normal to its planes of symmetry."""
     return Scene(
         name="thick sphere",
         mesh=sphere_octant(INNER, OUTER, cells, grading=1.5, order=order),
@@ -63,28 +62,23 @@ def sphere_scene(cells: tuple[int, int], order: int = 2) -> Scene:
 
 
 def inner_stretch(sphere: Simulator, stretch: float, nu: float = NU) -> float:
-    """Mean hoop stretch of the inner surface at the pressure of ``stretch``."""
+    """Return the mean hoop stretch of the inner surface at the pressure of ``stretch``."""
     theta = jnp.array([MU, bulk_modulus(MU, nu), pressure_at(stretch)])
     solution = sphere.solve(theta).require_converged("thick sphere")
     mesh = sphere.scene.mesh
     inner = mesh.node_set("inner")
-    place = mesh.nodes[inner] + np.asarray(solution.displacement)[inner]
-    return float(np.linalg.norm(place, axis=1).mean()) / INNER
-
-
-def order_of(coarse: float, middle: float, fine: float) -> float:
-    """Order of convergence of three values, of elements half as long each time."""
-    return float(np.log2(abs(middle - coarse) / abs(fine - middle)))
+    position = mesh.nodes[inner] + np.asarray(solution.displacement)[inner]
+    return float(np.linalg.norm(position, axis=1).mean()) / INNER
 
 
 def verify_sphere() -> list[Benchmark]:
-    """Stretch against pressure, its order of convergence, and the work of the pressure."""
+    """Check the stretch at three pressures, its order of convergence, and the pressure's work."""
     rows, sphere = [], Simulator(sphere_scene((6, 4)))
     nodes = f"{len(sphere.scene.mesh.nodes)} nodes"
     for stretch in (1.1, 1.2, 1.3):
-        found = inner_stretch(sphere, stretch)
+        measured = inner_stretch(sphere, stretch)
         name = f"thick sphere, {pressure_at(stretch):.4f} kPa, {nodes}: inner stretch"
-        rows.append(Benchmark(name, found, stretch, 0.005 * stretch, _SOURCE))
+        rows.append(Benchmark(name, measured, stretch, 0.005 * stretch, _SOURCE))
     nested = [Simulator(sphere_scene((n, n))) for n in (2, 4, 8)]
     for nu in (0.499, NU):
         order = order_of(*(inner_stretch(each, STRETCH, nu) for each in nested))
@@ -94,7 +88,7 @@ def verify_sphere() -> list[Benchmark]:
 
 
 def verify_pressure_work() -> list[Benchmark]:
-    """Work of a pressure in a uniform swelling, exact and as released, over ``p dV``."""
+    """Check the work of a pressure in a uniform swelling, exact and as released, over ``p dV``."""
     rows = []
     for stretch in (1.1, 1.5, 2.0):
         exact = _work_ratio(CavityPressure("inner"), stretch)
@@ -108,7 +102,7 @@ def verify_pressure_work() -> list[Benchmark]:
 
 
 def _work_ratio(load: CavityPressure | PublishedPressure, stretch: float) -> float:
-    """Derivative of the load's work in ``stretch``, a uniform swelling, over ``p dV``."""
+    """Return the derivative of the load's work in a uniform ``stretch``, over ``p dV``."""
     scene = replace(sphere_scene((4, 2), order=1), loads=(load,))
     term = load.term(scene.discretisation)
     X = jnp.asarray(scene.mesh.nodes)

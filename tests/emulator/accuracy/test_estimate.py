@@ -2,7 +2,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import sparsax
 
 import emulator as em
 from emulator.accuracy.estimate import error_bar
@@ -189,27 +188,7 @@ def test_nothing_that_is_not_finite_comes_out(beam, bar, exact, what):
     assert estimate.max > 0.0  # not known to be wrong is not known to be right
 
 
-@pytest.mark.slow
-def test_the_tangent_of_the_centre_is_factorised_once(beam, simulator, bar):
-    theta = beam.from_unit(jnp.array([0.55, 0.5]))
-    map_there = Off(beam, simulator(theta), 0.02)
-    present = bar.of_field(map_there(theta), theta)
-    bars = [error_bar(map_there, simulator, "centre", iterations=k) for k in (2, 6)]
-    few, more = (each(theta) for each in bars)
-    assert few.valid
-    assert 0.5 < float(few.max / np.linalg.norm(map_there.error, axis=1).max()) < 2.0
-    # More conjugate gradients, closer to what the tangent of the prediction gives.
-    assert far(more.field, present.field) < 0.2 * far(few.field, present.field)
-    before = sparsax.factorization_count()
-    bars[1](beam.from_unit(jnp.array([0.6, 0.5])))
-    assert sparsax.factorization_count() == before
-
-
 def test_refusals(beam, simulator, off, cube):
-    with pytest.raises(InputError, match="tangent 'past'; use present or centre"):
-        error_bar(off(0.1), simulator, "past")
-    with pytest.raises(InputError, match="0 conjugate gradients"):
-        error_bar(off(0.1), simulator, "centre", iterations=0)
     with pytest.raises(InputError, match="over all nodes"):
         error_bar(fem_forward(simulator).at(np.array([3])), simulator)
     with pytest.raises(InputError, match="the simulator of 'twisting_cube'"):

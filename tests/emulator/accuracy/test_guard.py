@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.accuracy.guard import guard, invariants, outside_box
+from emulator.accuracy.estimate import guard, invariants, outside_box
 from scene_support import block
 
 

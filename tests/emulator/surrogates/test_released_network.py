@@ -12,9 +12,8 @@ from jax._src.array import _reconstruct_array
 import emulator as em
 from calibrate.cli import main
 from emulator.core.errors import InputError
-from emulator.released.files import units
 from emulator.released.network import read_network
-from emulator.released.scenes import published_tests
+from emulator.released.scenes import published_tests, units
 from emulator.surrogates.network.pignn import Processor
 from emulator.surrogates.released_network import released_network
 

@@ -8,10 +8,16 @@ from scipy.integrate import quad
 import axisymmetric_support
 import emulator as em
 from emulator.verify import CASES, Benchmark
-from emulator.verify.consistency import verify_barriers, verify_invariance, verify_patch
+from emulator.verify.benchmark import order_of
+from emulator.verify.consistency import (
+    taylor_of_energy,
+    verify_barriers,
+    verify_invariance,
+    verify_patch,
+)
 from emulator.verify.cook import deflection, membrane
 from emulator.verify.land import apexes, beam, contraction, fibres
-from emulator.verify.sphere import INNER, OUTER, inner_stretch, order_of, pressure_at, sphere_scene
+from emulator.verify.sphere import INNER, OUTER, inner_stretch, pressure_at, sphere_scene
 from emulator.verify.sphere import MU as SHEAR
 
 
@@ -25,6 +31,11 @@ from emulator.verify.sphere import MU as SHEAR
 def test_what_holds_exactly(case):
     rows = case()
     assert [row for row in rows if not row.passed] == []
+
+
+def test_the_tangent_is_the_derivative_of_the_residual():
+    """Both triangles of it: its upper triangle alone would leave a remainder of order one."""
+    assert [row.measured for row in taylor_of_energy("P1")] == pytest.approx([2.0, 2.0], abs=0.05)
 
 
 def test_a_row_outside_its_tolerance_has_not_passed():

@@ -263,8 +263,7 @@ def _rows(names: list[str]) -> list[Benchmark]:
     if names and names[0] == "published":
         if len(names) != 2:
             raise InputError("verify published: give the folder of the released data, and only it")
-        from emulator.released.files import models_in
-        from emulator.released.scenes import MODELS
+        from emulator.released.scenes import MODELS, models_in
 
         rows = verify_published(names[1])
         absent = sorted(set(MODELS) - set(models_in(names[1])))

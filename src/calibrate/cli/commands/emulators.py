@@ -52,7 +52,7 @@ def run_predict(arguments: argparse.Namespace) -> int:
     import jax
     import numpy as np
 
-    from emulator.accuracy.guard import guard
+    from emulator.accuracy.estimate import guard
     from emulator.fem.fields import element_fields
     from emulator.geometry.io import write_solution
     from emulator.surrogates import load

@@ -29,6 +29,24 @@ def test_gradients_that_do_not_get_there_say_so():
     assert nothing.convex
 
 
+def test_two_iterations_are_those_of_the_textbook():
+    rng = np.random.default_rng(0)
+    A, M = (np.eye(6) + 0.1 * (R + R.T) for R in rng.normal(size=(2, 6, 6)))
+    left = b = rng.normal(size=6)
+    x, p, before = np.zeros(6), 0.0, 1.0
+    for k in range(2):
+        z = np.linalg.solve(M, left)
+        p = z + (left @ z / before if k else 0.0) * p
+        before = left @ z
+        length = before / (p @ A @ p)
+        x, left = x + length * p, left - length * A @ p
+    found = conjugate_gradients(
+        lambda v: A @ v, lambda r: jnp.linalg.solve(M, r), jnp.asarray(b), 2, 0.0
+    )
+    np.testing.assert_allclose(found.x, x, rtol=1e-10)
+    assert found.convex
+
+
 def test_a_kept_factor_leads_to_the_same_equilibrium(monkeypatch):
     """As on a mesh large enough for it, and with fewer factorisations than tangents."""
     scene = em.scenes.left_ventricle(4, 8, 1, order=1)

@@ -3,8 +3,13 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
-from emulator.released.files import models_in, read_geometry, read_tests
-from emulator.released.scenes import published_scene, published_tests
+from emulator.released.scenes import (
+    models_in,
+    published_scene,
+    published_tests,
+    read_geometry,
+    read_tests,
+)
 
 
 def test_the_built_in_beam_is_the_released_one(published):

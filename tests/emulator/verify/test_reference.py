@@ -9,11 +9,11 @@ import emulator as em
 from emulator.core.errors import InputError
 from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
-from emulator.released import reference
-from emulator.released.reference import published_reference
 from emulator.released.scenes import published_scene
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import Gravity
+from emulator.verify import released as module
+from emulator.verify.released import published_reference
 
 MU, LAM = Parameter("mu", "kPa", 3.5, 10.0, "log"), Parameter("lam", "kPa", 3.5, 10.0, "log")
 
@@ -45,7 +45,7 @@ def simulators():
 def compiled_once(simulators, monkeypatch):
     """One simulator a scene, whichever test asks for it."""
     once = lambda scene: simulators.setdefault(scene.fingerprint, em.Simulator(scene))
-    monkeypatch.setattr(reference, "Simulator", once)
+    monkeypatch.setattr(module, "Simulator", once)
 
 
 @pytest.fixture(scope="module")
