@@ -159,7 +159,7 @@ def in_process(solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
 
 
 def at_once(simulator: Simulator, nodes: int | None = None) -> int:
-    """Return the number of solves that this machine does at once, one for each core and its memory.
+    """Return how many solves this machine does at once, limited by its cores and its memory.
 
     It is 1 on large meshes, where a factor is kept between solves or Python calls the solver, and
     for a simulator of another class: only FEM simulators of this package are known to be
