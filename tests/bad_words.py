@@ -141,7 +141,7 @@ COMMANDS = [
     ("simulate once_clamped_beam --theta mu=inf lam=60", "mu' is inf kPa; scene"),
     ("demo --scene luck", "invalid choice: 'luck'"),
     ("released nowhere", "are required: --root, --out"),
-    ("train liver --sweeps 60 --out x", "recipe 'hybrid' takes FEM runs, not sweeps"),
+    ("train liver --sweeps 60 --out x", "--sweeps has no effect with recipe 'hybrid', which makes"),
     ("train liver --recipe sweeps --sweeps 3 --out x", "3 sweeps; the loads rise over 15"),
     (
         "train liver --recipe sweeps --simulations 9 --out x",

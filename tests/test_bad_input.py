@@ -21,10 +21,10 @@ from calibrate.measurements.data import read_data, write_data
 from calibrate.project import Run, make_data
 from cli_support import write_block
 from emulator.core.errors import InputError
-from emulator.surrogates.files import SHIPPED
+from emulator.surrogates.emulator import SHIPPED
 from emulator.training import recipe
-from emulator.training.budget import Budget
-from emulator.training.plan import Plan
+from emulator.training.graph_network import GraphNetwork
+from emulator.training.job import Budget
 from linear_support import linear_forward
 
 BEAM = em.scenes.once_clamped_beam(cells=(4, 2, 2), order=1)
@@ -103,7 +103,7 @@ PYTHON = [
     (lambda: Run("liver", draws=0), "draws is 0; it must be 1 or more"),
     (lambda: Run("liver", forward_options={"fem_runs": 9}), "no effect without --forward reduced"),
     (lambda: recipe("luck"), "recipe 'luck' is unknown; known: hybrid"),
-    (lambda: Plan(steps=0), "steps is 0; it must be 1 or more"),
+    (lambda: GraphNetwork(steps=0), "steps is 0; it must be 1 or more"),
     (lambda: Budget(1.0, 0.0), "a budget of 1 s: one FEM solution and its compilation alone take"),
 ]
 

@@ -19,7 +19,7 @@ from studies.inverse_benchmark.score import score
 
 from emulator.fem import Simulator, run_campaign, sobol
 from emulator.scenes import Scene
-from emulator.surrogates.additive import Emulator
+from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.protocol import ForwardMap
 from emulator.surrogates.taylor import expand

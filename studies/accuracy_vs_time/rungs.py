@@ -23,8 +23,8 @@ from calibrate.measurements import landmarks, spread_landmarks
 from emulator.core.errors import InputError
 from emulator.fem import NewtonOptions, Simulator, run_campaign, sobol
 from emulator.scenes import Scene
-from emulator.surrogates.additive import Emulator
 from emulator.surrogates.corrected import corrected
+from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.protocol import ForwardMap
 from emulator.surrogates.taylor import expand

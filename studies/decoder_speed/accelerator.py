@@ -24,9 +24,9 @@ from calibrate.samplers.smc import SMCOptions
 from calibrate.statistical_model import Data, Model
 from emulator.core.store import write_json
 from emulator.training.checkpoint import State
+from emulator.training.graph_network import PAPER
+from emulator.training.job import Job
 from emulator.training.loop import Steps
-from emulator.training.plan import recipe
-from emulator.training.problem import prepare
 
 HERE = Path(__file__).parent
 SEED = 12
@@ -55,10 +55,9 @@ def particles(model: Model, data: dict[str, Any], size: int) -> dict[str, Any]:
 
 def step_s(device: jax.Device, batch: int, steps: int) -> float:
     """Seconds of a step of the paper's training, ``batch`` theta each, prepared on the CPU."""
-    plan = replace(recipe("paper"), steps=steps, batch=batch)
+    plan = replace(PAPER, steps=steps, batch=batch)
     with jax.default_device(jax.devices("cpu")[0]):
-        training = prepare(em.load(SCENE).scene, plan).training
-        assert training is not None
+        training = plan.prepare(Job(em.load(SCENE).scene)).training
         state = State(*training.initial())
     state = jax.device_put(state, device)
     advance = Steps([training])

@@ -19,7 +19,7 @@ from calibrate.measurements import Landmarks, landmarks, spread_landmarks
 from emulator.surrogates import Architecture, CachedEmulator, Emulator, augment
 from emulator.surrogates.network.part import Network, fresh
 from emulator.surrogates.taylor import expand
-from emulator.training.basis import mechanical_modes
+from emulator.training.hybrid import mechanical_modes
 
 LANDMARKS = 24
 ROUNDS = 5

@@ -14,7 +14,8 @@ from emulator import Simulator
 from emulator.core.gaussian_process import Features, fit_lengths, fit_weights, fold
 from emulator.fem import Runs, run_campaign
 from emulator.scenes import Scene
-from emulator.surrogates.discrepancy import Discrepancy, Warp, fit, fit_discrepancy
+from emulator.surrogates import discrepancy
+from emulator.surrogates.discrepancy import Discrepancy, Warp, fit_discrepancy
 from emulator.surrogates.pod_gp import ReducedForward, fit_reduced
 from emulator.surrogates.taylor import Expansion, expand
 
@@ -94,7 +95,7 @@ def fit_rival(scene: Scene, runs: Runs, modes: int = RIVAL_MODES) -> ReducedForw
 
 def plain_kernel(scene: Scene, runs: Runs, series: Expansion, mean_map: Map | None) -> Discrepancy:
     """Our discrepancy model with a kernel of positions only."""
-    with patch.object(fit, "_FEATURES", 0):
+    with patch.object(discrepancy, "_FEATURES", 0):
         return fit_discrepancy(scene, runs, series, mean_map)
 
 

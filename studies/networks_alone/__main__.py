@@ -31,14 +31,15 @@ from emulator.core.store import write_json
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates import Architecture, Emulator, load, shipped
-from emulator.training import Plan, recipe
+from emulator.training import recipe
 from emulator.training.checkpoint import State
-from emulator.training.loop import Steps, optimise
-from emulator.training.modal import ARCHITECTURE, Modal
-from emulator.training.network import NetworkTraining
-from emulator.training.problem import prepare
-from emulator.training.start import with_weights
-from emulator.training.step import make_step
+from emulator.training.graph_network import GraphNetwork
+from emulator.training.job import Job
+from emulator.training.loop import NetworkTraining, Steps, optimise
+from emulator.training.modal import ARCHITECTURE, Modal, mode_training
+from emulator.training.mode_fit import ModeFit
+from emulator.training.network_plan import Problem, with_weights
+from emulator.training.objectives import loss_scales
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
@@ -49,7 +50,7 @@ SMALL = Architecture(
 )
 
 
-class ByAdam(Modal):
+class ByAdam(ModeFit):
     """The modal recipe whose last layer descends like the others and is solved for at the end."""
 
     def descend(self, weights, number, *kept):
@@ -78,16 +79,16 @@ class Idea:
 
     name: str
     recipe: str = "modal"
-    plan: Callable[[Plan], Plan] = lambda plan: plan
-    modal: Callable[[Modal], Modal] = lambda modal: modal
+    plan: Callable[[Any], Any] = lambda plan: plan
+    modal: Callable[[ModeFit], ModeFit] = lambda modal: modal
     optimiser: optax.GradientTransformation | None = None
 
 
-def _adams(modal: Modal) -> Modal:
+def _adams(modal: ModeFit) -> ModeFit:
     return ByAdam(modal.scene, modal.network, modal.runs, modal.scales)
 
 
-def _without_gradients(modal: Modal) -> Modal:
+def _without_gradients(modal: ModeFit) -> ModeFit:
     return replace(modal, scales=modal.scales._replace(gradient=1e9))
 
 
@@ -108,7 +109,7 @@ IDEAS = (
     Idea(
         "separable, with gradients",
         "network",
-        lambda p: replace(p, objective="gradients", decoder="separable", modes=0, freeze=10**9),
+        lambda p: replace(p, objective="gradients", decoder="separable"),
     ),
     Idea("modal, last layer by Adam", modal=_adams),
     Idea("modal, no slopes", modal=lambda modal: replace(modal, slopes=0.0)),
@@ -123,26 +124,27 @@ IDEAS = (
 def trained(idea: Idea, scene: Any, seed: int, arguments: argparse.Namespace) -> Emulator:
     """The emulator that ``idea`` leads to."""
     steps, runs = arguments.steps, arguments.simulations
-    plan = replace(recipe(idea.recipe), steps=steps, simulations=runs, seed=seed)
-    if idea.recipe == "modal":
+    plan: Any = recipe(idea.recipe).with_counts(steps=steps, simulations=runs)
+    plan = replace(plan, seed=seed)
+    if isinstance(plan, Modal):
         plan = replace(plan, freeze=steps // 2, polish=arguments.polish)
     plan = idea.plan(plan)
     sizes = SMALL if arguments.quick else ARCHITECTURE
-    if plan.decoder == "pointwise":
+    if isinstance(plan, GraphNetwork) and plan.decoder == "pointwise":
         sizes = Architecture(2, 8, (16, 16)) if arguments.quick else Architecture()
-    problem = prepare(scene, plan, sizes)
-    assert problem.training is not None, "every idea has a network"
-    training = _with(idea, problem.training)
+    problem = plan.prepare(Job(scene, sizes))
+    training = _with(idea, problem)
     state = optimise(State(*training.initial()), plan.steps, Steps([training]), [])
-    return with_weights(problem.emulator, training.finish(state.weights))
+    return with_weights(problem.emulator, training.finish(state.weights, False))
 
 
-def _with(idea: Idea, training: NetworkTraining) -> NetworkTraining:
-    if training.modal is None:
-        return training
-    modal, optimiser = idea.modal(training.modal), idea.optimiser or training.optimiser
-    step = make_step(training.plan, modal.descend, optimiser)
-    return replace(training, modal=modal, optimiser=optimiser, step=step)
+def _with(idea: Idea, problem: Problem) -> NetworkTraining:
+    if not isinstance(problem.plan, Modal):
+        return problem.training
+    scene, runs = problem.emulator.scene, problem.runs
+    scales = loss_scales(scene, runs, from_runs=True)
+    fit = idea.modal(ModeFit(scene, problem.training.network, runs, scales))
+    return mode_training(problem.plan, fit, idea.optimiser)
 
 
 def errors_of(emulator: Emulator, known: Any) -> dict[str, Any]:

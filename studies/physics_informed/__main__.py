@@ -28,6 +28,7 @@ from studies.common.output import Case, Results, parser, save
 from studies.physics_informed.finer_mesh import WAYS as FINER
 from studies.physics_informed.finer_mesh import on_finer
 from studies.physics_informed.judged import TEST_SEED, errors_of
+from studies.ventricle_family.shapes import ventricles
 
 import calibrate as cal
 import emulator as em
@@ -37,11 +38,11 @@ from emulator.core.errors import SolverError
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.scenes.loads import PublishedPressure
-from emulator.scenes.ventricle_family import ventricles
 from emulator.surrogates import Architecture, Emulator, load, save_emulator
 from emulator.surrogates.taylor import expand
 from emulator.training import recipe, train
-from emulator.training.sweeps import part_of, sweep_box
+from emulator.training.box_sweeps import polynomial_part, sweep_box
+from emulator.training.modal import Modal
 
 HERE = Path(__file__).parent
 SEED = 0
@@ -108,14 +109,14 @@ def sweeping(scene: Scene, known: Runs, sweeps: int, *, centre: bool = False) ->
                 seconds += time.perf_counter() - began
                 continue
             seconds += time.perf_counter() - began
-            emulator = Emulator(scene, polynomial=part_of(simulator, state))
+            emulator = Emulator(scene, polynomial=polynomial_part(simulator, state))
             errors = errors_of(emulator, known)
             curve.append(
                 {
                     "sweeps": state.number,
                     "seconds": round(seconds, 1),
                     "degree": state.polynomial.degree,
-                    "error_bar_mm": state.left,
+                    "error_bar_mm": state.error,
                     "err_u": errors["err_u"],
                 }
             )
@@ -154,17 +155,17 @@ def network(scene: Scene, known: Runs, name: str, keep: Path | None, given: Any)
     """The network that a recipe trains in so many minutes, and a posterior with it."""
     small = given.quick
     plan = replace(recipe(name), seed=given.seed)
-    sizes = SMALL if small and plan.decoder == "separable" else None
+    sizes = SMALL if small and isinstance(plan, Modal) else None
     if small:
-        plan = replace(plan, steps=60, simulations=20, freeze=30, polish=50)
+        plan = plan.with_counts(steps=60, simulations=20, freeze=30, polish=50)
     with tempfile.TemporaryDirectory() as folder:
         budget = None if small else 60.0 * given.minutes
         emulator = train(scene, plan, folder, architecture=sizes, budget=budget)
     record = emulator.record
     if keep:
         save_emulator(emulator, keep)
-    runs = 0 if plan.sweeps else plan.runs + int(plan.centred)
-    found = {"fem_solutions": runs, "seed": given.seed, "seconds": record["seconds"],
+    solved = 0 if "sweeps" in record else plan.runs + int(name != "paper")
+    found = {"fem_solutions": solved, "seed": given.seed, "seconds": record["seconds"],
              "steps": record["plan"]["steps"], "errors": errors_of(emulator, known)}  # fmt: skip
     return found | ({} if small else {"posterior": posterior(emulator, known)})
 

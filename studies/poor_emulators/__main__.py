@@ -31,9 +31,9 @@ from emulator.core.store import write_json
 from emulator.fem import Simulator, design, run_campaign, sobol
 from emulator.scenes.built_in.ventricles import left_ventricle
 from emulator.scenes.scene import Scene
-from emulator.surrogates.additive import Emulator
+from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import expand
-from emulator.training.discrepancy_stage import add_discrepancy
+from emulator.training.mechanics import add_discrepancy
 
 HERE = Path(__file__).parent
 SEED = 7

@@ -30,9 +30,9 @@ from emulator.scenes.built_in.ventricles import left_ventricle
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, Load, PublishedPressure
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.surrogates.additive import Emulator
+from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import expand
-from emulator.training.discrepancy_stage import add_discrepancy
+from emulator.training.mechanics import add_discrepancy
 
 HERE = Path(__file__).parent
 SEED = 11

@@ -20,7 +20,7 @@ import emulator as em
 from calibrate.figures.drawing import pyplot
 from calibrate.model_error import ModelError
 from emulator.core.errors import InputError
-from emulator.training.plan import recipe
+from emulator.training import recipe
 
 HERE = Path(__file__).parent
 SEED = 31

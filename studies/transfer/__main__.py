@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.common.output import save
+from studies.transfer.pretraining import pretrain
 
 import emulator as em
 from calibrate.figures.drawing import pyplot
@@ -29,10 +30,10 @@ from emulator.geometry.facets import Cavity
 from emulator.scenes import Scene
 from emulator.scenes.cavities import cavity_sets
 from emulator.surrogates import Architecture, Emulator
-from emulator.training import Plan, pretrain, recipe, train
-from emulator.training.problem import Problem, prepare
-from emulator.training.start import with_network_of
-from emulator.training.step import predictor
+from emulator.training import recipe, train
+from emulator.training.graph_network import GraphNetwork, predictor
+from emulator.training.job import Job
+from emulator.training.network_plan import Problem, with_network_of
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
@@ -203,7 +204,7 @@ def main() -> None:
     arguments = parser.parse_args()
     meshes, sizes = (QUICK_MESHES, QUICK_SIZES) if arguments.quick else (MESHES, SIZES)
     began = time.perf_counter()
-    plan = Plan(objective="energy", steps=arguments.pretrain, batch=8, learning_rate=2e-3)
+    plan = GraphNetwork(objective="energy", steps=arguments.pretrain, batch=8, learning_rate=2e-3)
     groups = {"family": family(arguments.family, meshes["family"])}
     if arguments.one:
         groups["one"] = [em.scenes.left_ventricle(*meshes["family"], order=1)]
@@ -221,7 +222,7 @@ def main() -> None:
     cases = [mechanics(scene, arguments.runs, known)]
     print(f"mechanics: {cases[0]['seconds']} s, {cases[0]['err_u']['median']:.2e} mm", flush=True)
     ready = time.perf_counter()
-    problem = prepare(scene, plan, sizes)
+    problem = plan.prepare(Job(scene, sizes))
     steps_from(problem, problem.emulator, 1)
     ready = time.perf_counter() - ready
     network = problem.emulator.network

@@ -15,7 +15,7 @@ from emulator.scenes import Scene
 from emulator.scenes.cavities import find_cavity
 from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.surrogates.taylor import expand
-from emulator.training.plan import recipe
+from emulator.training import recipe
 
 IMAGE = 8.0 * KPA_PER_MMHG  # kPa, of the image
 

@@ -22,8 +22,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from emulator.scenes.built_in.ventricles import left_ventricle
 from scipy.stats import qmc
 from studies.common.output import save
+from studies.ventricle_family.shapes import ventricles
+from studies.ventricle_family.training import PLAN, BodyRuns, train_family
 from studies.ventricle_family.workers import (
     KEYS,
     NETWORK,
@@ -42,10 +45,7 @@ from emulator.accuracy.comparison import quantiles
 from emulator.core.store import read_arrays, write_json
 from emulator.fem.campaign import run_campaign
 from emulator.fem.campaign.designs import sobol
-from emulator.scenes.built_in.ventricles import left_ventricle
-from emulator.scenes.ventricle_family import ventricles
 from emulator.surrogates import load, save_emulator
-from emulator.training.ventricles import PLAN, BodyRuns, train_family
 
 HERE = Path(__file__).parent
 TRAINING_SEED, TEST_SEED = 0, 1

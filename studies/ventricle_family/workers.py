@@ -21,7 +21,7 @@ from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.taylor import constant, expand_at
 from emulator.training import recipe
 from emulator.training import train as train_emulator
-from emulator.training.discrepancy_stage import add_discrepancy
+from emulator.training.mechanics import add_discrepancy
 
 THETA_SEED = 90_210
 NETWORK = "ventricle_family"

@@ -14,8 +14,7 @@ from calibrate.project import simulator_of
 from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.scene import all_nodes
 from emulator.surrogates import save_emulator
-from emulator.surrogates.kind import ForwardKind, Option
-from emulator.surrogates.protocol import fingerprint_of, inside_only
+from emulator.surrogates.protocol import ForwardKind, Option, fingerprint_of, inside_only
 from emulator.surrogates.registry import FORWARD_MAPS
 from network_support import untrained
 

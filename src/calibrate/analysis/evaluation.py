@@ -11,8 +11,7 @@ from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign.designs import Reference, fem_reference, outside_reference
 from emulator.surrogates import load
-from emulator.surrogates.kind import Ingredients
-from emulator.surrogates.protocol import ForwardMap
+from emulator.surrogates.protocol import ForwardMap, Ingredients
 from emulator.surrogates.registry import build_forward, full_options
 from emulator.verify.released import published_reference
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import jax
 
     from emulator.scenes.scene import Scene
-    from emulator.surrogates.additive import Emulator
+    from emulator.surrogates.emulator import Emulator
 
 COMMAND_NAME = "calibrate"
 

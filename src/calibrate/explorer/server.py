@@ -24,7 +24,7 @@ from emulator.fem import Simulator, Status
 from emulator.geometry.facets import Cavity, surface_mesh
 from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.loads import KPA_PER_MMHG
-from emulator.surrogates.additive import Emulator
+from emulator.surrogates.emulator import Emulator
 
 
 class Explorer:

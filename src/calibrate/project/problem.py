@@ -39,8 +39,7 @@ from emulator.fem import NewtonOptions, Simulator
 from emulator.scenes.scene import Scene
 from emulator.surrogates import registry
 from emulator.surrogates.fem import fem_forward
-from emulator.surrogates.kind import Ingredients
-from emulator.surrogates.protocol import ForwardMap
+from emulator.surrogates.protocol import ForwardMap, Ingredients
 
 
 class Simulators:

@@ -1,7 +1,6 @@
 """Maps from theta to displacement: the protocol, and all kinds of maps."""
 
-from emulator.surrogates.additive import CachedEmulator, Emulator
-from emulator.surrogates.files import load, save_emulator, shipped
+from emulator.surrogates.emulator import CachedEmulator, Emulator, load, save_emulator, shipped
 from emulator.surrogates.network.graph import AugmentedGraph, GraphOptions, augment
 from emulator.surrogates.network.pignn import Architecture
 

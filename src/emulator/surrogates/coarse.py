@@ -3,7 +3,7 @@ r"""An emulator of the same body on a coarser mesh, as a part of one on the fine
 .. math:: u(x) = P \Big[ \sum_\text{parts} u_p(x) \Big]
 
 with :math:`P` the prolongation (:mod:`emulator.geometry.refinement`), so that the part is the same
-function of place on both meshes, and of theta. What the coarse mesh gets wrong varies little with
+function of position and theta on both meshes. What the coarse mesh gets wrong varies little with
 theta, compared with the displacement: a discrepancy model of a few runs on the finer mesh, with
 their sensitivities, adds it (recipe ``two_meshes``; two levels of the model of Kennedy and O'Hagan
 2000, of fields and their slopes), and so does a polynomial of a few sweeps over the box (recipe
@@ -39,23 +39,24 @@ _PARTS: dict[str, type[Part]] = {
 
 @dataclass(frozen=True, eq=False)
 class Coarse:
-    """Parts of an emulator on a coarser mesh, carried to the nodes of the finer one.
+    """Parts of an emulator on a coarser mesh, interpolated at the nodes of the finer one.
 
-    parts : by name, over the coarse nodes. prolongation : (fine nodes, coarse nodes).
+    parts : the parts by name, over the coarse nodes.
+    prolongation : the matrix P, (fine nodes, coarse nodes).
     """
 
     parts: Mapping[str, Part]
     prolongation: csr_matrix
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (n, 3) in mm of the finer mesh's nodes at ``position`` (p,)."""
+        """Return the displacement (n, 3) mm of the finer mesh's nodes at ``position`` (p,)."""
         cached = self.cache(np.arange(self.prolongation.shape[0]))
         return jnp.asarray(cached.offset) + jnp.tensordot(
             cached.coefficients(position), cached.modes, axes=1
         )
 
     def cache(self, nodes: np.ndarray) -> CachedPart:
-        """The part over ``nodes`` (k,) of the finer mesh."""
+        """Return the part over ``nodes`` (k,) of the finer mesh."""
         rows = self.prolongation[nodes]
         used = np.unique(rows.indices)
         carry, cached = rows[:, used], [part.cache(used) for part in self.parts.values()]
@@ -69,14 +70,14 @@ class Coarse:
         )
 
     def arrays(self) -> dict[str, Any]:
-        """Arrays of all parts, as ``taylor/derivatives`` and so on, and of the prolongation."""
+        """Return the arrays of all parts, as ``taylor/derivatives``, and of the prolongation."""
         rows = self.prolongation
-        kept = {f"{n}/{k}": a for n, part in self.parts.items() for k, a in part.arrays().items()}
-        places = {name: getattr(rows, name) for name in ("data", "indices", "indptr")}
-        return kept | {f"prolongation/{name}": array for name, array in places.items()}
+        arrays = {f"{n}/{k}": a for n, part in self.parts.items() for k, a in part.arrays().items()}
+        matrix = {name: getattr(rows, name) for name in ("data", "indices", "indptr")}
+        return arrays | {f"prolongation/{name}": array for name, array in matrix.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """Nodes of the coarse mesh, and what the parts say."""
+        """Return the number of nodes of the coarse mesh, and the JSON of the parts."""
         parts = {name: part.to_json() for name, part in self.parts.items()}
         return {"nodes": self.prolongation.shape[1], "parts": parts}
 
@@ -84,10 +85,10 @@ class Coarse:
     def restore(
         cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> Self:
-        """The part with this description and these arrays."""
-        places = inside(arrays, "prolongation")
+        """Return the part with this description and these arrays."""
+        matrix = inside(arrays, "prolongation")
         shape = len(scene.mesh.nodes), description["nodes"]
-        rows = csr_matrix((widened(places["data"]), places["indices"], places["indptr"]), shape)
+        rows = csr_matrix((widened(matrix["data"]), matrix["indices"], matrix["indptr"]), shape)
         parts = {
             name: _PARTS[name].restore(scene, part, inside(arrays, name))
             for name, part in description["parts"].items()
@@ -96,7 +97,7 @@ class Coarse:
 
 
 def carried(parts: Mapping[str, Part], body: Finer) -> Coarse:
-    """``parts`` of an emulator of ``body.coarse``, on the finer mesh.
+    """Return the ``parts`` of an emulator of ``body.coarse`` on the finer mesh.
 
     Raises
     ------

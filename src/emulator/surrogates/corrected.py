@@ -23,13 +23,20 @@ from emulator.fem.assembly import System
 from emulator.fem.energy import volume_ratio
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
-from emulator.surrogates.files import EMULATOR
-from emulator.surrogates.kind import ForwardKind, Ingredients, Option, Options
-from emulator.surrogates.protocol import ForwardMap, Prediction, fingerprint_of
+from emulator.surrogates.emulator import EMULATOR
+from emulator.surrogates.protocol import (
+    ForwardKind,
+    ForwardMap,
+    Ingredients,
+    Option,
+    Options,
+    Prediction,
+    fingerprint_of,
+)
 
 
 def newton_step(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
-    """``u`` (n, 3) mm after one full Newton step, without a line search."""
+    """Return ``u`` (n, 3) mm after one full Newton step, without a line search."""
     u = system.scene.on_supports(u, theta)
     tangent = system.pattern.safe_values(system.tangent(u, theta))
     return u - system.extend(system.solve(tangent, system.residual(u, theta)))
@@ -80,29 +87,29 @@ class CorrectedForward:
             (theta,), (direction,) = primals, tangents
             u = correct(theta)
             tangent = system.pattern.safe_values(system.tangent(u, theta))
-            _, (force, held) = jax.jvp(system.residual_on_supports(u), (theta,), (direction,))
-            return u, held + system.extend(-system.solve(tangent, force))
+            _, (force, prescribed) = jax.jvp(system.residual_on_supports(u), (theta,), (direction,))
+            return u, prescribed + system.extend(-system.solve(tangent, force))
 
         return correct
 
     def evaluate(self, theta: jax.Array) -> Prediction:
-        """Displacement (k, 3) in mm, valid where ``base`` is and no element is inverted."""
+        """Return the displacement (k, 3) mm, valid where ``base`` is and no element is inverted."""
         u = self._corrected(theta)
-        sound = jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
-        u = jnp.where(sound, u, 0.0)
-        return Prediction(u[self.nodes], self.base.evaluate(theta).valid & sound)
+        valid = jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
+        u = jnp.where(valid, u, 0.0)
+        return Prediction(u[self.nodes], self.base.evaluate(theta).valid & valid)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Displacement (k, 3) in mm."""
+        """Return the displacement (k, 3) mm."""
         return self.evaluate(theta).displacement
 
     def at(self, nodes: np.ndarray) -> CorrectedForward:
-        """The map restricted to ``nodes``; it still computes them all."""
+        """Return the map restricted to ``nodes``; it still computes them all."""
         return replace(self, nodes=check_nodes(self.scene, nodes))
 
 
 def corrected(base: ForwardMap, simulator: Simulator, steps: int = 1) -> CorrectedForward:
-    """``base``, a map over all nodes, corrected by ``steps`` Newton steps."""
+    """Return ``base``, a map over all nodes, corrected by ``steps`` Newton steps."""
     if len(base.nodes) != len(base.scene.mesh.nodes):
         raise InputError("correction needs a forward map over all nodes")
     if steps < 1:
@@ -110,9 +117,9 @@ def corrected(base: ForwardMap, simulator: Simulator, steps: int = 1) -> Correct
     return CorrectedForward(base, simulator, steps, all_nodes(base.scene))
 
 
-def _build(made_of: Ingredients, options: Options) -> ForwardMap:
-    """The emulator's prediction, corrected."""
-    return corrected(EMULATOR.build(made_of, {}), made_of.simulator, options["steps"])
+def _build(ingredients: Ingredients, options: Options) -> ForwardMap:
+    """Return the emulator followed by Newton steps."""
+    return corrected(EMULATOR.build(ingredients, {}), ingredients.simulator, options["steps"])
 
 
 CORRECTED = ForwardKind(

@@ -13,15 +13,22 @@ from emulator.core.store import to_json
 from emulator.fem.campaign import Executor, Row, Solver, in_process, solve_rows
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
-from emulator.surrogates.kind import ForwardKind
-from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, fingerprint_of
+from emulator.surrogates.protocol import (
+    ForwardKind,
+    ForwardMap,
+    Prediction,
+    SolvingMap,
+    fingerprint_of,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class FEMForward(SolvingMap):
-    """The simulator as a forward map; Newton begins at ``start(theta)``, or at rest if ``None``.
+    """The simulator as a forward map.
 
-    execute : solves many theta, in this process by default.
+    simulator, nodes : the simulator, and the nodes (k,) whose displacement is returned.
+    start : the map that predicts where Newton's method begins; ``None`` for the body at rest.
+    execute : solves many theta; by default in this process.
     """
 
     simulator: Simulator
@@ -44,17 +51,17 @@ class FEMForward(SolvingMap):
         return fingerprint_of(self.kind, self.scene.fingerprint, options, self.nodes)
 
     def evaluate(self, theta: jax.Array) -> Prediction:
-        """Displacement (k, 3) in mm and whether the solve converged."""
+        """Return the displacement (k, 3) mm, and whether the solve converged."""
         start = None if self.start is None else self.start(theta)
         solution = self.simulator.solve(theta, start)
         return Prediction(solution.displacement[self.nodes], solution.converged)
 
     def evaluate_all(self, thetas: jax.Array) -> Prediction:
-        """Predictions at many theta (c, p), one after the other or as ``execute`` does."""
+        """Return the predictions at many theta (c, p), which ``execute`` solves."""
         return self._predicted(self._rows(thetas))
 
     def slopes_all(self, thetas: jax.Array) -> tuple[Prediction, jax.Array]:
-        """Predictions at many theta (c, p), and du/dtheta (c, p, k, 3) from the solves' factors."""
+        """Return the predictions at many theta (c, p), and du/dtheta (c, p, k, 3)."""
         rows = self._rows(thetas, sensitivities=True)
         slopes = jnp.stack([row.sensitivities[:, self.nodes] for row in rows])
         return self._predicted(rows), slopes
@@ -73,26 +80,26 @@ class FEMForward(SolvingMap):
         return sorted(rows, key=lambda row: row.number)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Displacement (k, 3) in mm."""
+        """Return the displacement (k, 3) mm."""
         return self.evaluate(theta).displacement
 
     def at(self, nodes: np.ndarray) -> FEMForward:
-        """The same simulator, returning only ``nodes``."""
+        """Return the same map over other ``nodes``."""
         return replace(self, nodes=check_nodes(self.scene, nodes))
 
     def solved_by(self, execute: Executor) -> FEMForward:
-        """The same map, whose many solves are another executor's."""
+        """Return the same map, whose solves at many theta are done by ``execute``."""
         return replace(self, execute=execute)
 
 
 def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMForward:
-    """The simulator as a forward map over all nodes; ``start`` predicts where Newton begins."""
+    """Return the simulator as a forward map over all nodes; ``start`` predicts its starts."""
     return FEMForward(simulator, all_nodes(simulator.scene), start)
 
 
 FEM = ForwardKind(
     "fem",
     "finite elements, from rest each time",
-    lambda made_of, _: fem_forward(made_of.simulator),
+    lambda ingredients, _: fem_forward(ingredients.simulator),
     solves_fem=True,
 )

@@ -1,4 +1,4 @@
-r"""What an emulator is a sum of.
+r"""The parts that an emulator is the sum of.
 
 .. math:: u(x) = \sum_\text{parts} u_p(x), \qquad
     u_p(x) = \bar u_p + \sum_k c_{pk}(x)\, \phi_{pk} + d_p(x)
@@ -10,13 +10,14 @@ with a pointwise decoder has a field :math:`d` that is not a sum of modes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self
+from dataclasses import dataclass, fields, replace
+from typing import Any, Protocol, Self, get_type_hints
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.store import inside, named_leaves
 from emulator.scenes.scene import Scene
 
 
@@ -24,50 +25,77 @@ class Part(Protocol):
     """One term of an emulator's sum."""
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (n, 3) in mm of all nodes at ``position`` (p,) in the unit box."""
+        """Return the displacement (n, 3) mm of all nodes at ``position`` (p,) in the unit box."""
         ...
 
     def cache(self, nodes: np.ndarray) -> CachedPart:
-        """The part over ``nodes`` (k,), everything that does not depend on theta evaluated."""
+        """Return the part over ``nodes`` (k,), all evaluated that does not depend on theta."""
         ...
 
     def arrays(self) -> Mapping[str, Any]:
-        """All arrays the part consists of, by the names a file keeps them under."""
+        """Return all arrays of the part by their names in a file."""
         ...
 
     def to_json(self) -> dict[str, Any]:
-        """All else the part consists of, as plain JSON."""
+        """Return all else that the part consists of, as plain JSON."""
         ...
 
     @classmethod
     def restore(
         cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> Self:
-        """The part with this :meth:`to_json` and these :meth:`arrays`, in float32 or float64."""
+        """Return the part of this :meth:`to_json` and these :meth:`arrays`, float32 or float64."""
         ...
 
 
-class OfArrays:
-    """What a part is that its arrays are all of: they are its fields."""
+class ArrayPart:
+    """A part whose fields are all arrays, or named tuples of arrays: what files keep of it.
+
+    A dataclass that inherits from this class has its arrays written and read by their names; those
+    of a named tuple ``warp`` are called ``warp/centre`` and so on.
+    """
 
     def arrays(self) -> dict[str, Any]:
-        """All fields by name."""
-        return vars(self).copy()
+        """Return all arrays by name."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
+        plain = {n: v._asdict() if hasattr(v, "_asdict") else v for n, v in values.items()}
+        return named_leaves(plain)
 
     def to_json(self) -> dict[str, Any]:
-        """Nothing: the arrays are all."""
+        """Return nothing: the arrays are all."""
         return {}
+
+    @classmethod
+    def restore(
+        cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> Self:
+        """Return the part with these arrays."""
+        del scene, description
+        return _filled(cls, arrays)
+
+
+def _filled(kind: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the dataclass or named tuple ``kind`` with its fields taken from ``arrays``."""
+    values: dict[str, Any] = {}
+    for name, hint in get_type_hints(kind).items():
+        if hint is np.ndarray:
+            values[name] = widened(arrays[name])
+        elif hint is jax.Array:
+            values[name] = jnp.asarray(widened(arrays[name]))
+        else:
+            values[name] = _filled(hint, inside(arrays, name))
+    return kind(**values)
 
 
 class NodalField(Protocol):
     """Displacement of some nodes as a function of position, not a sum of modes."""
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (..., k, 3) in mm at ``position`` (..., p)."""
+        """Return the displacement (..., k, 3) mm at ``position`` (..., p)."""
         ...
 
     def at(self, rows: np.ndarray) -> NodalField:
-        """The field over rows of its nodes."""
+        """Return the field over some rows of its nodes."""
         ...
 
 
@@ -75,10 +103,10 @@ class NodalField(Protocol):
 class CachedPart:
     """A part over k nodes.
 
-    offset : (k, 3) mm. modes : (t, k, 3) mm. Both NumPy's: a JAX array made during somebody's
-        trace would belong to that trace.
-    coefficients : position (p,) to the coefficients (t,) of the modes.
-    field : what is not a sum of modes, or None.
+    offset, modes : (k, 3) mm and (t, k, 3) mm. They are NumPy's, because a JAX array that is made
+        while a caller is traced would belong to that trace.
+    coefficients : the function from position (p,) to the coefficients (t,) of the modes.
+    field : the field that is not a sum of modes, or ``None``.
     """
 
     offset: np.ndarray
@@ -87,17 +115,17 @@ class CachedPart:
     field: NodalField | None = None
 
     def at(self, rows: np.ndarray) -> CachedPart:
-        """The part over rows of its nodes."""
+        """Return the part over some rows of its nodes."""
         field = None if self.field is None else self.field.at(rows)
         return replace(self, offset=self.offset[rows], modes=self.modes[:, rows], field=field)
 
 
 def no_modes(nodes: np.ndarray, field: NodalField) -> CachedPart:
-    """A part that is nothing but ``field`` over ``nodes`` (k,)."""
+    """Return a part that is nothing but ``field`` over ``nodes`` (k,)."""
     count = len(nodes)
     return CachedPart(np.zeros((count, 3)), np.zeros((0, count, 3)), lambda _: jnp.zeros(0), field)
 
 
 def widened(array: np.ndarray) -> np.ndarray:
-    """Floating point numbers in float64; a file may keep them in float32."""
+    """Return floating point numbers in float64; a file may keep them in float32."""
     return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array

@@ -26,9 +26,13 @@ from emulator.core.precision import require_float64
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import sobol
 from emulator.scenes.scene import Scene, all_nodes
-from emulator.surrogates.kind import Arrays, ForwardKind, Ingredients, Option, Options
 from emulator.surrogates.protocol import (
+    Arrays,
+    ForwardKind,
     ForwardMap,
+    Ingredients,
+    Option,
+    Options,
     Prediction,
     fingerprint_of,
     inside_only,
@@ -37,7 +41,7 @@ from emulator.surrogates.protocol import (
 
 # Variance added to each process, whose coefficients have variance 1: FEM has no noise.
 _JITTER = 1e-10
-# What a reduced model is made of, besides its scene.
+# The arrays of a reduced model.
 _ARRAYS = ("nodes", "mean", "modes", "inputs", "lengths", "weights")
 
 
@@ -45,10 +49,12 @@ _ARRAYS = ("nodes", "mean", "modes", "inputs", "lengths", "weights")
 class ReducedForward:
     """A fitted reduced model.
 
-    nodes : (k,). mean : (k, 3) mm. modes : (r, k, 3) mm, each times its coefficient's standard
-        deviation over the runs.
-    inputs : (c, p), theta of the FEM runs as positions in the box.
-    lengths : (r, p), length scales. weights : (r, c), amplitude times alpha of each process.
+    scene, nodes : the scene, and the nodes (k,) whose displacement is returned.
+    mean : the mean of the runs, (k, 3) mm.
+    modes : the modes, each times its coefficient's standard deviation over the runs, (r, k, 3) mm.
+    inputs : the theta of the FEM runs as positions in the box, (c, p).
+    lengths : the length scales of each process, (r, p).
+    weights : the amplitude times alpha of each process, (r, c).
     """
 
     scene: Scene
@@ -73,7 +79,7 @@ class ReducedForward:
         return fingerprint_of(self.kind, self.scene.fingerprint, *arrays)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Displacement (k, 3) in mm at ``theta`` (p,).
+        """Return the displacement (k, 3) mm at ``theta`` (p,).
 
         Raises
         ------
@@ -85,15 +91,15 @@ class ReducedForward:
         coefficients = jnp.sum(
             self.weights * squared_exponential(jnp.sum(gap**2, axis=-1)), axis=-1
         )
-        found = self.mean + jnp.tensordot(coefficients, self.modes, axes=1)
-        return self.scene.on_supports(found, theta, self.nodes)
+        u = self.mean + jnp.tensordot(coefficients, self.modes, axes=1)
+        return self.scene.on_supports(u, theta, self.nodes)
 
     def evaluate(self, theta: jax.Array) -> Prediction:
-        """Displacement and whether ``theta`` is inside the box of the FEM runs."""
+        """Return the displacement, and whether ``theta`` is inside the box of the FEM runs."""
         return inside_only(self, theta)
 
     def at(self, nodes: np.ndarray) -> ReducedForward:
-        """The map restricted to ``nodes``, all of which must be among its own."""
+        """Return the map restricted to ``nodes``, all of which must be among its own."""
         rows = rows_of(self, nodes)
         return replace(
             self, nodes=self.nodes[rows], mean=self.mean[rows], modes=self.modes[:, rows]
@@ -119,10 +125,10 @@ def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> Reduce
     left, size, right = np.linalg.svd(
         (snapshots - mean).reshape(len(snapshots), -1), full_matrices=False
     )
-    kept = size > truncation * size[0]
+    used = size > truncation * size[0]
     inputs = np.asarray(scene.to_unit(runs.theta))
-    fits = [_fit_one(inputs, column) for column in (left[:, kept] * np.sqrt(len(snapshots))).T]
-    modes = right[kept] * size[kept, None] / np.sqrt(len(snapshots))
+    fits = [_fit_one(inputs, column) for column in (left[:, used] * np.sqrt(len(snapshots))).T]
+    modes = right[used] * size[used, None] / np.sqrt(len(snapshots))
     return ReducedForward(
         scene=scene,
         nodes=all_nodes(scene),
@@ -135,7 +141,7 @@ def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> Reduce
 
 
 def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Length scales (p,) and prediction weights (c,) of one coefficient (c,) of unit variance."""
+    """Return the length scales (p,) and weights (c,) of one coefficient (c,) of unit variance."""
     from sklearn.exceptions import ConvergenceWarning  # slow to import, and only for a fit
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
@@ -151,11 +157,11 @@ def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.atleast_1d(fitted.k2.length_scale), fitted.k1.constant_value * process.alpha_
 
 
-def _build(made_of: Ingredients, options: Options) -> ForwardMap:
-    """A reduced model fitted to FEM runs at a Sobol sequence of theta."""
-    thetas = sobol(made_of.scene, options["fem_runs"], made_of.seed)
-    runs = run_campaign(made_of.simulator, thetas, progress=made_of.progress)
-    return made_of.ranged(fit_reduced(made_of.scene, runs))
+def _build(ingredients: Ingredients, options: Options) -> ForwardMap:
+    """Return a reduced model fitted to FEM runs at a Sobol sequence of theta."""
+    thetas = sobol(ingredients.scene, options["fem_runs"], ingredients.seed)
+    runs = run_campaign(ingredients.simulator, thetas, progress=ingredients.progress)
+    return ingredients.ranged(fit_reduced(ingredients.scene, runs))
 
 
 def _to_arrays(forward: ForwardMap) -> Arrays:

@@ -1,4 +1,4 @@
-r"""A polynomial of theta as a part of an emulator.
+r"""Polynomials of theta: a part of an emulator, and their fit to fields of known error.
 
 .. math:: u(x) = \sum_k c_k(x)\, \phi_k, \qquad
     c_k(x) = \sum_{|\alpha| \le d} w_{\alpha k}
@@ -7,29 +7,40 @@ r"""A polynomial of theta as a part of an emulator.
 with :math:`x` theta's position in the unit box and the Legendre polynomials :math:`P_k`. The terms
 have a mean square of 1 over the box and no mean product with each other, so that a singular value
 decomposition of the fields' coefficients leaves out what is least over the box.
+
+The fit to fields :math:`v_i` with errors of about :math:`\epsilon_i` is
+
+.. math:: \min_c \sum_i \frac{|v_i - \sum_\alpha c_\alpha P_\alpha(x_i)|^2}{(\epsilon_i + s)^2}
+
+where :math:`s` is about the error of the polynomial itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from math import comb, sqrt
-from typing import Any, Self
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 
-from emulator.scenes.scene import Scene
-from emulator.surrogates.part import CachedPart, OfArrays, widened
+from emulator.surrogates.part import ArrayPart, CachedPart
+
+MOST_TERMS = 500
+"""The largest number of terms that a polynomial is fitted with."""
+_PLENTY = 1.3  # least number of fields for each term
 
 
 @dataclass(frozen=True, eq=False)
-class Polynomial(OfArrays):
-    """Displacement as a polynomial, a part of an emulator.
+class Polynomial(ArrayPart):
+    """A polynomial of theta, a part of an emulator.
 
-    degrees : (m, p) alpha of each term. weights : (m, r). modes : (r, n, 3) mm.
+    degrees : the degrees alpha of each term, (m, p).
+    weights : the weight of each term in each coefficient, (m, r).
+    modes : (r, n, 3) mm.
     """
 
     degrees: np.ndarray
@@ -37,31 +48,24 @@ class Polynomial(OfArrays):
     modes: np.ndarray
 
     def coefficients(self, position: jax.Array) -> jax.Array:
-        """Of the modes, (..., r), at ``position`` (..., p) in the unit box."""
+        """Return the coefficients (..., r) at ``position`` (..., p) in the unit box."""
         return legendre(position, self.degrees) @ self.weights
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (..., n, 3) mm at ``position`` (..., p) in the unit box."""
+        """Return the displacement (..., n, 3) mm at ``position`` (..., p) in the unit box."""
         return jnp.tensordot(self.coefficients(position), self.modes, axes=1)
 
     def cache(self, nodes: np.ndarray) -> CachedPart:
-        """The polynomial over ``nodes`` (k,)."""
+        """Return the polynomial over ``nodes`` (k,)."""
         modes = self.modes[:, nodes]
         return CachedPart(np.zeros(modes.shape[1:]), modes, self.coefficients)
 
-    @classmethod
-    def restore(
-        cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-    ) -> Self:
-        """The polynomial with these arrays."""
-        del scene, description
-        return cls(*(widened(arrays[name]) for name in ("degrees", "weights", "modes")))
-
 
 def compressed(degrees: np.ndarray, fields: np.ndarray, error: float) -> Polynomial:
-    """The polynomial with the fields (m, n, 3) mm of its terms, in as few modes as it needs.
+    """Return a polynomial with as few modes as its error allows.
 
-    error : mm, root mean square over box and nodes, that it may differ by.
+    degrees, fields : the degrees (m, p) and the fields (m, n, 3) mm of its terms.
+    error : the root mean square over box and nodes, mm, by which it may differ from them.
     """
     flat = fields.reshape(len(fields), -1)
     left, sizes, right = np.linalg.svd(flat, full_matrices=False)
@@ -76,12 +80,12 @@ def compressed(degrees: np.ndarray, fields: np.ndarray, error: float) -> Polynom
 
 
 def terms(parameters: int, degree: int) -> int:
-    """Number of terms of a polynomial of ``degree`` in so many ``parameters``."""
+    """Return the number of terms of a polynomial of ``degree`` in so many ``parameters``."""
     return comb(parameters + degree, degree)
 
 
 def degrees_up_to(parameters: int, degree: int) -> np.ndarray:
-    """All alpha (m, p) with a sum of ``degree`` or less, by that sum."""
+    """Return all alpha (m, p) with a sum of ``degree`` or less, sorted by that sum."""
     chosen = [
         np.bincount(np.array(term, dtype=int), minlength=parameters)
         for total in range(degree + 1)
@@ -91,9 +95,9 @@ def degrees_up_to(parameters: int, degree: int) -> np.ndarray:
 
 
 def legendre(position: Any, degrees: np.ndarray) -> Any:
-    """Terms (..., m) of ``degrees`` (m, p) at ``position`` (..., p), of mean square 1.
+    """Return the terms (..., m) of ``degrees`` (m, p) at ``position`` (..., p).
 
-    NumPy's where the position is, whose shapes are many.
+    It computes with NumPy where the position is NumPy's, because each shape would be compiled.
     """
     xp: Any = np if isinstance(position, np.ndarray) else jnp
     t = 2.0 * position - 1.0
@@ -102,3 +106,67 @@ def legendre(position: Any, degrees: np.ndarray) -> Any:
         rows.append(((2 * k + 1) * t * rows[k] - k * rows[k - 1]) / (k + 1))
     each = xp.stack([sqrt(2 * k + 1) * row for k, row in enumerate(rows)], axis=-1)
     return xp.prod(each[..., np.arange(degrees.shape[1]), degrees], axis=-1)
+
+
+class Samples(NamedTuple):
+    """Fields at positions in the unit box.
+
+    position : (c, p). fields : (c, f) mm. error : the error of each field, (c,) mm.
+    """
+
+    position: np.ndarray
+    fields: np.ndarray
+    error: np.ndarray
+
+    def take(self, rows: slice | np.ndarray) -> Samples:
+        """Return the samples in ``rows``."""
+        return Samples(*(array[rows] for array in self))
+
+    def followed_by(self, more: Samples) -> Samples:
+        """Return these samples and ``more``."""
+        return Samples(*(np.concatenate(both) for both in zip(self, more, strict=True)))
+
+
+class PolynomialFit(NamedTuple):
+    """A fitted polynomial: degrees (m, p) and coefficients (m, f) mm of its terms."""
+
+    degrees: np.ndarray
+    coefficients: np.ndarray
+
+    @property
+    def degree(self) -> int:
+        """The largest sum of degrees."""
+        return int(self.degrees.sum(axis=1).max())
+
+    def at(self, position: np.ndarray) -> np.ndarray:
+        """Return the fields (c, f) mm at ``position`` (c, p)."""
+        return legendre(position, self.degrees) @ self.coefficients
+
+
+def fit(samples: Samples, degree: int, own_error: float) -> PolynomialFit:
+    """Return the polynomial of ``degree``, or of the largest one for which there are samples.
+
+    own_error : about the error of the polynomial itself, mm.
+    """
+    while degree > 0 and terms(samples.position.shape[1], degree) > len(samples.position):
+        degree -= 1
+    degrees = degrees_up_to(samples.position.shape[1], degree)
+    own_error = max(own_error, np.finfo(float).tiny)  # it is 0 where every field is a polynomial's
+    weight = (own_error / (samples.error + own_error))[:, None]
+    rows = weight * legendre(samples.position, degrees)
+    q, r = scipy.linalg.qr(rows, mode="economic")
+    return PolynomialFit(degrees, scipy.linalg.solve_triangular(r, q.T @ (weight * samples.fields)))
+
+
+def best_degree(known: Samples, new: Samples, degree: int, own_error: float) -> int:
+    """Return ``degree`` or a neighbour, by which fit to ``known`` is nearest to ``new`` samples.
+
+    No fit has seen the new samples. The degree stays where there are too few for any fit.
+    """
+    parameters, misfits = new.position.shape[1], {}
+    for trial in range(max(degree - 1, 1), degree + 2):
+        count = terms(parameters, trial)
+        if count <= MOST_TERMS and count * _PLENTY <= len(known.position):
+            error = fit(known, trial, own_error).at(new.position) - new.fields
+            misfits[trial] = float(np.median(np.sum(error**2, axis=1)))
+    return min(misfits, key=misfits.__getitem__) if misfits else degree

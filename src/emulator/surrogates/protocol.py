@@ -1,12 +1,16 @@
-"""Forward maps: theta to displacement. Calibration sees nothing else of the mechanics."""
+"""Forward maps: theta to displacement. Calibration sees nothing else of the mechanics.
+
+A kind of forward map is one :class:`ForwardKind` beside its map, and one line in
+:mod:`emulator.surrogates.registry`.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +18,12 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.campaign import Executor
+from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene, check_nodes
 
 
 class Prediction(NamedTuple):
-    """Displacement (k, 3) in mm at a forward map's nodes, and whether it may be used, () bool."""
+    """The displacement (k, 3) mm at a forward map's nodes, and whether it is valid, () bool."""
 
     displacement: jax.Array
     valid: jax.Array
@@ -34,7 +39,7 @@ class ForwardMap(Protocol):
 
     @property
     def label(self) -> str:
-        """How pictures and tables call this map, e.g. ``emulator + 2 Newton steps``."""
+        """The name in pictures and tables, e.g. ``emulator + 2 Newton steps``."""
         ...
 
     @property
@@ -53,15 +58,15 @@ class ForwardMap(Protocol):
         ...
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Displacement (k, 3) in mm at ``theta`` (p,)."""
+        """Return the displacement (k, 3) mm at ``theta`` (p,)."""
         ...
 
     def evaluate(self, theta: jax.Array) -> Prediction:
-        """Displacement (k, 3) in mm at ``theta`` (p,) with its validity, for use in a density."""
+        """Return the displacement (k, 3) mm at ``theta`` (p,), and whether it is valid."""
         ...
 
     def at(self, nodes: np.ndarray) -> ForwardMap:
-        """The map restricted to ``nodes``; a fast map then computes only those."""
+        """Return the map restricted to ``nodes``; a fast map then computes only those."""
         ...
 
 
@@ -73,34 +78,34 @@ class SolvingMap(ABC):
 
     @abstractmethod
     def evaluate_all(self, thetas: jax.Array) -> Prediction:
-        """Predictions at many theta (c, p); fields gain a leading axis."""
+        """Return the predictions at many theta (c, p); fields gain a leading axis."""
 
     @abstractmethod
     def slopes_all(self, thetas: jax.Array) -> tuple[Prediction, jax.Array]:
-        """Predictions at many theta (c, p), and du/dtheta (c, p, k, 3)."""
+        """Return the predictions at many theta (c, p), and du/dtheta (c, p, k, 3)."""
 
     @abstractmethod
     def solved_by(self, execute: Executor) -> ForwardMap:
-        """The same map with its solves at many theta done by ``execute``."""
+        """Return the same map with its solves at many theta done by ``execute``."""
 
 
-_AT_ONCE = 64  # theta evaluated side by side
+_AT_ONCE = 64  # theta in one batch
 
 
 def evaluator(forward: ForwardMap) -> Callable[[jax.Array], Prediction]:
-    """Predictions at many theta (c, p), by a program that is compiled when first called."""
+    """Return the function from theta (c, p) to predictions; its first call compiles it."""
     if isinstance(forward, SolvingMap):
         return forward.evaluate_all
     return jax.jit(lambda t: jax.lax.map(forward.evaluate, t, batch_size=_AT_ONCE))
 
 
 def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
-    """Predictions at many theta (c, p); fields gain a leading axis."""
+    """Return the predictions at many theta (c, p); fields gain a leading axis."""
     return evaluator(forward)(thetas)
 
 
 def require_answers(forward: ForwardMap, predicted: Prediction, what: str) -> None:
-    """:class:`InputError` where one of many predictions is not valid; ``what`` begins its line."""
+    """Raise :class:`InputError` where a prediction is not valid; ``what`` begins the message."""
     invalid = ~np.asarray(predicted.valid)
     if invalid.any():
         raise InputError(
@@ -109,7 +114,7 @@ def require_answers(forward: ForwardMap, predicted: Prediction, what: str) -> No
 
 
 def solved_by(forward: ForwardMap, execute: Executor) -> ForwardMap:
-    """``forward`` with its solves at many theta done by ``execute``.
+    """Return ``forward`` with its solves at many theta done by ``execute``.
 
     Raises
     ------
@@ -125,7 +130,7 @@ def solved_by(forward: ForwardMap, execute: Executor) -> ForwardMap:
 
 
 def fingerprint_of(*parts: str | np.ndarray | jax.Array) -> str:
-    """Short hash of words and arrays; shape and type of an array count as its values do."""
+    """Return a short hash of words and arrays, of whose shapes and types, too."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, str):
@@ -137,7 +142,7 @@ def fingerprint_of(*parts: str | np.ndarray | jax.Array) -> str:
 
 
 def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
-    """``forward(theta)``, valid inside the box; outside it the value at the box's centre.
+    """Return ``forward(theta)``, valid inside the box; outside, the value at the centre.
 
     A map fitted inside the box may be infinite outside it. ``jnp.where`` would still pass the
     gradient of that infinite branch on, as NaN, so the map is never evaluated there.
@@ -149,7 +154,7 @@ def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Extrapolated:
-    """``base`` outside the box too: valid wherever its displacement is finite.
+    """The map ``base`` without the limits of its box: valid wherever its displacement is finite.
 
     It measures how the error grows outside the box; a density must not use it.
     """
@@ -182,21 +187,21 @@ class Extrapolated:
         return fingerprint_of("extrapolated", self.base.fingerprint)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Displacement (k, 3) in mm."""
+        """Return the displacement (k, 3) mm."""
         return self.base(theta)
 
     def evaluate(self, theta: jax.Array) -> Prediction:
-        """Displacement (k, 3) in mm, and whether it is finite."""
+        """Return the displacement (k, 3) mm, and whether it is finite."""
         u = self.base(theta)
         return Prediction(u, jnp.all(jnp.isfinite(u)))
 
     def at(self, nodes: np.ndarray) -> Extrapolated:
-        """The extrapolated map restricted to ``nodes``."""
+        """Return the extrapolated map restricted to ``nodes``."""
         return Extrapolated(self.base.at(nodes))
 
 
 def rows_of(forward: ForwardMap, nodes: np.ndarray) -> np.ndarray:
-    """Rows of ``forward`` that belong to ``nodes``; :class:`InputError` for a node it lacks."""
+    """Return the rows of ``forward`` that belong to ``nodes``; refuse a node that it lacks."""
     nodes = check_nodes(forward.scene, nodes)
     position = {int(node): k for k, node in enumerate(forward.nodes)}
     missing = [int(node) for node in nodes if int(node) not in position]
@@ -205,3 +210,82 @@ def rows_of(forward: ForwardMap, nodes: np.ndarray) -> np.ndarray:
             f"node {missing[0]} is not among the {len(position)} this {forward.kind} map returns"
         )
     return np.array([position[int(node)] for node in nodes])
+
+
+Options = Mapping[str, int]
+Arrays = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Option:
+    """A whole number that a kind of forward map is built with.
+
+    name : the name in Python and in files, e.g. ``fem_runs``; ``--fem-runs`` on the command line.
+    default, least : the default, and the smallest value allowed.
+    help : the words of the command line.
+    """
+
+    name: str
+    default: int
+    help: str
+    least: int = 1
+
+    @property
+    def flag(self) -> str:
+        """The option on the command line."""
+        return f"--{self.name.replace('_', '-')}"
+
+    def checked(self, value: Any) -> int:
+        """Return ``value``; refuse what is no whole number or too small."""
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise InputError(f"{self.name} is {value!r}; it must be a whole number")
+        if value < self.least:
+            raise InputError(f"{self.name} is {value}; it must be {self.least} or more")
+        return value
+
+
+@dataclass(frozen=True)
+class Ingredients:
+    """The ingredients from which forward maps are built.
+
+    scene, simulator : the scene and its FEM simulator.
+    emulator : a shipped name or a folder; ``None`` for the emulator shipped for the scene.
+    seed : the seed of the design of FEM runs.
+    extrapolate : whether the map also answers outside the box, to measure its error there.
+    progress : whether progress bars are shown.
+    """
+
+    scene: Scene
+    simulator: Simulator
+    emulator: str | None = None
+    seed: int = 0
+    extrapolate: bool = False
+    progress: bool = False
+
+    def ranged(self, forward: ForwardMap) -> ForwardMap:
+        """Return ``forward``, extrapolated beyond the box if that is asked for."""
+        return Extrapolated(forward) if self.extrapolate else forward
+
+
+@dataclass(frozen=True)
+class ForwardKind:
+    """A kind of forward map.
+
+    name, help : the name, and the words of the command line.
+    build : makes the map over all nodes from ingredients and a value of every option.
+    options : the options of ``build``.
+    to_arrays, from_arrays : write and read the arrays of a map that is fitted while it is built,
+        because a second fit may give another map; they are kept with results. ``from_arrays``
+        raises ``KeyError`` where one is missing. ``None`` for a kind that is not fitted.
+    from_emulator : whether an emulator is one of its ingredients.
+    solves_fem : whether a prediction is a FEM solve, which workers of a cluster can do.
+    """
+
+    name: str
+    help: str
+    build: Callable[[Ingredients, Options], ForwardMap]
+    options: tuple[Option, ...] = ()
+    to_arrays: Callable[[ForwardMap], Arrays] | None = None
+    from_arrays: Callable[[Scene, Arrays], ForwardMap] | None = None
+    from_emulator: bool = False
+    solves_fem: bool = False

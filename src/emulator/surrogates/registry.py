@@ -1,7 +1,7 @@
 """Every kind of forward map by name: the one list of them.
 
-To add one, write its map and its :class:`~emulator.surrogates.kind.ForwardKind` in a file, and add
-it here; command line, calibration and evaluation then know it.
+To add one, write its map and its :class:`~emulator.surrogates.protocol.ForwardKind` in a file, and
+add it here; command line, calibration and evaluation then know it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from typing import Any
 from emulator.core.errors import InputError, look_up
 from emulator.core.store import read_arrays, save_arrays
 from emulator.surrogates.corrected import CORRECTED
+from emulator.surrogates.emulator import EMULATOR
 from emulator.surrogates.fem import FEM
-from emulator.surrogates.files import EMULATOR
-from emulator.surrogates.kind import ForwardKind, Ingredients, Option
 from emulator.surrogates.pod_gp import REDUCED
-from emulator.surrogates.protocol import ForwardMap
+from emulator.surrogates.protocol import ForwardKind, ForwardMap, Ingredients, Option
 
 FORWARD_MAPS: dict[str, ForwardKind] = {
     kind.name: kind for kind in (EMULATOR, CORRECTED, REDUCED, FEM)
@@ -25,12 +24,12 @@ FORWARD_MAPS: dict[str, ForwardKind] = {
 
 
 def forward_kind(name: str) -> ForwardKind:
-    """The kind called ``name``; :class:`InputError` lists the known ones."""
+    """Return the kind called ``name``; :class:`InputError` lists the known ones."""
     return look_up(FORWARD_MAPS, name, "forward map")
 
 
 def known_options() -> dict[str, tuple[Option, tuple[str, ...]]]:
-    """Every option of every kind by name, with the names of the kinds that take it."""
+    """Return every option of every kind by name, with the names of the kinds that take it."""
     found: dict[str, tuple[Option, tuple[str, ...]]] = {}
     for kind in FORWARD_MAPS.values():
         for option in kind.options:
@@ -40,7 +39,7 @@ def known_options() -> dict[str, tuple[Option, tuple[str, ...]]]:
 
 
 def full_options(name: str, given: Mapping[str, Any]) -> dict[str, int]:
-    """A value of every option of the kind called ``name``, from ``given`` or by default.
+    """Return a value of every option of the kind called ``name``, from ``given`` or by default.
 
     Raises
     ------
@@ -61,21 +60,21 @@ def full_options(name: str, given: Mapping[str, Any]) -> dict[str, int]:
 
 
 def check_emulator(name: str, emulator: str | None) -> None:
-    """:class:`InputError` if an emulator is given to a kind that is not built from one."""
+    """Refuse an emulator for a kind that is not built from one."""
     if emulator is not None and not forward_kind(name).from_emulator:
         owners = " or ".join(kind.name for kind in FORWARD_MAPS.values() if kind.from_emulator)
         raise InputError(f"--emulator has no effect without --forward {owners}")
 
 
 def check_scheduler(name: str, scheduler: str | None) -> None:
-    """:class:`InputError` if a scheduler is given to a kind whose predictions solve no FEM."""
+    """Refuse a scheduler for a kind whose predictions solve no FEM."""
     if scheduler is not None and not forward_kind(name).solves_fem:
         owners = " or ".join(kind.name for kind in FORWARD_MAPS.values() if kind.solves_fem)
         raise InputError(f"--scheduler has no effect without --forward {owners}")
 
 
 def build_forward(name: str, ingredients: Ingredients, given: Mapping[str, Any] = {}) -> ForwardMap:
-    """The forward map called ``name`` over all nodes, with the options ``given``."""
+    """Return the forward map called ``name`` over all nodes, with the options ``given``."""
     return forward_kind(name).build(ingredients, full_options(name, given))
 
 
@@ -89,7 +88,7 @@ def keep_forward(forward: ForwardMap, path: str | Path) -> None:
 def restore_forward(
     name: str, ingredients: Ingredients, given: Mapping[str, Any], path: str | Path
 ) -> ForwardMap:
-    """The map :func:`keep_forward` wrote to ``path``, or a new one of a kind that keeps none.
+    """Return the map that :func:`keep_forward` wrote, or a new one of a kind that writes none.
 
     Raises
     ------

@@ -18,7 +18,7 @@ from emulator.geometry.mesh import frozen_array
 from emulator.released.network import ReleasedNetwork, read_network
 from emulator.released.scenes import published_scene, published_tests, theta_units, units
 from emulator.scenes.scene import Scene
-from emulator.surrogates.additive import Emulator
+from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import Network, Standardisation, filled
 from emulator.surrogates.network.pignn import Architecture
@@ -39,7 +39,7 @@ _OTHER_ENERGY = 0.05
 
 
 def released_network(model: str, root: str | Path) -> Emulator:
-    """The released network of ``model``, as an emulator of ``published:<model>``.
+    """Return the released network of ``model``, as an emulator of ``published:<model>``.
 
     Parameters
     ----------
@@ -52,18 +52,18 @@ def released_network(model: str, root: str | Path) -> Emulator:
         Files that are missing or damaged, weights or a graph of another model, or a pickle that
         holds anything but arrays.
     """
-    scene, found = published_scene(model, root), read_network(root, model)
+    scene, released = published_scene(model, root), read_network(root, model)
     graph = AugmentedGraph(
-        node_features=frozen_array(found.node_features, np.float32),
-        edge_features=frozen_array(found.edge_features, np.float32),
-        senders=frozen_array(found.senders, np.int32),
-        receivers=frozen_array(found.receivers, np.int32),
+        node_features=frozen_array(released.node_features, np.float32),
+        edge_features=frozen_array(released.edge_features, np.float32),
+        senders=frozen_array(released.senders, np.int32),
+        receivers=frozen_array(released.receivers, np.int32),
         real=len(scene.mesh.nodes),
     )
     count = len(scene.parameters)
-    if len(found.mean) != count:
+    if len(released.mean) != count:
         raise InputError(
-            f"published data: theta of {model} has {len(found.mean)} means; expected {count}"
+            f"published data: theta of {model} has {len(released.mean)} means; expected {count}"
         )
     unit = theta_units(model)
     basis = np.zeros((0, *scene.held.shape), dtype=np.float32)
@@ -71,21 +71,21 @@ def released_network(model: str, root: str | Path) -> Emulator:
         architecture=_ARCHITECTURE,
         parameters=count,
         graph=graph,
-        weights=filled(_ARCHITECTURE, graph, count, basis, _renamed(found, model)),
+        weights=filled(_ARCHITECTURE, graph, count, basis, _renamed(released, model)),
         scale=np.full(3, units(model).length),
         basis=basis,
-        standardisation=Standardisation(scene.space, found.mean * unit, found.sd * unit),
+        standardisation=Standardisation(scene.space, released.mean * unit, released.sd * unit),
     )
     emulator = Emulator(scene, network=network, record={"released": model})
     _check_energy(emulator, model, root)
     return emulator
 
 
-def _renamed(found: ReleasedNetwork, model: str) -> dict[str, np.ndarray]:
-    """Released weights by our names."""
+def _renamed(released: ReleasedNetwork, model: str) -> dict[str, np.ndarray]:
+    """Return the released weights by our names."""
     places = {f"FlaxMLP_{k}": place for k, place in enumerate(_PERCEPTRONS)}
     renamed = {}
-    for name, array in found.weights.items():
+    for name, array in released.weights.items():
         owner, *rest = name.split("/")
         if owner == "LayerNorm_0":
             owner, rest = "processor", ["norm", *rest]
@@ -108,9 +108,9 @@ def _check_energy(emulator: Emulator, model: str, root: str | Path) -> None:
     def energy(theta: jax.Array) -> jax.Array:
         return potential_energy(scene)(emulator(theta), theta)
 
-    found, stored = float(energy(thetas[0])), float(tests.energy[0])
-    if not abs(found - stored) <= _OTHER_ENERGY * abs(stored):
+    predicted, stored = float(energy(thetas[0])), float(tests.energy[0])
+    if not abs(predicted - stored) <= _OTHER_ENERGY * abs(stored):
         raise InputError(
             f"published data: these weights are not of {model}: at the first stored theta their "
-            f"prediction has an energy of {found:.4g} mN mm, the solution {stored:.4g}"
+            f"prediction has an energy of {predicted:.4g} mN mm, the solution {stored:.4g}"
         )

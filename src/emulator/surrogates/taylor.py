@@ -15,17 +15,17 @@ ventricle with five parameters, over the whole box, orders 1, 2, 3 and 4 leave a
 0.20, 0.047, 0.010 and 0.003 mm; at the corners, near the series' radius of convergence, the error
 is much larger.
 
-Where the displacement is a sum, as that of a body whose mesh is loaded
-(:mod:`emulator.fem.loaded`), each one's terms of an order follow from those of the ones before.
+Where the displacement is a sum, as of a body whose mesh is loaded (:mod:`emulator.fem.loaded`), the
+terms of each summand follow from those of the ones before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations, combinations_with_replacement
 from math import comb, factorial, prod
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,23 +35,23 @@ from emulator.core.errors import InputError, SolverError
 from emulator.fem.derivatives import Equations
 from emulator.fem.simulator import Simulator
 from emulator.fem.unloading import Unloader
-from emulator.scenes.scene import Scene
-from emulator.surrogates.part import CachedPart, OfArrays, widened
+from emulator.surrogates.part import ArrayPart, CachedPart
 
 Terms = dict[tuple[int, ...], jax.Array]
-"""Derivatives (n, 3) mm by the parameters they are in, in order."""
+"""Derivatives (n, 3) mm by the parameters in which they are taken, in order."""
 
 _MOST_TERMS = 200  # in one order; 18 parameters have 171 of the second and 1140 of the third
 
 
 @dataclass(frozen=True, eq=False)
-class Expansion(OfArrays):
+class Expansion(ArrayPart):
     """Taylor series of a scene's equilibrium about one theta, a part of an emulator.
 
-    centre : (p,) position in the unit box about which the series is taken.
-    displacement : (n, 3) mm, the equilibrium at the centre.
-    indices : (t, order) parameters each term is differentiated in, -1 for none; sorted by order.
-    derivatives : (t, n, 3) mm, with respect to position.
+    centre : the position in the unit box about which the series is taken, (p,).
+    displacement : the equilibrium at the centre, (n, 3) mm.
+    indices : the parameters in which each term is differentiated, -1 for none, (t, order); sorted
+        by order.
+    derivatives : the derivatives with respect to position, (t, n, 3) mm.
     """
 
     centre: np.ndarray
@@ -60,11 +60,11 @@ class Expansion(OfArrays):
     derivatives: jax.Array
 
     def monomials(self, position: jax.Array) -> jax.Array:
-        """The factor of each derivative at ``position`` (..., p), shape (..., t)."""
+        """Return the factor of each derivative at ``position`` (..., p), shape (..., t)."""
         return monomials(self.indices, position - self.centre)
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (..., n, 3) mm at ``position`` (..., p) in the unit box."""
+        """Return the displacement (..., n, 3) mm at ``position`` (..., p) in the unit box."""
         return self.displacement + jnp.tensordot(self.monomials(position), self.derivatives, axes=1)
 
     @property
@@ -73,23 +73,12 @@ class Expansion(OfArrays):
         return int(np.max(np.sum(self.indices >= 0, axis=1), initial=0))
 
     def cache(self, nodes: np.ndarray) -> CachedPart:
-        """The series over ``nodes`` (k,): its derivatives are the modes."""
+        """Return the series over ``nodes`` (k,): its derivatives are the modes."""
         offset, modes = np.asarray(self.displacement)[nodes], np.asarray(self.derivatives)[:, nodes]
         return CachedPart(offset, modes, self.monomials)
 
-    @classmethod
-    def restore(
-        cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-    ) -> Self:
-        """The series with these arrays."""
-        del scene, description
-        centre, u, indices, derivatives = (
-            widened(arrays[name]) for name in ("centre", "displacement", "indices", "derivatives")
-        )
-        return cls(centre, jnp.asarray(u), indices, jnp.asarray(derivatives))
-
     def less(self, part: CachedPart) -> Expansion:
-        """What is left of the series without that of ``part``, over all nodes, about its centre.
+        """Return the series less that of ``part``, over all nodes, about its centre.
 
         Added to the part, it has the same derivatives there as FEM.
         """
@@ -113,18 +102,18 @@ class Expansion(OfArrays):
         )
 
     def rounded(self) -> Expansion:
-        """The series in numbers float32 can hold, so that a file of half the size loses nothing."""
+        """Return the series rounded to float32, so that a file of half the size loses nothing."""
         u, derivatives = (rounded(a) for a in (self.displacement, self.derivatives))
         return replace(self, displacement=u, derivatives=derivatives)
 
 
 def rounded(array: jax.Array) -> jax.Array:
-    """The array in float64, its numbers rounded to float32."""
+    """Return the array in float64, its numbers rounded to float32."""
     return array.astype(jnp.float32).astype(jnp.float64)
 
 
 def constant(position: np.ndarray, displacement: jax.Array) -> Expansion:
-    """The series of order 0: ``displacement`` (n, 3) everywhere."""
+    """Return the series of order 0: ``displacement`` (n, 3) everywhere."""
     return Expansion(
         np.asarray(position),
         jnp.asarray(displacement),
@@ -134,7 +123,7 @@ def constant(position: np.ndarray, displacement: jax.Array) -> Expansion:
 
 
 def monomials(indices: np.ndarray, step: jax.Array) -> jax.Array:
-    """Taylor monomials (..., t) of ``step`` (..., p): products over the multi-indices' factorials.
+    """Return the Taylor monomials (..., t) of ``step`` (..., p), divided by the factorials.
 
     The term of ``u,aab`` is ``s_a s_a s_b / (2! 1!)``: each multi-index stands once.
     """
@@ -150,7 +139,7 @@ def monomials(indices: np.ndarray, step: jax.Array) -> jax.Array:
 def expand(
     simulator: Simulator | Unloader, theta: jax.Array | None = None, order: int = 3
 ) -> Expansion:
-    """The Taylor series of the equilibrium about ``theta`` (p,), the centre of the box by default.
+    """Return the Taylor series of the equilibrium about ``theta`` (p,), by default the centre.
 
     Parameters
     ----------
@@ -173,32 +162,32 @@ def expand(
 def expand_at(
     simulator: Simulator | Unloader, u: jax.Array, theta: jax.Array, order: int
 ) -> Expansion:
-    """:func:`expand` about a known equilibrium ``u`` (n, 3) mm at ``theta`` (p,)."""
+    """Return :func:`expand` about a known equilibrium ``u`` (n, 3) mm at ``theta`` (p,)."""
     _check_order(order)
     scene, theta, u = simulator.scene, jnp.asarray(theta, dtype=float), jnp.asarray(u, dtype=float)
     position = scene.to_unit(theta)
     chain = simulator.equations(u, theta)
     count = len(position)
-    found: list[Terms] = [{} for _ in chain]
+    known: list[Terms] = [{} for _ in chain]
     for degree in range(1, order + 1):
         if comb(count + degree - 1, degree) > _MOST_TERMS:
             break
         terms = list(combinations_with_replacement(range(count), degree))
         for k, each in enumerate(chain):
             system = each.system
-            forces, held = _forces(chain[: k + 1], position, terms, found)
-            solved = -jax.jit(system.solve)(each.tangent, forces.T)
-            moved = jax.vmap(system.extend, in_axes=1)(solved) + held
-            if not jnp.isfinite(moved).all():
+            forces, prescribed = _forces(chain[: k + 1], position, terms, known)
+            free = -jax.jit(system.solve)(each.tangent, forces.T)
+            derivatives = jax.vmap(system.extend, in_axes=1)(free) + prescribed
+            if not jnp.isfinite(derivatives).all():
                 raise SolverError(
                     f"scene '{scene.name}': derivatives of order {degree} in theta are not finite"
                 )
-            found[k].update(zip(terms, moved, strict=True))
-    if not found[0]:
+            known[k].update(zip(terms, derivatives, strict=True))
+    if not known[0]:
         return constant(np.asarray(position), u)
-    indices = np.array([[*term, *(-1,) * (order - len(term))] for term in found[0]])
-    derivatives = sum(jnp.stack(list(each.values())) for each in found)
-    return Expansion(np.asarray(position), u, indices, jnp.asarray(derivatives))
+    indices = np.array([[*term, *(-1,) * (order - len(term))] for term in known[0]])
+    total = sum(jnp.stack(list(each.values())) for each in known)
+    return Expansion(np.asarray(position), u, indices, jnp.asarray(total))
 
 
 def _check_order(order: int) -> None:
@@ -210,13 +199,13 @@ def _forces(
     chain: tuple[Equations, ...],
     position: jax.Array,
     terms: list[tuple[int, ...]],
-    found: list[Terms],
+    known: list[Terms],
 ) -> tuple[jax.Array, jax.Array]:
-    """Mixed derivative (t, f) of the last residual of ``chain`` along each term's path.
+    """Return the mixed derivative (t, f) of the last residual of ``chain`` along each path.
 
-    Its own term is left out there; those of the displacements before are in ``found``.
-    And (t, n, 3) of the displacement where theta moves supports, (t, 1, 1) of zeros where it moves
-    none. Term by term (``lax.map``): the paths of all terms at once would not fit into memory.
+    The path leaves out the term itself; the terms before it are in ``known``. The second result is
+    the derivative of prescribed displacements, (t, n, 3), or zeros (t, 1, 1) where theta moves no
+    support. Terms are taken one by one (``lax.map``): the paths of all would not fit into memory.
     """
     degree, last = len(terms[0]), chain[-1]
     scene = last.system.scene
@@ -225,45 +214,47 @@ def _forces(
     proper = [s for size in range(1, degree) for s in combinations(range(degree), size)]
     whole = [*proper, tuple(range(degree))]
     subsets = [whole if each is not last else proper for each in chain]
-    paths = [_places(terms, parts, here) for parts, here in zip(subsets, found, strict=False)]
+    paths = [_places(terms, parts, here) for parts, here in zip(subsets, known, strict=False)]
     nothing = jnp.zeros((0, *last.u.shape))
-    known = [jnp.stack(list(h.values())) if h else nothing for h in found[: len(chain)]]
+    fields = [jnp.stack(list(h.values())) if h else nothing for h in known[: len(chain)]]
     moving = bool(scene.prescribed.per_unit)
 
-    def one(argument: tuple[jax.Array, list[jax.Array]], known: Any) -> tuple[jax.Array, jax.Array]:
+    def one(
+        argument: tuple[jax.Array, list[jax.Array]], fields: Any
+    ) -> tuple[jax.Array, jax.Array]:
         directions, paths = argument
 
         def along(*steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-            fields = []
-            for each, parts, path, values in zip(chain, subsets, paths, known, strict=True):
+            displacements = []
+            for each, parts, path, values in zip(chain, subsets, paths, fields, strict=True):
                 v = each.u
                 for part, place in zip(parts, path, strict=True):
                     v = v + prod((steps[k] for k in part), start=jnp.ones(())) * values[place]
-                fields.append(v)
+                displacements.append(v)
             x = position + sum(s * d for s, d in zip(steps, directions, strict=True))
             theta = scene.from_unit(x)
             if not moving:
-                return last.residual(theta, *fields), jnp.zeros((1, 1))
-            v = scene.on_supports(fields[-1], theta)
-            return last.residual(theta, *fields[:-1], v), jnp.where(scene.held, v, 0.0)
+                return last.residual(theta, *displacements), jnp.zeros((1, 1))
+            v = scene.on_supports(displacements[-1], theta)
+            return last.residual(theta, *displacements[:-1], v), jnp.where(scene.held, v, 0.0)
 
         return _mixed(along, degree)()
 
     directions = jnp.stack([jnp.eye(len(position))[jnp.array(term)] for term in terms])
     return jax.jit(lambda d, p, k: jax.lax.map(lambda each: one(each, k), (d, p)))(
-        directions, paths, known
+        directions, paths, fields
     )
 
 
-def _places(terms: list[tuple[int, ...]], parts: list[tuple[int, ...]], found: Terms) -> jax.Array:
-    """Places (t, parts) in ``found`` of the derivatives in each of the ``parts`` of each term."""
-    places = {term: k for k, term in enumerate(found)}
+def _places(terms: list[tuple[int, ...]], parts: list[tuple[int, ...]], known: Terms) -> jax.Array:
+    """Return the indices (t, parts) in ``known`` of the derivatives in each part of each term."""
+    places = {term: k for k, term in enumerate(known)}
     rows = [[places[tuple(term[k] for k in part)] for part in parts] for term in terms]
     return jnp.array(rows, dtype=int).reshape(len(terms), len(parts))
 
 
 def _mixed(function: Callable[..., Any], degree: int) -> Callable[[], Any]:
-    """The derivative of ``function`` once in each of its ``degree`` scalars, at zero."""
+    """Return the derivative of ``function`` once in each of its ``degree`` scalars, at zero."""
     if degree == 0:
         return function
     derivative = lambda *rest: jax.jvp(  # noqa: E731

@@ -1,4 +1,4 @@
-"""A training's checkpoints: weights, optimiser, plan and architecture, all that resuming needs."""
+"""The checkpoints of a training: weights, optimiser, plan and architecture, to resume from."""
 
 from __future__ import annotations
 
@@ -13,16 +13,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, look_up
+from emulator.core.schema import read_as
 from emulator.core.store import fill_tree, named_leaves, read_arrays, save_arrays
+from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.plan import Plan
+from emulator.training.plan import Plan, Record
 
 CHECKPOINT, SWEEPS = "checkpoint.safetensors", "sweeps.safetensors"
 
 
 class State(NamedTuple):
-    """Weights, optimiser state, optimiser steps done, and the loss of the last step."""
+    """The state between two optimiser steps.
+
+    weights, optimiser : the weights of the network and the state of the optimiser.
+    done : the number of steps done.
+    loss : the loss of the last step.
+    """
 
     weights: Any
     optimiser: Any
@@ -32,14 +39,16 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Session:
-    """One training, begun or resumed: what its checkpoints say of it, and its clock.
+    """A training that begins or is resumed, its checkpoint and its clock.
 
-    path : of the checkpoint.
-    fingerprint : of the scene, or of all scenes of a family.
-    architecture : of the network, None without one.
-    start : record of the emulator whose network training started from; empty when afresh.
-    began : of the performance counter, less the time spent before it was resumed.
-    arrays, loss : of the checkpoint it goes on from; no arrays when it begins.
+    path : the file of the checkpoint.
+    fingerprint : the fingerprint of the scene, or of all scenes of a family.
+    plan : the plan that is followed.
+    architecture : the sizes of the network; ``None`` without one.
+    began : the time it began, on the performance counter, less the time spent before it was
+        resumed.
+    start : the record of the emulator from which training started; empty when afresh.
+    arrays, loss : those of the checkpoint that it resumes from; no arrays when it begins.
     """
 
     path: Path
@@ -53,14 +62,14 @@ class Session:
 
     @property
     def seconds(self) -> float:
-        """Time spent so far."""
+        """The time spent so far."""
         return time.perf_counter() - self.began
 
     def write(self, state: State, total: int) -> None:
         """Replace the checkpoint; ``total`` is the number of steps aimed at."""
         sizes = None if self.architecture is None else asdict(self.architecture)
         metadata = {
-            "plan": json.dumps(asdict(replace(self.plan, steps=total))),
+            "plan": json.dumps(asdict(self.plan.with_counts(steps=total))),
             "architecture": json.dumps(sizes),
             "start": json.dumps(dict(self.start)),
             "fingerprint": self.fingerprint,
@@ -70,12 +79,17 @@ class Session:
         tree = {"weights": state.weights, "optimiser": state.optimiser, "step": state.done}
         save_arrays(self.path, named_leaves(tree), metadata)
 
-    def announce(self) -> None:
-        """A checkpoint without weights: the plan, of a training whose sweeps come first."""
-        self.write(State({}, (), 0), self.plan.steps)
+    def finished(self, emulator: Emulator, record: Record) -> Emulator:
+        """Return ``emulator`` with its record: where it started, and the seconds it took."""
+        start = {"start": dict(self.start)} if self.start else {}
+        return replace(emulator, record={**record, **start, "seconds": round(self.seconds, 1)})
+
+    def write_plan(self) -> None:
+        """Write a checkpoint without weights, for a training that has no optimiser step so far."""
+        self.write(State({}, ()), getattr(self.plan, "steps", 0))
 
     def first(self, state: State, total: int) -> State:
-        """The state to go on from: the checkpoint's, else ``state``, which then is kept."""
+        """Return the checkpoint's state; without one ``state``, which is written."""
         if self.arrays is None:
             self.write(state, total)
             return state
@@ -84,8 +98,9 @@ class Session:
         return State(filled["weights"], filled["optimiser"], int(self.arrays["step"]), self.loss)
 
     def __call__(self, state: State, total: int) -> int:
-        """Keep the state as often as the plan says, and after the last step; a hook."""
-        if state.done % self.plan.checkpoint_every == 0 or state.done == total:
+        """Write the state as often as the plan says and after the last step; a hook."""
+        every: int = self.plan.checkpoint_every  # type: ignore[attr-defined]
+        if state.done % every == 0 or state.done == total:
             self.write(state, total)
         return total
 
@@ -96,15 +111,19 @@ def open_session(
     name: str,
     plan: Plan,
     architecture: Architecture | None,
+    plan_kinds: Mapping[str, type[Plan]],
     *,
     resume: bool,
 ) -> Session:
-    """A training in ``folder``: one that begins, or the one whose checkpoint is there.
+    """Return a training in ``folder``: one that begins, or the one whose checkpoint is there.
 
     Parameters
     ----------
-    name : of what has that ``fingerprint``, for messages.
-    plan, architecture : where it begins; a checkpoint has its own.
+    folder : the folder of the checkpoint.
+    fingerprint, name : the fingerprint of what is emulated, and its name for messages.
+    plan, architecture : those of a training that begins; a checkpoint has its own.
+    plan_kinds : the classes of plans by the name of their recipe, to read a checkpoint's.
+    resume : whether to read the checkpoint.
 
     Raises
     ------
@@ -121,11 +140,13 @@ def open_session(
         raise InputError(f"{path} belongs to another scene than '{name}'; train afresh")
     try:
         sizes = json.loads(metadata["architecture"])
+        options = json.loads(metadata["plan"])
+        kind = look_up(plan_kinds, options["recipe"], "recipe")
         return Session(
             path,
             fingerprint,
-            Plan(**json.loads(metadata["plan"])),
-            Architecture.from_json(sizes) if sizes else architecture,
+            read_as(kind, options, str(path)),
+            read_as(Architecture, sizes, str(path)) if sizes else architecture,
             now - float(metadata["seconds"]),
             json.loads(metadata["start"]),
             arrays if len(arrays) > 1 else None,  # weights, besides the number of steps

@@ -18,19 +18,38 @@ pass through the barriers, which are inactive near any solution.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from emulator.core.errors import InputError
+from emulator.fem.campaign import Runs
 from emulator.fem.energy import displacement_gradient, potential_energy
 from emulator.mechanics.kinematics import Barriers
 from emulator.scenes.scene import Scene
-from emulator.training.plan import Objective
+
+Objective = Literal["energy", "simulations", "gradients", "both"]
+OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
+
+# Standard deviation of the displacements, as a fraction of the centre's, where no FEM run shows it.
+_GUESSED_SD = 0.2
+
+
+def check_objective(name: str) -> None:
+    """Raise :class:`InputError` for an objective that does not exist."""
+    if name not in OBJECTIVES:
+        *first, last = OBJECTIVES
+        raise InputError(f"objective '{name}': use {', '.join(first)} or {last}")
 
 
 class Batch(NamedTuple):
-    """theta (b, p); FEM displacement (b, n, 3) mm and energy (b,) mN mm, empty without FEM."""
+    """The theta of a step and their FEM solutions.
+
+    theta : (b, p). displacement : (b, n, 3) mm. energy : (b,) mN mm. Those of FEM are empty for the
+    objective ``energy``.
+    """
 
     theta: jax.Array
     displacement: jax.Array
@@ -51,7 +70,10 @@ class Scales(NamedTuple):
 def make_loss(
     scene: Scene, objective: Objective, scales: Scales, weight: float
 ) -> Callable[[jax.Array, Batch], jax.Array]:
-    """``loss(u, batch)`` for predicted displacements ``u`` (b, n, 3); ``weight`` is gamma above."""
+    """Return ``loss(u, batch)`` of predicted displacements ``u`` (b, n, 3) mm.
+
+    weight : the factor gamma of the objective ``both``.
+    """
     Pi = jax.vmap(potential_energy(scene, Barriers()))
 
     def energy(u: jax.Array, batch: Batch) -> jax.Array:
@@ -79,11 +101,40 @@ def make_loss(
 
 
 def mean_square_gradient(scene: Scene, difference: jax.Array) -> jax.Array:
-    """Mean over fields and volume of ``|F(u) - F(v)|^2`` for ``difference`` u - v (b, n, 3), ().
+    """Return the mean over fields and volume of ``|F(u) - F(v)|^2``, ().
 
-    F is linear in the displacement, so one gradient of the difference is enough.
+    difference : u - v, (b, n, 3) mm. F is linear in the displacement, so that one gradient of the
+        difference is enough.
     """
     weights = scene.discretisation.weights
     H = jax.vmap(lambda d: displacement_gradient(scene, d))(difference)
     squares = jnp.sum(H * H, axis=(-2, -1))
     return jnp.sum(weights * jnp.mean(squares, axis=0)) / jnp.sum(weights)
+
+
+def loss_scales(scene: Scene, runs: Runs, *, from_runs: bool) -> Scales:
+    """Return the scales of the loss: root mean squares of the runs' deviations from the centre's.
+
+    from_runs : whether the deviations are those of the runs, or guessed from the centre's solution.
+    """
+    deviation = _deviations(runs, from_runs)
+    return Scales(
+        displacement=float(np.sqrt(np.mean(np.sum(deviation**2, axis=-1)))),
+        gradient=float(jnp.sqrt(mean_square_gradient(scene, jnp.asarray(deviation)))),
+        energy=float(jnp.abs(runs.energy[0])),
+    )
+
+
+def component_scales(scene: Scene, runs: Runs, *, from_runs: bool) -> np.ndarray:
+    """Return root mean squares of the deviations at free nodes by component, (3,) mm."""
+    deviation, free = _deviations(runs, from_runs), ~scene.held
+    component = [float(np.sqrt(np.mean(deviation[:, free[:, k], k] ** 2))) for k in range(3)]
+    return np.maximum(component, 1e-3 * max(component))
+
+
+def _deviations(runs: Runs, from_runs: bool) -> np.ndarray:
+    """Return displacements less the centre's, (c, n, 3) mm."""
+    centre = np.asarray(runs.displacement[0])
+    if from_runs and len(runs.theta) > 1:
+        return np.asarray(runs.displacement[1:]) - centre
+    return _GUESSED_SD * centre[None]

@@ -1,12 +1,12 @@
-r"""Where equilibria should be, one guarded step from where a map says they are.
+r"""Estimates of equilibria: one guarded step from the displacements that a map predicts.
 
 At each theta a few conjugate gradients for the linearised equations,
 
 .. math:: K(v_i, \theta_i)\, e_i = -r(v_i, \theta_i),
 
-beside one Cholesky factor for eight neighbours: of the tangent in the middle of them, where the map
-says. Newton's guard decides how much of :math:`e_i` is taken: it lowers the potential and crushes
-no element. There is no iteration at a theta, and no solution of FEM.
+preconditioned by one Cholesky factor for eight neighbours, that of the tangent at the prediction in
+their middle. Newton's guard decides which fraction of :math:`e_i` is taken: the step lowers the
+potential and inverts no element. There is no iteration at a theta, and no solution of FEM.
 """
 
 from __future__ import annotations
@@ -26,19 +26,22 @@ from emulator.fem.line_search import ARMIJO, armijo, backtrack
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
 
-_GROUP = 8  # theta beside one factor
-_MIDDLES = 3  # of a group, whose tangents are tried
+_GROUP = 8  # theta that share a factor
+_MIDDLES = 3  # members of a group whose tangents are tried, the middle first
 _STEPS, _TOLERANCE = 4, 1e-8  # of conjugate gradients
 _LEAST_J = 0.05
 _LEAST_FRACTION = 2.0**-7
 
 
 class Targets(NamedTuple):
-    """Targets at c theta, in their order.
+    """The targets at c theta.
 
-    fields : (c, f) mm where free. step : (c,) mm, root mean square over the nodes of the whole
-    step. fraction : (c,) of it that was taken, 0 for none. contraction : (c,) of the residual, in
-    the norm of the factor's inverse. gap : (c,) of the potential that the step closes, relative.
+    fields : the free displacements after the step, (c, f) mm.
+    step : the root mean square over the nodes of the whole step, (c,) mm.
+    fraction : the fraction of the step that is taken, 0 for none, (c,).
+    contraction : the ratio of the residuals after and before the step, in the norm of the factor's
+        inverse, (c,).
+    gap : the relative decrease of the potential by the step, (c,).
     """
 
     fields: np.ndarray
@@ -49,19 +52,20 @@ class Targets(NamedTuple):
 
     @property
     def error(self) -> np.ndarray:
-        """What each target may still be off, (c,) mm: infinite where no step was taken."""
+        """The remaining error of each target, (c,) mm; infinite where no step was taken."""
         with np.errstate(invalid="ignore"):
-            left = self.step * (1.0 - self.fraction + self.fraction * self.contraction)
-        usable = (self.fraction > 0.0) & np.isfinite(left) & np.isfinite(self.fields).all(axis=1)
-        return np.where(usable, left, np.inf)
+            error = self.step * (1.0 - self.fraction + self.fraction * self.contraction)
+        usable = (self.fraction > 0.0) & np.isfinite(error) & np.isfinite(self.fields).all(axis=1)
+        return np.where(usable, error, np.inf)
 
 
 def targets(
     simulator: Simulator, fields: np.ndarray, position: np.ndarray, level: float
 ) -> Targets:
-    """Targets at ``position`` (c, p) in the unit box, c eight times a power of two.
+    """Return the targets at ``position`` (c, p) in the unit box, c eight times a power of two.
 
-    fields : (c, f) mm where free, as a map says. level : of the loads and moved supports.
+    fields : the free displacements that the map predicts, (c, f) mm.
+    level : the level of the loads and of moved supports.
     """
     system, load = simulator.system, jnp.asarray(level)
     thetas = np.asarray(simulator.scene.from_unit(jnp.asarray(position)))
@@ -80,19 +84,19 @@ def targets(
         each = [_target(system, factor, fields[k], thetas[k], load) for k in rows]
         return Targets(*(np.stack([np.asarray(x) for x in row]) for row in zip(*each, strict=True)))
 
-    told: Iterator[Targets] = in_order(of_group, iter(groups), at_once(simulator))
-    joined = [np.concatenate(column) for column in zip(*told, strict=True)]
+    results: Iterator[Targets] = in_order(of_group, iter(groups), at_once(simulator))
+    joined = [np.concatenate(column) for column in zip(*results, strict=True)]
     back = np.argsort(np.concatenate(groups))
     return Targets(*(column[back] for column in joined))
 
 
-def _placed(system: System, v: jax.Array, theta: jax.Array, level: jax.Array) -> jax.Array:
-    """Displacement (n, 3) with ``v`` (f,) where free, and held by the supports at ``level``."""
+def _displacement(system: System, v: jax.Array, theta: jax.Array, level: jax.Array) -> jax.Array:
+    """Return the displacement (n, 3): ``v`` (f,) where free, that of the supports elsewhere."""
     return system.scene.on_supports(system.extend(v), theta, level=level)
 
 
 def _groups(position: np.ndarray) -> list[np.ndarray]:
-    """Rows of eight neighbours each in ``position`` (c, p), those in the middle first."""
+    """Return the rows of ``position`` (c, p) in groups of eight, each from its middle on."""
     parts = [np.arange(len(position))]
     while len(parts[0]) > _GROUP:
         halves = []
@@ -113,8 +117,8 @@ def _groups(position: np.ndarray) -> list[np.ndarray]:
 def _tangent(
     system: System, v: jax.Array, theta: jax.Array, level: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Nonzeros (nnz,) of the tangent at ``v`` (f,), and whether it is positive definite."""
-    values, solvable = system.safe_tangent(_placed(system, v, theta, level), theta, level)
+    """Return the nonzeros (nnz,) of the tangent at ``v`` (f,), and whether it is definite."""
+    values, solvable = system.safe_tangent(_displacement(system, v, theta, level), theta, level)
     outcome = system.attempt(values, jnp.zeros_like(v))[1]
     return values, solvable & (outcome == Outcome.OK)
 
@@ -123,34 +127,34 @@ def _tangent(
 def _target(
     system: System, factor: jax.Array, v: jax.Array, theta: jax.Array, level: jax.Array
 ) -> tuple[jax.Array, ...]:
-    """Of :class:`Targets`, at ``theta`` (p,) from ``v`` (f,), beside the tangent ``factor``."""
+    """Return the target from ``v`` (f,) at ``theta`` (p,), preconditioned by ``factor``."""
 
     def residual(v: jax.Array) -> jax.Array:
-        return system.residual(_placed(system, v, theta, level), theta, level)
+        return system.residual(_displacement(system, v, theta, level), theta, level)
 
-    def beside(force: jax.Array) -> jax.Array:
+    def precondition(force: jax.Array) -> jax.Array:
         return system.attempt(factor, force)[0]
 
-    r, pulled = jax.linearize(residual, v)
-    step = conjugate_gradients(pulled, beside, -r, _STEPS, _TOLERANCE).x
+    r, tangent_times = jax.linearize(residual, v)
+    step = conjugate_gradients(tangent_times, precondition, -r, _STEPS, _TOLERANCE).x
     slope = jnp.vdot(r, step)
 
     def at(fraction: jax.Array) -> jax.Array:
-        return _placed(system, v + fraction * step, theta, level)
+        return _displacement(system, v + fraction * step, theta, level)
 
     def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
         return system.potential(at(fraction), theta, level)
 
-    def sound(fraction: jax.Array) -> jax.Array:
+    def valid(fraction: jax.Array) -> jax.Array:
         return system.least_volume_ratio(at(fraction)) > _LEAST_J  # False for NaN
 
-    trial = backtrack(sound, armijo(potential, ARMIJO * slope), _LEAST_FRACTION)
+    trial = backtrack(valid, armijo(potential, ARMIJO * slope), _LEAST_FRACTION)
     usable = trial.accepted & (slope <= 0.0)  # False for NaN
     fraction = jnp.where(usable, trial.fraction, 0.0)
-    moved = jnp.where(usable, v + fraction * step, v)
-    left = residual(moved)
-    before, after = jnp.vdot(r, beside(r)), jnp.vdot(left, beside(left))
+    target = jnp.where(usable, v + fraction * step, v)
+    rest = residual(target)
+    before, after = jnp.vdot(r, precondition(r)), jnp.vdot(rest, precondition(rest))
     contraction = jnp.sqrt(jnp.abs(after) / jnp.where(before > 0.0, before, 1.0))
     length = jnp.sqrt(jnp.sum(step**2) / system.scene.held.shape[0])
     size = potential(jnp.zeros(()))[1]
-    return moved, length, fraction, contraction, -0.5 * slope / size
+    return target, length, fraction, contraction, -0.5 * slope / size

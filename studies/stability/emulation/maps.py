@@ -12,7 +12,7 @@ from studies.stability.emulation.check import Ended, add
 import emulator as em
 from emulator.accuracy.estimate import error_bar
 from emulator.fem import Simulator
-from emulator.surrogates.additive import Emulator
+from emulator.surrogates.emulator import Emulator
 
 NAMES = ("once_clamped_beam", "twisting_cube", "liver", "left_ventricle")
 SHIPPED = (*NAMES, *(f"{name}_pignn" for name in NAMES))

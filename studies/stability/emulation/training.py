@@ -18,7 +18,7 @@ import emulator as em
 from emulator.accuracy.estimate import error_bar
 from emulator.fem import Simulator, sobol
 from emulator.scenes import Scene
-from emulator.surrogates.additive import Emulator
+from emulator.surrogates.emulator import Emulator
 from emulator.training import RECIPES, objectives, train
 
 FAMILY = "training"

@@ -9,7 +9,7 @@ import pytest
 from calibrate.cli import COMMANDS, main
 from calibrate.cli.words import seconds
 from cli_support import SCENE, answer, complaint, write_block
-from emulator.surrogates.files import load
+from emulator.surrogates.emulator import load
 
 
 @pytest.fixture

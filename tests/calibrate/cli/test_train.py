@@ -3,7 +3,8 @@
 import pytest
 
 from calibrate.cli import main
-from emulator.training.plan import OBJECTIVES, RECIPES
+from emulator.training.objectives import OBJECTIVES
+from emulator.training.trainer import RECIPES
 
 
 @pytest.mark.parametrize(("option", "names"), [("--recipe", RECIPES), ("--objective", OBJECTIVES)])

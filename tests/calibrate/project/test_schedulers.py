@@ -48,7 +48,7 @@ def test_a_certificate(beam, simulator, observe, address):
 
 def posterior_of(beam, simulator, observe):
     """From a series about the centre, which FEM corrects a little."""
-    from emulator.surrogates.additive import Emulator
+    from emulator.surrogates.emulator import Emulator
     from emulator.surrogates.taylor import expand
 
     forward = Emulator(beam, taylor=expand(simulator, order=2)).cache()

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from studies.ventricle_family import training as ventricles
+from studies.ventricle_family.training import PLAN, BodyRuns, train_family
 
 import emulator as em
 from calibrate.cli import main
@@ -24,7 +26,8 @@ from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.pignn import Architecture, Processor
 from emulator.surrogates.network.ventricle_graph import describe
 from emulator.training import recipe, train
-from emulator.training.ventricles import PLAN, BodyRuns, train_family
+from emulator.training.job import Job
+from emulator.training.mechanics import Mechanics
 
 SMALL = Architecture(
     steps=2, latent=8, hidden=(16,), decoder="separable", modes=4, trunk=(16,), branch=(16,)
@@ -92,8 +95,6 @@ def test_it_learns_and_takes_it_to_a_body_unseen(family: Emulator) -> None:
 @pytest.mark.slow
 def test_padding_changes_nothing(family: Emulator) -> None:
     """What training sees of a padded body is what is predicted on it."""
-    from emulator.training import ventricles
-
     body = runs(SHAPES[0])
     assert family.family is not None
     learned = family.family.learned
@@ -164,12 +165,10 @@ def test_a_start_for_other_recipes(family: Emulator, tmp_path: Path) -> None:
     alone = train(scene, recipe("family"), tmp_path, start=start)
     assert list(alone.parts) == ["family"]
     assert alone.record["start"]["fingerprint"] == start.fingerprint
-    plan = replace(recipe("mechanics"), order=1, simulations=1, batch=1)
-    from emulator.training.problem import prepare
-
-    problem = prepare(scene, plan, start=start)
+    plan = Mechanics(order=1, simulations=1)
+    started, *_ = plan.prepare(Job(scene, start=start))
     u = em.Simulator(scene)(scene.centre)
-    found = problem.emulator.cache()
+    found = started.cache()
     assert np.allclose(found(scene.centre), u, atol=1e-5)
     # Its slopes at the centre are FEM's, too.
     slope = jax.jacfwd(found)(scene.centre)

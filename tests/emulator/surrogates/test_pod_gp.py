@@ -10,8 +10,8 @@ from emulator.accuracy.comparison import evaluate
 from emulator.core.errors import InputError
 from emulator.core.store import save_arrays
 from emulator.fem import run_campaign, sobol
-from emulator.surrogates.kind import Ingredients
 from emulator.surrogates.pod_gp import REDUCED, fit_reduced
+from emulator.surrogates.protocol import Ingredients
 from emulator.surrogates.registry import keep_forward, restore_forward
 
 

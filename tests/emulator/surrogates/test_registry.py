@@ -4,8 +4,13 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
-from emulator.surrogates.kind import ForwardKind, Ingredients, Option
-from emulator.surrogates.protocol import Extrapolated, fingerprint_of
+from emulator.surrogates.protocol import (
+    Extrapolated,
+    ForwardKind,
+    Ingredients,
+    Option,
+    fingerprint_of,
+)
 from emulator.surrogates.registry import (
     FORWARD_MAPS,
     build_forward,

@@ -12,27 +12,32 @@ from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import design, sobol
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training import Plan, pretrain, recipe, train
-from emulator.training.budget import Budget
+from emulator.training import train
+from emulator.training.job import Job
 from emulator.training.modal import Modal
-from emulator.training.objectives import mean_square_gradient
-from emulator.training.problem import prepare
+from emulator.training.mode_fit import ModeFit
+from emulator.training.objectives import loss_scales, mean_square_gradient
 from emulator.training.step import orthogonal_steps
 
 SMALL = Architecture(
     steps=2, latent=8, hidden=(16, 16), decoder="separable", modes=6, trunk=(16, 40)
 )
-PLAN = replace(recipe("modal"), simulations=12, batch=4, steps=60, freeze=30, polish=100)
+PLAN = Modal(simulations=12, steps=60, freeze=30, polish=100)
 
 
 @pytest.fixture(scope="module")
 def problem(beam):
-    return prepare(beam, PLAN, SMALL)
+    return PLAN.prepare(Job(beam, SMALL))
 
 
 @pytest.fixture(scope="module")
-def modal(problem) -> Modal:
-    return problem.training.modal
+def modal(problem) -> ModeFit:
+    return mode_fit_of(problem)
+
+
+def mode_fit_of(problem):
+    scene, runs = problem.emulator.scene, problem.runs
+    return ModeFit(scene, problem.training.network, runs, loss_scales(scene, runs, from_runs=True))
 
 
 def field(modal, seed):
@@ -120,17 +125,16 @@ def test_orthogonal_steps_are_as_long_in_every_direction():
 
 
 def test_a_budget_leaves_time_for_the_branch():
-    budget = Budget(100.0, 0.0)
-    assert budget.network_deadline(PLAN) < budget.network_deadline(replace(PLAN, polish=0)) <= 100.0
+    assert PLAN.budget_share < replace(PLAN, polish=0).budget_share <= 1.0
 
 
 def test_coefficients_are_of_values_and_slopes(modal, problem):
     """A branch that gives the coefficients gives displacements and their slopes in theta."""
     scene, runs = modal.scene, problem.runs
-    weights = jax.jit(modal._settled)(problem.training.initial()[0])
-    taught = modal.keep(weights)
+    weights = jax.jit(modal._with_solved_layer)(problem.training.initial()[0])
+    branch = modal.branch_targets(weights)
     s = modal.scales.displacement
-    found = s * np.tensordot(np.asarray(taught.values), np.asarray(taught.modes, float), axes=1)
+    found = s * np.tensordot(np.asarray(branch.values), np.asarray(branch.modes, float), axes=1)
     expected = np.asarray(runs.displacement - runs.displacement[0])
     free = ~scene.held
     size = np.sqrt(np.mean(expected[:, free] ** 2))
@@ -142,7 +146,7 @@ def test_coefficients_are_of_values_and_slopes(modal, problem):
     for k in range(len(x)):
         ends = [simulator(scene.from_unit(x.at[k].add(sign * h))) for sign in (1.0, -1.0)]
         slope = np.asarray(ends[0] - ends[1]) / (2.0 * h)
-        found = s * np.tensordot(np.asarray(taught.slopes[3, k]), np.asarray(taught.modes), axes=1)
+        found = s * np.tensordot(np.asarray(branch.slopes[3, k]), np.asarray(branch.modes), axes=1)
         assert np.sqrt(np.mean((found - slope)[free] ** 2)) < 0.1 * np.sqrt(np.mean(slope**2))
 
 
@@ -189,18 +193,14 @@ def _killed_after(scene, folder, stop, monkeypatch):
 
 @pytest.mark.slow
 def test_more_modes_than_snapshots_leave_zeros(beam):
-    plan = replace(PLAN, simulations=4, batch=2)
+    plan = replace(PLAN, simulations=4)
     runs = run_campaign(em.Simulator(beam), design(beam, 2, 0), sensitivities=True)
-    problem = prepare(beam, plan, replace(SMALL, modes=30))
-    few = Modal(beam, problem.emulator.network, Runs(*runs), problem.training.modal.scales)
+    problem = plan.prepare(Job(beam, replace(SMALL, modes=30)))
+    few = ModeFit(beam, problem.emulator.network, Runs(*runs), mode_fit_of(problem).scales)
     assert (np.asarray(few.targets)[..., 20:] == 0.0).all()
-    assert np.isfinite(few.keep(problem.training.initial()[0]).values).all()
+    assert np.isfinite(few.branch_targets(problem.training.initial()[0]).values).all()
 
 
-def test_bad_plans_and_families(beam, tmp_path):
-    for other in ("network", "hybrid", "paper"):
-        with pytest.raises(InputError, match=f"recipe '{other}' cannot have the objective 'modes'"):
-            replace(recipe(other), objective="modes")
-    with pytest.raises(InputError, match="recipe 'modal' solves for the last layer of one scene"):
-        pretrain([beam, beam], PLAN, tmp_path, architecture=SMALL)
-    assert Plan().slopes is False
+def test_a_plan_without_runs_is_refused():
+    with pytest.raises(InputError, match="0 simulations; modes need 1 or more"):
+        replace(PLAN, simulations=0)

@@ -10,11 +10,9 @@ import pytest
 import emulator as em
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates import Architecture
-from emulator.training import Plan
-from emulator.training.network import scales_of
-from emulator.training.objectives import Batch, Scales, make_loss
-from emulator.training.plan import OBJECTIVES
-from emulator.training.problem import prepare
+from emulator.training.graph_network import GraphNetwork
+from emulator.training.job import Job
+from emulator.training.objectives import OBJECTIVES, Batch, Scales, loss_scales, make_loss
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 SCALES = Scales(displacement=2.0, gradient=0.3, energy=7.0)
@@ -38,7 +36,7 @@ def test_objectives_by_hand(beam, tests):
         "gradients": misfit,  # a shift has none
         "both": misfit + 0.5 * gap,
     }
-    assert set(expected) == set(OBJECTIVES) - {"modes"}  # test_modal.py
+    assert set(expected) == set(OBJECTIVES)
     for objective, value in expected.items():
         loss = make_loss(beam, objective, SCALES, weight=0.5)
         assert float(loss(u, batch)) == pytest.approx(float(value), rel=1e-12)
@@ -102,9 +100,9 @@ def test_other_objectives_do_not_know_the_scale_of_gradients(beam, tests, object
 
 def test_both_terms_of_gradients_are_one_at_the_centre(beam):
     """Over the runs its scales were taken from."""
-    plan = Plan(objective="gradients", steps=1, simulations=8, batch=4)
-    runs = prepare(beam, plan, SMALL).runs
-    _, scales = scales_of(beam, plan, runs)
+    plan = GraphNetwork(objective="gradients", steps=1, simulations=8, batch=4)
+    runs = plan.prepare(Job(beam, SMALL)).runs
+    scales = loss_scales(beam, runs, from_runs=True)
     batch = Batch(*runs.take(slice(1, None))[:3])
     centre = jnp.broadcast_to(runs.displacement[0], batch.displacement.shape)
     simulations, gradients = (

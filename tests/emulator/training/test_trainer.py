@@ -13,10 +13,13 @@ from emulator.fem import run_campaign, sobol, uniform
 from emulator.fem.campaign import StoredRuns
 from emulator.geometry.refinement import to_quadratic
 from emulator.surrogates import Architecture, Emulator
-from emulator.training import Plan, recipe, train
-from emulator.training.checkpoint import CHECKPOINT, Session
-from emulator.training.problem import prepare
-from emulator.training.step import WARMUP, learning_rate
+from emulator.training import recipe, train
+from emulator.training.checkpoint import CHECKPOINT, Session, State
+from emulator.training.graph_network import GraphNetwork
+from emulator.training.hybrid import Hybrid
+from emulator.training.job import Job
+from emulator.training.mechanics import Mechanics
+from emulator.training.step import WARMUP
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 
@@ -37,7 +40,7 @@ def tests(beam, simulator):
     ],
 )
 def test_training_lowers_the_error(beam, tests, objective, factor, tmp_path):
-    plan = Plan(objective=objective, steps=300, simulations=16, batch=8, learning_rate=3e-3)
+    plan = GraphNetwork(objective=objective, steps=300, simulations=16, batch=8, learning_rate=3e-3)
     emulator = train(beam, plan, tmp_path, architecture=SMALL)
     centre = em.Simulator(beam)(beam.centre)
     before = np.median(np.linalg.norm(tests.displacement - centre, axis=-1))
@@ -47,7 +50,7 @@ def test_training_lowers_the_error(beam, tests, objective, factor, tmp_path):
 
 
 def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
-    plan = Plan(steps=30, simulations=8, batch=4, checkpoint_every=10)
+    plan = GraphNetwork(steps=30, simulations=8, batch=4, checkpoint_every=10)
     whole = train(beam, plan, tmp_path / "whole", architecture=SMALL)
 
     write, kept = Session.write, []
@@ -63,7 +66,7 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
         train(beam, plan, tmp_path / "killed", architecture=SMALL)
     monkeypatch.setattr(Session, "write", write)
     # The plan comes from the checkpoint, not from the call.
-    resumed = train(beam, Plan(), tmp_path / "killed", architecture=SMALL, resume=True)
+    resumed = train(beam, GraphNetwork(), tmp_path / "killed", architecture=SMALL, resume=True)
     leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
     for a, b in zip(*leaves, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -73,8 +76,8 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_resuming_needs_a_checkpoint_of_this_scene(beam, cube, tmp_path):
     with pytest.raises(InputError, match="nothing to resume"):
-        train(beam, Plan(), tmp_path, resume=True)
-    plan = Plan(steps=3, simulations=4, batch=2, checkpoint_every=2)
+        train(beam, GraphNetwork(), tmp_path, resume=True)
+    plan = GraphNetwork(steps=3, simulations=4, batch=2, checkpoint_every=2)
     train(beam, plan, tmp_path, architecture=SMALL)
     with pytest.raises(InputError, match="belongs to another scene than 'twisting_cube'"):
         train(cube, plan, tmp_path, architecture=SMALL, resume=True)
@@ -86,8 +89,8 @@ def test_resuming_needs_a_checkpoint_of_this_scene(beam, cube, tmp_path):
 
 @pytest.mark.slow
 def test_a_step_without_a_finite_gradient_is_not_taken(beam):
-    plan = Plan(steps=10, simulations=4, batch=2)
-    problem = prepare(beam, plan, SMALL)
+    plan = GraphNetwork(steps=10, simulations=4, batch=2)
+    problem = plan.prepare(Job(beam, SMALL))
     leaves, structure = jax.tree.flatten(problem.emulator.network.weights)
     leaves[3] = jnp.full_like(leaves[3], jnp.nan)
     weights = jax.tree.unflatten(structure, leaves)
@@ -101,7 +104,7 @@ def test_a_step_without_a_finite_gradient_is_not_taken(beam):
 
 @pytest.mark.slow
 def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
-    emulator = train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=25.0)
+    emulator = train(beam, GraphNetwork(simulations=16), tmp_path, architecture=SMALL, budget=25.0)
     assert emulator.record["plan"]["steps"] > WARMUP
     assert emulator.record["seconds"] < 50.0  # whatever else the machine is doing
 
@@ -110,10 +113,12 @@ def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
 def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
     """What 5 s are enough for is the machine's business, and what it has compiled before."""
     with pytest.raises(InputError, match="a budget of 1 s: one FEM solution and its compilation"):
-        train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=1.0)
+        train(beam, GraphNetwork(simulations=16), tmp_path, architecture=SMALL, budget=1.0)
     over = r"the budget leaves \d+ training steps .* give at least|the budget of 5 s is over after"
     try:
-        emulator = train(beam, Plan(simulations=16), tmp_path, architecture=SMALL, budget=5.0)
+        emulator = train(
+            beam, GraphNetwork(simulations=16), tmp_path, architecture=SMALL, budget=5.0
+        )
     except InputError as error:
         assert re.search(over, str(error))  # noqa: PT017 - it may also be enough
     else:
@@ -125,7 +130,7 @@ def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
     [
         (
             {"objective": "luck"},
-            "objective 'luck': use energy, simulations, gradients, both or modes",
+            "objective 'luck': use energy, simulations, gradients or both",
         ),
         (
             {"objective": "gradients", "simulations": 4},
@@ -139,13 +144,12 @@ def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
 )
 def test_plans_that_cannot_work(options, message):
     with pytest.raises(InputError, match=message):
-        Plan(**options)
+        GraphNetwork(**options)
 
 
 def test_learning_rate_rises_then_falls():
-    rates = np.array(
-        [learning_rate(Plan(), jnp.asarray(k), jnp.asarray(1000)) for k in range(1000)]
-    )
+    rate = GraphNetwork().rate
+    rates = np.array([rate(jnp.asarray(k), jnp.asarray(1000)) for k in range(1000)])
     assert rates[0] == pytest.approx(1e-3 / WARMUP)
     assert 90 < rates.argmax() < 110
     assert rates.max() < 1e-3
@@ -162,12 +166,8 @@ def test_samples_fill_the_box(beam):
     np.testing.assert_array_equal(sobol(beam, 5, 3), sobol(beam, 8, 3)[:5])
 
 
-HYBRID = Plan(
-    recipe="hybrid",
-    objective="energy",
+HYBRID = Hybrid(
     order=2,
-    decoder="separable",
-    discrepancy=True,
     simulations=11,
     steps=30,
     freeze=10,
@@ -184,9 +184,7 @@ def hybrid(beam, tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
-    series = Emulator(
-        beam, taylor=prepare(beam, replace(HYBRID, steps=0, simulations=1)).emulator.taylor
-    )
+    series = Emulator(beam, taylor=Mechanics(order=2, simulations=1).prepare(Job(beam))[2])
     before, after = (
         evaluate(e.cache(), tests.theta, tests.displacement)["err_u"]["median"]
         for e in (series, hybrid)
@@ -217,14 +215,14 @@ def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatc
     with pytest.raises(KeyboardInterrupt):
         train(beam, HYBRID, tmp_path, architecture=SMALL)
     monkeypatch.setattr(Session, "write", write)
-    resumed = train(beam, Plan(), tmp_path, architecture=SMALL, resume=True)
+    resumed = train(beam, GraphNetwork(), tmp_path, architecture=SMALL, resume=True)
     assert resumed.fingerprint == hybrid.fingerprint
     assert resumed.record["plan"] == hybrid.record["plan"]
 
 
 @pytest.mark.slow
 def test_frozen_modes_do_not_move(beam):
-    problem = prepare(beam, HYBRID, SMALL)
+    problem = HYBRID.prepare(Job(beam, SMALL))
     weights, state = problem.training.initial()
     number, total = jnp.asarray(0), jnp.asarray(30)
     for _ in range(2):  # momentum that would move them
@@ -246,8 +244,8 @@ def test_frozen_modes_do_not_move(beam):
 
 def test_the_papers_recipe_is_the_papers():
     plan = recipe("paper")
-    assert (plan.objective, plan.batch, plan.centred, plan.order) == ("energy", 1, False, 0)
-    rates = [float(learning_rate(plan, jnp.asarray(k), jnp.asarray(100))) for k in (0, 49, 50, 99)]
+    assert (plan.objective, plan.batch, plan.centred) == ("energy", 1, False)
+    rates = [float(plan.rate(jnp.asarray(k), jnp.asarray(100))) for k in (0, 49, 50, 99)]
     assert rates == pytest.approx([1e-4, 1e-4, 1e-5, 1e-5])
     with pytest.raises(
         InputError, match="recipe 'quick' is unknown; known: hybrid, mechanics, two_meshes, fam"
@@ -255,11 +253,10 @@ def test_the_papers_recipe_is_the_papers():
         recipe("quick")
 
 
-def test_plans_that_contradict_themselves():
-    with pytest.raises(InputError, match="series of order 2 without a centre"):
-        Plan(order=2, centred=False)
-    with pytest.raises(InputError, match="series of order 5"):
-        Plan(order=5)
+def test_orders_of_a_series():
+    for kind in (Hybrid, Mechanics):
+        with pytest.raises(InputError, match="series of order 5; give 0 to 4"):
+            kind(order=5)
 
 
 @pytest.mark.slow
@@ -269,14 +266,14 @@ def test_mechanics_builds_no_network(beam, tests, tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("a graph was built")
 
-    monkeypatch.setattr("emulator.training.network.augment", never)
+    monkeypatch.setattr("emulator.surrogates.network.graph.hierarchy", never)
     plan = replace(recipe("mechanics"), simulations=5, order=2)
     emulator = train(beam, plan, tmp_path)
     assert list(emulator.parts) == ["taylor", "discrepancy"]
     report = evaluate(emulator.cache(), tests.theta, tests.displacement)
     assert report["err_u"]["median"] < 1e-2
     assert emulator.record["final_loss"] is None
-    assert train(beam, Plan(), tmp_path, resume=True).fingerprint == emulator.fingerprint
+    assert train(beam, GraphNetwork(), tmp_path, resume=True).fingerprint == emulator.fingerprint
 
 
 @pytest.mark.slow
@@ -297,7 +294,7 @@ def test_a_network_on_a_quadratic_mesh(tmp_path):
     linear = em.scenes.once_clamped_beam(cells=(2, 1, 1), order=1)
     scene = replace(linear, mesh=to_quadratic(linear.mesh), origin={})
     emulator = train(
-        scene, Plan(objective="energy", steps=20, batch=4), tmp_path, architecture=SMALL
+        scene, GraphNetwork(objective="energy", steps=20, batch=4), tmp_path, architecture=SMALL
     )
     assert emulator.network.graph.real == len(scene.mesh.nodes)
     thetas = uniform(scene, 16, jax.random.key(1))
@@ -309,19 +306,18 @@ def test_a_network_on_a_quadratic_mesh(tmp_path):
 
 def test_an_aim_follows_the_clock(monkeypatch):
     """Steps of 1 s against a deadline in 1000 s, then of 2 s; no more than the plan's."""
-    from emulator.training import aim as module
-    from emulator.training.checkpoint import State
+    from emulator.training import loop as module
 
     now = [0.0]
     monkeypatch.setattr(module.time, "perf_counter", lambda: now[0])
-    aim = module.Aim(1000.0, Plan())
+    aim = module.StepLimit(1000.0)
     now[0] = 200.0
     assert aim(State({}, (), 200, 0.0), 5000) == 1000
     now[0] = 600.0
     assert aim(State({}, (), 400, 0.0), 1000) == 400 + int(400.0 / 1.5)
     assert aim(State({}, (), 401, 0.0), 666) == 666
     now[0] = 0.0
-    late = module.Aim(100.0, Plan(recipe="hybrid", discrepancy=True, steps=300))
+    late = module.StepLimit(100.0, most=300)
     now[0] = 200.0  # past the deadline: no step more
     assert late(State({}, (), 200, 0.0), 300) == 200
     now[0] = 20.0  # well before it: no more than the plan's
@@ -332,12 +328,14 @@ def test_an_aim_follows_the_clock(monkeypatch):
 def test_a_campaign_s_runs_are_asked_for_again(beam, tests, tmp_path):
     """Resumed on other FEM runs, a training would not be the one that was begun."""
     stored = StoredRuns(tests, "0123456789abcdef")
-    plan = Plan(steps=30, simulations=6, batch=2, checkpoint_every=10)
+    plan = GraphNetwork(steps=30, simulations=6, batch=2, checkpoint_every=10)
     whole = train(beam, plan, tmp_path, architecture=SMALL, campaign=stored)
     assert whole.record["plan"]["campaign"] == stored.digest
     with pytest.raises(InputError, match="trained on FEM runs of a campaign; resume it with"):
-        train(beam, Plan(), tmp_path, architecture=SMALL, resume=True)
-    resumed = train(beam, Plan(), tmp_path, architecture=SMALL, resume=True, campaign=stored)
+        train(beam, GraphNetwork(), tmp_path, architecture=SMALL, resume=True)
+    resumed = train(
+        beam, GraphNetwork(), tmp_path, architecture=SMALL, resume=True, campaign=stored
+    )
     leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
     for a, b in zip(*leaves, strict=True):
         np.testing.assert_array_equal(a, b)

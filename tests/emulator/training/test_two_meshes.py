@@ -14,7 +14,7 @@ from emulator.fem import simulator as fem_simulator
 from emulator.fem import sobol
 from emulator.scenes.finer import finer
 from emulator.surrogates import load, save_emulator
-from emulator.training import Plan, recipe, train
+from emulator.training import recipe, train
 
 PLAN = replace(recipe("two_meshes"), simulations=5)
 MECHANICS = replace(recipe("mechanics"), simulations=12)
@@ -93,10 +93,10 @@ def test_it_resumes_on_the_emulator_it_stands_on(body, coarse, fine, tmp_path):
     """The one kept beside the checkpoint, or the one given; no other."""
     save_emulator(coarse, tmp_path / "coarse")
     train(body.scene, PLAN, tmp_path, start=coarse)
-    assert train(body.scene, Plan(), tmp_path, resume=True).fingerprint == fine.fingerprint
+    assert train(body.scene, PLAN, tmp_path, resume=True).fingerprint == fine.fingerprint
     other = replace(coarse, discrepancy=None)
     with pytest.raises(InputError, match="stands on another emulator than is given"):
-        train(body.scene, Plan(), tmp_path, resume=True, start=other)
+        train(body.scene, PLAN, tmp_path, resume=True, start=other)
 
 
 @pytest.mark.slow

@@ -41,7 +41,7 @@ def completion(shell: str) -> str:
     from calibrate.cli import build_parser
     from emulator.mechanics.laws import LAWS
     from emulator.scenes import BUILT_IN
-    from emulator.surrogates.files import shipped
+    from emulator.surrogates.emulator import shipped
 
     of_words = {
         "SCENE": _words([*BUILT_IN], "toml"),

@@ -163,7 +163,7 @@ def add_scenes(commands: Any) -> None:
 def run_scenes(arguments: argparse.Namespace) -> int:
     """List the built-in scenes and the emulators shipped for them."""
     from emulator.scenes import BUILT_IN
-    from emulator.surrogates.files import shipped_for
+    from emulator.surrogates.emulator import shipped_for
 
     rows: list[dict[str, Any]] = []
     for name, make in sorted(BUILT_IN.items()):

@@ -102,7 +102,7 @@ def run_sensitivity(arguments: argparse.Namespace) -> int:
     from calibrate.priors import prior_of
     from calibrate.project.run import with_absolute_paths
     from emulator import Simulator
-    from emulator.surrogates.kind import Ingredients
+    from emulator.surrogates.protocol import Ingredients
     from emulator.surrogates.registry import build_forward, check_scheduler
 
     check_seed(arguments.seed, "sensitivity")

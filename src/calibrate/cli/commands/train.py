@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.output import DONE, emit, show_progress
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 def add_train(commands: Any) -> None:
     """Add the command."""
-    from emulator.training.plan import OBJECTIVES, RECIPES
+    from emulator.training import RECIPES
+    from emulator.training.objectives import OBJECTIVES
 
     parser = commands.add_parser("train", help="train an emulator")
     add_scene(parser)
@@ -43,8 +44,7 @@ def add_train(commands: Any) -> None:
         "--objective",
         choices=OBJECTIVES,
         help="what the network is trained on: the energy; FEM displacements; those and their "
-        "deformation gradients; FEM displacements and the energy; modes and coefficients, from "
-        "values and slopes of FEM runs",
+        "deformation gradients; FEM displacements and the energy",
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
@@ -74,26 +74,24 @@ def run_train(arguments: argparse.Namespace) -> int:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
     from emulator.surrogates import load, save_emulator
-    from emulator.training import recipe, remove_checkpoint
+    from emulator.training import remove_checkpoint
     from emulator.training import train as train_emulator
 
     scene = scene_of(arguments)
     check_folder(arguments.out)
     given = _plan_entries(arguments)
     start = load(arguments.start) if arguments.start else None
-    plan = replace(recipe(arguments.recipe or _default_recipe(start)), **given)
-    if not arguments.resume:
-        _refuse_idle(plan, given, arguments.budget)
+    plan = _plan(arguments.recipe or _default_recipe(start), given, arguments.budget)
     campaign = None
     if arguments.campaign:
         from emulator.fem.campaign.store import read_runs
 
         campaign = read_runs(arguments.campaign, scene)
         if "simulations" not in given:
-            plan = replace(plan, simulations=len(campaign.runs.theta))
+            plan = plan.with_counts(simulations=len(campaign.runs.theta))
     # Without a network its FEM runs are all that a plan has: only a budget that was asked for
     # makes them fewer.
-    whole = not plan.steps and arguments.budget is None
+    whole = not plan.trains_network and arguments.budget is None
     fixed = arguments.resume or "steps" in given or whole
     result = train_emulator(
         scene,
@@ -115,7 +113,7 @@ def run_train(arguments: argparse.Namespace) -> int:
     result = replace(result, record=record)
     save_emulator(result, arguments.out)
     remove_checkpoint(arguments.out)
-    runs = record["plan"]["simulations"]
+    runs = record["plan"].get("simulations", 0)
     text = _training_summary(arguments.out, scene.name, record)
     if not fixed and plan.runs > runs:
         text += f"\n{runs} of {plan.runs} FEM runs fit into the budget: more time, smaller errors"
@@ -128,14 +126,14 @@ def run_train(arguments: argparse.Namespace) -> int:
 def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str:
     """What was done, and how far the emulator is from FEM runs that it did not see."""
     plan = record["plan"]
-    counts = [f"{plan['simulations']} FEM runs"] if plan["simulations"] else []
+    counts = [f"{plan['simulations']} FEM runs"] if plan.get("simulations") else []
     if "sweeps" in record:
         counts = [f"no FEM run, {plan['sweeps']} sweeps"]
-    counts += [f"{plan['steps']} steps"] if plan["steps"] else []
+    counts += [f"{plan['steps']} steps"] if "steps" in plan else []
     text = f"trained {scene}: {', '.join([*counts, f'{record["seconds"]:.0f} s'])}"
-    found = record.get("discrepancy") or {}
-    error = found.get("held_out_err_u_mm", {}).get(found.get("on"))
-    if "sweeps" in record and not plan["steps"]:
+    choice = record.get("discrepancy") or {}
+    error = choice.get("held_out_err_u_mm", {}).get(choice.get("on"))
+    if "sweeps" in record and "steps" not in plan:
         usual, most = (record["sweeps"][name] for name in ("error_mm", "largest_error_mm"))
         return f"{text}; {usual:.1g} mm from equilibrium, {most:.1g} mm at the worst theta tried"
     if error is None:
@@ -162,27 +160,60 @@ def _plan_entries(arguments: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
-def _refuse_idle(plan: Plan, given: Mapping[str, Any], budget: str | None) -> None:
-    """:class:`InputError` for an option that changes nothing under ``plan``."""
-    idle = plan.idle | ({"budget": "trains nothing"} if plan.as_learned else {})
-    asked = [*given, *([] if budget is None else ["budget"])]
-    for name in (name for name in asked if name in idle):
-        raise InputError(
-            f"--{name} has no effect with recipe '{plan.recipe}', which {idle[name]}; leave it out"
-        )
+def _plan(name: str, given: Mapping[str, Any], budget: str | None) -> Plan:
+    """Return the recipe called ``name`` with the options ``given``; refuse one without effect.
+
+    Zero steps are what a recipe without a network takes.
+    """
+    from emulator.training import recipe
+
+    plan: Plan = recipe(name)
+    names = {each.name for each in fields(plan)}
+    if "steps" not in names and given.get("steps") == 0:
+        given = {word: value for word, value in given.items() if word != "steps"}
+    plan = replace(plan, **{word: value for word, value in given.items() if word in names})
+    unused = _unused(plan)
+    for word in [*given, *([] if budget is None else ["budget"])]:
+        if word in unused:
+            raise InputError(
+                f"--{word} has no effect with recipe '{plan.recipe}', which {unused[word]}; "
+                "leave it out"
+            )
+    return plan
+
+
+def _unused(plan: Plan) -> dict[str, str]:
+    """The options that change nothing under ``plan``, and why."""
+    names = {each.name for each in fields(plan)}
+    network = "takes all FEM runs at every step" if plan.trains_network else "trains no network"
+    reasons = {
+        "objective": "learns modes and coefficients" if plan.trains_network else network,
+        "steps": network,
+        "batch": network,
+        "simulations": "takes no FEM runs",
+        "sweeps": "makes none",
+    }
+    unused = {name: reason for name, reason in reasons.items() if name not in names}
+    if not plan.runs and "sweeps" not in names:
+        unused["simulations"] = reasons["simulations"]
+    if not names & {"steps", "simulations", "sweeps"}:
+        unused |= {"seed": "draws nothing at random", "budget": "trains nothing"}
+    return unused
 
 
 def command_line(scene: str, record: Mapping[str, Any]) -> str:
     """The command that repeats a training exactly, with the steps and runs it really took."""
-    from emulator.training.plan import Plan
+    from emulator.training.trainer import plan_of
 
     names = ("recipe", "objective", "steps", "simulations", "sweeps", "batch", "seed")
-    plan = Plan(**record["plan"])
-    options = " ".join(f"--{name} {getattr(plan, name)}" for name in names if name not in plan.idle)
+    options, unused = record["plan"], _unused(plan_of(record["plan"]))
+    words = [
+        f"--{name} {options[name]}" for name in names if name in options and name not in unused
+    ]
     # The record names the emulator training started from by its fingerprint, not by its folder.
     start = " --start EMULATOR" if "start" in record else ""
-    campaign = " --campaign STORE.zarr" if record["plan"]["campaign"] else ""
-    return f"calibrate train {scene} {options}{start}{campaign} --out DIR"
+    campaign = " --campaign STORE.zarr" if options["campaign"] else ""
+    return f"calibrate train {scene} {' '.join(words)}{start}{campaign} --out DIR"
 
 
 def add_released(commands: Any) -> None:

@@ -4,8 +4,8 @@ r"""A network that has learned a family of ventricles, as a part of an emulator.
 
 with :math:`V_{iv}` the vectors of node i, mm, that turn with the body
 (:mod:`emulator.surrogates.network.ventricle_graph`), :math:`z_i` its state after the messages, and
-:math:`g` the states' mean over the wall: coefficients depend on the whole body as modes do on its
-places. The messages know no theta, so that on a body the part is a sum of modes like any other.
+:math:`g` the states' mean over the wall, so that coefficients depend on the whole body. The
+messages know no theta, so that on a body the part is a sum of modes like any other.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ import numpy as np
 from flax import nnx
 
 from emulator.core.errors import InputError
+from emulator.core.schema import read_as
 from emulator.core.store import inside, named_leaves
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import filled_state, standardised
 from emulator.surrogates.network.pignn import Architecture, Processor, branch, trunk
-from emulator.surrogates.network.ventricle_graph import Described, describe
+from emulator.surrogates.network.ventricle_graph import BodyFeatures, describe
 from emulator.surrogates.part import CachedPart
 
 _SLACK = 1e-9  # of a parameter's range, for round-off
-_BEYOND = 0.1  # of the family's range by which a body may lie outside it
+_BEYOND = 0.1  # part of the family's range by which a body may lie outside it
 
 VECTORS = 7
-"""Vectors of a node that the output is a combination of."""
+"""The number of vectors of a node of which the output is a combination."""
 
 
 class FamilyModule(nnx.Module):
@@ -56,7 +57,7 @@ class FamilyModule(nnx.Module):
     def prepare(
         self, graph: AugmentedGraph, vectors: jax.Array, shares: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Modes (r, n, 3) in units of ``vectors`` (n, 7, 3), and the mean state (2M,).
+        """Return the modes (r, n, 3) in units of ``vectors`` (n, 7, 3), and the mean state (2M,).
 
         shares : (n,) of the wall's volume, at the nodes.
         """
@@ -66,27 +67,27 @@ class FamilyModule(nnx.Module):
         return modes, shares.astype(states.dtype) @ states
 
     def coefficients(self, theta: jax.Array, mean: jax.Array) -> jax.Array:
-        """Coefficients (..., r) at normalised ``theta`` (..., p) of a body with that mean state."""
+        """Return coefficients (..., r) at normalised ``theta`` (..., p) and a body's mean state."""
         return self.branch(theta, mean)
 
 
 def build_family(
     architecture: Architecture, widths: tuple[int, int, int], seed: int
 ) -> FamilyModule:
-    """A network with weights drawn from ``seed``; ``widths`` of nodes, edges and theta."""
+    """Return a network with weights drawn from ``seed``; ``widths`` of nodes, edges and theta."""
     return FamilyModule(architecture, *widths, nnx.Rngs(seed))
 
 
 class Standard(NamedTuple):
-    """Means and standard deviations of the features over a family, each (d,) or (4,)."""
+    """The means and standard deviations of the features over a family, each (d,) or (4,)."""
 
     node_mean: np.ndarray
     node_sd: np.ndarray
     edge_mean: np.ndarray
     edge_sd: np.ndarray
 
-    def graph(self, body: Described) -> AugmentedGraph:
-        """The graph of ``body``, features standardised."""
+    def graph(self, body: BodyFeatures) -> AugmentedGraph:
+        """Return the graph of ``body``, features standardised."""
         return AugmentedGraph(
             node_features=((body.nodes - self.node_mean) / self.node_sd).astype(np.float32),
             edge_features=((body.edges - self.edge_mean) / self.edge_sd).astype(np.float32),
@@ -97,11 +98,14 @@ class Standard(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What a family has taught, none of it of one body.
+    """A network that has learned a family of bodies, on no body.
 
-    weights : of :class:`FamilyModule`. scale : s, of displacements over the body's size.
-    parameters : theta's entries and the box they were drawn from. physics : law, constants, loads.
-    shapes : range of each number of :class:`Described`.shape over the family.
+    architecture, weights : the sizes and the weights of :class:`FamilyModule`.
+    standard : the means and deviations of the features.
+    scale : the scale s of displacements over the body's size.
+    parameters : the entries of theta, and the box from which they were drawn.
+    physics : law, constants and loads.
+    shapes : the range of each number of ``BodyFeatures.shape`` over the family.
     """
 
     architecture: Architecture
@@ -121,10 +125,13 @@ class Learned(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FamilyNetwork:
-    """What a family has taught, applied to one body.
+    """A network that has learned a family of bodies, on one body.
 
-    learned : the network. space : theta of the scene, within the box the network was trained on.
-    graph : of the body. vectors : (n, 7, 3) mm. shares : (n,) of the wall's volume.
+    learned : the network.
+    space : the parameters of the scene, within the box of the training.
+    graph : the graph of the body.
+    vectors : the vectors of each node, (n, 7, 3) mm.
+    shares : the part of the wall's volume at each node, (n,).
     """
 
     learned: Learned
@@ -141,14 +148,14 @@ class FamilyNetwork:
         return nnx.merge(self._definition, self.learned.weights)
 
     def _prepare(self) -> tuple[jax.Array, jax.Array]:
-        """Modes (r, n, 3) in mm and the mean state, from one processor pass."""
+        """Return the modes (r, n, 3) mm and the mean state, from one processor pass."""
         modes, mean = self._module().prepare(
             self.graph, jnp.asarray(self.vectors), jnp.asarray(self.shares)
         )
         return self.learned.scale * modes, mean
 
     def normalise(self, position: jax.Array) -> jax.Array:
-        """Positions (..., p) in the scene's box as the network takes them, float32."""
+        """Return the positions (..., p) in the scene's box as the network takes them, float32."""
         trained = ParameterSpace(self.learned.parameters)
         if self.space != trained:
             order = np.array([self.space.names.index(name) for name in trained.names])
@@ -156,7 +163,7 @@ class FamilyNetwork:
         return standardised(position)
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (n, 3) in mm at ``position`` (p,), processor included."""
+        """Return the displacement (n, 3) mm at ``position`` (p,), processor included."""
         modes, mean = self._prepare()
         coefficients = self._module().coefficients(self.normalise(position), mean)
         return jnp.tensordot(coefficients, modes, axes=1).astype(jnp.float64)
@@ -173,7 +180,7 @@ class FamilyNetwork:
         return CachedPart(np.zeros((len(nodes), 3)), kept, coefficients)
 
     def arrays(self) -> dict[str, Any]:
-        """Weights, features and their standard, vectors and shares by name."""
+        """Return the weights, features and their standard, vectors and shares by name."""
         return named_leaves(
             {
                 "weights": nnx.to_pure_dict(self.learned.weights),
@@ -185,7 +192,7 @@ class FamilyNetwork:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Architecture, scale, theta's box, physics and shapes."""
+        """Return the architecture, scale, box of theta, physics and shapes."""
         learned = self.learned
         return {
             "architecture": asdict(learned.architecture),
@@ -199,8 +206,8 @@ class FamilyNetwork:
     def restore(
         cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> Self:
-        """The part with this description and these arrays."""
-        architecture = Architecture.from_json(description["architecture"])
+        """Return the part with this description and these arrays."""
+        architecture = read_as(Architecture, description["architecture"], "architecture")
         standard = Standard(**inside(arrays, "standard"))
         learned = Learned(
             architecture=architecture,
@@ -218,9 +225,9 @@ class FamilyNetwork:
 
 
 def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNetwork:
-    """The network for ``scene``, which is one it can have learned about.
+    """Return the network for ``scene``, whose body must be like those of the family.
 
-    strict : refuse a body outside the shapes of the family.
+    strict : whether to refuse a body outside the shapes of the family.
 
     Raises
     ------
@@ -239,7 +246,7 @@ def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNet
 
 
 def physics_of(scene: Scene) -> dict[str, Any]:
-    """What a network can only know one of: law, constants, kinds of loads and supports."""
+    """Return the law, constants, and kinds of loads, of which a network knows one set."""
     loads = sorted(load.kind for load in scene.loads)
     regions = scene.regions is not None
     return {**scene.identity.description, "loads": loads, "regions": regions}
@@ -280,5 +287,5 @@ def _check_shape(learned: Learned, scene: Scene, shape: Mapping[str, float]) -> 
 
 
 def _outline(learned: Learned) -> FamilyModule:
-    """The network with shapes in place of weights."""
+    """Return the network with shapes in place of weights."""
     return nnx.eval_shape(lambda: build_family(learned.architecture, learned.widths, 0))

@@ -36,7 +36,7 @@ class AugmentedGraph:
     real: int
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The four arrays by name."""
+        """Return the four arrays by name."""
         names = ("node_features", "edge_features", "senders", "receivers")
         return {name: getattr(self, name) for name in names}
 
@@ -56,7 +56,7 @@ class GraphOptions:
 
 
 def augment(scene: Scene, options: GraphOptions = GraphOptions()) -> AugmentedGraph:
-    """The augmented graph of a scene's mesh; equal for equal scenes."""
+    """Return the augmented graph of a scene's mesh; equal for equal scenes."""
     layers = hierarchy(scene.mesh.nodes, mesh_edges(scene.mesh.elements), options)
     pairs = layers.pairs
     receivers, senders = pairs[:, 0], pairs[:, 1]
@@ -84,7 +84,7 @@ class Hierarchy:
     parents: tuple[np.ndarray, ...]
 
     def extend(self, values: np.ndarray) -> np.ndarray:
-        """``values`` (n, d) of the mesh nodes, and below them means over clusters, (N, d)."""
+        """Return ``values`` (n, d) of the mesh nodes and their means over clusters, (N, d)."""
         each = [values]
         for parent in self.parents:
             each.append(_cluster_means(each[-1], parent, int(parent.max()) + 1))
@@ -94,7 +94,7 @@ class Hierarchy:
 def hierarchy(
     positions: np.ndarray, edges: np.ndarray, options: GraphOptions = GraphOptions()
 ) -> Hierarchy:
-    """Virtual layers above the nodes at ``positions`` (n, 3), which ``edges`` (e, 2) join."""
+    """Return virtual layers above the nodes at ``positions`` (n, 3), joined by ``edges`` (e, 2)."""
     from sklearn.cluster import KMeans  # slow to import; a cached emulator needs no graph
 
     joined, parents, offset = [edges], [], 0
@@ -116,7 +116,7 @@ def hierarchy(
 
 
 def node_inputs(scene: Scene) -> np.ndarray:
-    """Features (n, d) of the mesh nodes: held components, prescribed displacement, position.
+    """Return the features (n, d) of the mesh nodes: supports, prescribed displacement, position.
 
     The displacement is left out where all prescribed ones are zero. Positions are relative to the
     mean of the nodes, so that a translated body has the same features.
@@ -129,7 +129,7 @@ def node_inputs(scene: Scene) -> np.ndarray:
 
 
 def mesh_edges(elements: np.ndarray) -> np.ndarray:
-    """Pairs of nodes (e, 2) joined by an edge of a tetrahedron (m, 4 or 10), each once.
+    """Return the pairs of nodes (e, 2) joined by an edge of a tetrahedron (m, 4 or 10).
 
     The edge a, b of a quadratic tetrahedron is two: a to its mid-side node and that node to b.
     """
@@ -159,6 +159,6 @@ def _nearest(positions: np.ndarray, neighbours: int) -> np.ndarray:
 
 
 def _normalise(values: np.ndarray) -> np.ndarray:
-    """Each column with mean 0 and standard deviation 1; a constant column becomes 0."""
+    """Return columns of mean 0 and standard deviation 1; a constant column becomes 0."""
     sd = values.std(axis=0)
     return (values - values.mean(axis=0)) / np.where(sd > 1e-12, sd, 1.0)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from emulator.core.schema import read_as
 from emulator.core.store import fill_tree, inside, named_leaves
 from emulator.scenes.parameter_space import ParameterSpace
 from emulator.scenes.scene import Scene
@@ -33,9 +34,10 @@ _TO_UNIT_SD = 12.0**0.5
 
 @dataclass(frozen=True, eq=False)
 class Standardisation:
-    """Theta as a network takes it that was trained on ``(theta - mean) / sd``.
+    """The standardisation ``(theta - mean) / sd`` of the input of a network.
 
-    space : the parameters, in whose units mean and sd (p,) are.
+    space : the parameters.
+    mean, sd : the mean and standard deviation of theta, (p,), in the parameters' units.
     """
 
     space: ParameterSpace
@@ -43,7 +45,7 @@ class Standardisation:
     sd: np.ndarray
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Standardised theta (..., p) at positions (..., p) in the unit box."""
+        """Return standardised theta (..., p) at positions (..., p) in the unit box."""
         return (self.space.from_unit(position) - self.mean) / self.sd
 
 
@@ -53,13 +55,13 @@ class Network:
 
     Parameters
     ----------
-    architecture : sizes of the network.
-    parameters : p, entries of theta.
+    architecture : the sizes of the network.
+    parameters : the number p of entries of theta.
     graph : the augmented graph of the scene's mesh.
-    weights : state of the network, an NNX ``State``.
-    scale : (3,) mm, of the network's output.
-    basis : (f, n, 3) in units of ``scale``, modes given to a separable decoder.
-    standardisation : of theta, for a network that takes theta in place of its position in the box.
+    weights : the state of the network, an NNX ``State``.
+    scale : the scale of the network's output by component, (3,) mm.
+    basis : the modes given to a separable decoder, (f, n, 3) in units of ``scale``.
+    standardisation : that of theta, for a network that takes theta in place of its position.
     """
 
     architecture: Architecture
@@ -77,28 +79,28 @@ class Network:
         return nnx.split(network)[0]
 
     def normalise(self, position: jax.Array) -> jax.Array:
-        """Positions (..., p) in the unit box as the network takes them, float32."""
+        """Return the positions (..., p) in the unit box as the network takes them, float32."""
         if self.standardisation is not None:
             return self.standardisation(position).astype(jnp.float32)
         return standardised(position)
 
     def prepare(self, weights: nnx.State) -> tuple[Decoder, jax.Array]:
-        """The decoder, and its part that does not depend on theta, from one processor pass."""
+        """Return the decoder and its part that does not depend on theta, by one processor pass."""
         network = nnx.merge(self.definition, weights)
         states = network.processor(self.graph)
         return network.decoder, network.decoder.prepare(states, jnp.asarray(self.basis))
 
     def decode(self, decoder: Decoder, prepared: jax.Array, position: jax.Array) -> jax.Array:
-        """Displacement (..., k, 3) in mm at ``position`` (..., p), from :meth:`prepare`."""
+        """Return the displacement (..., k, 3) mm at ``position`` (..., p), from :meth:`prepare`."""
         raw = decoder(prepared, self.normalise(position)).astype(jnp.float64)
         return raw * jnp.asarray(self.scale)
 
     def predict(self, weights: nnx.State, position: jax.Array) -> jax.Array:
-        """Displacement (b, n, 3) in mm at ``position`` (b, p): one processor pass for all."""
+        """Return the displacement (b, n, 3) mm at ``position`` (b, p), by one processor pass."""
         return self.decode(*self.prepare(weights), position)
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (n, 3) in mm at ``position`` (p,), processor included."""
+        """Return the displacement (n, 3) mm at ``position`` (p,), processor included."""
         return self.predict(self.weights, position[None])[0]
 
     def cache(self, nodes: np.ndarray) -> CachedPart:
@@ -116,7 +118,7 @@ class Network:
         return CachedPart(np.zeros((len(nodes), 3)), modes, coefficients)
 
     def arrays(self) -> dict[str, Any]:
-        """Weights, graph, scale and basis by name."""
+        """Return the weights, graph, scale and basis by name."""
         tree = {
             "weights": nnx.to_pure_dict(self.weights),
             "graph": self.graph.arrays(),
@@ -128,15 +130,15 @@ class Network:
         return named_leaves(tree)
 
     def to_json(self) -> dict[str, Any]:
-        """The architecture."""
+        """Return the architecture."""
         return {"architecture": asdict(self.architecture)}
 
     @classmethod
     def restore(
         cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> Self:
-        """The network with this description and these arrays."""
-        architecture = Architecture.from_json(description["architecture"])
+        """Return the network with this description and these arrays."""
+        architecture = read_as(Architecture, description["architecture"], "architecture")
         graph = AugmentedGraph(**inside(arrays, "graph"), real=len(scene.mesh.nodes))
         basis, parameters = arrays["basis"], len(scene.parameters)
         state = filled(architecture, graph, parameters, basis, inside(arrays, "weights"))
@@ -153,13 +155,13 @@ def filled(
     basis: np.ndarray,
     weights: Mapping[str, np.ndarray],
 ) -> nnx.State:
-    """The network's state with ``weights`` by name; :class:`InputError` where one does not fit."""
+    """Return the network's state with ``weights`` by name; refuse one of another shape."""
     outline = _outline(architecture, graph, parameters, len(basis))
     return filled_state(outline, weights, "the emulator's network")
 
 
 def filled_state(outline: nnx.Module, weights: Mapping[str, np.ndarray], what: str) -> nnx.State:
-    """State of the network that ``outline`` has the shapes of, with ``weights`` by name."""
+    """Return the state of the network of the shapes of ``outline``, with ``weights`` by name."""
     state = nnx.state(outline)
     pure = fill_tree(nnx.to_pure_dict(state), weights, what)
     nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, pure))
@@ -167,7 +169,7 @@ def filled_state(outline: nnx.Module, weights: Mapping[str, np.ndarray], what: s
 
 
 def standardised(position: jax.Array) -> jax.Array:
-    """Positions in the unit box with mean 0 and standard deviation 1 over it, float32."""
+    """Return positions in the unit box with mean 0 and standard deviation 1, float32."""
     return ((position - 0.5) * _TO_UNIT_SD).astype(jnp.float32)
 
 
@@ -179,7 +181,7 @@ def fresh(
     seed: int,
     basis: np.ndarray | None = None,
 ) -> Network:
-    """An untrained network, whose output is zero for every theta."""
+    """Return an untrained network, whose output is zero for every theta."""
     if basis is None:
         basis = np.zeros((0, *scene.held.shape), dtype=np.float32)
     count = len(scene.parameters)
@@ -191,7 +193,8 @@ def fresh(
 class Decoded:
     """The field of a pointwise decoder over some nodes.
 
-    prepared : the decoder's part that does not depend on theta, (3, k, hidden).
+    network, decoder : the network and its decoder.
+    prepared : the part of the decoder that does not depend on theta, (3, k, hidden).
     """
 
     network: Network
@@ -199,14 +202,14 @@ class Decoded:
     prepared: jax.Array
 
     def __call__(self, position: jax.Array) -> jax.Array:
-        """Displacement (..., k, 3) in mm at ``position`` (..., p)."""
+        """Return the displacement (..., k, 3) mm at ``position`` (..., p)."""
         return self.network.decode(self.decoder, self.prepared, position)
 
     def at(self, rows: np.ndarray) -> Decoded:
-        """The field over rows of its nodes."""
+        """Return the field over rows of its nodes."""
         return replace(self, prepared=self.prepared[:, rows])
 
 
 def _outline(architecture: Architecture, graph: AugmentedGraph, parameters: int, fixed: int) -> Any:
-    """The network with shapes in place of weights."""
+    """Return the network with shapes in place of weights."""
     return nnx.eval_shape(lambda: build(architecture, graph, parameters, fixed, 0))

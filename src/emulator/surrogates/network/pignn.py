@@ -17,9 +17,10 @@ messages do not depend on theta and are evaluated once a geometry.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from functools import reduce
+from itertools import pairwise
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -27,22 +28,21 @@ from flax import nnx
 
 from emulator.core.errors import InputError
 from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.mlp import MLP
 
 
 @dataclass(frozen=True)
 class Architecture:
     """Sizes of the network; the defaults are the paper's, about 510 000 weights.
 
-    steps : K, message-passing steps.
-    latent : M, width of node, edge and theta states.
-    hidden : widths of each network's hidden layers.
+    steps : the number K of message-passing steps.
+    latent : the width M of node, edge and theta states.
+    hidden : the widths of each network's hidden layers.
     decoder : ``pointwise``, Algorithm 1's, or ``separable``.
-    modes : learned modes of the separable decoder.
-    edge_sum : of a node's edges in its final state: ``antisymmetric``, Algorithm 1's, or over the
-        edges it ``receives``, as the released code has it.
-    trunk, branch : widths of the hidden layers below the learned modes and below the coefficients
-        of a separable decoder; empty for those of ``hidden``.
+    modes : the number of learned modes of the separable decoder.
+    edge_sum : the sum over a node's edges in its final state: ``antisymmetric``, Algorithm 1's, or
+        over the edges it ``receives``, as the released code has it.
+    trunk, branch : the widths of the hidden layers below the learned modes and below the
+        coefficients of a separable decoder; empty for those of ``hidden``.
     """
 
     steps: int = 5
@@ -60,11 +60,76 @@ class Architecture:
         if self.edge_sum not in ("antisymmetric", "receives"):
             raise InputError(f"edge sum '{self.edge_sum}': use antisymmetric or receives")
 
-    @classmethod
-    def from_json(cls, description: Mapping[str, Any]) -> Self:
-        """The architecture with these fields, JSON's lists turned into tuples."""
-        widths = {name: tuple(description.get(name, ())) for name in ("hidden", "trunk", "branch")}
-        return cls(**{**description, **widths})
+
+class MLP(nnx.Module):
+    """Dense layers with CELU between them, on an input concatenated from several parts.
+
+    The first layer is linear in each part, ``[a, b] @ W = a @ W_a + b @ W_b``, so a part shared by
+    many rows (theta by all nodes, a node by all its edges) is multiplied once and the product
+    copied: :meth:`project` each part, add, then :meth:`finish`.
+
+    Parameters
+    ----------
+    parts : width of each part of the input.
+    hidden : widths of the hidden layers.
+    out : width of the output.
+    layer_norm : normalise the output (encoders and processor; not decoders).
+    zero_last : start the last layer at zero.
+    """
+
+    def __init__(
+        self,
+        parts: tuple[int, ...],
+        hidden: tuple[int, ...],
+        out: int,
+        *,
+        layer_norm: bool,
+        zero_last: bool = False,
+        rngs: nnx.Rngs,
+    ) -> None:
+        self.parts = parts
+        widths = (sum(parts), *hidden, out)
+        layers = [nnx.Linear(a, b, param_dtype=jnp.float32, rngs=rngs) for a, b in pairwise(widths)]
+        if zero_last:
+            layers[-1] = nnx.Linear(
+                widths[-2],
+                out,
+                kernel_init=nnx.initializers.zeros_init(),
+                param_dtype=jnp.float32,
+                rngs=rngs,
+            )
+        self.layers = nnx.List(layers)
+        self.norm = nnx.LayerNorm(out, param_dtype=jnp.float32, rngs=rngs) if layer_norm else None
+
+    def project(self, part: int, values: jax.Array) -> jax.Array:
+        """Return what part number ``part`` adds to the first layer, (..., hidden[0])."""
+        start = sum(self.parts[:part])
+        kernel = self.layers[0].kernel[start : start + self.parts[part]]
+        return values.astype(kernel.dtype) @ kernel
+
+    def finish(self, first: jax.Array) -> jax.Array:
+        """Return the output (..., out) from the sum of all projections."""
+        x = self._before(first, len(self.layers))
+        return x if self.norm is None else self.norm(x)
+
+    def hidden(self, *values: jax.Array) -> jax.Array:
+        """Return the last hidden layer (..., hidden[-1]), from all parts."""
+        return jax.nn.celu(self._before(self._first(values), len(self.layers) - 1))
+
+    def _first(self, values: tuple[jax.Array, ...]) -> jax.Array:
+        return reduce(jnp.add, (self.project(k, v) for k, v in enumerate(values)))
+
+    def _before(self, first: jax.Array, stop: int) -> jax.Array:
+        """Return the output of layer ``stop - 1`` from the sum of all projections."""
+        bias = self.layers[0].bias
+        x = first if bias is None else first + bias
+        for layer in self.layers[1:stop]:
+            x = layer(jax.nn.celu(x))
+        return x
+
+    def __call__(self, *values: jax.Array) -> jax.Array:
+        """Return the output (..., out) from all parts."""
+        return self.finish(self._first(values))
 
 
 class MessagePassing(nnx.Module):
@@ -78,7 +143,7 @@ class MessagePassing(nnx.Module):
     def __call__(
         self, nodes: jax.Array, edges: jax.Array, graph: AugmentedGraph
     ) -> tuple[jax.Array, jax.Array]:
-        """Updated node (N, M) and edge (E, M) states."""
+        """Return the updated node (N, M) and edge (E, M) states."""
         first = (
             self.edge.project(0, edges)
             + self.edge.project(1, nodes)[graph.receivers]
@@ -90,13 +155,13 @@ class MessagePassing(nnx.Module):
 
 
 def antisymmetric_sum(messages: jax.Array, graph: AugmentedGraph) -> jax.Array:
-    """Sum at each node (N, M) of messages (E, M), which leave the sender with opposite sign."""
+    """Return the sum (N, M) at each node of messages (E, M), with opposite sign at the sender."""
     zero = jnp.zeros((len(graph.node_features), messages.shape[1]), messages.dtype)
     return zero.at[graph.receivers].add(messages).at[graph.senders].add(-messages)
 
 
 def received_sum(messages: jax.Array, graph: AugmentedGraph) -> jax.Array:
-    """Sum at each node (N, M) of the messages (E, M) it receives."""
+    """Return the sum (N, M) at each node of the messages (E, M) that it receives."""
     zero = jnp.zeros((len(graph.node_features), messages.shape[1]), messages.dtype)
     return zero.at[graph.receivers].add(messages)
 
@@ -117,7 +182,7 @@ class Processor(nnx.Module):
         self.edge_sum = architecture.edge_sum
 
     def __call__(self, graph: AugmentedGraph) -> jax.Array:
-        """States (n, 2M) of the mesh nodes."""
+        """Return the states (n, 2M) of the mesh nodes."""
         nodes = self.encode_node(jnp.asarray(graph.node_features))
         edges = self.encode_edge(jnp.asarray(graph.edge_features))
         for one_round in self.rounds:
@@ -130,7 +195,7 @@ class Processor(nnx.Module):
 def _recomputed(
     one_round: MessagePassing, nodes: jax.Array, edges: jax.Array, graph: AugmentedGraph
 ) -> tuple[jax.Array, jax.Array]:
-    """One round whose intermediate values the backward pass computes again instead of storing.
+    """Return one round, whose intermediate values are not stored for the backward pass.
 
     Storing them takes 79 MB for the beam, allocated anew at every step: recomputing is 1.4 times
     faster (26.5 against 38.8 ms for the gradient of the processor on 2 cores).
@@ -157,12 +222,12 @@ class PointwiseDecoder(nnx.Module):
         )
 
     def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
-        """What the node states add to each component's first layer, (3, n, hidden[0])."""
+        """Return what the states add to the first layer of each component, (3, n, hidden[0])."""
         del basis  # this decoder has no coefficients
         return jnp.stack([component.project(1, states) for component in self.components])
 
     def __call__(self, prepared: jax.Array, theta: jax.Array) -> jax.Array:
-        """Output (..., n, 3) for normalised ``theta`` (..., p), from :meth:`prepare`."""
+        """Return the output (..., n, 3) for normalised ``theta`` (..., p), from :meth:`prepare`."""
         encoded = self.encode_theta(theta)
         parts = [
             component.finish(component.project(0, encoded)[..., None, :] + prepared[k])
@@ -172,13 +237,13 @@ class PointwiseDecoder(nnx.Module):
 
 
 def branch(parts: tuple[int, ...], out: int, architecture: Architecture, rngs: nnx.Rngs) -> MLP:
-    """The network of the coefficients, zero before training."""
+    """Return the network of the coefficients, zero before training."""
     widths = architecture.branch or architecture.hidden
     return MLP(parts, widths, out, layer_norm=False, zero_last=True, rngs=rngs)
 
 
 def trunk(vectors: int, architecture: Architecture, rngs: nnx.Rngs) -> MLP:
-    """The network of the modes: from a node's state, ``vectors`` numbers for each mode."""
+    """Return the network of the modes: from a node's state, ``vectors`` numbers for each mode."""
     widths, out = architecture.trunk or architecture.hidden, vectors * architecture.modes
     return MLP((2 * architecture.latent,), widths, out, layer_norm=False, rngs=rngs)
 
@@ -195,20 +260,20 @@ class SeparableDecoder(nnx.Module):
         self.trunk = trunk(3, architecture, rngs)
 
     def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
-        """All modes (r, n, 3): ``basis`` (f, n, 3), then the learned ones."""
+        """Return all modes (r, n, 3): ``basis`` (f, n, 3), then the learned ones."""
         learned = self.trunk(states).reshape(len(states), 3, -1)
         return jnp.concatenate([basis.astype(learned.dtype), jnp.moveaxis(learned, -1, 0)])
 
     def features(self, states: jax.Array) -> jax.Array:
-        """What each learned mode is a linear combination of, (n, width of the last layer)."""
+        """Return the features (n, h) of which each learned mode is a linear combination."""
         return self.trunk.hidden(states)
 
     def coefficients(self, theta: jax.Array) -> jax.Array:
-        """Coefficients (..., r) of the modes for normalised ``theta`` (..., p)."""
+        """Return the coefficients (..., r) of the modes for normalised ``theta`` (..., p)."""
         return self.branch(theta)
 
     def __call__(self, prepared: jax.Array, theta: jax.Array) -> jax.Array:
-        """Output (..., n, 3) for normalised ``theta`` (..., p), from :meth:`prepare`."""
+        """Return the output (..., n, 3) for normalised ``theta`` (..., p), from :meth:`prepare`."""
         return jnp.tensordot(self.coefficients(theta), prepared, axes=1)
 
 
@@ -238,7 +303,7 @@ class PIGNN(nnx.Module):
 def build(
     architecture: Architecture, graph: AugmentedGraph, parameters: int, fixed: int, seed: int
 ) -> PIGNN:
-    """A network for ``graph``, with ``fixed`` given modes and weights drawn from ``seed``."""
+    """Return a network for ``graph`` with ``fixed`` given modes and weights from ``seed``."""
     return PIGNN(
         architecture,
         graph.node_features.shape[1],

@@ -22,13 +22,16 @@ from emulator.surrogates.network.graph import hierarchy, mesh_edges
 _NEAREST = 1e-3  # of L: a shorter distance counts as this much in a logarithm
 
 
-class Described(NamedTuple):
-    """A ventricle as a network takes it, before standardisation.
+class BodyFeatures(NamedTuple):
+    """The features of a ventricle before standardisation.
 
-    nodes : (N, d) features, mesh nodes first, then virtual ones. edges : (E, 4).
-    senders, receivers : (E,). real : mesh nodes. vectors : (n, 7, 3) mm, what the output is a
-    combination of. shares : (n,) of the wall's volume, at the nodes. shape : of the whole body, by
-    name.
+    nodes : the features of the nodes, mesh nodes first, then virtual ones, (N, d).
+    edges : the features of the edges, (E, 4).
+    senders, receivers : the nodes that each edge joins, (E,).
+    real : the number of mesh nodes.
+    vectors : the vectors of which the output is a combination, (n, 7, 3) mm.
+    shares : the part of the wall's volume at each node, (n,).
+    shape : the numbers that describe the whole body, by name.
     """
 
     nodes: np.ndarray
@@ -41,8 +44,8 @@ class Described(NamedTuple):
     shape: dict[str, float]
 
 
-def describe(scene: Scene) -> Described:
-    """The ventricle of ``scene``.
+def describe(scene: Scene) -> BodyFeatures:
+    """Return the ventricle of ``scene``.
 
     Raises
     ------
@@ -65,15 +68,15 @@ def describe(scene: Scene) -> Described:
     fibres = _fibre_tensor(body, scene)
     shape = _shape(body, fibres)
     local = np.column_stack([_places(body), _along_fibres(body, fibres)])
-    whole = np.array([shape[name] for name in _TOLD])
+    whole = np.array([shape[name] for name in _REPEATED])
     layers = hierarchy(body.offset, mesh_edges(scene.mesh.elements))
     nodes = layers.extend(np.column_stack([local, np.tile(whole, (len(local), 1))]))
     receivers, senders = layers.pairs.T
     vectors = body.vectors()
-    places, normals = layers.extend(body.offset), layers.extend(body.normal)
-    return Described(
+    positions, normals = layers.extend(body.offset), layers.extend(body.normal)
+    return BodyFeatures(
         nodes=nodes,
-        edges=_edges(places, normals, body.axis, layers.pairs),
+        edges=_edges(positions, normals, body.axis, layers.pairs),
         senders=senders,
         receivers=receivers,
         real=len(scene.mesh.nodes),
@@ -83,12 +86,12 @@ def describe(scene: Scene) -> Described:
     )
 
 
-_TOLD = ("wall over cavity", "length", "radius", "helix", "helix gradient")
-"""Of the whole body, repeated at every node, so that no message has to carry it."""
+_REPEATED = ("wall over cavity", "length", "radius", "helix", "helix gradient")
+"""Numbers of the whole body that are features of every node, so that no message carries them."""
 
 
 def _shape(body: Ventricle, fibres: np.ndarray) -> dict[str, float]:
-    """The body in numbers, with which a network is asked whether it knows its like."""
+    """Return the numbers by which a body is compared with the family of a network."""
     rim = body.inner & body.held
     shares = body.volume / body.wall
     helix = np.einsum("ni,nij,j->n", body.circumference, fibres, body.axis)
@@ -105,7 +108,7 @@ def _shape(body: Ventricle, fibres: np.ndarray) -> dict[str, float]:
 
 
 def _places(body: Ventricle) -> np.ndarray:
-    """Where the nodes lie, (n, 13)."""
+    """Return the features of the nodes' places, (n, 13)."""
     n, x, lean = body.normal, body.across, body.lean
     return np.column_stack(
         [
@@ -127,7 +130,7 @@ def _places(body: Ventricle) -> np.ndarray:
 
 
 def _along_fibres(body: Ventricle, fibres: np.ndarray) -> np.ndarray:
-    """Products of the fibres with the node's vectors, (n, 6); a fibre has no sign."""
+    """Return products of the fibres with the node's vectors, (n, 6); a fibre has no sign."""
     n, c = body.normal, body.circumference
     k = np.broadcast_to(body.axis, n.shape)
     pairs = ((k, k), (n, n), (c, c), (c, k), (n, k), (n, c))
@@ -135,7 +138,7 @@ def _along_fibres(body: Ventricle, fibres: np.ndarray) -> np.ndarray:
 
 
 def _fibre_tensor(body: Ventricle, scene: Scene) -> np.ndarray:
-    """Mean of f f^T over the elements at each node, weighted by volume, (n, 3, 3)."""
+    """Return the mean of f f^T over the elements at each node, weighted by volume, (n, 3, 3)."""
     elements, fibres = scene.mesh.elements, scene.fibres_at_points
     each = np.einsum("mq,mqi,mqj->mij", scene.discretisation.weights, fibres, fibres)
     total = np.zeros((len(body.depth), 3, 3))
@@ -144,7 +147,7 @@ def _fibre_tensor(body: Ventricle, scene: Scene) -> np.ndarray:
 
 
 def _edges(x: np.ndarray, normals: np.ndarray, axis: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Relative position from sender to receiver along n, c and k of their middle, and length."""
+    """Return positions from sender to receiver along n, c and k of their middle, and lengths."""
     receivers, senders = pairs.T
     relative = x[receivers] - x[senders]
     n = 0.5 * (normals[receivers] + normals[senders])

@@ -10,9 +10,8 @@ import emulator as em
 from emulator.core.errors import InputError
 from emulator.surrogates import Architecture, Emulator, augment
 from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.mlp import MLP
 from emulator.surrogates.network.part import fresh
-from emulator.surrogates.network.pignn import Processor, antisymmetric_sum, build
+from emulator.surrogates.network.pignn import MLP, Processor, antisymmetric_sum, build
 from emulator.surrogates.taylor import constant
 from network_support import SMALL, untrained
 

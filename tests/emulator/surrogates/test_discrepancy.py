@@ -9,8 +9,7 @@ import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem import run_campaign, sobol
 from emulator.scenes.loads import Gravity
-from emulator.surrogates.discrepancy import fit_discrepancy
-from emulator.surrogates.discrepancy.fit import maximin_subset
+from emulator.surrogates.discrepancy import fit_discrepancy, maximin_subset
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.taylor import constant, expand
 from scene_support import block

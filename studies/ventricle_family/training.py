@@ -14,7 +14,7 @@ since a message's sign on a mesh unknown follows from the numbering of its nodes
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -26,7 +26,7 @@ from flax import nnx
 from emulator.core.errors import InputError
 from emulator.core.progress import counting
 from emulator.scenes.scene import Scene
-from emulator.surrogates.additive import Emulator
+from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.family import (
     FamilyModule,
     Learned,
@@ -38,11 +38,11 @@ from emulator.surrogates.network.family import (
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import standardised
 from emulator.surrogates.network.pignn import Architecture
-from emulator.surrogates.network.ventricle_graph import Described, describe
+from emulator.surrogates.network.ventricle_graph import BodyFeatures, describe
 from emulator.training.checkpoint import State, open_session
 from emulator.training.loop import require_finite, run
 from emulator.training.plan import Plan
-from emulator.training.step import clipped_adam, make_step
+from emulator.training.step import clipped_adam, cosine, make_step
 
 ARCHITECTURE = Architecture(
     steps=4,
@@ -55,9 +55,23 @@ ARCHITECTURE = Architecture(
 )
 """Sizes of the shipped network."""
 
-PLAN = Plan(
-    recipe="ventricles", objective="gradients", decoder="separable", steps=30_000, modes=0, freeze=0
-)
+
+@dataclass(frozen=True)
+class FamilyPlan(Plan):
+    """The options of the training.
+
+    steps, learning_rate : the number of optimiser steps, and the largest learning rate.
+    checkpoint_every : the number of steps between two checkpoints.
+    """
+
+    recipe: str = "ventricles"
+    steps: int = 30_000
+    learning_rate: float = 1e-3
+    checkpoint_every: int = 500
+
+
+PLAN = FamilyPlan()
+"""The options of the shipped network."""
 
 _LEAST_SD = 1e-6  # a feature that varies less over the family is left at zero
 
@@ -105,7 +119,7 @@ class _Sizes:
 
 def train_family(
     runs: Sequence[BodyRuns],
-    plan: Plan,
+    plan: FamilyPlan,
     folder: str | Path,
     home: Scene,
     *,
@@ -118,13 +132,19 @@ def train_family(
     Parameters
     ----------
     runs : equally many of each body, of equal parameters and physics.
-    plan : its steps, learning rate, schedule, seed and checkpoints.
+    plan : the number of steps, learning rate, seed and checkpoints.
     folder : where checkpoints go.
     """
     session = open_session(
-        folder, _check(runs), f"{len(runs)} bodies", plan, architecture, resume=resume
+        folder,
+        _check(runs),
+        f"{len(runs)} bodies",
+        plan,
+        architecture,
+        {plan.recipe: FamilyPlan},
+        resume=resume,
     )
-    plan, architecture = session.plan, session.architecture or architecture
+    plan, architecture = cast(FamilyPlan, session.plan), session.architecture or architecture
     described = [describe(r.scene) for r in counting(runs, "describe", disable=not progress)]
     standard = _standard(described)
     sizes = _sizes(runs, described)
@@ -145,7 +165,7 @@ def train_family(
     definition, weights = nnx.split(module)
     optimiser = clipped_adam()
     descend = _descent(definition, scale, _gradient_scale(bodies), sizes.real)
-    step = make_step(plan, descend, optimiser, moves=lambda updates, _: updates)
+    step = make_step(cosine(plan.learning_rate), descend, optimiser, lambda updates, _: updates)
 
     def advance(state: State, total: int) -> State:
         body = bodies[_taken(state.done, len(bodies), plan.seed)]
@@ -157,8 +177,7 @@ def train_family(
     state = State(weights, optimiser.init(weights))
     state = run(session, state, plan.steps, advance, progress=progress)
     record: dict[str, Any] = {
-        "plan": asdict(plan),
-        "final_loss": require_finite(state),
+        **plan.record(require_finite(state)),
         "bodies": len(runs),
         "seconds": round(session.seconds, 1),
     }
@@ -190,7 +209,7 @@ def _check(runs: Sequence[BodyRuns]) -> str:
     return "+".join(each.scene.fingerprint for each in runs)
 
 
-def _standard(described: Sequence[Described]) -> Standard:
+def _standard(described: Sequence[BodyFeatures]) -> Standard:
     """Means and deviations of all features over all bodies."""
     nodes = np.concatenate([body.nodes for body in described])
     edges = np.concatenate([body.edges for body in described])
@@ -203,13 +222,13 @@ def _sd(values: np.ndarray) -> np.ndarray:
     return np.where(sd > _LEAST_SD, sd, np.inf)
 
 
-def _ranges(described: Sequence[Described]) -> dict[str, tuple[float, float]]:
+def _ranges(described: Sequence[BodyFeatures]) -> dict[str, tuple[float, float]]:
     """Range of each number that a whole body has."""
     found = {name: [body.shape[name] for body in described] for name in described[0].shape}
     return {name: (min(values), max(values)) for name, values in found.items()}
 
 
-def _sizes(runs: Sequence[BodyRuns], described: Sequence[Described]) -> _Sizes:
+def _sizes(runs: Sequence[BodyRuns], described: Sequence[BodyFeatures]) -> _Sizes:
     return _Sizes(
         real=max(body.real for body in described),
         virtual=max(len(body.nodes) - body.real for body in described) + 1,
@@ -220,7 +239,7 @@ def _sizes(runs: Sequence[BodyRuns], described: Sequence[Described]) -> _Sizes:
 
 def _padded(
     runs: BodyRuns,
-    body: Described,
+    body: BodyFeatures,
     standard: Standard,
     sizes: _Sizes,
     generator: np.random.Generator,

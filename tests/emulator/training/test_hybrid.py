@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.surrogates.taylor import constant, expand
-from emulator.training.basis import mechanical_modes
+from emulator.training.hybrid import mechanical_modes
 
 
 def test_modes_are_orthogonal_in_the_tangent_and_span_the_series(beam, simulator):

@@ -1,22 +1,21 @@
-"""Starting from another emulator's network, and pretraining one over a family."""
+"""Starting from another emulator's network."""
 
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.surrogates import load, save_emulator
-from emulator.training import Plan, pretrain, recipe, train
+from emulator.training import recipe, train
 from emulator.training.checkpoint import CHECKPOINT, Session
-from emulator.training.problem import prepare
-from emulator.training.start import with_network_of
+from emulator.training.graph_network import GraphNetwork
+from emulator.training.job import Job
 from network_support import SMALL, untrained
 
-PLAN = Plan(objective="energy", steps=12, batch=2, checkpoint_every=5)
+PLAN = GraphNetwork(objective="energy", steps=12, batch=2, checkpoint_every=5)
 
 
 def same(a, b):
@@ -38,7 +37,7 @@ def start(beam):
 @pytest.fixture(scope="module")
 def own(other):
     """What training the other beam afresh works on."""
-    return prepare(other, PLAN, SMALL)
+    return PLAN.prepare(Job(other, SMALL))
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +60,7 @@ def kill_after(writes, monkeypatch):
 
 @pytest.mark.slow
 def test_before_any_step_the_network_is_the_other_ones(other, own, start):
-    problem = prepare(other, PLAN, start=start)
+    problem = PLAN.prepare(Job(other, start=start))
     emulator, own = problem.emulator, own.emulator
     network = emulator.network
     same(network.weights, start.network.weights)
@@ -107,9 +106,9 @@ def test_a_started_run_killed_resumes_without_its_start(
         with pytest.raises(KeyboardInterrupt):
             train(other, PLAN, tmp_path, start=start)
     with pytest.raises(InputError, match="has its network's weights; resume it without a start"):
-        train(other, Plan(), tmp_path, start=start, resume=True)
+        train(other, GraphNetwork(), tmp_path, start=start, resume=True)
     # Neither the start nor its architecture is said again.
-    resumed = train(other, Plan(), tmp_path, resume=True)
+    resumed = train(other, GraphNetwork(), tmp_path, resume=True)
     same(resumed.network.weights, whole.network.weights)
     assert resumed.record["start"] == whole.record["start"]
 
@@ -124,7 +123,7 @@ def test_what_cannot_be_started_from(beam, other, cube, start, tmp_path):
     refused(other, PLAN, r"has a network .*latent=8.*; 'once_clamped_beam' .*latent=9", wider)
     refused(other, replace(PLAN, decoder="separable"), "decoder='pointwise'.*'separable'")
     refused(cube, PLAN, "'once_clamped_beam' has parameters mu, lam; 'twisting_cube' has")
-    refused(other, replace(PLAN, decoder="separable", order=2), "modes mean nothing on another")
+    refused(other, recipe("hybrid"), "modes mean nothing on another")
     nothing = "'once_clamped_beam' has no network to start from, only taylor . discrepancy"
     refused(other, PLAN, nothing, start=em.load("once_clamped_beam"))
     refused(other, recipe("mechanics"), "recipe 'mechanics' trains no network")
@@ -132,55 +131,3 @@ def test_what_cannot_be_started_from(beam, other, cube, start, tmp_path):
     moved = replace(other, supports=(*other.supports, clamped))
     refused(moved, PLAN, "has 6 features a node, 'once_clamped_beam' has 9")
     assert not (tmp_path / CHECKPOINT).exists()
-
-
-FAMILY = replace(PLAN, steps=9, checkpoint_every=4)
-
-
-@pytest.fixture(scope="module")
-def pretrained(beam, other, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("family")
-    return pretrain([beam, other], FAMILY, folder, architecture=SMALL)
-
-
-@pytest.mark.slow
-def test_a_family_shares_one_network(beam, other, own, pretrained):
-    same(pretrained[0].network.weights, pretrained[1].network.weights)
-    assert [e.scene for e in pretrained] == [beam, other]
-    np.testing.assert_array_equal(pretrained[1].network.scale, own.emulator.network.scale)
-    same(pretrained[1].network.graph.edge_features, own.emulator.network.graph.edge_features)
-    assert pretrained[0].record["family"] == [beam.fingerprint, other.fingerprint]
-
-
-@pytest.mark.slow
-def test_a_family_takes_its_scenes_in_turn(beam, own, pretrained):
-    problems = [prepare(beam, FAMILY, SMALL), own]
-    weights = with_network_of(problems[0].emulator, problems[1].emulator).network.weights
-    state = problems[0].training.optimiser.init(weights)
-    for number in range(FAMILY.steps):
-        weights, state, _ = problems[number % 2].training.step(
-            weights, state, jnp.asarray(number), jnp.asarray(FAMILY.steps)
-        )
-    same(weights, pretrained[0].network.weights)
-
-
-@pytest.mark.slow
-def test_a_family_killed_resumes_to_the_same(beam, other, pretrained, tmp_path, monkeypatch):
-    scenes = [beam, other]
-    with monkeypatch.context() as patch:
-        kill_after(2, patch)
-        with pytest.raises(KeyboardInterrupt):
-            pretrain(scenes, FAMILY, tmp_path, architecture=SMALL)
-    resumed = pretrain(scenes, Plan(), tmp_path, resume=True)
-    same(resumed[0].network.weights, pretrained[0].network.weights)
-    with pytest.raises(InputError, match="belongs to another scene"):
-        pretrain(scenes[::-1], FAMILY, tmp_path, resume=True)
-
-
-def test_families_that_cannot_be(beam, cube, tmp_path):
-    with pytest.raises(InputError, match="no scene is given"):
-        pretrain([], FAMILY, tmp_path)
-    with pytest.raises(InputError, match="fits a discrepancy model, which belongs to one"):
-        pretrain([beam], recipe("hybrid"), tmp_path)
-    with pytest.raises(InputError, match="'twisting_cube' has E, nu"):
-        pretrain([beam, cube], FAMILY, tmp_path, architecture=SMALL)

@@ -1,11 +1,11 @@
-r"""Fitting a discrepancy model: Gaussian processes of the principal modes of what a map leaves.
+r"""Discrepancy models: Gaussian processes of the principal modes of what a map leaves of FEM.
 
 .. math:: u(\theta) \approx m(\theta) + \bar e + \sum_k c_k(x)\, \phi_k
 
 with :math:`m` a map made before the runs (none, a Taylor series, a network), the modes those of the
 remainders and their sensitivities together, and :math:`c_k` a Gaussian process conditioned on
-values *and* derivatives (:mod:`emulator.core.gaussian_process`). A run with its
-sensitivities counts as p + 1 observations for a tenth more time.
+values *and* derivatives (:mod:`emulator.core.gaussian_process`). A run with its sensitivities
+counts as p + 1 observations for a tenth more time.
 
 A stationary kernel in theta fits badly where a body is stiff in one corner of the box and soft in
 another. Its distance is therefore taken between features that contain some mechanics: theta's
@@ -16,20 +16,23 @@ where the body is soft.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.core.gaussian_process import Features, fit_lengths, fit_weights, fold
+from emulator.core.gaussian_process import Features, fit_lengths, fit_weights, fold, mean
+from emulator.core.precision import require_float64
 from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
-from emulator.surrogates.discrepancy.model import Discrepancy, Warp
-from emulator.surrogates.taylor import Expansion
+from emulator.surrogates.part import ArrayPart, CachedPart
+from emulator.surrogates.taylor import Expansion, monomials, rounded
 
 Mean = Callable[[jax.Array], jax.Array]
-"""Position in the unit box (p,) to displacement (n, 3) mm."""
+"""A map from the position in the unit box (p,) to the displacement (n, 3) mm."""
 
 # Weight of a sensitivity among the snapshots: a typical step as a fraction of the unit box.
 _SENSITIVITY_WEIGHT = 0.3
@@ -42,6 +45,75 @@ _FEATURES = 4
 _FEATURE_SAMPLES = 400
 
 
+class Warp(NamedTuple):
+    """The features of a position: itself and polynomials of it, each divided by its length.
+
+    centre : the position about which the polynomials are taken, (p,).
+    indices : the Taylor multi-indices of their terms, (t, o).
+    coefficients : the coefficients of the terms, (t, f).
+    inverse_lengths : the inverse length scales of all features, (p + f,).
+    """
+
+    centre: np.ndarray
+    indices: np.ndarray
+    coefficients: jax.Array
+    inverse_lengths: jax.Array
+
+    def __call__(self, position: jax.Array) -> jax.Array:
+        """Return the features (p + f,) of ``position`` (p,)."""
+        polynomials = monomials(self.indices, position - self.centre) @ self.coefficients
+        return jnp.concatenate([position, polynomials]) * self.inverse_lengths
+
+    def with_derivatives(self, positions: jax.Array) -> Features:
+        """Return the features of ``positions`` (c, p) and their derivatives in position."""
+        features: Callable[[jax.Array], jax.Array] = self.__call__
+        return Features(jax.vmap(features)(positions), jax.vmap(jax.jacfwd(features))(positions))
+
+
+@dataclass(frozen=True, eq=False)
+class Discrepancy(ArrayPart):
+    """The displacement to add to a map to meet FEM, a part of an emulator.
+
+    warp : the features of a position.
+    known : the features of the runs, (c, q).
+    value_weights, derivative_weights : the weights (c, r) and (c, q, r) of the Gaussian processes,
+        from :func:`~emulator.core.gaussian_process.fold`.
+    offset, modes : (n, 3) mm and (r, n, 3) mm.
+    """
+
+    warp: Warp
+    known: jax.Array
+    value_weights: jax.Array
+    derivative_weights: jax.Array
+    offset: jax.Array
+    modes: jax.Array
+
+    def coefficients(self, position: jax.Array) -> jax.Array:
+        """Return the coefficients (r,) of the modes at ``position`` (p,) in the unit box.
+
+        Raises
+        ------
+        InputError
+            float64 is off. The weights of nearly equal runs are large and cancel: in float32 the
+            shipped ventricle would be 9 mm off.
+        """
+        require_float64("a discrepancy model")
+        return mean(self.warp(position), self.known, self.value_weights, self.derivative_weights)
+
+    def __call__(self, position: jax.Array) -> jax.Array:
+        """Return the displacement (n, 3) mm to add at ``position`` (p,)."""
+        return self.offset + jnp.tensordot(self.coefficients(position), self.modes, axes=1)
+
+    def cache(self, nodes: np.ndarray) -> CachedPart:
+        """Return the model over ``nodes`` (k,)."""
+        offset, modes = np.asarray(self.offset)[nodes], np.asarray(self.modes)[:, nodes]
+        return CachedPart(offset, modes, self.coefficients)
+
+    def rounded(self) -> Discrepancy:
+        """Return the model with offset and modes rounded to float32, for a smaller file."""
+        return replace(self, offset=rounded(self.offset), modes=rounded(self.modes))
+
+
 def fit_discrepancy(
     scene: Scene, runs: Runs, expansion: Expansion, mean_map: Mean | None = None
 ) -> Discrepancy:
@@ -49,8 +121,8 @@ def fit_discrepancy(
 
     Parameters
     ----------
-    runs : with sensitivities.
-    expansion : Taylor series whose leading coefficients are features of the kernel.
+    scene, runs : the scene, and its FEM runs with sensitivities.
+    expansion : the Taylor series whose leading coefficients are features of the kernel.
     mean_map : a differentiable approximation of FEM; ``None`` is zero.
 
     Raises
@@ -103,7 +175,7 @@ def _check(scene: Scene, runs: Runs, expansion: Expansion) -> None:
 def _remainder(
     scene: Scene, runs: Runs, positions: jax.Array, mean_map: Mean | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """FEM minus ``mean_map``: fields (c, n, 3) and their derivatives in position (c, p, n, 3)."""
+    """Return FEM minus ``mean_map``: fields (c, n, 3) and derivatives in position (c, p, n, 3)."""
     fields = np.asarray(runs.displacement)
     assert runs.sensitivities is not None, "checked above"
     derivatives = np.array(scene.space.unit_sensitivities(runs.theta, runs.sensitivities))
@@ -121,25 +193,25 @@ def _remainder(
 
 
 def _project(fields: np.ndarray, derivatives: np.ndarray) -> tuple[np.ndarray, jax.Array]:
-    """Modes (r, 3n) in mm, and the coefficients (c (1 + p), r) of fields and derivatives."""
+    """Return modes (r, 3n) mm, and coefficients (c (1 + p), r) of fields and derivatives."""
     count, parameters = derivatives.shape[:2]
     fields, derivatives = fields.reshape(count, -1), derivatives.reshape(count, parameters, -1)
     weighted = _SENSITIVITY_WEIGHT * derivatives.reshape(count * parameters, -1)
     snapshots = np.concatenate([fields, weighted])
-    wanted = min(_MOST_MODES, *snapshots.shape)
+    most = min(_MOST_MODES, *snapshots.shape)
     from sklearn.utils.extmath import randomized_svd  # slow to import, and only for a fit
 
-    _, size, right = randomized_svd(snapshots, wanted, n_iter=4, random_state=0)
-    kept = size > max(_TRUNCATION * size[0], np.finfo(float).tiny)
-    if not kept.any():
+    _, size, right = randomized_svd(snapshots, most, n_iter=4, random_state=0)
+    used = size > max(_TRUNCATION * size[0], np.finfo(float).tiny)
+    if not used.any():
         raise InputError("a discrepancy model has nothing to fit: the map meets every FEM run")
-    scale = size[kept] / np.sqrt(len(snapshots))
-    both = np.concatenate([fields[:, None], derivatives], axis=1) @ (right[kept].T / scale)
-    return right[kept] * scale[:, None], jnp.asarray(both.reshape(-1, kept.sum()))
+    scale = size[used] / np.sqrt(len(snapshots))
+    both = np.concatenate([fields[:, None], derivatives], axis=1) @ (right[used].T / scale)
+    return right[used] * scale[:, None], jnp.asarray(both.reshape(-1, used.sum()))
 
 
 def _lengths(features: Features, positions: np.ndarray, observations: jax.Array) -> jax.Array:
-    """Inverse lengths (q,) fitted to a subset of the runs and the leading modes."""
+    """Return inverse lengths (q,) fitted to a subset of the runs and the leading modes."""
     each = 1 + positions.shape[1]
     chosen = maximin_subset(positions, max(4, _MOST_OBSERVATIONS // each))
     rows = (chosen[:, None] * each + np.arange(each)).ravel()
@@ -148,7 +220,7 @@ def _lengths(features: Features, positions: np.ndarray, observations: jax.Array)
 
 
 def _warp(expansion: Expansion, parameters: int) -> Warp:
-    """Features: position, and the coefficients of the series' leading modes over the box."""
+    """Return position, and the coefficients of the series' leading modes over the box."""
     if not len(expansion.indices):
         plain = jnp.zeros((0, 0))
         return Warp(expansion.centre, expansion.indices, plain, jnp.ones(parameters))
@@ -170,7 +242,7 @@ def _warp(expansion: Expansion, parameters: int) -> Warp:
 
 
 def maximin_subset(positions: np.ndarray, count: int) -> np.ndarray:
-    """Rows of at most ``count`` different ``positions`` (c, p).
+    """Return the rows of at most ``count`` different ``positions`` (c, p).
 
     From the first on, each next row is the one whose least distance from the chosen is greatest.
     """

@@ -13,13 +13,13 @@ from emulator.core.store import read_arrays
 from emulator.fem import design
 from emulator.fem.campaign import run_campaign
 from emulator.surrogates import Architecture, Emulator, augment, load, save_emulator
-from emulator.surrogates.additive import PARTS
 from emulator.surrogates.discrepancy import fit_discrepancy
+from emulator.surrogates.emulator import PARTS
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import fresh
 from emulator.surrogates.polynomial import compressed, degrees_up_to
 from emulator.surrogates.taylor import expand
-from emulator.training.basis import mechanical_modes
+from emulator.training.hybrid import mechanical_modes
 from network_support import drawn
 
 SMALL = Architecture(steps=1, latent=8, hidden=(16, 16), decoder="separable", modes=3)

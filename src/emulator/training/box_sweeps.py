@@ -1,0 +1,381 @@
+r"""Equilibria over the whole box from residuals alone, without one FEM solution.
+
+The displacement is a polynomial of theta, at first zero. A *sweep* draws new theta, finds at each
+of them how far the polynomial is from equilibrium (:mod:`~emulator.training.targets`: one guarded
+step, a few substitutions with a factor that eight neighbours share), and fits the polynomial to
+where the steps lead (:func:`~emulator.surrogates.polynomial.fit`). So the potential is minimised
+over the box at once, with a preconditioner in place of the energy's plain gradient.
+
+The loads rise over the first sweeps, and each new level starts at the extrapolation of the last
+two. A level that most steps do not reach is tried again with a smaller rise, and one that is
+reached roughly gets more sweeps. At one level the targets of earlier sweeps are kept, each with its
+remaining error, and the degree of the polynomial grows with their number as long as the newest
+targets, which no fit has seen, say that it should. At a theta not seen before the step is the
+polynomial's own error to first order, so that every sweep gives an honest error bar, and the sweeps
+end where that is round-off.
+
+On a finer mesh the sweeps can stand on a map of the coarser one: the polynomial is then what that
+map leaves, which is small and smooth, so that a low degree and a few sweeps do.
+
+A sweep of c theta costs c/8 factorisations and, for each theta, some six substitutions and
+products. Smooth equilibria are followed to round-off in a few parameters; in five, terms run out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.core.errors import InputError, SolverError
+from emulator.core.progress import counting
+from emulator.core.store import inside, named_leaves, read_arrays, save_arrays
+from emulator.fem import Simulator
+from emulator.fem.campaign import Runs
+from emulator.fem.compiled import compiled
+from emulator.fem.energy import potential_energy
+from emulator.scenes.scene import Scene
+from emulator.surrogates.polynomial import (
+    MOST_TERMS,
+    Polynomial,
+    PolynomialFit,
+    Samples,
+    best_degree,
+    compressed,
+    degrees_up_to,
+    fit,
+    legendre,
+    terms,
+)
+from emulator.training.checkpoint import SWEEPS
+from emulator.training.targets import targets
+
+_LEVELS = 15  # least number of levels of the loads
+# A step counts as taken from this fraction of it on; a level is reached where so many are.
+_TAKEN, _ENOUGH = 0.25, 0.9
+# Relative error of the displacement up to which the loads rise, and the most sweeps at a level.
+_ROUGH, _PATIENCE = 0.01, 4
+_LEAST_RISE = 1.0 / 500.0
+_FIRST_DEGREE = 2
+_FEWEST = 32  # least number of theta in a sweep
+_KEPT = 3  # targets kept for each term of the next degree
+_DONE = 1e-10  # relative error of the displacement at which the sweeps end
+_ROUNDED = 1e-2  # part of the error bar that leaving out modes may add
+_WRITE_EVERY = 30.0  # seconds
+_NUMBERS = (
+    "number", "here", "level", "rise", "gap", "error", "largest_error", "taken", "lost"
+)  # fmt: skip
+
+Map = Callable[[jax.Array], jax.Array]
+"""A map from the position (p,) in the unit box to the displacement (n, 3) mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class SweepState:
+    """The state between two sweeps.
+
+    polynomial : the polynomial of the free displacements.
+    before : its coefficients at the load level that lies ``gap`` below.
+    values : the targets that are kept.
+    number, here : the number of sweeps done, and of those at this load level.
+    level, rise : the load level, and by how much it rises next.
+    gap : the distance to the level of ``before``.
+    error, largest_error : the median and the largest step at theta not seen before, mm.
+    taken : the part of the last sweep's theta at which a step was taken.
+    lost : whether no step could be taken from the start, so that the sweeps went on from rest.
+    """
+
+    polynomial: PolynomialFit
+    before: np.ndarray
+    values: Samples
+    number: int = 0
+    here: int = 0
+    level: float = 0.0
+    rise: float = 1.0 / _LEVELS
+    gap: float = 1.0
+    error: float = np.inf
+    largest_error: float = np.inf
+    taken: float = 0.0
+    lost: bool = False
+
+    @property
+    def done(self) -> bool:
+        """Whether the error bar is round-off."""
+        return self.level == 1.0 and self.error <= _DONE * self._size
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The entries of an emulator's record."""
+        entries = {
+            "number": self.number,
+            "error_mm": self.error,
+            "largest_error_mm": float(self.largest_error),
+        }
+        return entries | ({"start": "left for rest"} if self.lost else {})
+
+    @property
+    def rises(self) -> bool:
+        """Whether the next sweep is at a higher load level."""
+        accurate = self.error <= _ROUGH * self._size or self.here > _PATIENCE
+        return self.level < 1.0 and (self.level == 0.0 or accurate)
+
+    @property
+    def _size(self) -> float:
+        """The root mean square displacement of the free nodes, mm."""
+        return float(np.sqrt(3.0 * np.mean(self.polynomial.coefficients[0] ** 2)))
+
+
+def sweep_box(
+    simulator: Simulator,
+    sweeps: int,
+    seed: int,
+    *,
+    start: Map | None = None,
+    beneath: Map | None = None,
+    folder: Path | None = None,
+    deadline: float = np.inf,
+    progress: bool = False,
+) -> SweepState:
+    """Sweep over the box of a scene until the error bar is round-off.
+
+    Parameters
+    ----------
+    simulator : the simulator of the scene.
+    sweeps : the largest number of sweeps.
+    seed : the seed from which the theta are drawn.
+    start : a map to begin at under the whole load; by default sweeps begin at the body at rest, and
+        so they do where no step can be taken from ``start``, because no tangent there is positive
+        definite.
+    beneath : a map under the whole load to which the polynomial, at first zero, is added.
+    folder : the folder where the state is kept and taken up again.
+    deadline : the time, on the performance counter, after which no sweep begins, once the loads are
+        at their whole level.
+    progress : whether a progress bar is shown.
+
+    Raises
+    ------
+    InputError
+        A load of the scene has no potential, or too few sweeps for the loads to rise from rest.
+    SolverError
+        Equilibria were not followed up to the loads, or not over the whole box.
+    """
+    check_sweeps(simulator.scene, sweeps, at_rest=start is None and beneath is None)
+    state = _restored(folder) or _first(simulator, start, beneath)
+    written = time.perf_counter()
+    with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
+        while state.number < sweeps and not state.done:
+            if time.perf_counter() > deadline and state.level == 1.0:
+                break
+            state, shown = _sweep(simulator, state, seed, beneath)
+            if start is not None and state.level == 1.0 and not np.isfinite(state.error):
+                state = replace(_at_rest(simulator), number=state.number, lost=True)
+            bar.set_postfix(shown)
+            bar.update()
+            if folder is not None and time.perf_counter() - written > _WRITE_EVERY:
+                _write(folder, state)
+                written = time.perf_counter()
+    if folder is not None:
+        _write(folder, state)
+    _require_answer(simulator.scene, state)
+    return state
+
+
+def check_sweeps(scene: Scene, sweeps: int, *, at_rest: bool) -> None:
+    """Refuse what cannot be swept, with the :class:`InputError` of :func:`sweep_box`."""
+    potential_energy(scene)  # refuses a scene that has none
+    if at_rest and sweeps <= _LEVELS:
+        raise InputError(
+            f"training: {sweeps} sweeps; the loads rise over {_LEVELS}, give {_LEVELS + 1} or more"
+        )
+
+
+def _require_answer(scene: Scene, state: SweepState) -> None:
+    """Raise :class:`SolverError` where equilibria were lost on the way or in a part of the box."""
+    if state.level < 1.0:
+        lost = "no step could be taken from where the start says, and from rest " * state.lost
+        raise SolverError(
+            f"scene '{scene.name}': {lost}{state.number} sweeps followed the equilibria "
+            f"to {100 * state.level:.0f} % of the loads; give more of them, or use a recipe with "
+            "FEM runs"
+        )
+    if state.taken < _ENOUGH:
+        raise SolverError(
+            f"scene '{scene.name}': {state.number} sweeps know no equilibrium at "
+            f"{100 * (1.0 - state.taken):.0f} % of the box; give more of them, or use a recipe "
+            "with FEM runs"
+        )
+
+
+def _first(simulator: Simulator, start: Map | None, beneath: Map | None) -> SweepState:
+    """Return the state before the first sweep."""
+    if beneath is not None:
+        return replace(_at_rest(simulator), level=1.0)
+    return _at_rest(simulator) if start is None else _at(simulator, start)
+
+
+def _at_rest(simulator: Simulator) -> SweepState:
+    parameters, free = len(simulator.scene.parameters), len(simulator.system.free)
+    degrees = degrees_up_to(parameters, _first_degree(parameters))
+    zero = np.zeros((len(degrees), free))
+    none = Samples(np.zeros((0, parameters)), np.zeros((0, free)), np.zeros(0))
+    return SweepState(PolynomialFit(degrees, zero), zero, none)
+
+
+def _at(simulator: Simulator, start: Map) -> SweepState:
+    """Return the state under the whole load whose polynomial is fitted to ``start``."""
+    rest = _at_rest(simulator)
+    parameters, degree = rest.values.position.shape[1], rest.polynomial.degree
+    if terms(parameters, degree + 1) <= MOST_TERMS:
+        degree += 1
+    position = np.random.default_rng(0).random((2 * terms(parameters, degree), parameters))
+    fields = _free_fields(simulator, start, position)
+    if not np.isfinite(fields).all():
+        return replace(rest, lost=True)
+    polynomial = fit(Samples(position, fields, np.zeros(len(position))), degree, 1.0)
+    before = 0.0 * polynomial.coefficients
+    return replace(rest, polynomial=polynomial, before=before, level=1.0)
+
+
+def _free_fields(simulator: Simulator, displacement: Map, position: np.ndarray) -> np.ndarray:
+    """Return the free displacements (c, f) mm of a map at ``position`` (c, p)."""
+    free = lambda x: simulator.system.restrict(displacement(x))  # noqa: E731
+    return np.asarray(jax.lax.map(free, jnp.asarray(position)))
+
+
+def _first_degree(parameters: int) -> int:
+    return _FIRST_DEGREE if terms(parameters, _FIRST_DEGREE) <= MOST_TERMS else 1
+
+
+def _sweep(
+    simulator: Simulator, state: SweepState, seed: int, beneath: Map | None
+) -> tuple[SweepState, dict[str, Any]]:
+    """Return the state after one sweep, and what the progress bar shows of it."""
+    from scipy.stats import qmc  # half a second, which only this needs
+
+    parameters, count = len(simulator.scene.parameters), _FEWEST
+    while count < 2 * terms(parameters, _first_degree(parameters)):
+        count *= 2
+    rng = np.random.default_rng([seed, state.number])
+    position = qmc.Sobol(parameters, rng=rng).random(count)
+    level, ahead = _next_level(state) if state.rises else (state.level, state.polynomial)
+    below = 0.0 if beneath is None else _free_fields(simulator, beneath, position)
+    steps = targets(simulator, below + ahead.at(position), position, level)
+    usable = np.isfinite(steps.error)
+    taken = float(np.mean(usable & (steps.fraction >= _TAKEN)))
+    shown = {"load": f"{level:.2f}", "taken": f"{taken:.2f}"}
+    new = Samples(position, steps.fields - below, steps.error).take(usable)
+    lengths = steps.step[usable]
+    if not usable.any() or (state.rises and taken < _ENOUGH):
+        after = _with_smaller_rise(state)
+    elif state.rises:
+        after = _at_level(state, level, new, float(np.median(lengths)))
+        after = replace(after, largest_error=lengths.max())
+    else:
+        after = _with_targets(state, new, float(np.median(lengths)))
+        after = replace(after, largest_error=lengths.max())
+        shown["energy gap"] = f"{np.median(steps.gap[usable]):.0e}"
+    shown |= {"degree": f"{after.polynomial.degree}", "error_mm": f"{after.error:.1e}"}
+    return replace(after, number=state.number + 1, taken=taken), shown
+
+
+def _next_level(state: SweepState) -> tuple[float, PolynomialFit]:
+    """Return the level of the next sweep, and the extrapolation of the last two levels to it."""
+    level = state.level + state.rise
+    level = level if level < 1.0 - _LEAST_RISE else 1.0
+    now, before = state.polynomial, state.before
+    reach = (level - state.level) / state.gap
+    return level, now._replace(coefficients=now.coefficients + reach * (now.coefficients - before))
+
+
+def _with_smaller_rise(state: SweepState) -> SweepState:
+    """Return the state after a level that was not reached: a lower one next, or more sweeps."""
+    if state.rise > _LEAST_RISE:
+        return replace(state, rise=state.rise / 2.0)
+    return replace(state, rise=1.0 / _LEVELS, here=0, error=np.inf)
+
+
+def _at_level(state: SweepState, level: float, new: Samples, error: float) -> SweepState:
+    """Return the state at another ``level``, where the targets ``new`` are all that is known."""
+    polynomial = fit(new, state.polynomial.degree, error)
+    return replace(
+        state,
+        polynomial=polynomial,
+        before=_padded(state.polynomial.coefficients, polynomial),
+        values=new,
+        here=1,
+        level=level,
+        rise=min(1.5 * state.rise, 1.0 / _LEVELS),
+        gap=level - state.level,
+        error=error,
+    )
+
+
+def _with_targets(state: SweepState, new: Samples, error: float) -> SweepState:
+    """Return the state after targets ``new`` at its level; ``error`` is the median step to them."""
+    degree = best_degree(state.values, new, state.polynomial.degree, error)
+    parameters = new.position.shape[1]
+    most = _KEPT * min(terms(parameters, degree + 1), MOST_TERMS)
+    known = state.values.followed_by(new).take(slice(-max(most, 4 * len(new.position)), None))
+    polynomial = fit(known, degree, error)
+    return replace(
+        state,
+        polynomial=polynomial,
+        before=_padded(state.before, polynomial),
+        values=known,
+        here=state.here + 1,
+        error=error,
+    )
+
+
+def _padded(coefficients: np.ndarray, polynomial: PolynomialFit) -> np.ndarray:
+    """Return ``coefficients`` for the terms of ``polynomial``: terms of low degree come first."""
+    padded = np.zeros_like(polynomial.coefficients)
+    shared = min(len(padded), len(coefficients))
+    padded[:shared] = coefficients[:shared]
+    return padded
+
+
+def polynomial_part(simulator: Simulator, state: SweepState) -> Polynomial:
+    """Return the polynomial as a part of an emulator, with as many modes as its error needs."""
+    fields = jax.vmap(simulator.system.extend)(jnp.asarray(state.polynomial.coefficients))
+    return compressed(state.polynomial.degrees, np.asarray(fields), _ROUNDED * state.error)
+
+
+def runs_of(simulator: Simulator, state: SweepState, thetas: jax.Array) -> Runs:
+    """Return displacements, energies and slopes of the polynomial at ``thetas`` (c, p)."""
+    scene, system = simulator.scene, simulator.system
+    degrees, coefficients = state.polynomial
+
+    def displacement(theta: jax.Array) -> jax.Array:
+        v = legendre(scene.to_unit(theta), degrees) @ coefficients
+        return scene.on_supports(system.extend(v), theta)
+
+    def each(theta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        u, slopes = displacement(theta), jax.jacfwd(displacement)(theta)
+        return u, system.potential(u, theta)[0], jnp.moveaxis(slopes, -1, 0)
+
+    return Runs(thetas, *compiled(lambda t: jax.lax.map(each, t))(thetas))
+
+
+def _write(folder: Path, state: SweepState) -> None:
+    fits = {name: getattr(state, name)._asdict() for name in ("polynomial", "values")}
+    numbers = {name: np.asarray(getattr(state, name)) for name in _NUMBERS}
+    save_arrays(folder / SWEEPS, named_leaves({**fits, **numbers, "before": state.before}))
+
+
+def _restored(folder: Path | None) -> SweepState | None:
+    if folder is None or not (folder / SWEEPS).is_file():
+        return None
+    arrays, _ = read_arrays(folder / SWEEPS)
+    return SweepState(
+        PolynomialFit(**inside(arrays, "polynomial")),
+        arrays["before"],
+        Samples(**inside(arrays, "values")),
+        **{name: arrays[name].item() for name in _NUMBERS},
+    )

@@ -1,0 +1,199 @@
+"""Recipes ``network`` and ``paper``: the graph network of Dalton et al. (2023), Algorithm 1.
+
+``network`` adds it to the FEM solution at the centre of the box and trains it on FEM runs and the
+energy. ``paper`` trains it from zero on the energy at one theta a step, by Adam at 1e-4 and then
+1e-5, as the released code does. Recipe ``hybrid`` takes batches of theta by the same functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from emulator.core.errors import InputError
+from emulator.fem import Simulator
+from emulator.fem.campaign import Runs
+from emulator.fem.campaign.designs import uniform
+from emulator.surrogates.emulator import Emulator
+from emulator.surrogates.network.graph import augment
+from emulator.surrogates.network.part import fresh
+from emulator.surrogates.taylor import constant
+from emulator.training.job import Job
+from emulator.training.loop import NetworkTraining
+from emulator.training.network_plan import (
+    NetworkPlan,
+    Problem,
+    architecture_of,
+    with_network_of,
+)
+from emulator.training.objectives import (
+    Batch,
+    Objective,
+    Scales,
+    check_objective,
+    component_scales,
+    loss_scales,
+    make_loss,
+)
+from emulator.training.step import Descent, Rate, Weights, clipped_adam, cosine, halves, make_step
+
+
+@dataclass(frozen=True)
+class BatchPlan(NetworkPlan):
+    """The options of recipes that minimise an objective over batches of theta.
+
+    Parameters
+    ----------
+    objective : what is minimised (:mod:`~emulator.training.objectives`).
+    simulations : the number of FEM runs.
+    batch : the number of theta a step.
+    energy_weight : the weight of the energy gap in ``both``.
+    """
+
+    objective: Objective = "both"
+    simulations: int = 256
+    batch: int = 16
+    energy_weight: float = 0.3
+
+    def check(self) -> None:
+        """Raise :class:`InputError` for options that cannot work."""
+        super().check()
+        check_objective(self.objective)
+        self.require_at_least(1, "batch")
+        if self.objective != "energy" and self.simulations < self.batch:
+            raise InputError(
+                f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"
+            )
+
+    @property
+    def learns_from_runs(self) -> bool:
+        """Whether FEM runs are in the objective."""
+        return self.objective != "energy"
+
+
+@dataclass(frozen=True)
+class GraphNetwork(BatchPlan):
+    """A graph network about the FEM solution at the centre, or from zero.
+
+    Parameters
+    ----------
+    centred : whether the network is added to the FEM solution at the centre, or to zero.
+    schedule : ``cosine`` to zero after a warm-up, or ``halves``: the rate, then a tenth of it.
+    decoder : ``pointwise``, or ``separable`` without mechanical modes.
+    """
+
+    recipe: str = "network"
+    centred: bool = True
+    schedule: Literal["cosine", "halves"] = "cosine"
+    decoder: Literal["pointwise", "separable"] = "pointwise"
+
+    @property
+    def runs(self) -> int:
+        """The number of FEM runs besides the one at the centre, which the energy alone needs."""
+        return self.simulations if self.learns_from_runs else 0
+
+    @property
+    def rate(self) -> Rate:
+        """The learning rate as a function of the step."""
+        return (halves if self.schedule == "halves" else cosine)(self.learning_rate)
+
+    def prepare(self, job: Job) -> Problem:
+        """Return the FEM runs, and an emulator whose network is untrained."""
+        scene, architecture = job.scene, architecture_of(self, job, self.decoder)
+        runs = job.fem_runs(Simulator(scene), self)
+        job.require_time(f"{len(runs.theta)} FEM runs")
+        plan = self.with_counts(simulations=len(runs.theta) - 1) if self.runs else self
+        if self.centred:
+            series = constant(np.asarray(scene.to_unit(scene.centre)), runs.displacement[0])
+            scale = component_scales(scene, runs, from_runs=self.learns_from_runs)
+        else:
+            series = None
+            scale = np.full(3, np.sqrt(np.mean(np.asarray(runs.displacement[0]) ** 2)))
+        network = fresh(scene, augment(scene), architecture, scale, self.seed)
+        emulator = with_network_of(Emulator(scene, taylor=series, network=network), job.start)
+        training = batch_training(emulator, plan, self.rate, runs)
+        return Problem(plan, emulator, runs, training)
+
+
+PAPER = GraphNetwork(
+    recipe="paper",
+    objective="energy",
+    centred=False,
+    batch=1,
+    learning_rate=1e-4,
+    schedule="halves",
+    steps=100_000,
+)
+"""The recipe of the paper."""
+
+
+def batch_training(
+    emulator: Emulator,
+    plan: BatchPlan,
+    rate: Rate,
+    runs: Runs,
+    freeze: int | None = None,
+) -> NetworkTraining:
+    """Return the training of the emulator's network on batches of theta, by Adam.
+
+    freeze : the step at which the modes of a separable decoder are frozen; ``None`` for never.
+    """
+    network, optimiser = emulator.network, clipped_adam()
+    assert network is not None, "an emulator in training has a network"
+    scales = loss_scales(emulator.scene, runs, from_runs=plan.learns_from_runs)
+    step = make_step(rate, batch_descent(emulator, plan, runs, scales), optimiser)
+
+    def frozen(weights: Weights) -> tuple[jax.Array, ...]:
+        return (jax.jit(lambda w: network.prepare(w)[1])(weights),)
+
+    return NetworkTraining(network, optimiser, step, freeze, frozen)
+
+
+def batch_descent(emulator: Emulator, plan: BatchPlan, runs: Runs, scales: Scales) -> Descent:
+    """Return the descent of the objective on batches, each of which follows from the step."""
+    predict = predictor(emulator)
+    loss = make_loss(emulator.scene, plan.objective, scales, plan.energy_weight)
+
+    def draw(number: jax.Array) -> Batch:
+        key = jax.random.fold_in(jax.random.key(plan.seed), number)
+        if not plan.learns_from_runs:
+            nothing = jnp.zeros(0)
+            return Batch(uniform(emulator.scene, plan.batch, key), nothing, nothing)
+        rows = jax.random.choice(key, len(runs.theta), (plan.batch,), replace=False)
+        return Batch(runs.theta[rows], runs.displacement[rows], runs.energy[rows])
+
+    def descend(
+        weights: Weights, number: jax.Array, *frozen: jax.Array
+    ) -> tuple[jax.Array, Weights, Weights]:
+        batch = draw(number)
+        misfit = lambda w: loss(predict(w, batch.theta, *frozen), batch)  # noqa: E731
+        return *jax.value_and_grad(misfit)(weights), weights
+
+    return descend
+
+
+def predictor(emulator: Emulator) -> Callable[..., jax.Array]:
+    """Return ``predict(weights, thetas, *frozen)``: displacement (b, n, 3) mm at theta (b, p).
+
+    It is the emulator's with other weights of its network. ``frozen`` is the part of the decoder
+    that does not depend on theta; without it the processor is run.
+    """
+    scene, network, series = emulator.scene, emulator.network, emulator.taylor
+    assert network is not None, "an emulator in training has a network"
+
+    def predict(weights: Weights, thetas: jax.Array, *frozen: jax.Array) -> jax.Array:
+        position = scene.to_unit(thetas)
+        if frozen:
+            decoder = nnx.merge(network.definition, weights).decoder
+            free = network.decode(decoder, frozen[0], position)
+        else:
+            free = network.predict(weights, position)
+        return scene.on_supports(free if series is None else series(position) + free, thetas)
+
+    return predict

@@ -1,0 +1,172 @@
+"""Recipe ``mechanics``: a Taylor series of the equilibrium, and a discrepancy model of FEM runs.
+
+There is no network; from a mesh to an emulator takes a minute. On a body of a family that a network
+has learned, the series is that of what the network leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.core.errors import InputError
+from emulator.fem import Simulator
+from emulator.fem.campaign import Runs
+from emulator.scenes.scene import all_nodes
+from emulator.surrogates.discrepancy import fit_discrepancy
+from emulator.surrogates.emulator import Emulator
+from emulator.surrogates.taylor import Expansion, constant, expand
+from emulator.training.checkpoint import Session
+from emulator.training.family import family_on
+from emulator.training.job import FEWEST, Job, Recipe
+from emulator.training.plan import Plan, Record, check_model_runs, check_order
+
+_HELD_OUT = 5  # every fifth run is held out
+_OBSERVATIONS = 4000  # values and derivatives; their covariance matrix takes 128 MB
+FEM_SHARE = 0.3
+"""The share of a budget after which no FEM run begins."""
+
+
+@dataclass(frozen=True)
+class Mechanics(Recipe):
+    """A Taylor series and a discrepancy model.
+
+    Parameters
+    ----------
+    simulations : the number of FEM runs, with their sensitivities.
+    order : the order of the series; 0 is the FEM solution at the centre of the box.
+    """
+
+    recipe: str = "mechanics"
+    simulations: int = 60
+    order: int = 3
+    needs_slopes: ClassVar[bool] = True
+
+    def check(self) -> None:
+        """Raise :class:`InputError` for options that cannot work."""
+        check_model_runs(self.simulations)
+        check_order(self.order)
+
+    def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion]:
+        """Return the emulator without its discrepancy model, the FEM runs, and FEM's series."""
+        scene, start = job.scene, job.start
+        if start is not None and start.family is None:
+            raise InputError(
+                f"recipe '{self.recipe}' trains no network, so it cannot start from that of "
+                f"the emulator of '{start.scene.name}'"
+            )
+        family = None if start is None else family_on(start, scene)
+        series, runs = series_and_runs(job, Simulator(scene), self, self.order)
+        rest = series if family is None else series.less(family.cache(all_nodes(scene))).rounded()
+        return Emulator(scene, taylor=rest, family=family), runs, series
+
+    def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
+        """Return the emulator and its record."""
+        emulator, runs, series = self.prepare(job)
+        plan = self.with_counts(simulations=len(runs.theta) - 1)
+        replace(session, plan=plan, architecture=None).write_plan()
+        emulator, choice = add_discrepancy(emulator, runs, series)
+        return emulator, {**plan.record(), "discrepancy": choice}
+
+
+def series_and_runs(
+    job: Job, simulator: Simulator, plan: Plan, order: int
+) -> tuple[Expansion, Runs]:
+    """Return the series about the centre of the box, rounded as a file stores it, and FEM runs.
+
+    The discrepancy model is fitted to the series that is loaded from a file.
+    """
+    series = expand(simulator, order=order).rounded() if order else None
+    if series is not None:
+        job.require_time("the series about the centre of the box")
+    runs = job.fem_runs(simulator, plan, series, job.deadline(FEM_SHARE))
+    job.require_time(f"{len(runs.theta)} FEM runs")
+    if series is None:
+        series = constant(np.asarray(job.scene.to_unit(job.scene.centre)), runs.displacement[0])
+    return series, runs
+
+
+def add_discrepancy(
+    emulator: Emulator, runs: Runs, series: Expansion | None = None
+) -> tuple[Emulator, dict[str, Any]]:
+    """Return ``emulator`` with a discrepancy model of ``runs``, and a record of its choice.
+
+    The model is fitted on top of nothing, of the Taylor series, and of series and network, and the
+    sum with the least error at held-out runs is taken, then fitted to all runs: a network helps
+    where runs are few and harms where they are many. Parts that are not in that sum are dropped.
+
+    Parameters
+    ----------
+    emulator : the emulator without a discrepancy model.
+    runs : FEM runs with sensitivities.
+    series : the series of FEM, where that in ``emulator`` is of what a family's network leaves.
+
+    Raises
+    ------
+    InputError
+        No run besides the centre's.
+    """
+    most = _OBSERVATIONS // (1 + runs.theta.shape[1])
+    runs = runs.take(slice(0, most))
+    count = len(runs.theta)
+    if count < 2:
+        raise InputError(
+            "the discrepancy model needs FEM runs besides the centre's; give a larger budget"
+        )
+    series = (
+        series
+        or emulator.taylor
+        or constant(np.full(runs.theta.shape[1], 0.5), jnp.zeros(emulator.scene.held.shape))
+    )
+
+    def fitted(bare: Emulator, some: Runs) -> Emulator:
+        model = fit_discrepancy(bare.scene, some, series, _mean(bare)).rounded()
+        return replace(bare, discrepancy=model)
+
+    sums = _sums(emulator, series)
+    errors: dict[str, float] = {}
+    best = next((n for n in ("coarse", "taylor") if n in sums), "nothing")
+    if count >= FEWEST:
+        test = np.arange(count) % _HELD_OUT == _HELD_OUT - 1
+        for name, bare in sums.items():
+            errors[name] = _error(fitted(bare, runs.take(~test)), runs.take(test))
+        best = min(errors, key=errors.__getitem__)
+    whole = fitted(sums[best], runs)
+    assert whole.discrepancy is not None, "it was fitted above"
+    modes = len(whole.discrepancy.modes)
+    record = {"on": best, "runs": count, "modes": modes, "held_out_err_u_mm": errors}
+    return whole, record
+
+
+def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:
+    """Return the sums of parts to which a discrepancy model may be added, by name."""
+    bare = replace(emulator, discrepancy=None)
+    nothing = replace(bare, taylor=None, network=None, family=None)
+    if emulator.coarse is not None:  # on the same body, it has learned from many runs
+        candidates = [bare]
+    elif emulator.family is not None:
+        alone = replace(bare, taylor=None)
+        candidates = [nothing, replace(nothing, taylor=series), alone, bare]
+    else:
+        candidates = [nothing, replace(bare, network=None), bare]
+    return {" + ".join(sum_.parts) or "nothing": sum_ for sum_ in candidates}
+
+
+def _mean(emulator: Emulator) -> Callable[[jax.Array], jax.Array] | None:
+    """Return the displacement of all parts as a function of position; None without parts."""
+    if not emulator.parts:
+        return None
+    cached = emulator.cache()
+    return lambda position: cached(emulator.scene.from_unit(position))
+
+
+def _error(emulator: Emulator, runs: Runs) -> float:
+    """Return the geometric mean of err_u over ``runs``, mm, so that no single error decides."""
+    predicted = jax.jit(emulator.cache())(runs.theta)
+    each = jnp.mean(jnp.linalg.norm(predicted - runs.displacement, axis=-1), axis=-1)
+    return float(jnp.exp(jnp.mean(jnp.log(each + 1e-300))))
