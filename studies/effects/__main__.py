@@ -14,7 +14,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from emulator.scenes.built_in import BUILT_IN
 from studies.common.output import Case, Results, parser, save
 from studies.effects.scenes import SCENES, observed, other_choices, points, published
 
@@ -27,6 +26,7 @@ from calibrate.samplers import NUTSOptions
 from emulator.fem import run_campaign
 from emulator.fem.campaign.designs import design
 from emulator.scenes import Scene
+from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.effects import effects_of, leave_out
 from emulator.surrogates.emulator import Emulator

@@ -22,7 +22,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from emulator.scenes.built_in.ventricles import left_ventricle
 from scipy.stats import qmc
 from studies.common.output import save
 from studies.ventricle_family.shapes import ventricles
@@ -45,6 +44,7 @@ from emulator.accuracy.comparison import quantiles
 from emulator.core.store import read_arrays, write_json
 from emulator.fem.campaign import run_campaign
 from emulator.fem.campaign.designs import sobol
+from emulator.scenes.built_in.ventricles import left_ventricle
 from emulator.surrogates import load, save_emulator
 
 HERE = Path(__file__).parent
