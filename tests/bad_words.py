@@ -270,7 +270,7 @@ INFERENCES = [
     ("--truth mu=73 lam=61 --noise much", "--noise: 'much' is not a number"),
     (
         "--truth mu=73 lam=61 --noise-scale displacement=0",
-        "displacement (mm): noise 'gaussian': standard deviation is 0.0",
+        "displacement (mm): standard deviation is 0.0",
     ),
     (
         "--truth mu=73 lam=61 --noise student_t:dof=4",
