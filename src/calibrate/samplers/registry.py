@@ -53,5 +53,5 @@ def options_from(
         A name that the sampler has no option of, or a value of another type.
     """
     options = sampler.options.sized(warmup=warmup, draws=draws, chains=chains)
-    table = parse(table_of(sampler.options), dict(values), f"sampler '{sampler.name}'", toml=False)
-    return replace(options, **{name: getattr(table, name) for name in table.model_fields_set})
+    parse(table_of(sampler.options), dict(values), f"sampler '{sampler.name}'", toml=False)
+    return replace(options, **values)
