@@ -166,7 +166,10 @@ def test_members_have_what_is_common_and_what_is_their_own(file):
             ("[members.second.noise]\ndisplacement", "[population]\nmedian.mu = [70.0]\nspread.mu"),
             "line 22: median of 'mu' is [70.0]; give median and relative sd",
         ),
-        (("= 0.4", "= -0.4"), "member 'second': displacement (mm): noise: standard deviation is"),
+        (
+            ("= 0.4", "= -0.4"),
+            "member 'second': displacement (mm): noise 'gaussian': standard deviation is",
+        ),
         (("[members.first]", "[members.'a/b']"), "members: 'a/b' is no name"),
         (("[members.first]\n", "[other]\n"), "unknown key 'other'"),
         (("[members.second.noise]", "[population]"), "[population], line 22: unknown key 'displ"),
