@@ -59,7 +59,7 @@ def test_a_scene_that_does_not_match(folder):
         (lambda d: d["parts"]["network"].clear(), "'network' lacks or garbles 'architecture'"),
         (
             lambda d: d["parts"].update(discrepancy={}),
-            "'discrepancy' lacks or garbles 'coefficients'",
+            "'discrepancy' lacks or garbles 'centre'",
         ),
         (
             lambda d: d["parts"].update(magic={}),
