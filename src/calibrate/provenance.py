@@ -66,10 +66,10 @@ def commit(folder: str | Path) -> str | None:
     """Commit checked out at ``folder``, with ``+`` if files were changed; ``None`` without git."""
     try:
         words = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=12"]
-        done = subprocess.run(words, capture_output=True, text=True, check=True)
+        process = subprocess.run(words, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
-    return done.stdout.strip()
+    return process.stdout.strip()
 
 
 def study_header(folder: str | Path, seed: int) -> dict[str, Any]:

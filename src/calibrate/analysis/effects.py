@@ -26,8 +26,8 @@ from emulator.scenes.effects import Effect, Onto, effects_of, leave_out
 from emulator.scenes.scene import Scene
 
 _ASIDE = 1e-7
-_SAVES = 0.97  # of the time, below which leaving an effect out is worth it
-_HELD_OUT = 1_000_003  # added to the seed for theta that judge
+_SAVES = 0.97  # share of the time; an effect is left out if the solves take less
+_HELD_OUT = 1_000_003  # added to the seed to draw the theta that test the choice
 _WORD = re.compile(r"([0-9.+-]+(?:[eE][+-]?[0-9]+)?)\s*(\S*)")
 
 
@@ -88,13 +88,13 @@ def recommend(
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
 ) -> Recommendation:
-    """The cheapest of the simpler scenes that keep the observations.
+    """Return the cheapest of the simpler scenes that keep the observations.
 
     Parameters
     ----------
-    tolerance : of each observation, in its unit, by name; a bare number for one observation.
-    samples : theta at which each scene is solved; as many others judge the choice.
-    say : is told what is being measured.
+    tolerance : the tolerance of each observation, in its unit, by name; or one number for one.
+    samples : the number of theta at which each scene is solved; as many more test the choice.
+    say : the function that is called with a sentence on what is being measured.
 
     Raises
     ------
@@ -104,10 +104,10 @@ def recommend(
     SolverError
         FEM fails on the scene as it is.
     """
-    seen = observations(observe)
-    if seen.states != ("",):
+    observation_points = observations(observe)
+    if observation_points.states != ("",):
         raise InputError("effects: observations of several load states; take one at a time")
-    limits = seen.name(tolerance, "effects: tolerance")
+    limits = observation_points.name(tolerance, "effects: tolerance")
     for name, limit in limits.items():
         if not 0.0 < limit < np.inf:
             raise InputError(f"effects: the tolerance of {name} is {limit:g}; it must be above 0")
@@ -117,7 +117,7 @@ def recommend(
     effects = effects_of(scene)
     if not effects:
         raise InputError(f"scene '{scene.name}' has no effect that it can do without")
-    compared = Comparison(scene, seen, samples, seed, say)
+    compared = Comparison(scene, observation_points, samples, seed, say)
     alone = [compared.without((name,)) for name in effects]
     chosen: tuple[str, ...] = ()
     best = compared.without(())
@@ -132,7 +132,7 @@ def recommend(
     while chosen:
         trials += 1
         judge = Comparison(
-            scene, seen, samples, seed + trials * _HELD_OUT, say, compared.simulators
+            scene, observation_points, samples, seed + trials * _HELD_OUT, say, compared.simulators
         )
         judged = judge.without(chosen)
         if judged.within(limits):
@@ -140,7 +140,7 @@ def recommend(
         chosen, judged = chosen[:-1], whole
     return Recommendation(
         limits,
-        {name: part.unit for name, part in seen.parts.items()},
+        {name: part.unit for name, part in observation_points.parts.items()},
         whole,
         alone,
         judged,
@@ -150,7 +150,7 @@ def recommend(
 
 
 def tolerances(words: Sequence[str], observe: Observations) -> dict[str, float]:
-    """Tolerance of each observation from words such as ``0.5mm``, matched by their units."""
+    """Return each observation's tolerance from words such as ``0.5mm``, matched by their units."""
     by_unit: dict[str, float] = {}
     for word in words:
         match = _WORD.fullmatch(word.strip())
@@ -199,11 +199,11 @@ class Comparison:
         self._values: list[dict[str, np.ndarray]] = []
 
     def without(self, names: tuple[str, ...]) -> Measured:
-        """What the scene without these effects gives, measured once."""
+        """Return the comparison with the scene without these effects; it is measured once."""
         return self.of(names, lambda: leave_out(self._scene, names))
 
     def of(self, names: tuple[str, ...], make: Callable[[], Scene]) -> Measured:
-        """What another scene gives that takes the whole one's parameters or some of them."""
+        """Return the comparison with another scene, whose parameters the whole one has, too."""
         if names and () not in self._known:
             self.without(())
         if names not in self._known:
@@ -266,14 +266,14 @@ class Comparison:
 
 
 def _clocked(simulator: Simulator, theta: jax.Array) -> tuple[float, Solution]:
-    """Processor seconds of a solve from rest, and its solution."""
+    """Return the processor seconds of a solve from rest, and its solution."""
     began = time.process_time()
     solution = jax.block_until_ready(simulator.solve(theta))
     return time.process_time() - began, solution
 
 
 def operations(scene: Scene) -> float | None:
-    """Floating-point operations of the potential energy and its gradient, as compiled."""
+    """Return the floating-point operations of the compiled potential energy and its gradient."""
     if not all(load.has_potential for load in scene.loads):
         return None
     both = jax.jit(jax.value_and_grad(potential_energy(scene)))
@@ -282,7 +282,7 @@ def operations(scene: Scene) -> float | None:
 
 
 def _largest(change: np.ndarray) -> float:
-    """Of displacements (d, 3) the largest length, of other numbers the largest size."""
+    """Return the largest length of displacements (d, 3), or the largest size of other numbers."""
     if change.ndim == 2 and change.shape[1] == 3:
         return float(np.linalg.norm(change, axis=1).max())
     return float(np.abs(change).max())

@@ -103,13 +103,13 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
 def _outside(
     forward: ForwardMap, beyond: Reference, fraction: float
 ) -> tuple[Errors | None, dict[str, Any]]:
-    """Errors outside the box and their report; no errors where no case has a valid prediction."""
+    """Return errors outside the box and their report; no errors without a valid prediction."""
     report: dict[str, Any] = {"fraction": fraction, "failed": beyond.failed}
-    solved = len(beyond.thetas)
+    case_count = len(beyond.thetas)
     try:
-        errors = case_errors(forward, beyond.thetas, beyond.displacement) if solved else None
+        errors = case_errors(forward, beyond.thetas, beyond.displacement) if case_count else None
     except SolverError:  # the map has no valid prediction at any of them
         errors = None
     if errors is None:
-        return None, {"cases": 0, "invalid": solved, **report}
+        return None, {"cases": 0, "invalid": case_count, **report}
     return errors, {**errors.report(), **report}

@@ -43,12 +43,12 @@ from calibrate.statistical_model.errors import errors_of_data
 from emulator.core.errors import InputError
 
 _DATA_SETS = 64
-_FROM_PRIOR, _AROUND = 3072, 512  # draws of the prior, shared, and of Student's t, a data set
-_ROUNDS = 2  # of Student's t
+_FROM_PRIOR, _AROUND = 3072, 512  # draws of the prior, for all data sets; of Student's t, for each
+_ROUNDS = 2  # fits of Student's t to the draws before
 _BATCH = 128
-_EFFECTIVE = 30.0  # draws; of fewer the covariance is that of the linear map and a normal prior
+_EFFECTIVE = 30.0  # effective draws; below, the covariance of the linear map and a normal prior
 _DOF = 5.0
-_WIDER = 1.3  # Student's t than the covariance it is told
+_WIDER = 1.3  # factor by which Student's t is wider than the estimated covariance
 
 
 def expected_precision(
@@ -59,7 +59,7 @@ def expected_precision(
     data_sets: int = _DATA_SETS,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """What ``model``'s observations would determine, before any data; plain JSON.
+    """Return what ``model``'s observations would determine, before any data; plain JSON.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class _Around(NamedTuple):
     root: jax.Array
 
     def draw(self, key: jax.Array, count: int) -> jax.Array:
-        """Draws (count, q)."""
+        """Return draws (count, q)."""
         normal, chi2 = jax.random.split(key)
         q = len(self.centre)
         z = jax.random.normal(normal, (count, q))
@@ -118,7 +118,7 @@ class _Around(NamedTuple):
         return self.centre + (z / jnp.sqrt(g)) @ self.root.T
 
     def log_density(self, x: jax.Array) -> jax.Array:
-        """Of x (s, q), shape (s,)."""
+        """Return the log density (s,) of the points x (s, q)."""
         q = len(self.centre)
         z = solve_triangular(self.root, (x - self.centre).T, lower=True)
         constant = (
@@ -129,7 +129,7 @@ class _Around(NamedTuple):
 
 
 def _informations(model: Model, errors: Errors, theta: np.ndarray, *, log: bool) -> np.ndarray:
-    """F (k, q, q) at ``theta`` (q,), for each size that errors of unknown size may have."""
+    """Return F (k, q, q) at ``theta`` (q,), for each size that errors of unknown size may have."""
     means, valid = model.predict(dict(zip(model.states.unknowns, theta, strict=True)))
     _some(valid)
     error = errors(means)
@@ -149,7 +149,7 @@ def _posterior_covariances(
     *,
     log: bool,
 ) -> np.ndarray:
-    """Covariances (r, q, q) of the posteriors of data made at draws of the prior (s, q)."""
+    """Return the posterior covariances (r, q, q) given data made at draws of the prior (s, q)."""
     names = model.states.unknowns
 
     def thetas(x: jax.Array) -> jax.Array:
@@ -159,8 +159,8 @@ def _posterior_covariances(
         return dict(zip(names, thetas(x), strict=True))
 
     def log_prior(x: jax.Array) -> jax.Array:
-        covariances = model.log_prior(values(x)) + (jnp.sum(x) if log else 0.0)
-        return jnp.where(jnp.isnan(covariances), -jnp.inf, covariances)
+        log_density = model.log_prior(values(x)) + (jnp.sum(x) if log else 0.0)
+        return jnp.where(jnp.isnan(log_density), -jnp.inf, log_density)
 
     def predicted(x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         return model.predict(values(x))
@@ -172,11 +172,11 @@ def _posterior_covariances(
         error: ModelError | None,
     ) -> jax.Array:
         means, valid = answer
-        covariances = model.log_density(means, model.noise_values({}), data)
+        log_density = model.log_density(means, model.noise_values({}), data)
         if error is not None:
             residual = {name: data[name] - mean for name, mean in means.items()}
-            covariances += log_ratio(error, thetas(x), residual, means)
-        return jnp.where(valid & jnp.isfinite(covariances), covariances, -jnp.inf)
+            log_density += log_ratio(error, thetas(x), residual, means)
+        return jnp.where(valid & jnp.isfinite(log_density), log_density, -jnp.inf)
 
     information = information_at(model, model.observe, model.noise, log=log)
     shared = jnp.asarray(np.log(prior[count:]) if log else prior[count:])[:_FROM_PRIOR]
@@ -189,7 +189,7 @@ def _posterior_covariances(
     def first(
         x: jax.Array, sizes: jax.Array, data: dict[str, jax.Array], error: ModelError | None
     ) -> _Around:
-        """A Newton step from where the data was made, in the linear map with a normal prior."""
+        """Return a Newton step from the data's own x, in the linear map with a normal prior."""
         Q = _inverse(information(x, error, sizes)[0] + precision)
         score = jax.grad(lambda x: log_likelihood(x, predicted(x), data, error))(x)
         score -= precision @ (x - shared.mean(axis=0))
@@ -203,36 +203,36 @@ def _posterior_covariances(
         means: dict[str, jax.Array],
         error: ModelError | None,
     ) -> jax.Array:
-        noise, *rounds, own = keys
+        noise_key, *round_keys, error_key = keys
         if error is not None:
-            means = error.draw(own, jnp.concatenate([thetas(x), sizes]), means)
+            means = error.draw(error_key, jnp.concatenate([thetas(x), sizes]), means)
         parts = model.distributions(means, model.noise_values({}))
-        each = jax.random.split(noise, len(parts))
+        each = jax.random.split(noise_key, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
         likely_shared = jax.vmap(log_likelihood, in_axes=(0, 0, None, None))(
             shared, ahead, data, error
         )
         around = start = first(x, sizes, data, error)
         C = normal = start.root @ start.root.T / _WIDER**2
-        for k in rounds:
-            drawn = around.draw(k, _AROUND)
-            inside = jax.vmap(log_prior)(drawn)
-            # Where the prior is nothing the map is not asked.
-            asked = jnp.where(jnp.isfinite(inside)[:, None], drawn, x)
+        for k in round_keys:
+            proposals = around.draw(k, _AROUND)
+            inside = jax.vmap(log_prior)(proposals)
+            # Where the prior density is 0 the map may be undefined: it is evaluated at x instead.
+            evaluated = jnp.where(jnp.isfinite(inside)[:, None], proposals, x)
             likely = jax.lax.map(
-                lambda x: log_likelihood(x, predicted(x), data, error), asked, batch_size=_BATCH
+                lambda x: log_likelihood(x, predicted(x), data, error), evaluated, batch_size=_BATCH
             )
-            points = jnp.concatenate([shared, drawn])
+            points = jnp.concatenate([shared, proposals])
             p = jnp.concatenate([p_shared, inside])
             mixture = jnp.logaddexp(
                 jnp.log(share) + p, jnp.log1p(-share) + around.log_density(points)
             )
             weights = jax.nn.softmax(p + jnp.concatenate([likely_shared, likely]) - mixture)
             mean = weights @ points
-            off = points - mean
-            # A few draws that carry all weight have next to no spread, and would promise too much.
+            deviation = points - mean
+            # A few draws that carry all weight hardly spread: their covariance would be too small.
             enough = 1.0 / jnp.sum(weights**2) >= _EFFECTIVE
-            C = jnp.where(enough, (weights[:, None] * off).T @ off, normal)
+            C = jnp.where(enough, (weights[:, None] * deviation).T @ deviation, normal)
             around = _Around(mean, _WIDER * jnp.linalg.cholesky(C))
         return C
 
@@ -249,14 +249,14 @@ def _posterior_covariances(
 
 
 def _some(valid: Any) -> np.ndarray:
-    """Where it is true; :class:`InputError` where it is nowhere."""
+    """Return the indices at which ``valid`` is true; :class:`InputError` if there are none."""
     if not np.any(valid):
         raise InputError("identifiability: the forward map has no valid answer at any draw")
     return np.flatnonzero(valid)
 
 
 def _inverse(A: jax.Array) -> jax.Array:
-    """Of a symmetric positive definite matrix."""
+    """Return the inverse of a symmetric positive definite matrix."""
     root = jnp.linalg.cholesky(A)
     half = solve_triangular(root, jnp.eye(len(A)), lower=True)
     return half.T @ half

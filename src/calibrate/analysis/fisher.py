@@ -57,7 +57,7 @@ whether the map is valid there."""
 def information_at(
     model: Model, observe: Observations, noise: Mapping[str, Noise], *, log: bool
 ) -> At:
-    """F of data ``observe`` with ``noise`` of known sd, as a function of x.
+    """Return F of data ``observe`` with ``noise`` of known sd, as a function of x.
 
     Both may be other than the model's: a measurement to add, in all of its load states or some.
 
@@ -100,7 +100,7 @@ Errors = Callable[[Mapping[str, Any]], ModelError | None]
 
 
 def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError | None:
-    """Errors of each data set, as one with a leading axis, from means (r, ...) by name."""
+    """Return the errors of all data sets, stacked along a leading axis; means (r, ...) by name."""
     arrays = {name: np.asarray(values) for name, values in means.items()}
     count = len(next(iter(arrays.values())))
     each = [errors({name: values[k] for name, values in arrays.items()}) for k in range(count)]
@@ -109,7 +109,7 @@ def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError | None
 
 
 def _stacked(arrays: Sequence[Any]) -> np.ndarray:
-    """One array of several, with zeros where one has fewer rows: such a mode changes nothing."""
+    """Return the arrays stacked, with zeros for missing rows: a mode of zeros changes nothing."""
     shape = np.max([np.shape(array) for array in arrays], axis=0).astype(int)
     stack = np.zeros((len(arrays), *shape))
     for k, array in enumerate(arrays):
@@ -119,7 +119,7 @@ def _stacked(arrays: Sequence[Any]) -> np.ndarray:
 
 
 def sizes_of(error: ModelError | None, count: int = _SIZES) -> jax.Array:
-    """Sizes (count, 1) that are inferred, each as probable; (count, 0) where none is."""
+    """Return equally probable sizes (count, 1) of the error; (count, 0) if its size is known."""
     priors = [] if error is None else list(error.priors.values())
     if not priors:
         return jnp.zeros((count, 0))
@@ -128,7 +128,7 @@ def sizes_of(error: ModelError | None, count: int = _SIZES) -> jax.Array:
 
 
 def log_ratio(error: ModelError, theta: jax.Array, residual: Means, means: Means) -> jax.Array:
-    """What an error adds to the log likelihood of ``residual`` at ``theta`` (q,), shape ()."""
+    """Return an error's share () of the log likelihood of ``residual`` at ``theta`` (q,)."""
     sizes = sizes_of(error) if error.priors else jnp.zeros((1, 0))
 
     def at(size: jax.Array) -> jax.Array:

@@ -50,15 +50,15 @@ from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
 
 _PRIOR_DRAWS = 4096
-# Exponents are told rounded, to be readable; those that round to zero are left out.
+# Exponents are rounded to be readable; those that round to zero are left out.
 _DIGITS = 1
-_LEARNED = 0.95  # largest share of its prior sd that a combination is told with
-_TOGETHER = 0.7  # least absolute correlation of pairs that are told
-_BEST = 2  # combinations that are told
+_LEARNED = 0.95  # largest posterior sd over prior sd of a reported combination
+_TOGETHER = 0.7  # least absolute correlation of reported pairs
+_BEST = 2  # reported combinations
 
 
 def identify(posterior: Posterior) -> dict[str, Any]:
-    """Contraction, correlations and identified combinations, as plain JSON.
+    """Return contraction, correlations and identified combinations, as plain JSON.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def identify(posterior: Posterior) -> dict[str, Any]:
 
 
 def prior_table(model: Model) -> np.ndarray:
-    """Draws (s, q) of the unknowns of theta from their prior."""
+    """Return draws (s, q) of the unknowns of theta from their prior."""
     draws = model.prior_draws(jax.random.key(0), _PRIOR_DRAWS)
     return np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
 
@@ -103,7 +103,7 @@ def _on_scale(thetas: np.ndarray, log: np.ndarray) -> np.ndarray:
 def combinations(
     names: tuple[str, ...], after: np.ndarray, before: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Products of powers of which something was learned, the most contracted first.
+    """Return the products of powers that the data informs, the most contracted first.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def combinations(
 
 
 def in_words(result: dict[str, Any]) -> str:
-    """The result in words: contractions, correlated pairs, the best combinations."""
+    """Return the result in words: contractions, correlated pairs, the best combinations."""
     learned = ", ".join(f"{name} {100 * c:.0f} %" for name, c in result["contraction"].items())
     lines = [f"learned from the data (1 - sd / prior sd): {learned}"]
     names = list(result["correlation"])
@@ -141,7 +141,7 @@ def in_words(result: dict[str, Any]) -> str:
 
 
 def products_in_words(combinations: list[dict[str, Any]], best: int) -> list[str]:
-    """The ``best`` combinations, a line each."""
+    """Return the ``best`` combinations, a line each."""
     return [
         f"known best: {_product(entry['exponents'])} to {100 * entry['known_to']:.2g} % "
         f"(prior {100 * entry['prior']:.2g} %)"
@@ -150,7 +150,7 @@ def products_in_words(combinations: list[dict[str, Any]], best: int) -> list[str
 
 
 def _product(exponents: dict[str, float]) -> str:
-    """As a quotient, the largest exponents first."""
+    """Return the combination as a quotient, the largest exponents first."""
     ordered = sorted(exponents.items(), key=lambda item: -abs(item[1]))
 
     def factors(sign: float) -> str:
@@ -183,7 +183,7 @@ class Candidate(NamedTuple):
 def next_measurement(
     posterior: Posterior, candidates: Mapping[str, tuple[Observation, Noise]]
 ) -> dict[str, Candidate]:
-    """Candidates by name, the most informative first.
+    """Return the candidates by name, the most informative first.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def next_measurement(
 
 
 def _gain(C: np.ndarray, information: np.ndarray) -> tuple[float, np.ndarray]:
-    """Bits, and sd afterwards relative to now (q,)."""
+    """Return the gain in bits, and the sd afterwards relative to now (q,)."""
     root = np.linalg.cholesky(C)
     precision = np.eye(len(C)) + root.T @ information @ root
     after = root @ np.linalg.solve(precision, root.T)
@@ -247,7 +247,7 @@ def stress_band(
     stretches: Sequence[float] | np.ndarray = STRETCHES,
     probability: float = 0.9,
 ) -> StressBand:
-    """The band of stresses under a stretch along ``fibre`` or ``cross-fibre``.
+    """Return the band of stresses under a stretch along ``fibre`` or ``cross-fibre``.
 
     A law without fibres has no directions; both are the same then. In a scene with regions it is
     that of a stiffness factor of the first.
@@ -272,7 +272,7 @@ def stress_band(
 
 
 def stresses(scene: Scene, theta: jax.Array, axis: jax.Array, stretch: np.ndarray) -> jax.Array:
-    """Stress difference (n,) in kPa along ``axis`` (3,); fibres are along x, sheets along y."""
+    """Return stress differences (n,), kPa, along ``axis`` (3,); fibres along x, sheets along y."""
     energy, at = point_energy(scene, theta), _tissue(scene)
 
     def along(value: jax.Array) -> jax.Array:
@@ -285,7 +285,7 @@ def stresses(scene: Scene, theta: jax.Array, axis: jax.Array, stretch: np.ndarra
 
 
 def _tissue(scene: Scene) -> Tissue:
-    """One element's tissue with the fibre along x, and the sheet along y."""
+    """Return the tissue of one element with the fibre along x, and the sheet along y."""
     directions = None
     if scene.law.sheets:
         directions = jnp.stack([_FIBRE, _CROSS])

@@ -82,7 +82,7 @@ class Factors:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What is varied independently: groups, in the order of their first parameters."""
+        """The names of what varies independently, in the order of their first parameters."""
         return tuple(dict.fromkeys(self.group_of))
 
     @property
@@ -97,14 +97,14 @@ class Factors:
 
 
 def quantiles(prior: Prior, names: Sequence[str], points: jax.Array) -> jax.Array:
-    """Theta (..., p) whose cumulative probabilities are ``points`` (..., p)."""
+    """Return theta (..., p) whose cumulative probabilities are ``points`` (..., p)."""
     inside = jnp.clip(points, _EDGE, 1.0 - _EDGE)
     columns = [_quantile(prior[name], inside[..., k]) for k, name in enumerate(names)]
     return jnp.stack(columns, axis=-1)
 
 
 def densities(prior: Prior, names: Sequence[str], theta: jax.Array) -> jax.Array:
-    """Density (..., p) of each parameter at ``theta`` (..., p): dx/dtheta of its point x."""
+    """Return each parameter's density (..., p) at ``theta`` (..., p): dx/dtheta of its point x."""
     columns = [jnp.exp(prior[name].log_prob(theta[..., k])) for k, name in enumerate(names)]
     return jnp.stack(columns, axis=-1)
 
@@ -154,7 +154,7 @@ def analyse(
     derivative: Derivative | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Sensitivity of the outputs of ``function``.
+    """Return the sensitivity of the outputs of ``function``.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def _by_derivatives(
 
 
 def _evaluated(function: Function, points: np.ndarray) -> np.ndarray:
-    """Outputs (n, m) at ``points``, all finite."""
+    """Return the outputs (n, m) at ``points``; :class:`InputError` unless all are finite."""
     outputs = np.asarray(function(points), dtype=float)
     if outputs.ndim == 1:
         outputs = outputs[:, None]
@@ -292,13 +292,13 @@ def _evaluated(function: Function, points: np.ndarray) -> np.ndarray:
 
 
 def _base(outputs: np.ndarray, factors: int) -> np.ndarray:
-    """Outputs at the two independent samples of a variance-based design."""
+    """Return the outputs at the two independent samples of a variance-based design."""
     block = outputs.reshape(-1, factors + 2, outputs.shape[1])
     return np.concatenate([block[:, 0], block[:, -1]])
 
 
 def _varies(outputs: np.ndarray) -> np.ndarray:
-    """Which outputs vary by more than round-off, (m,)."""
+    """Return whether each output (m,) varies by more than round-off."""
     size = np.abs(outputs).max(axis=0)
     return outputs.std(axis=0) > 1e-12 * np.where(size > 0.0, size, 1.0)
 

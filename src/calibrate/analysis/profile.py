@@ -48,7 +48,7 @@ class Profile(NamedTuple):
 
 
 def profile_likelihood(posterior: Posterior, name: str, points: int = 21) -> Profile:
-    """The profile of the unknown ``name``, to four posterior sd on each side.
+    """Return the profile of the unknown ``name``, to four posterior sd on each side.
 
     Raises
     ------
@@ -81,23 +81,23 @@ def profile_likelihood(posterior: Posterior, name: str, points: int = 21) -> Pro
 def _profile(
     log_likelihood: LogLikelihood, z: np.ndarray, k: int, grid: np.ndarray, limits: np.ndarray
 ) -> np.ndarray:
-    """Largest log likelihood with coordinate ``k`` at each of ``grid``, from draws ``z`` (s, q).
+    """Return the largest log likelihood at each ``grid`` value of coordinate ``k``.
 
     Each maximisation starts from the draw nearest in that coordinate, and from the best of the
     point before.
     """
-    others = np.array([j for j in range(z.shape[1]) if j != k])
+    nuisance = np.array([j for j in range(z.shape[1]) if j != k])
 
     @jax.jit
     @jax.value_and_grad
     def objective(rest: jax.Array, value: jax.Array) -> jax.Array:
-        return -log_likelihood(jnp.zeros(z.shape[1]).at[k].set(value).at[others].set(rest))
+        return -log_likelihood(jnp.zeros(z.shape[1]).at[k].set(value).at[nuisance].set(rest))
 
     best, last = [], None
     for value in grid:
-        starts = [z[int(np.argmin(np.abs(z[:, k] - value))), others]]
+        starts = [z[int(np.argmin(np.abs(z[:, k] - value))), nuisance]]
         starts += [] if last is None else [last]
-        low, high = -limits[others], limits[others]
+        low, high = -limits[nuisance], limits[nuisance]
         optima = [
             minimise(partial(objective, value=value), np.clip(s, low, high), low=low, high=high)
             for s in starts
@@ -109,7 +109,7 @@ def _profile(
 
 
 def _interval(values: np.ndarray, drop: np.ndarray) -> tuple[float, float]:
-    """Where the drop crosses :data:`DROP_95` on each side of its least, by interpolation."""
+    """Return the points on each side of the least drop where it crosses :data:`DROP_95`."""
     best = int(np.argmin(drop))
     below, above = drop[: best + 1][::-1], drop[best:]
     return (

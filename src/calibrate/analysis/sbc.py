@@ -83,7 +83,7 @@ class Calibration:
         return len(next(iter(self.ranks.values())))
 
     def band(self, name: str, probability: float = 0.95) -> Band:
-        """Empirical distribution function of a quantity's ranks with its band.
+        """Return the empirical distribution function of a quantity's ranks, with its band.
 
         ``probability`` is that with which the whole function of a right posterior stays inside.
         """
@@ -97,7 +97,7 @@ class Calibration:
         )
 
     def outside(self, probability: float = 0.95) -> dict[str, float]:
-        r"""Distance of each quantity's function from its band, 0 inside.
+        r"""Return the distance of each quantity's function from its band, 0 inside.
 
         All q functions of a right posterior stay inside together with ``probability`` at least:
         each has a band of :math:`1 - (1 - \text{probability}) / q` (Bonferroni).
@@ -111,7 +111,7 @@ class Calibration:
         return not any(self.outside().values())
 
     def coverage(self, probability: float = 0.95) -> dict[str, dict[float, tuple[float, ...]]]:
-        """Per quantity and level: fraction of central intervals that cover, and its own interval.
+        """Return the share of central intervals that cover, with its own interval, by quantity.
 
         The interval is Clopper and Pearson's, of ``probability``.
         """
@@ -121,7 +121,7 @@ class Calibration:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON: ranks, distances from the bands, coverage."""
+        """Return plain JSON: ranks, distances from the bands, coverage."""
         names = ("covered", "low", "high")
         return {
             "replicates": self.replicates,
@@ -140,7 +140,7 @@ class Calibration:
 
 @lru_cache(maxsize=32)
 def _pointwise(count: int, probability: float) -> float:
-    """Probability of the pointwise bands that hold together with ``probability``."""
+    """Return the probability of the pointwise bands that hold together with ``probability``."""
     x, rng = np.arange(1, count) / count, np.random.default_rng(0)
     return float(
         ecdf_utils.simulate_confidence_bands(count, 1, x, probability, _BAND_SIMULATIONS, rng)
@@ -148,7 +148,7 @@ def _pointwise(count: int, probability: float) -> float:
 
 
 def _fraction(hits: np.ndarray, probability: float) -> tuple[float, float, float]:
-    """Fraction of ``hits``, and the ends of its interval."""
+    """Return the fraction of ``hits``, and the ends of its interval."""
     count, n, tail = int(hits.sum()), len(hits), 0.5 * (1.0 - probability)
     low = float(beta.ppf(tail, count, n - count + 1)) if count else 0.0
     high = float(beta.ppf(1.0 - tail, count + 1, n - count)) if count < n else 1.0
@@ -156,7 +156,7 @@ def _fraction(hits: np.ndarray, probability: float) -> tuple[float, float, float
 
 
 def calibration_of(replicates: Iterator[Replicate], seed: int = 0) -> Calibration:
-    """Ranks of the truths among the draws of their posteriors.
+    """Return the ranks of the truths among the draws of their posteriors.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def sbc(
     draw: Sample | None = None,
     scheduler: str | None = None,
 ) -> Calibration:
-    """Simulation-based calibration of ``model``, its forward map and a sampler.
+    """Return the simulation-based calibration of ``model``, its forward map and a sampler.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def sbc(
 
 
 def _data_sets(truth: Model, count: int, seed: int, scheduler: str | None) -> predictions.Prior:
-    """Draws of the prior of ``truth``, and data made there."""
+    """Return draws of the prior of ``truth``, and data made there."""
     rng_key = jax.random.key(seed)
     if scheduler is None:
         return predictions.prior_replicates(truth, rng_key, count)

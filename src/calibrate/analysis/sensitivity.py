@@ -38,7 +38,7 @@ def sensitivity(
     seed: int = 0,
     scheduler: str | None = None,
 ) -> xr.DataTree:
-    """Which parameter moves which observation, and by how much.
+    """Return how much each parameter moves each observation.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def sensitivity(
 
 
 def _over_unit_cube(outputs: Outputs, prior: Prior, factors: Factors) -> tuple[Function, Function]:
-    """All numbers (n, m) and their derivatives (n, m, p) at points (n, p) of the unit cube."""
+    """Return functions of points (n, p) of the unit cube: all numbers (n, m), and derivatives."""
 
     def at(points: np.ndarray) -> jax.Array:
         return quantiles(prior, factors.names, jnp.asarray(points))
@@ -114,12 +114,12 @@ def _over_unit_cube(outputs: Outputs, prior: Prior, factors: Factors) -> tuple[F
 
 
 def _some(function: Function, entries: slice) -> Function:
-    """Some of the outputs (n, m, ...) of ``function``."""
+    """Return a function that gives some of the outputs (n, m, ...) of ``function``."""
     return lambda points: function(points)[:, entries]
 
 
 def _remembered(function: Function) -> Function:
-    """``function`` that repeats its last answer to the same points."""
+    """Return ``function``, made to repeat its last answer to the same points."""
     last: dict[bytes, np.ndarray] = {}
 
     def again(points: np.ndarray) -> np.ndarray:

@@ -83,7 +83,7 @@ class Check:
 
     @property
     def correction(self) -> Correction:
-        """What is added to the map."""
+        """The correction that is added to the map."""
         return self.pool.correction
 
 
@@ -242,8 +242,8 @@ def _train(
     for size in _rounds(max(round(_ADAPTIVE * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
-            chosen = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
-            runs = Runs.joined([runs, solver(chosen)])
+            points = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
+            runs = Runs.joined([runs, solver(points)])
         pool = pool.corrected_by(correction_from(runs, predictive, most))
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = pool.stepped(pool.log_explored, rng)

@@ -166,8 +166,8 @@ def change_by(
 
     value, error = jackknife(lambda used: change(fine.corrected, used), len(x))
     leave_one_out = [
-        change(fine.corrected_by(correction_by(z[others], D[others])).corrected)
-        for others in ~np.eye(len(z), dtype=bool)
+        change(fine.corrected_by(correction_by(z[remaining], D[remaining])).corrected)
+        for remaining in ~np.eye(len(z), dtype=bool)
     ]
     variance = np.sum((np.array(leave_one_out) - value) ** 2, axis=0) * (len(z) - 1) / len(z)
     error = np.hypot(error, np.sqrt(variance))
@@ -212,9 +212,9 @@ def _at_draws(
     """
     z = pool.z[rng.choice(len(pool.z), size=count, p=pool.corrected)]
     every = list(differences(z))
-    solved = np.array([difference is not None for difference in every], dtype=bool)
+    converged = np.array([difference is not None for difference in every], dtype=bool)
     D = np.array([difference for difference in every if difference is not None])
-    return z[solved], D.reshape(-1, len(pool.predictive.scales))
+    return z[converged], D.reshape(-1, len(pool.predictive.scales))
 
 
 def _followed(pool: Pool, correction: Correction, rng: np.random.Generator) -> Pool:

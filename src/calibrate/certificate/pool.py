@@ -37,7 +37,7 @@ from calibrate.samplers.diagnostics import effective, normalised
 
 ENOUGH = 800.0  # effective points at which the pool is good
 MOST_TEMPERED = 300.0  # effective points that the kernels of the next step are put on, at most
-_TEMPERED_SHARE = 0.15  # of the pool's points, likewise
+_TEMPERED_SHARE = 0.15  # that number at most, as a share of the pool's points
 _NEAR, _FREEDOM = 2048, 5.0  # points of the proposal that follows the draws, degrees of freedom
 _WIDE, _WIDE_WIDTHS, _WIDE_FREEDOM = 512, (1.0, 2.0), 3.0
 _PRIOR = 512
@@ -87,7 +87,7 @@ class Kernels:
     @classmethod
     def following(cls, z: np.ndarray, rng: np.random.Generator) -> Kernels:
         """Return narrow kernels, which smooth the density of the points z (s, p)."""
-        # In many dimensions narrower kernels would be needles.
+        # In many dimensions narrower kernels would not overlap.
         widths = (0.15, 0.5) if z.shape[1] <= 2 else (0.35, 0.7)
         return cls.around(z, widths, _FREEDOM, rng)
 
@@ -130,7 +130,7 @@ class Pool:
     at : log prior and log likelihoods of the points, (s,) each.
     proposals, counts : the kernels, and the number of points from each.
     log_kernels : log density (c, s) of each proposal at each point.
-    near : the index of the proposal that follows the draws; the next one surrounds them.
+    follower : the index of the proposal that follows the draws; the next one surrounds them.
     """
 
     predictive: Predictive
@@ -141,7 +141,7 @@ class Pool:
     proposals: tuple[Kernels, ...] = ()
     counts: tuple[int, ...] = ()
     log_kernels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    near: int = 0
+    follower: int = 0
 
     @classmethod
     def search(
@@ -163,7 +163,7 @@ class Pool:
             if _effective(pool.log_explored) >= _TEMPERED_SHARE * len(pool.z):
                 break
             pool = pool.stepped(pool.log_explored, rng)
-        pool = replace(pool, near=len(pool.proposals))
+        pool = replace(pool, follower=len(pool.proposals))
         pool = pool.extended(Kernels.following(draws, rng), _NEAR, rng)
         pool = pool.extended(Kernels.surrounding(draws, rng), _WIDE, rng)
         for points in modes:
@@ -211,10 +211,10 @@ class Pool:
     def log_chances(self) -> np.ndarray:
         """Log probability (s,) of each point to be a test: a mixture of several weights."""
         # Two parts ignore what the map says, because it may be wrong, corrected or not.
-        near, around = self.log_kernels[self.near : self.near + 2] - self.log_mixture
+        at_draws, around = self.log_kernels[self.follower : self.follower + 2] - self.log_mixture
         parts = (
             (_CORRECTED, self.log_corrected),
-            (_DRAWS, near),
+            (_DRAWS, at_draws),
             (_EXPLORED, self.log_explored),
             (_AROUND, around),
             (_EVEN, np.zeros(len(self.z))),

@@ -117,7 +117,7 @@ def fit_correction(
     fitted.at[: len(x)] = x
     linear = _TREND * (1.0 + x @ x.T)
     squared_errors = np.mean((errors / scales) ** 2, axis=1)
-    judged = slice(None) if likely is None or not likely.any() else likely
+    test_rows = slice(None) if likely is None or not likely.any() else likely
     smallest_loss, loss_where_likely = np.inf, np.inf
     distances = ((x[:, None] - x) ** 2).sum(axis=-1)
     for length, nugget in product(_LENGTHS, _NUGGETS):
@@ -131,11 +131,11 @@ def fit_correction(
         loss = np.log(square + _NEGLIGIBLE**2).mean()
         if loss < smallest_loss:
             smallest_loss = loss
-            loss_where_likely = np.log(square[judged] + _NEGLIGIBLE**2).mean()
+            loss_where_likely = np.log(square[test_rows] + _NEGLIGIBLE**2).mean()
             fitted.weights[: len(x)], fitted.inverse[: len(x), : len(x)] = weights, inverse
             scale = float(np.mean(square / variance))
             fitted = fitted._replace(length=length, nugget=nugget, scale=scale)
-    if loss_where_likely < np.log(squared_errors[judged] + _NEGLIGIBLE**2).mean():
+    if loss_where_likely < np.log(squared_errors[test_rows] + _NEGLIGIBLE**2).mean():
         return fitted
     return none._replace(scale=float(np.mean(squared_errors / (np.diag(linear) + 1.0))))
 

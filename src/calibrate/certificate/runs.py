@@ -66,7 +66,7 @@ class Runs(NamedTuple):
 
     @property
     def converged(self) -> np.ndarray:
-        """Where FEM converged, (s,)."""
+        """Whether FEM converged in each run, (s,)."""
         return np.isfinite(self.means).all(axis=1)
 
     def likely(self, dimension: int) -> np.ndarray:
@@ -185,9 +185,9 @@ class _Descent:
 
     def advanced(self, predictive: Predictive, runs: Runs, k: int) -> _Descent:
         """Return the descent at run ``k`` if FEM's posterior is higher there, else a half step."""
-        there = _Descent.from_run(predictive, runs, k)
-        if there is not None and there.log_posterior > self.log_posterior:
-            return there
+        trial = _Descent.from_run(predictive, runs, k)
+        if trial is not None and trial.log_posterior > self.log_posterior:
+            return trial
         return replace(self, target=0.5 * (self.z + self.target))
 
     def converged(self, predictive: Predictive) -> bool:
@@ -271,9 +271,9 @@ class _KnownRegion:
             return []
         z = np.stack(list(points.values()))
         at = self._predictive.evaluate(z, self._predictive.uncorrected)
-        near = (((z - self._mean) @ self._whiten) ** 2).sum(axis=1) <= self._far
-        known = near & (at.prior + at.cheap > self._least)
-        return [key for key, inside in zip(points, known, strict=True) if not inside]
+        among_draws = (((z - self._mean) @ self._whiten) ** 2).sum(axis=1) <= self._far
+        inside_region = among_draws & (at.prior + at.cheap > self._least)
+        return [key for key, inside in zip(points, inside_region, strict=True) if not inside]
 
 
 def _gauss_newton_step(

@@ -287,7 +287,7 @@ class Certificate(TableRepr):
 
     @property
     def shift(self) -> dict[str, float]:
-        """By parameter, mean under FEM less mean of the draws, in posterior sd."""
+        """The mean under FEM less the mean of the draws, in posterior sd, by parameter."""
         return {name: figure.value for name, figure in self.evidence.draws.shift.items()}
 
     def to_json(self) -> dict[str, Any]:

@@ -156,7 +156,7 @@ def body_figure(study: xr.DataTree, scene: Scene) -> Any:
     labels = [str(label) for label in values[values.dims[0]].values][:_MOST_MAPS]
     nodes, triangles = scene.mesh.nodes, flat_triangles(scene.mesh.surface)
     known = np.asarray(values)[:, triangles]
-    # A node that is held does not vary; a facet takes the mean of the others, or is grey.
+    # A fixed node has no index: a facet has the mean over its other nodes, or is grey.
     counted = np.isfinite(known)
     total = np.where(counted, known, 0.0).sum(axis=-1)
     shades = np.where(counted.any(axis=-1), total / np.maximum(counted.sum(axis=-1), 1), np.nan)
@@ -177,7 +177,7 @@ def body_figure(study: xr.DataTree, scene: Scene) -> Any:
         axes.set_axis_off()
         axes.set_title(label)
         panels.append(axes)
-    said = {"total": "total index", "mu_star": "mean absolute effect (mm)"}
-    label = said.get(name, "bound on the total index")
+    quantities = {"total": "total index", "mu_star": "mean absolute effect (mm)"}
+    label = quantities.get(name, "bound on the total index")
     figure.colorbar(colour, ax=panels, label=f"{label} of the displacement", shrink=0.8)
     return figure

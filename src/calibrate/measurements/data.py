@@ -85,7 +85,7 @@ def read_measurements(
 
 
 def _states(files: Files) -> Iterator[tuple[Path, str, DataTable]]:
-    """Path, load state and content of each file and state."""
+    """Return the path, load state and content of each file and state."""
     if not isinstance(files, Mapping):
         for state, table in open_data(Path(files)).states().items():
             yield Path(files), state, table
@@ -98,7 +98,7 @@ def _states(files: Files) -> Iterator[tuple[Path, str, DataTable]]:
 
 
 def _others(table: Table, tables: Iterable[Table]) -> set[str]:
-    """Columns measured by other observations that share columns of places with ``table``."""
+    """Return the columns of other observations that share columns of places with ``table``."""
     places = _columns(table, where=True)
     sharing = (t for t in tables if t is not table and places & _columns(t, where=True))
     return {word for other in sharing for word in _columns(other, where=False)}
@@ -109,7 +109,7 @@ def _columns(table: Table, *, where: bool) -> set[str]:
 
 
 def _tables(path: Path, file: DataTable) -> dict[str, tuple[type[Observation], Table]]:
-    """Kind and table of each observation that the file has all columns of, by name."""
+    """Return kind and table of each observation that the file has all columns of, by name."""
     complete: dict[str, tuple[type[Observation], Table]] = {}
     partial: list[list[str]] = []
     used: set[str] = set()
@@ -131,7 +131,7 @@ def _tables(path: Path, file: DataTable) -> dict[str, tuple[type[Observation], T
 
 
 def _expected(file: DataTable) -> str:
-    """The columns or variables of every kind, for error messages."""
+    """Return the columns or variables of every kind, for error messages."""
     every = [
         ",".join(word for field in table.fields for word in file.words_of(field))
         for name, kind in OBSERVATIONS.items()

@@ -48,12 +48,12 @@ class NodalDisplacements(DisplacementPoints):
     place_field = Field("node", ("node",), where=True)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """The displacements themselves."""
+        """Return the displacements themselves."""
         return displacement
 
     @classmethod
     def of(cls, scene: Scene, nodes: str | np.ndarray | list[int] = "all") -> Self:
-        """Observe ``nodes``: ``all``, the name of a node set, or indices.
+        """Return the observation of ``nodes``: ``all``, the name of a node set, or indices.
 
         Raises
         ------
@@ -74,12 +74,12 @@ class NodalDisplacements(DisplacementPoints):
 
     @classmethod
     def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Nodes with a free component."""
+        """Return nodes with a free component."""
         return spread_nodes(scene, count, seed)
 
     @classmethod
     def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """``nodes:N`` (N free ones at random), ``all``, a node set, or node numbers."""
+        """Read ``nodes:N`` (N random free nodes), ``all``, a node set, or node numbers."""
         if word == "all" or word in scene.mesh.node_sets:
             return DISPLACEMENT, cls.of(scene, word)
         if word.partition(":")[0] == cls.kind:
@@ -121,13 +121,13 @@ class Landmarks(DisplacementPoints):
     place_field = Field("position", XYZ, where=True)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Interpolated displacements (..., d, 3)."""
+        """Return interpolated displacements (..., d, 3)."""
         values = displacement[..., self.members, :]
         return jnp.sum(values * self.weights[:, :, None], axis=-2)
 
     @classmethod
     def of(cls, scene: Scene, points: Any) -> Self:
-        """Observe material points given by reference positions ``points`` (d, 3) in mm.
+        """Return the observation of material points at reference positions ``points`` (d, 3) in mm.
 
         Raises
         ------
@@ -142,7 +142,7 @@ class Landmarks(DisplacementPoints):
 
     @classmethod
     def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Points uniform over the volume."""
+        """Return points that are uniform over the volume."""
         return spread_landmarks(scene, count, seed)
 
     @classmethod
@@ -186,13 +186,13 @@ class Length(Scalar):
     arguments = ("first", "second")
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Length (...) in mm."""
+        """Return the length (...) in mm."""
         x = self.ends + jnp.einsum("ek,...ki->...ei", self.weights, displacement)
         return jnp.linalg.norm(x[..., 1, :] - x[..., 0, :], axis=-1)
 
     @classmethod
     def of(cls, scene: Scene, first: str, second: str) -> Self:
-        """Observe the distance between two landmarks.
+        """Return the observation of the distance between two landmarks.
 
         Parameters
         ----------
@@ -244,7 +244,7 @@ def spread_landmarks(scene: Scene, count: int, seed: int) -> np.ndarray:
 
 
 def _are_deformed(scene: Scene, points: np.ndarray, values: np.ndarray) -> bool:
-    """Whether points (d, 3) less their displacements, and not as they are, lie in the body."""
+    """Return whether points (d, 3) lie in the body only once displacements are subtracted."""
     measured = np.isfinite(values).all(axis=1)
     try:
         locate(scene.mesh, points[measured] - values[measured])
@@ -254,7 +254,7 @@ def _are_deformed(scene: Scene, points: np.ndarray, values: np.ndarray) -> bool:
 
 
 def _landmark(scene: Scene, text: str) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of a landmark."""
+    """Return nodes and weights of a landmark."""
     if text in scene.mesh.node_sets:
         nodes = scene.mesh.node_set(text)
         return nodes, np.full(len(nodes), 1.0 / len(nodes))

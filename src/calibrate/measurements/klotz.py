@@ -185,11 +185,11 @@ class KlotzVolume(Scalar):
 
     @classmethod
     def of(cls, scene: Scene, pressure: str) -> Self:
-        """Observe the volume at this pressure in kPa."""
+        """Return the observation of the volume at this pressure in kPa."""
         return cls(scene, float(pressure))
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """V_m (...) in mL."""
+        """Return V_m (...) in mL."""
         pressure = theta[..., self.column]
         return self.volume(displacement, theta) / _ratio(pressure, self.measured_pressure)
 

@@ -66,7 +66,7 @@ def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
 
 
 def _axis(scene: Scene) -> np.ndarray:
-    """Unit vector from apex to base, (3,)."""
+    """Return the unit vector from apex to base, (3,)."""
     mesh = scene.mesh
     if (axis := getattr(scene.fibre_rule, "axis", None)) is not None:
         return unit(np.asarray(axis, dtype=float))
@@ -76,7 +76,7 @@ def _axis(scene: Scene) -> np.ndarray:
 
 
 def _basis(scene: Scene) -> dict[str, np.ndarray]:
-    """All directions that the scene has, (m, q, 3) each."""
+    """Return all directions that the scene has, (m, q, 3) each."""
     for name in (ENDOCARDIUM, EPICARDIUM):
         if name not in scene.mesh.facet_sets:
             known = ", ".join(sorted(scene.mesh.facet_sets)) or "none"

@@ -58,7 +58,7 @@ def locate_gradients(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Element (d,) of each point and its barycentric coordinates there, (d, 4)."""
+    """Return the element (d,) of each point and its barycentric coordinates there, (d, 4)."""
     _check_extent(mesh, points)
     straight = MeshTet(mesh.nodes.T.copy(), mesh.corners.T.copy(), sort_t=False, validate=False)
     finder, nodes = straight.element_finder(), mesh.nodes[mesh.elements]
@@ -93,7 +93,7 @@ def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
 
 
 def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric coordinates (c, 4) of ``point`` in elements with nodes ``X`` (c, a, 3).
+    """Return barycentric coordinates (c, 4) of ``point`` in elements with nodes ``X`` (c, a, 3).
 
     They are not clipped: a coordinate below 0 says that the point lies beyond a face. Their
     gradients (c, 4, 3) in space, 1/mm, are returned, too.
@@ -117,7 +117,7 @@ def _barycentric(xi: np.ndarray) -> np.ndarray:
 
 
 def _nearest(mesh: Mesh, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The element nearest to ``point``, and barycentric coordinates (1, 4) of the point on it."""
+    """Return the element nearest to ``point``, and the barycentric coordinates (1, 4) on it."""
     every = mesh.nodes[mesh.elements]
     distances, _ = _onto(every[:, :4], point)
     candidates = np.argsort(distances, kind="stable")[:_ELEMENTS]
@@ -132,7 +132,7 @@ def _nearest(mesh: Mesh, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _onto(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (c,) of ``point`` to elements with nodes ``X`` (c, a, 3), and coordinates (c, 4).
+    """Return the element's closest points to ``point``: distances (c,), coordinates (c, 4).
 
     The barycentric coordinates are those of the point moved onto the element: from beyond a face
     along its normal; coordinates that are still below 0 are clipped.
@@ -203,7 +203,7 @@ def _surface_point(facets: np.ndarray, facet: int, barycentric: np.ndarray) -> S
 
 
 def _onto_triangles(corners: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric coordinates (f, 3) of each triangle's closest point, and its distance (f,)."""
+    """Return each triangle's closest point, barycentric (f, 3), and its distance (f,)."""
     side = corners[:, 1:] - corners[:, :1]
     gram = np.einsum("fai,fbi->fab", side, side)
     right = np.einsum("fai,fi->fa", side, point - corners[:, 0])
@@ -226,7 +226,7 @@ def _onto_triangles(corners: np.ndarray, point: np.ndarray) -> tuple[np.ndarray,
 def _onto_curved(
     facets: np.ndarray, barycentric: np.ndarray, point: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`_onto_triangles`, on quadratic facets (f, 6, 3), from a start on straight ones."""
+    """Return closest points on quadratic facets (f, 6, 3), from a start on straight ones."""
     for _ in range(_GAUSS_NEWTON_STEPS):
         values, slopes = facet_shapes(barycentric, 6)
         offset = point - np.einsum("fa,fai->fi", values, facets)

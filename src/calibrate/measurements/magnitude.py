@@ -117,7 +117,7 @@ def predict_over_prior(
 
 
 def _closest(predict: Predict, name: str, data: np.ndarray, draws: np.ndarray) -> np.ndarray:
-    """Predictions (s, ...) at more draws, and at the ends of descents towards the data."""
+    """Return predictions (s, ...) at more draws, and at the ends of descents towards the data."""
     low, high = draws.min(axis=0), draws.max(axis=0)
     width = np.where(high > low, high - low, 1.0)
 
@@ -165,7 +165,7 @@ def complaint(
 
 
 def _guess(part: Observation, size: float, norms: np.ndarray, ratio: float) -> str:
-    """The unit that would bring the data to the size of the predictions."""
+    """Return the unit that would bring the data to the size of the predictions."""
     fitting = {
         unit: factor
         for unit, factor in part.other_units.items()
@@ -178,6 +178,6 @@ def _guess(part: Observation, size: float, norms: np.ndarray, ratio: float) -> s
 
 
 def _norm(values: np.ndarray) -> float:
-    """Euclidean norm, also of numbers whose squares overflow."""
+    """Return the Euclidean norm, also of numbers whose squares overflow."""
     largest = float(np.abs(values).max(initial=0.0))
     return largest * float(np.linalg.norm(values / largest)) if largest > 0.0 else 0.0

@@ -171,11 +171,11 @@ class Observation(ABC):
 
     @property
     def full_sites(self) -> Sites | None:
-        """Where each number without gaps was measured; None for what has no one place."""
+        """The position of each number without gaps; None for what has no one position."""
         return None
 
     def full_labels(self, name: str) -> Labels:
-        """Labels of the data without gaps where the observation is called ``name``."""
+        """Return labels of the data without gaps if the observation is called ``name``."""
         return Labels()
 
     @abstractmethod
@@ -253,7 +253,7 @@ class Observation(ABC):
 
     @property
     def sites(self) -> Sites | None:
-        """Where each number of the data was measured; None for what has no one place."""
+        """The position of each number of the data; None for what has no one position."""
         sites = self.full_sites
         if sites is None or self.entries is None:
             return sites
@@ -302,7 +302,7 @@ class Scalar(Observation):
 
     @classmethod
     def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """``kind:argument:argument``; the word is its name."""
+        """Read ``kind:argument:argument``; the word is the observation's name."""
         kind, _, rest = word.partition(":")
         if kind != cls.kind:
             return None
@@ -317,7 +317,7 @@ class Scalar(Observation):
             raise cls.misuse(word) from None
 
     def described(self) -> dict[str, Any]:
-        """The word that asks for it."""
+        """Return the word that asks for the observation."""
         return {"word": self.names[-1]}
 
     @classmethod
@@ -327,7 +327,7 @@ class Scalar(Observation):
 
     @classmethod
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """One column for each word ``<kind>`` or ``<kind>:...``."""
+        """Return one column for each word ``<kind>`` or ``<kind>:...``."""
         own = (word for word in words if word.partition(":")[0] == cls.kind)
         return {word: Table((), (Field(word, (word,)),)) for word in own}
 
@@ -342,7 +342,7 @@ class Scalar(Observation):
         return part, arrays[name].reshape(())
 
     def block(self, name: str, values: np.ndarray) -> Block:
-        """The number under its name."""
+        """Return the number under the observation's name."""
         return [(Field(name, (name,)), np.asarray(values))]
 
     def check_values(self, name: str, values: np.ndarray) -> None:

@@ -109,7 +109,7 @@ class Outputs:
         return np.asarray(self._derivatives_along(predicted.displacement, sensitivities, thetas))
 
     def _along(self, u: jax.Array, sensitivity: jax.Array, theta: jax.Array) -> jax.Array:
-        """Derivatives (m, p) at ``theta`` (p,), from ``u`` (k, 3) and du/dtheta (p, k, 3)."""
+        """Return derivatives (m, p) at ``theta`` (p,), by ``u`` (k, 3) and du/dtheta (p, k, 3)."""
 
         def along(du: jax.Array, direction: jax.Array) -> jax.Array:
             return jax.jvp(self.of, (u, theta), (du, direction))[1]
@@ -184,6 +184,6 @@ def mesh_errors(
 
 
 def _size(values: jax.Array) -> float:
-    """A number as it is, of several the root mean square."""
+    """Return a number as it is, or the root mean square of several."""
     array = np.asarray(values, float)
     return float(np.sqrt(np.mean(array**2))) if array.ndim else float(array)

@@ -47,7 +47,7 @@ class MeasuredParameter(Scalar):
         self._derive(unit=unit, other_units=_OTHER_UNITS.get(unit, {}), nodes=np.zeros(1, int))
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """The entry (...) of ``theta``."""
+        """Return the entry (...) of ``theta``."""
         return theta[..., self.scene.parameter_names.index(self.parameter)]
 
     def check_values(self, name: str, values: np.ndarray) -> None:

@@ -93,7 +93,7 @@ class PointObservation(Observation):
 
     @classmethod
     def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """``kind:N`` or ``kind:selection:N``: at N places drawn at random."""
+        """Read ``kind:N`` or ``kind:selection:N``: N places drawn at random."""
         kind, _, rest = word.partition(":")
         if kind != cls.kind:
             return None
@@ -108,7 +108,7 @@ class PointObservation(Observation):
         return part.names[0], part
 
     def described(self) -> dict[str, Any]:
-        """The arguments of ``of``."""
+        """Return the arguments of ``of``."""
         arguments = {argument: getattr(self, argument) for argument in self.arguments}
         return {
             a: v if isinstance(v, str) else np.asarray(v).tolist() for a, v in arguments.items()
@@ -122,7 +122,7 @@ class PointObservation(Observation):
 
     @classmethod
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """One table for each selection."""
+        """Return one table for each selection."""
         every = cls.selections(words)
         return {cls.name.format(*s): Table(s, cls.fields(*s)) for s in every}
 
@@ -139,7 +139,7 @@ class PointObservation(Observation):
         return part, values if part.components else values[:, 0]
 
     def block(self, name: str, values: np.ndarray) -> Block:
-        """The places, and the values of each field."""
+        """Return the places, and the values of each field."""
         place, *fields = self.fields(*self.selection)
         rows = values.reshape(len(values), -1)
         ends = np.cumsum([len(field.columns) for field in fields])
@@ -157,7 +157,7 @@ class PointObservation(Observation):
         return "point", np.arange(len(self.points))
 
     def full_labels(self, name: str) -> Labels:
-        """Places and components; the reference positions as a constant."""
+        """Return places and components; the reference positions are a constant."""
         # Only one observation is called `displacement`; it keeps the plain labels.
         suffix = "" if name == DISPLACEMENT else f"_{name}"
         word, numbers = self.rows()

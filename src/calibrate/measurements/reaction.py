@@ -51,7 +51,7 @@ class Reaction(Scalar):
         self._derive(force=force, nodes=force.nodes)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Force (...) in N."""
+        """Return the force (...) in N."""
         return self.force(displacement, theta) / MN_PER_N
 
 

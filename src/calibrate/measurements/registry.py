@@ -64,7 +64,7 @@ def parse_observation(
 
 
 def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
-    """Name and observation; the word before a colon names the kind, others are tried in turn."""
+    """Return name and observation; a word's part before the colon is its kind, others are tried."""
     named = OBSERVATIONS.get(word.partition(":")[0])
     for kind in (named,) if named else OBSERVATIONS.values():
         if (observation := kind.parse(scene, word, seed)) is not None:

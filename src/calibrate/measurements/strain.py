@@ -107,18 +107,18 @@ class Strains(PointObservation):
 
     @classmethod
     def fields(cls, *selection: Any) -> tuple[Field, ...]:
-        """Places, and a column for each component, such as ``E_circ``."""
+        """Return the places, and a column for each component, such as ``E_circ``."""
         columns = (cls.prefix + COMPONENTS[name] for name in selection[0])
         return (cls.place_field, *(Field(column, (column,)) for column in columns))
 
     @classmethod
     def selections(cls, words: Collection[str]) -> list[tuple[Any, ...]]:
-        """Components that columns name; one as an example where there is none."""
+        """Return the components that columns name, or one as an example if there are none."""
         components = tuple(c for c, column in COMPONENTS.items() if cls.prefix + column in words)
         return [(components or ("circumferential",),)]
 
     def block(self, name: str, values: np.ndarray) -> Block:
-        """Places, and the components in the order of the basis."""
+        """Return the places, and the components in the order of the basis."""
         place, *columns = super().block(name, values)
         order = [self.prefix + column for column in COMPONENTS.values()]
         return [place, *sorted(columns, key=lambda column: order.index(column[0].variable))]
@@ -151,17 +151,17 @@ class Strain(Strains):
     place_field = Field("position_strain", XYZ, where=True)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Strains (..., d, c)."""
+        """Return strains (..., d, c)."""
         return self.samples(displacement)
 
     @classmethod
     def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Points uniform over the volume."""
+        """Return points that are uniform over the volume."""
         return spread_landmarks(scene, count, seed)
 
     @classmethod
     def of(cls, scene: Scene, components: str | Sequence[str], points: Any) -> Self:
-        """Observe strains along ``components`` at reference positions ``points`` (d, 3) in mm.
+        """Return the observation of strains along ``components`` at material ``points`` (d, 3) mm.
 
         Parameters
         ----------
@@ -207,12 +207,12 @@ class SegmentStrain(Strains):
     place_field = Field("segment", ("segment",), where=True)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Mean strains (..., d, c)."""
+        """Return mean strains (..., d, c)."""
         return jnp.einsum("ds,...sc->...dc", self.weights, self.samples(displacement))
 
     @classmethod
     def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """``segment_strain:circumferential,radial``: of all 17 segments."""
+        """Read ``segment_strain:circumferential,radial``: strains of all 17 segments."""
         kind, _, components = word.partition(":")
         if kind != cls.kind:
             return None
@@ -222,7 +222,7 @@ class SegmentStrain(Strains):
 
     @classmethod
     def of(cls, scene: Scene, components: str | Sequence[str], segments: Any = None) -> Self:
-        """Observe strains along ``components``, averaged over ``segments`` (d,).
+        """Return the observation of mean strains along ``components`` in ``segments`` (d,).
 
         Parameters
         ----------
@@ -253,11 +253,11 @@ class SegmentStrain(Strains):
         return cls(names, segments, samples, weights, weights @ X.reshape(-1, 3))
 
     def rows(self) -> tuple[str, np.ndarray]:
-        """Numbers of the segments."""
+        """Return the numbers of the segments."""
         return "segment", self.segments
 
     def constants(self) -> dict[str, np.ndarray]:
-        """None: a segment's number says where it is."""
+        """Return no constants: a segment's number says where it is."""
         return {}
 
 
@@ -270,7 +270,7 @@ def _names(components: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def _checked(segments: Any) -> np.ndarray:
-    """Whole numbers of segments, each once."""
+    """Return the numbers of segments; :class:`InputError` unless they are whole and unique."""
     numbers = np.asarray(segments, dtype=float)
     for number in numbers:
         if number not in range(1, SEGMENTS + 1):

@@ -65,7 +65,7 @@ class OfFacetSet(PointObservation):
 
     @classmethod
     def selections(cls, words: Collection[str]) -> list[tuple[Any, ...]]:
-        """Facet sets that columns name; a placeholder where only the kind is named."""
+        """Return the facet sets that columns name, or a placeholder if only the kind is named."""
         (field,) = cls.value_fields
         prefixes = [name.format("") for name in (field.variable, *field.columns)]
         sets = {w.removeprefix(p): None for w in words for p in prefixes if w.startswith(p)}
@@ -102,13 +102,13 @@ class SurfacePoints(OfFacetSet):
     components = ()
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Normal displacements (..., d)."""
+        """Return normal displacements (..., d)."""
         along = self.weights[:, :, None] * self.normals[:, None]
         return jnp.einsum("dai,...dai->...d", along, displacement[..., self.members, :])
 
     @classmethod
     def of(cls, scene: Scene, facet_set: str, points: Any, slack: float = _SLACK) -> Self:
-        """Observe the normal displacement of ``points`` (d, 3) mm of the reference surface.
+        """Return the observation of normal displacements at ``points`` (d, 3) mm of the surface.
 
         Parameters
         ----------
@@ -139,11 +139,11 @@ class SurfacePoints(OfFacetSet):
 
     @classmethod
     def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Points uniform over the surface."""
+        """Return points that are uniform over the surface."""
         return spread_on_surface(scene, selection, count, seed)
 
     def constants(self) -> dict[str, np.ndarray]:
-        """Reference positions and normals."""
+        """Return reference positions and normals."""
         return {"position": self.points, "normal": self.normals}
 
 
@@ -178,7 +178,7 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
     value_fields = (Field("markers:{}", ("mx:{}", "my:{}", "mz:{}")),)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Displacements (..., d, 3) in mm."""
+        """Return displacements (..., d, 3) in mm."""
         shift = jnp.einsum("k,...ki->...i", self.weights, displacement)
         x = self.rest + displacement - shift[..., None, :]
         along = self.weights[:, None] * (self.rest @ self.axes[:2].T) / self.variance
@@ -199,7 +199,7 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
 
     @classmethod
     def of(cls, scene: Scene, facet_set: str, points: Any) -> Self:
-        """Observe markers on pins that stand on a surface and turn with it.
+        """Return the observation of markers on pins that stand on a surface and turn with it.
 
         Parameters
         ----------
@@ -265,7 +265,7 @@ def spread_on_surface(scene: Scene, facet_set: str, count: int, seed: int) -> np
 
 
 def _orthonormal(T: jax.Array) -> jax.Array:
-    """Right-handed axes (..., 3, 3) in columns, of which two are closest to ``T`` (..., 3, 2)."""
+    """Return right-handed axes (..., 3, 3) in columns; two are closest to ``T`` (..., 3, 2)."""
     first, second = T[..., 0], T[..., 1]
     a, b = jnp.sum(first**2, axis=-1), jnp.sum(second**2, axis=-1)
     c = jnp.sum(first * second, axis=-1)

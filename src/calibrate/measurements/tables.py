@@ -188,7 +188,7 @@ def _is_number(word: str) -> bool:
 
 
 def _lines(path: Path) -> list[str]:
-    """Lines that are neither empty nor comments, the header first."""
+    """Return the lines that are neither empty nor comments, the header first."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -200,7 +200,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def _delimiter(header: str) -> str:
-    """The separator of the header's words; quoted text does not count."""
+    """Return the separator of the header's words; quoted text does not count."""
     bare = re.sub(r'"[^"]*"', "", header)
     return next((mark for mark in ";\t" if mark in bare), ",")
 
@@ -226,7 +226,7 @@ class NetCDFTable:
         self.words: Sequence[str] = list(map(str, self.data.variables))
 
     def states(self) -> dict[str, NetCDFTable]:
-        """Variables of each state, by what follows ``@`` in their names."""
+        """Return the variables of each state, by what follows ``@`` in their names."""
         tables: dict[str, NetCDFTable] = {}
         # Coordinates without values of their own belong to no state.
         own = [w for w in self.words if w not in self.data.dims]
@@ -237,7 +237,7 @@ class NetCDFTable:
         return tables
 
     def known(self) -> dict[str, float]:
-        """Numbers of variables ``known:NAME``."""
+        """Return the numbers in the variables ``known:NAME``."""
         words = [word for word in self.words if word.startswith(KNOWN)]
         arrays = self.arrays([Field(word, (word,), where=True) for word in words])
         for word, array in arrays.items():
@@ -246,13 +246,13 @@ class NetCDFTable:
         return {word.removeprefix(KNOWN): float(array) for word, array in arrays.items()}
 
     def words_of(self, field: Field) -> tuple[str, ...]:
-        """The field's variable."""
+        """Return the field's variable."""
         return (field.variable,)
 
     def arrays(
         self, fields: Sequence[Field], others: Collection[str] = ()
     ) -> dict[str, np.ndarray]:
-        """The variables as numbers."""
+        """Return the variables as numbers."""
         arrays = {}
         for name in (field.variable for field in fields):
             try:
@@ -295,7 +295,7 @@ def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:
 
 
 def _rows(blocks: Sequence[Block]) -> list[dict[str, str]]:
-    """Rows of one load state: cells by column."""
+    """Return the rows of one load state: cells by column."""
     rows: list[dict[str, str]] = []
     numbers: dict[str, str] = {}
     used: set[str] = set()

@@ -55,7 +55,7 @@ class CavityVolume(Scalar):
 
     @classmethod
     def of(cls, scene: Scene, facet_set: str = "") -> Self:
-        """Observe the cavity of this wall, or the only one."""
+        """Return the observation of the cavity of this wall, or of the only one."""
         return cls(scene, facet_set or None)
 
     @property
@@ -64,7 +64,7 @@ class CavityVolume(Scalar):
         return self.kind, *super().names
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Volume (...) in mL."""
+        """Return the volume (...) in mL."""
         return self.cavity(displacement)
 
 

@@ -117,7 +117,7 @@ class RigidMotion:
     at: Literal["loaded", "rest"] = "loaded"
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
-        """Three shifts and three turns."""
+        """Return three shifts and three turns."""
         positions = {}
         for each in measured.named(self.of):
             points, displacement = measured.points(each)
@@ -142,7 +142,7 @@ class Placement:
         _check_not_negative(sd=self.sd)
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
-        """One offset a number."""
+        """Return one offset for each number."""
         observed = measured.named(self.of)
         shapes = {np.shape(measured.whole(each)[1]) for each in observed}
         if len(shapes) > 1:
@@ -177,7 +177,7 @@ class Pins:
         _check_not_negative(sd=self.sd)
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
-        """One offset along each axis."""
+        """Return one offset along each axis."""
         modes = {}
         for each in measured.named(self.of):
             points, displacement = measured.points(each)
@@ -203,7 +203,7 @@ class Gain:
         _check_not_negative(share=self.share)
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
-        """One factor."""
+        """Return one factor."""
         shapes = {each: np.shape(measured.whole(each)[1]) for each in measured.named(self.of)}
         shares = {each: np.full((1, *shape), self.share) for each, shape in shapes.items()}
         return Systematic((name,), {}, shares=shares)
@@ -241,7 +241,7 @@ class Curve:
         check_curve(self.length, self.constant)
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
-        """As many unknowns as the curve can tell apart."""
+        """Return as many unknowns as the curve can tell apart."""
         observed = measured.named(self.of)
         for each in observed:
             if np.shape(measured.whole(each)[1]) != ():

@@ -187,11 +187,11 @@ class ModelError:
         if self.varying is not None:
             key, varying_key = jax.random.split(rng_key)
         z = jax.random.normal(key, self.strength.shape)
-        drawn = flat + self.size(unknowns) * (z @ self.modes)
+        perturbed = flat + self.size(unknowns) * (z @ self.modes)
         if self.varying is not None:
             V = self.varying.at(self._inferred_size(unknowns), flat)
-            drawn += jax.random.normal(varying_key, (len(V),)) @ V
-        return unravel(drawn)
+            perturbed += jax.random.normal(varying_key, (len(V),)) @ V
+        return unravel(perturbed)
 
     def largest(self, means: Means) -> np.ndarray:
         """Return V (r, d) beside data like ``means``, an inferred size at its 99.7 % quantile."""
@@ -258,7 +258,7 @@ class ModelError:
 
     @property
     def words(self) -> dict[str, Any]:
-        """What :meth:`restore` needs besides the arrays: plain JSON, empty for learned errors."""
+        """The plain JSON that :meth:`restore` needs besides arrays; empty for learned errors."""
         if self.mixing is None:
             return {}
         size = None if self.varying is None else self.varying.name

@@ -86,8 +86,8 @@ def from_score(
     # Scores above 0 are counted from the upper end: 1 - 1e-17 is 1, 1e-17 is not 0.
     upper = score > 0.0
     q = jnp.where(upper, -score, score)
-    near, far = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
-    mass = ndtr(near) + ndtr(q) * (ndtr(far) - ndtr(near))
+    lower_end, upper_end = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
+    mass = ndtr(lower_end) + ndtr(q) * (ndtr(upper_end) - ndtr(lower_end))
     t = ndtri(jnp.maximum(mass, _LEAST))
     # Round-off may leave the interval by its last digit.
     return jnp.clip(mean + sd * jnp.where(upper, -t, t), low, high)
@@ -100,9 +100,9 @@ def to_score(
     a, b = (low - jnp.asarray(mean)) / sd, (high - jnp.asarray(mean)) / sd
     t = jnp.clip((value - jnp.asarray(mean)) / sd, -_FARTHEST, _FARTHEST)
     upper = t > 0.0
-    near, far = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
-    whole = ndtr(far) - ndtr(near)
-    mass = (ndtr(jnp.where(upper, -t, t)) - ndtr(near)) / whole
+    lower_end, upper_end = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
+    whole = ndtr(upper_end) - ndtr(lower_end)
+    mass = (ndtr(jnp.where(upper, -t, t)) - ndtr(lower_end)) / whole
     q = ndtri(jnp.maximum(mass, _LEAST))
     slope = jnp.asarray(sd) * whole * jnp.exp(0.5 * (t**2 - q**2))
     return jnp.where(upper, -q, q), slope

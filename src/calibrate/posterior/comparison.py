@@ -68,7 +68,7 @@ class Compared:
 
     @property
     def ceiling(self) -> float:
-        """What elpd is at most: how well the data are predicted by draws that have seen them."""
+        """The upper bound of elpd: how well draws that have seen the data predict it."""
         return self.elpd + self.parameters
 
 
@@ -81,7 +81,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """What can be said of the best model, in one sentence."""
+        """A sentence that says what is certain about the best model."""
         best, *others = self.models
         bad = [model.name for model in others if model.unreliable and not self._beaten(model)]
         if best.unreliable:
@@ -100,7 +100,7 @@ class Comparison:
         return f"{best.name} predicts better, by {gap:.1f} +- {error:.1f}"
 
     def _beaten(self, model: Compared) -> bool:
-        """Whether the best model's elpd is above all that ``model``'s can be, beyond its error."""
+        """Return whether the best elpd exceeds ``model``'s upper bound, beyond its error."""
         gap = self.models[0].elpd - model.ceiling
         return gap >= max(FEW, SURE * model.difference_se)
 

@@ -16,7 +16,7 @@ from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 def summary_of(
     draws: Mapping[str, np.ndarray], probability: float = 0.9
 ) -> dict[str, dict[str, float]]:
-    """Of draws (chains, draws): mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
+    """Return mean, sd, equal-tailed interval, R-hat, bulk and tail ESS of draws (chains, draws)."""
     dataset = base.dict_to_dataset(dict(draws))
     # By default ArviZ takes the tails of its own interval, which a user may have set.
     bulk = stats.ess(dataset, method="bulk")
@@ -51,7 +51,7 @@ def diagnose(
     summary: Mapping[str, Mapping[str, float]],
     attributes: Mapping[str, Any],
 ) -> list[str]:
-    """One sentence for each thing that is wrong, with what to do; empty where nothing is.
+    """Return a sentence for each thing that is wrong, with what to do; empty if nothing is.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def _divergences(draws: Mapping[str, np.ndarray], diverging: np.ndarray | None) 
 
 
 def _where(name: str, values: np.ndarray, diverging: np.ndarray) -> tuple[float, str] | None:
-    """How far, and ``low mu (51.2 to 53.4)``, where they gather at one side of a parameter."""
+    """Return the distance and side, as ``low mu (51.2 to 53.4)``, at which divergences gather."""
     values, inside = np.asarray(values), np.asarray(values)[diverging]
     shift = (np.median(inside) - np.median(values)) / max(float(values.std()), 1e-300)
     if abs(shift) < _MARKED:

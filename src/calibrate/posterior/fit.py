@@ -22,7 +22,7 @@ import xarray as xr
 
 SMALLEST_P = 0.005
 OUTLYING = 4.0  # sds; of 100 Gaussian data 0.6 % have one beyond
-_FEWEST = 200  # replicates that such a p can be told from
+_FEWEST = 200  # replicates from which such a small p can be estimated
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,14 @@ class Misfit:
     def of(
         cls, places: list[str], whole: np.ndarray, simulated: np.ndarray, distance: np.ndarray
     ) -> Misfit:
-        """From draws (s,): whether simulated data is as unlikely, and distances from prediction.
+        """Return the misfit of one observation from s draws.
 
-        ``simulated`` (s, n) and ``distance`` (s, n) or (1, n) of simulated and of measured data,
-        whose names are ``places`` (n,).
+        places : the names of the data (n,).
+        whole : whether the data simulated at each draw is as unlikely as the measured, (s,).
+        simulated : the distance of simulated data from its prediction, (s, n).
+        distance : the distance of measured data from its prediction, (s, n) or (1, n).
         """
-        # The sd is the simulated data's: not every distribution knows its own.
+        # The sd is estimated from simulated data, because some distributions give none.
         sd = np.sqrt(np.mean(simulated**2, axis=0))
         simulated, distance = simulated / sd, distance / sd
         mean = distance.mean(axis=0)
@@ -58,14 +60,14 @@ class Misfit:
 
 
 def places_of(name: str, shape: tuple[int, ...]) -> list[str]:
-    """Names of an observation's data in order: ``displacement[1, 2]``, or ``volume`` of one."""
+    """Return names of an observation's data: ``displacement[1, 2]``, or ``volume`` for one."""
     if math.prod(shape) == 1:
         return [name]
     return [f"{name}[{', '.join(map(str, k))}]" for k in np.ndindex(shape)]
 
 
 def misfits(tree: xr.DataTree) -> list[str]:
-    """A sentence for each observation that does not fit; none without replicated data."""
+    """Return a sentence for each observation that does not fit; none without replicated data."""
     if "posterior_predictive" not in tree.children:
         return []
     replicates, observed = (tree[k].to_dataset() for k in ("posterior_predictive", "observed_data"))
@@ -77,7 +79,10 @@ def misfits(tree: xr.DataTree) -> list[str]:
 
 
 def misfit_of(name: str, replicates: np.ndarray, data: np.ndarray) -> Misfit:
-    """From replicates (chains, draws, *shape) of data (*shape); missing data is left out."""
+    """Return the misfit of data (*shape) to its replicates (chains, draws, *shape).
+
+    Missing data is left out.
+    """
     present = np.isfinite(data).ravel()
     y = replicates.reshape(-1, data.size)[:, present]
     simulated, distance = np.abs(y - y.mean(axis=0)), np.abs(data.ravel()[present] - y.mean(axis=0))
@@ -87,7 +92,7 @@ def misfit_of(name: str, replicates: np.ndarray, data: np.ndarray) -> Misfit:
 
 
 def _sentence(name: str, replicates: np.ndarray, data: np.ndarray) -> str:
-    """About data (*shape) and replicates (chains, draws, *shape); empty where they agree."""
+    """Return a sentence on data (*shape) that its replicates do not fit; empty if they do."""
     y = replicates.reshape(-1, data.size)
     if len(y) < _FEWEST or not np.isfinite(y).all() or not (y.std(axis=0) > 0.0).all():
         return ""

@@ -53,7 +53,7 @@ def klotz_band(
     seed: int = 0,
     state: str | None = None,
 ) -> KlotzBand:
-    """Where ``count`` curves of the prior lie.
+    """Return the band in which ``count`` curves of the prior lie.
 
     Parameters
     ----------

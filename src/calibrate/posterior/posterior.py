@@ -45,7 +45,7 @@ class Posterior(TableRepr):
     data: Data
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
-        """Mean and sd of every unknown, draws, and what is wrong with them."""
+        """Return mean and sd of every unknown, the draws, and what is wrong with them."""
         table, sizes = self.summary(), self.tree["posterior"].sizes
         rows = [(name, f"{row['mean']:.4g} +- {row['sd']:.2g}") for name, row in table.items()]
         worst = max(row["r_hat"] for row in table.values())
@@ -54,11 +54,11 @@ class Posterior(TableRepr):
         return f"Posterior of '{self.model.forward.scene.name}'", rows
 
     def draws(self) -> dict[str, np.ndarray]:
-        """All draws by name, chains joined, each (s,)."""
+        """Return all draws by name, chains joined, each (s,)."""
         return {n: np.asarray(self.tree["posterior"][n]).reshape(-1) for n in self.model.names}
 
     def thetas(self, state: str | None = None) -> jax.Array:
-        """All draws of theta, (s, p), in load state ``state``, or in the only one.
+        """Return all draws of theta, (s, p), in load state ``state``, or in the only one.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class Posterior(TableRepr):
     def predict(
         self, known: Mapping[str, float], observe: Observation, *, state: str | None = None
     ) -> np.ndarray:
-        """What ``observe`` would say at every draw, without noise: one ``(s, *shape)`` array.
+        """Return the noise-free values of ``observe`` at every draw: one ``(s, *shape)`` array.
 
         Parameters
         ----------
@@ -103,7 +103,7 @@ class Posterior(TableRepr):
         return predicted(self.model.full, observe, thetas)
 
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
-        """Per parameter: mean, sd, equal-tailed interval, R-hat, bulk and tail ESS."""
+        """Return mean, sd, equal-tailed interval, R-hat, bulk and tail ESS, by parameter."""
         draws = self.tree["posterior"]
         return summary_of({n: np.asarray(draws[n]) for n in self.model.names}, probability)
 
@@ -114,7 +114,7 @@ class Posterior(TableRepr):
         return int(statistics["diverging"].sum()) if "diverging" in statistics else 0
 
     def warnings(self) -> list[str]:
-        """What is wrong with run or data and what to do, a sentence each; empty if nothing is."""
+        """Return a sentence for each fault of run or data, with what to do; empty if none."""
         groups = [self.tree[name].to_dataset() for name in ("posterior", "sample_stats")]
         draws, statistics = (
             {str(name): np.asarray(values) for name, values in group.data_vars.items()}
@@ -129,7 +129,7 @@ class Posterior(TableRepr):
 
 
 def read_tree(path: str | Path) -> xr.DataTree:
-    """The DataTree in a netCDF file, in memory; :class:`InputError` when it is not one."""
+    """Return the DataTree in a netCDF file, in memory; :class:`InputError` when it is not one."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"posterior file {path} does not exist")
@@ -141,7 +141,7 @@ def read_tree(path: str | Path) -> xr.DataTree:
 
 
 def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str, Any]:
-    """Everything needed to repeat how a posterior was made; plain JSON values."""
+    """Return everything needed to repeat how a posterior was made; plain JSON values."""
     scene = model.forward.scene
     return {
         "scene": dict(scene.origin),
@@ -165,7 +165,7 @@ def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str,
 
 
 def describe_distribution(distribution: dist.Distribution) -> str:
-    """A distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
+    """Return a distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
     parts = {name: getattr(distribution, name, None) for name in distribution.arg_constraints}
     base = getattr(distribution, "base_dist", None)
     # The arguments of a named transform such as LogUniform describe it fully.
@@ -216,15 +216,15 @@ def sample(
         or of which all values are missing, a sampler that needs a simulator and has none, a
         checkpoint of another run.
     """
-    chosen = find_sampler(sampler)
-    options = check_options(chosen, options)
+    method = find_sampler(sampler)
+    options = check_options(method, options)
     model, checked = model.given(data)
-    fem = _fem_likelihood(chosen, model, simulator)
+    fem = _fem_likelihood(method, model, simulator)
     record = provenance(model, seed, sampler, options)
     state = Checkpoint(checkpoint, _identity(record, checked))
     context = Context(progress, state, fem)
     density = density_of(model)
-    run = chosen.sample(density, checked, options, seed, context)
+    run = method.sample(density, checked, options, seed, context)
     attributes = dict(run.attributes)
     if MISSED_BY not in attributes:
         z = np.asarray(run.z).reshape(-1, density.dimension)

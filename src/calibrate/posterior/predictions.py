@@ -58,7 +58,7 @@ def log_likelihood(
 
 
 def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> np.ndarray:
-    """What ``observe`` says without noise, ``(s, *shape)``, at ``thetas`` (s, p).
+    """Return the values of ``observe`` without noise, ``(s, *shape)``, at ``thetas`` (s, p).
 
     Raises
     ------
@@ -71,14 +71,14 @@ def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> n
 
 @lru_cache(maxsize=4)
 def _outputs(forward: ForwardMap, observe: Observation) -> Outputs:
-    """Kept, so that a loop over pressures compiles once."""
+    """Return the outputs; cached, so that a loop over pressures compiles once."""
     return Outputs(forward, {"observed": observe})
 
 
 def replicates(
     model: Model, draws: Draws, rng_key: jax.Array, means: Draws | None = None
 ) -> dict[str, np.ndarray]:
-    """Data replicated at each draw, (chains, draws, *shape), by the observation's name.
+    """Return data replicated at each draw, (chains, draws, *shape), by the observation's name.
 
     ``means`` as of :func:`log_likelihood`.
     """
@@ -88,7 +88,7 @@ def replicates(
 
 
 def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
-    """Up to ``count`` draws of the prior, and data replicated there.
+    """Return up to ``count`` draws of the prior, and data replicated there.
 
     A tenth more is drawn; draws where the forward map has no answer are left out.
     """
@@ -103,15 +103,15 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
 
 
 def spread(draws: Draws, count: int = REPLICATES) -> tuple[np.ndarray, Draws]:
-    """At most about ``count`` draws, evenly spaced along the chains: their indices and values."""
+    """Return indices and values of about ``count`` draws, evenly spaced along the chains."""
     chains, length = next(iter(draws.values())).shape
-    kept = min(length, -(-count // chains))
-    rows = np.linspace(0, length - 1, kept).astype(int)
+    count_per_chain = min(length, -(-count // chains))
+    rows = np.linspace(0, length - 1, count_per_chain).astype(int)
     return rows, {name: np.asarray(values)[:, rows] for name, values in draws.items()}
 
 
 def _solved_prior(model: Model, keys: jax.Array) -> Any:
-    """What the program ``prior`` gives, by solves that are driven from Python.
+    """Return the result of the program ``prior``, by solves that are driven from Python.
 
     The theta of all draws first, then every solve, then the data: keys decide on all of them alike.
     """
@@ -122,17 +122,17 @@ def _solved_prior(model: Model, keys: jax.Array) -> Any:
     )
     draws = jax.jit(jax.vmap(lambda key: prior_of(key, at_rest)[0]))(keys)
     thetas = jax.jit(jax.vmap(states.thetas))({name: draws[name] for name in states.unknowns})
-    solved = evaluate_all(model.forward, thetas.reshape(-1, thetas.shape[-1]))
+    solutions = evaluate_all(model.forward, thetas.reshape(-1, thetas.shape[-1]))
     shape = thetas.shape[:2]
-    known = Prediction(
-        solved.displacement.reshape(*shape, *solved.displacement.shape[1:]),
-        jnp.all(solved.valid.reshape(shape), axis=1),
+    prediction = Prediction(
+        solutions.displacement.reshape(*shape, *solutions.displacement.shape[1:]),
+        jnp.all(solutions.valid.reshape(shape), axis=1),
     )
-    return jax.jit(jax.vmap(prior_of))(keys, known)
+    return jax.jit(jax.vmap(prior_of))(keys, prediction)
 
 
 def _prior(model: Model, rng_key: jax.Array, prediction: Prediction | None = None) -> Any:
-    """A draw of the prior, data replicated there, and whether the forward map has an answer."""
+    """Return a draw of the prior, data replicated there, and the validity of the prediction."""
     trace = handlers.trace(handlers.seed(model, rng_key)).get_trace(None, prediction)
     draw = {name: trace[name]["value"] for name in model.names}
     data = {name: trace[_site(name)]["value"] for name in model.observe.parts}
@@ -203,7 +203,7 @@ def _flat(draws: Draws) -> dict[str, jax.Array]:
 
 
 def _flat_means(means: Draws | None) -> dict[str, jax.Array] | None:
-    """Chains one after the other, (s, *shape)."""
+    """Return the means with the chains one after the other, (s, *shape)."""
     if means is None:
         return None
     return {n: jnp.asarray(m).reshape(-1, *np.shape(m)[2:]) for n, m in means.items()}

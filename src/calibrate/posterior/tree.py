@@ -29,7 +29,7 @@ def make_tree(
     rng_key: jax.Array | None,
     means: Mapping[str, np.ndarray] | None = None,
 ) -> xr.DataTree:
-    """Draws and statistics (chains, draws) by name, with all that follows from them.
+    """Return draws and statistics (chains, draws) by name, with all that follows from them.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def _predictions(
     rng_key: jax.Array,
     means: Mapping[str, np.ndarray] | None,
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """The groups of predictions, and which draws of each chain data was replicated at."""
+    """Return the groups of predictions, and the draws of each chain that have replicated data."""
     posterior_key, prior_key = jax.random.split(rng_key)
     rows, some = predictions.spread(draws)
     own_means = (
@@ -93,7 +93,7 @@ def _likelihood(
     dims: Mapping[str, list[str]],
     coords: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Dependent data have one number a draw and not the data's dimensions."""
+    """Return the log likelihoods; dependent data have one number a draw and no data dimensions."""
     full = {name: np.atleast_1d(values).ndim + 2 for name, values in data.items()}
     pointwise: dict[Any, Any] = {
         name: dims[name] for name in values if name in dims and values[name].ndim == full[name]
@@ -107,7 +107,7 @@ def _likelihood(
 def labels_of(
     observe: Observations,
 ) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
-    """Constants, dimensions and coordinates of all observations."""
+    """Return constants, dimensions and coordinates of all observations."""
     constants: dict[str, np.ndarray] = {}
     dims: dict[str, list[str]] = {}
     coords: dict[str, Any] = {}
@@ -120,7 +120,7 @@ def labels_of(
 
 
 def units_of(model: Model) -> dict[str, str]:
-    """Units by the names of parameters, observations and unknown numbers of noise."""
+    """Return units by the names of parameters, observations and unknown numbers of noise."""
     parameters = {p.name: p.unit for p in model.forward.scene.parameters}
     units = {name: parameters[split(name)[0]] for name in model.states.unknowns}
     for name, part in model.observe.parts.items():

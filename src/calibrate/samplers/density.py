@@ -157,5 +157,5 @@ def _observed_sites(model: Model, data: dict[str, np.ndarray]) -> list[str]:
 
 def named_draws(model: Model, z: np.ndarray) -> dict[str, np.ndarray]:
     """Return draws by parameter name, each (chains, draws), from ``z`` (chains, draws, p)."""
-    named = density_of(model).constrain(jnp.asarray(z.reshape(-1, z.shape[-1])))
-    return {name: np.asarray(named[name]).reshape(z.shape[:2]) for name in model.names}
+    draws = density_of(model).constrain(jnp.asarray(z.reshape(-1, z.shape[-1])))
+    return {name: np.asarray(draws[name]).reshape(z.shape[:2]) for name in model.names}

@@ -154,16 +154,16 @@ def _empty(size: int) -> _Gaussian:
 
 def _precision(density: Density, data: Data, mode: np.ndarray) -> np.ndarray:
     """Return minus the Hessian at the mode; :class:`SolverError` where it is no mode."""
-    precision, smallest, away = _curvature(density, data, mode)
+    precision, smallest, distance = _curvature(density, data, mode)
     if not smallest > 0.0:
         raise SolverError(
             f"the posterior has no curvature at its mode in some direction ({smallest:.2g}): it is "
             "flat there, or ends; use a sampler, such as nuts"
         )
-    if not away < _AWAY:
+    if not distance < _AWAY:
         raise SolverError(
-            f"the optimiser stopped {away:.2g} sd from a mode: the posterior density ends or bends "
-            "sharply there; use a sampler, such as nuts"
+            f"the optimiser stopped {distance:.2g} sd from a mode: the posterior density ends or "
+            "bends sharply there; use a sampler, such as nuts"
         )
     return precision
 
@@ -263,8 +263,8 @@ def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> di
     log_det = np.linalg.slogdet(covariance)[1]
     whitener = np.linalg.cholesky(np.linalg.inv(covariance))
     some = z[np.linspace(0, len(z) - 1, min(_SAMPLE, len(z))).astype(int)]
-    drawn = np.mean([height(each) for each in some])
-    drawn += 0.5 * (len(covariance) * (1.0 + np.log(2.0 * np.pi)) + log_det)
+    log_mass_of_draws = np.mean([height(each) for each in some])
+    log_mass_of_draws += 0.5 * (len(covariance) * (1.0 + np.log(2.0 * np.pi)) + log_det)
     for mode, top in zip(*modes, strict=True):
         distances = (((z - mode) @ whitener) ** 2).sum(axis=1)
         if distances.min() < _BESIDE**2:
@@ -274,7 +274,7 @@ def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> di
         lowest = min(height(each) for each in mode + way * (nearest - mode))
         if not lowest < min(top, height(nearest)) - _VALLEY:
             continue
-        lighter = float(drawn - _log_mass(density, data, mode, top))
+        lighter = float(log_mass_of_draws - _log_mass(density, data, mode, top))
         if lighter < min(attributes[MISSED_BY], _LIGHTER):
             attributes = {MISSED_BY: lighter, MISSED_AT: _in_words(density, mode)}
     return attributes
@@ -295,8 +295,8 @@ def _in_words(density: Density, z: np.ndarray) -> str:
 
 def _log_mass(density: Density, data: Data, mode: np.ndarray, top: float) -> float:
     """Return the log of Laplace's mass; none where the density is flat or ``mode`` is no mode."""
-    precision, smallest, away = _curvature(density, data, mode)
-    if not (smallest > 0.0 and away < _AWAY_OF_MASS):
+    precision, smallest, distance = _curvature(density, data, mode)
+    if not (smallest > 0.0 and distance < _AWAY_OF_MASS):
         return -np.inf
     log_det = np.linalg.slogdet(precision)[1]
     return float(top + 0.5 * (len(mode) * np.log(2.0 * np.pi) - log_det))

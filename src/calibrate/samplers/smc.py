@@ -149,9 +149,9 @@ def _run(
     keys = jax.random.split(jax.random.key(seed), options.chains)
     template = jax.eval_shape(programs.start, keys[0])
     state = context.checkpoint.restore(lambda: _State(template, template))
-    done = [] if state is None else _unstack(state.done)
+    finished_sets = [] if state is None else _unstack(state.done)
     current = programs.start(keys[0]) if state is None else state.current
-    bar.update(len(done))
+    bar.update(len(finished_sets))
     while True:
         while current.temperature < 1.0:
             current = jax.tree.map(np.asarray, programs.step(current, data))
@@ -162,12 +162,12 @@ def _run(
                     f"{float(current.temperature):.2g} after {options.temperatures} steps; allow "
                     "more temperatures, or look at the likelihood: it may be flat or very sharp"
                 )
-            context.checkpoint.keep(lambda: _State(_stack(done, template), current))  # noqa: B023
-        done.append(current)
+            context.checkpoint.keep(lambda: _State(_stack(finished_sets, template), current))  # noqa: B023
+        finished_sets.append(current)
         bar.update()
-        if len(done) == options.chains:
-            return _stack(done, template)
-        current = programs.start(keys[len(done)])
+        if len(finished_sets) == options.chains:
+            return _stack(finished_sets, template)
+        current = programs.start(keys[len(finished_sets)])
 
 
 def _stack(sets: list[_Particles], template: Any) -> _Particles:

@@ -127,9 +127,9 @@ class FEMLikelihood:
         """
         thetas = jnp.concatenate([self.model.states.thetas(draw) for draw in draws])
         states = len(self.model.states.states)
-        solved: dict[int, dict[int, jax.Array]] = {number: {} for number in range(len(draws))}
+        solutions: dict[int, dict[int, jax.Array]] = {number: {} for number in range(len(draws))}
         # A draw that fails in one load state is done: its other states are not begun.
-        numbers = (k for k in range(len(thetas)) if k // states in solved)
+        numbers = (k for k in range(len(thetas)) if k // states in solutions)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
         for row in solve_rows(
             self._solver,
@@ -139,15 +139,15 @@ class FEMLikelihood:
             execute=self.execute,
         ):
             number, state = divmod(row.number, states)
-            if number not in solved:
+            if number not in solutions:
                 continue
             if not row.converged:
-                del solved[number]
+                del solutions[number]
                 yield number, None
                 continue
-            solved[number][state] = row.solution.displacement
-            if len(solved[number]) == states:
-                fields = solved.pop(number)
+            solutions[number][state] = row.solution.displacement
+            if len(solutions[number]) == states:
+                fields = solutions.pop(number)
                 yield number, [jnp.asarray(fields[k]) for k in range(states)]
 
     def _stable(self, fields: list[jax.Array], thetas: jax.Array) -> bool | None:
