@@ -123,7 +123,8 @@ def _differences_of_fem(
     def difference(thetas: jax.Array) -> np.ndarray | None:
         try:
             estimates = [
-                error(theta, model.full(theta), near=first.get(s)) for s, theta in enumerate(thetas)
+                error(theta, model.full(theta), neighbour=first.get(s))
+                for s, theta in enumerate(thetas)
             ]
         except SolverError:
             return None

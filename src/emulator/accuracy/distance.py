@@ -88,9 +88,9 @@ def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
     values = system.pattern.safe_values(tangent)
     step, outcome = system.attempt(values, residual)
     error = system.extend(step)
-    after = u - error
-    upright = _least_J(system.scene, after) > _LEAST_SHARE * _least_J(system.scene, u)
-    remainder = system.residual(jnp.where(upright, after, u), theta)
+    corrected = u - error
+    upright = _least_J(system.scene, corrected) > _LEAST_SHARE * _least_J(system.scene, u)
+    remainder = system.residual(jnp.where(upright, corrected, u), theta)
     length = _norm(error)
     contraction = _norm(system.attempt(values, remainder)[0]) / jnp.where(length > 0, length, 1.0)
     gap = 0.5 * jnp.vdot(residual, system.restrict(error))
@@ -115,23 +115,23 @@ def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Di
 
     def advance(carry: tuple[NewtonState, jax.Array, jax.Array]):  # noqa: ANN202
         state, _, _ = carry
-        after = stepping.step(state)
-        way, step = _norm(after.u - u), _norm(after.u - state.u)
+        next_state = stepping.step(state)
+        way, step = _norm(next_state.u - u), _norm(next_state.u - state.u)
         # A shortened step is small too, but leaves most of its residual.
-        short = (step <= _CONTRACTION * way) & (after.load >= 1.0)
-        short &= after.relative_residual <= _GOOD_STEP * state.relative_residual
-        done = short | (after.status == Status.CONVERGED)
-        return after, done, step / jnp.where(way > 0, way, 1.0)
+        short = (step <= _CONTRACTION * way) & (next_state.load >= 1.0)
+        short &= next_state.relative_residual <= _GOOD_STEP * state.relative_residual
+        finished = short | (next_state.status == Status.CONVERGED)
+        return next_state, finished, step / jnp.where(way > 0, way, 1.0)
 
     def unfinished(carry: tuple[NewtonState, jax.Array, jax.Array]) -> jax.Array:
-        state, done, _ = carry
+        state, finished, _ = carry
         running = (state.status == Status.RUNNING) & (state.load >= 1.0)
-        return running & ~done & (state.iterations < _MOST_ITERATIONS)
+        return running & ~finished & (state.iterations < _MOST_ITERATIONS)
 
     start = stepping.begin(u)
     converged = start.status == Status.CONVERGED
-    state, done, ratio = while_loop(unfinished, advance, (start, converged, jnp.array(0.0)))
+    state, finished, ratio = while_loop(unfinished, advance, (start, converged, jnp.array(0.0)))
     follower = system.follower_force(u, theta)
     gap = system.potential(u, theta, 1.0, follower)[0]
     gap = gap - system.potential(state.u, theta, 1.0, follower)[0]
-    return Distance(u - state.u, gap, ratio, state.iterations, jnp.array(False), done)
+    return Distance(u - state.u, gap, ratio, state.iterations, jnp.array(False), finished)

@@ -95,14 +95,15 @@ class MeshError:
         theta: jax.Array,
         start: jax.Array | None = None,
         *,
-        near: MeshErrorEstimate | None = None,
+        neighbour: MeshErrorEstimate | None = None,
     ) -> MeshErrorEstimate:
         """Estimate the error at ``theta`` (p,).
 
         Parameters
         ----------
         start : (n, 3) mm, where the solve on the mesh begins; at rest by default.
-        near : the estimate at a nearby theta, whose difference of meshes the iteration starts with.
+        neighbour : the estimate at a nearby theta, whose difference between the meshes begins the
+            iteration.
 
         Raises
         ------
@@ -113,8 +114,8 @@ class MeshError:
         what = "the error of the mesh"
         coarse = self.simulator.solve(theta, start).require_converged(what).displacement
         begin = self._prolonged(coarse)
-        if near is not None:
-            begin = begin + near.fine - self._prolonged(near.coarse)
+        if neighbour is not None:
+            begin = begin + neighbour.fine - self._prolonged(neighbour.coarse)
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
         stepped = None if self.fine.scene.loaded_by else self._stepped(theta, begin)
         if stepped is not None:

@@ -199,14 +199,14 @@ class System:
 
         A load without a potential counts as the dead force ``follower_force`` (n, 3).
         """
-        stored = self.internal_energy(u, theta)
+        internal = self.internal_energy(u, theta)
         work = jnp.vdot(self.dead_force(theta), u)
         if self.forces:
             work = work + jnp.vdot(jnp.asarray(follower_force), u)
         if self.terms:
             values = self.scene.resolve(theta)
             work = work - sum(term.total(u, values) for term in self.terms)
-        return stored - load * work, jnp.abs(stored) + jnp.abs(load * work)
+        return internal - load * work, jnp.abs(internal) + jnp.abs(load * work)
 
     def residual(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
         """Return the residual (f,) in mN: internal less ``load`` times external force."""
@@ -371,8 +371,8 @@ class System:
         (docs/experiments.md, "A fused multiply-add").
         """
         prescribed = load * self.scene.held_at(theta)
-        apart = jnp.abs(prescribed - u) > _LAST_BITS * jnp.max(jnp.abs(prescribed))
-        return jnp.where(self.scene.held & apart, prescribed - u, 0.0)
+        differs = jnp.abs(prescribed - u) > _LAST_BITS * jnp.max(jnp.abs(prescribed))
+        return jnp.where(self.scene.held & differs, prescribed - u, 0.0)
 
     @compiled
     def supports_met(self, u: jax.Array, theta: jax.Array, load: jax.Array) -> jax.Array:
@@ -411,16 +411,16 @@ class System:
         return solve(self.direct, self.pattern, tangent, rhs)
 
     def attempt(
-        self, tangent: jax.Array, rhs: jax.Array, *, near: bool = True
+        self, tangent: jax.Array, rhs: jax.Array, *, may_reuse: bool = True
     ) -> tuple[jax.Array, jax.Array]:
         """Return ``x`` (f,) with ``K x = rhs`` by Cholesky, and the outcome.
 
         INDEFINITE, and NaN, where K is symmetric and not positive definite. On a large mesh the
-        factor of an earlier tangent may serve, where the arguments are numbers; ``near`` says
+        factor of an earlier tangent may serve, where the arguments are numbers; ``may_reuse`` says
         whether this tangent may resemble the earlier one.
         """
         if self.kept is not None and not is_traced(tangent, rhs):
-            return self.kept.attempt(tangent, rhs, near=near)
+            return self.kept.attempt(tangent, rhs, may_reuse=may_reuse)
         if self.direct.on_host:
             return attempt(self.direct, self.pattern, tangent, rhs)
         return self._attempt(tangent, rhs)

@@ -72,16 +72,16 @@ def differentiable(
     find : the function that finds their root.
     """
     by_steps = partial(find, system, options)
-    whole = compiled(one_by_one(by_steps))
+    program = compiled(one_by_one(by_steps))
 
     def stepwise(theta: jax.Array, start: jax.Array) -> Solution:
-        return (whole if is_traced(theta, start) else by_steps)(theta, start)
+        return (program if is_traced(theta, start) else by_steps)(theta, start)
 
     def derivative(u: jax.Array, theta: jax.Array, direction: jax.Array) -> jax.Array:
         tangent = system.safe_tangent(u, theta, 1.0)[0]
         return _directional_derivative(system, tangent, u, theta, direction)
 
-    return implicit(stepwise if system.stepwise else whole, derivative)
+    return implicit(stepwise if system.stepwise else program, derivative)
 
 
 def implicit(

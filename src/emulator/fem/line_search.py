@@ -53,8 +53,8 @@ def backtrack(admissible: Admissible, progress: Progress, least: float) -> Trial
 
     def halve(trial: Trial) -> Trial:
         fraction = 0.5 * trial.fraction
-        allowed, (lower, energy) = admissible(fraction), progress(fraction)
-        return Trial(fraction, energy, allowed & lower, allowed, ~trial.admissible)
+        is_admissible, (lower, energy) = admissible(fraction), progress(fraction)
+        return Trial(fraction, energy, is_admissible & lower, is_admissible, ~trial.admissible)
 
     def proceeds(trial: Trial) -> jax.Array:
         return ~trial.accepted & (trial.fraction >= 2.0 * least)
@@ -81,7 +81,7 @@ def armijo(
     ceiling = energy + _ROUND_OFF * size
 
     def progress(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-        ahead = potential(fraction)[0]
-        return ahead <= ceiling + fraction * descent, ahead
+        trial_energy = potential(fraction)[0]
+        return trial_energy <= ceiling + fraction * descent, trial_energy
 
     return progress

@@ -206,12 +206,14 @@ class Newton:
 
         A kept tangent is worth a full step or none: its direction is not searched along.
         """
-        system, theta, before = self.system, self.theta, state.relative_residual
-        none = Step(state.u, state.residual, before, jnp.zeros(()), jnp.array(False))
-        near = _is_near(direction.on_supports, before) & state.displacement_only
+        system, theta, initial_residual = self.system, self.theta, state.relative_residual
+        none = Step(state.u, state.residual, initial_residual, jnp.zeros(()), jnp.array(False))
+        in_newton_range = (
+            _is_near(direction.on_supports, initial_residual) & state.displacement_only
+        )
 
         def attempt(trial: _TrialStep) -> _TrialStep:
-            searches = trial.searched | ~near
+            searches = trial.searched | ~in_newton_range
             fraction, inverting = cond(
                 searches,
                 lambda: self._search(state, direction),
@@ -220,12 +222,12 @@ class Newton:
             u = _advance(system, state.u, theta, direction.step, fraction, state.load)
             residual, relative = system.admissible_balance(u, theta, state.load)
             J, J_before = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
-            good = searches | _is_good(relative, before, J, self.options.shrink, J_before)
+            good = searches | _is_good(relative, initial_residual, J, self.options.shrink, J_before)
             step = Step(u, residual, relative, fraction, inverting)
             step = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), step, none)
             return _TrialStep(step, jnp.array(True), good | ~state.renew)
 
-        first = _TrialStep(none, jnp.array(False), ~near & ~state.renew)
+        first = _TrialStep(none, jnp.array(False), ~in_newton_range & ~state.renew)
         return while_loop(lambda trial: ~trial.ends, attempt, first).step
 
     def _search(self, state: NewtonState, direction: Direction) -> tuple[jax.Array, jax.Array]:

@@ -147,8 +147,10 @@ class SupportForce:
         sprung = np.zeros(len(virtual), dtype=bool)
         for spring in spring_terms(self.scene):
             sprung[spring.nodes] = True
-        held = self.scene.held
-        return np.where(held, virtual, 0.0), np.where(sprung[:, None] & ~held, virtual, 0.0)
+        prescribed = self.scene.held
+        return np.where(prescribed, virtual, 0.0), np.where(
+            sprung[:, None] & ~prescribed, virtual, 0.0
+        )
 
     @cached_property
     def _adjacent(self) -> np.ndarray:
@@ -159,9 +161,11 @@ class SupportForce:
 
     @cached_property
     def _bulk(self) -> Blocks:
-        whole = self._balanced.blocks
-        connectivity = self._renumbered[whole.connectivity[self._adjacent]]
-        return Blocks(connectivity, whole.gradients[self._adjacent], whole.weights[self._adjacent])
+        blocks = self._balanced.blocks
+        connectivity = self._renumbered[blocks.connectivity[self._adjacent]]
+        return Blocks(
+            connectivity, blocks.gradients[self._adjacent], blocks.weights[self._adjacent]
+        )
 
     @cached_property
     def _parts(self) -> tuple[list[LocalTerm], list[LocalForce], list[LocalTerm]]:
@@ -242,12 +246,12 @@ class SupportForce:
         return [replace(part, nodes=self._renumbered[part.nodes]) for part in parts]
 
 
-def _touching[T: (LocalTerm, LocalForce)](parts: Sequence[T], moves: np.ndarray) -> list[T]:
+def _touching[T: (LocalTerm, LocalForce)](parts: Sequence[T], at_support: np.ndarray) -> list[T]:
     """Return the contributions of ``parts`` that have a node that ``moves`` (n,)."""
-    touching: list[T] = []
+    contributions: list[T] = []
     for part in parts:
-        rows = np.flatnonzero(moves[part.nodes].any(axis=1))
+        rows = np.flatnonzero(at_support[part.nodes].any(axis=1))
         if len(rows):
             data = jax.tree.map(lambda array: array[rows], part.data)  # noqa: B023 - used at once
-            touching.append(replace(part, nodes=part.nodes[rows], data=data))
-    return touching
+            contributions.append(replace(part, nodes=part.nodes[rows], data=data))
+    return contributions

@@ -152,9 +152,9 @@ class Simulator(TableRepr):
             last_two: tuple[jax.Array, jax.Array], theta: jax.Array
         ) -> tuple[tuple[jax.Array, jax.Array], Solution]:
             u, u_before = last_two
-            ahead = self.scene.on_supports(2.0 * u - u_before, theta)
+            extrapolation = self.scene.on_supports(2.0 * u - u_before, theta)
             # Nothing can be extrapolated at rest, and supports that jump alone invert elements.
-            solution = self.solve(theta, jnp.where(jnp.any(u != 0.0), ahead, self.rest))
+            solution = self.solve(theta, jnp.where(jnp.any(u != 0.0), extrapolation, self.rest))
             return (solution.displacement, u), solution
 
         solutions: Solution = scan(next_point, (self.rest, self.rest), thetas)[1]

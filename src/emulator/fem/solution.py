@@ -68,12 +68,12 @@ class Solution(NamedTuple):
     def require_converged(self, what: str = "simulation") -> Solution:
         """Return itself, or raise :class:`~emulator.core.errors.SolverError` naming the failure."""
         status = np.atleast_1d(np.asarray(self.status)).ravel()
-        failed = np.flatnonzero(status != Status.CONVERGED)
-        if failed.size:
-            reached = float(np.atleast_1d(np.asarray(self.load_reached)).ravel()[failed[0]])
-            which = f" {failed[0]} of {status.size}" if status.size > 1 else ""
+        failures = np.flatnonzero(status != Status.CONVERGED)
+        if failures.size:
+            reached = float(np.atleast_1d(np.asarray(self.load_reached)).ravel()[failures[0]])
+            which = f" {failures[0]} of {status.size}" if status.size > 1 else ""
             raise SolverError(
-                f"{what}{which}: {Status(int(status[failed[0]])).text} "
+                f"{what}{which}: {Status(int(status[failures[0]])).text} "
                 f"(converged up to {100 * reached:.3g} % of it)"
             )
         return self

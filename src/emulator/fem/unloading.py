@@ -261,7 +261,7 @@ def _by_fixed_point(
     def correct(state: _FixedPointState) -> _FixedPointState:
         trial = system_at_rest(system, state.w, theta)
         loaded = find_equilibrium(trial, options, theta, state.u)
-        solved = loaded.status == Status.CONVERGED
+        load_converged = loaded.status == Status.CONVERGED
         distance = state.w + loaded.displacement
         relaxation = _aitken(state, distance)
         step = -relaxation * distance
@@ -269,12 +269,12 @@ def _by_fixed_point(
         fraction = largest_admissible(
             lambda part: floor < system.least_volume_ratio(state.w + part * step), _SHORTEST
         )
-        met = jnp.max(jnp.abs(distance)) <= tolerance
+        converged = jnp.max(jnp.abs(distance)) <= tolerance
         exhausted = state.corrections + 1 >= _MOST_CORRECTIONS
         status = jnp.where(exhausted, Status.ITERATION_LIMIT, Status.RUNNING)
         status = jnp.where(fraction > 0.0, status, Status.INVERTED_ELEMENT)
-        status = jnp.where(met, Status.CONVERGED, status)
-        status = jnp.where(solved, status, loaded.status)
+        status = jnp.where(converged, Status.CONVERGED, status)
+        status = jnp.where(load_converged, status, loaded.status)
         running = status == Status.RUNNING
         return _FixedPointState(
             w=jnp.where(running, state.w + fraction * step, state.w),
@@ -292,15 +292,15 @@ def _by_fixed_point(
         start, -start, jnp.zeros_like(start), jnp.ones(()), count, count, count, running
     )
     state = while_loop(lambda state: state.status == Status.RUNNING, correct, first)
-    met = state.status == Status.CONVERGED
-    w = jnp.where(met, state.w, 0.0)
+    converged = state.status == Status.CONVERGED
+    w = jnp.where(converged, state.w, 0.0)
     solution = Solution(
         displacement=w,
         status=state.status,
         iterations=state.iterations,
         factorisations=state.factorisations,
         residual=system.relative_residual(w, theta),
-        load_reached=jnp.where(met, 1.0, 0.0),
+        load_reached=jnp.where(converged, 1.0, 0.0),
     )
     return _check_corners(system, solution)
 
@@ -398,10 +398,10 @@ def scene_at_rest(scene: Scene, w: jax.Array) -> Scene:
 
 def system_at_rest(system: System, w: jax.Array, theta: jax.Array) -> System:
     """Return the equations of the scene on the mesh x + w, for arrays that may be traced."""
-    there = System(_traced_scene_at_rest(system.scene, w, theta), system.factorisation)
+    rest_system = System(_traced_scene_at_rest(system.scene, w, theta), system.factorisation)
     # Evaluated here, so that no program inside another keeps what depends on its own tracers.
-    _ = there.springs, there.terms, there.forces, there.dead
-    return there
+    _ = rest_system.springs, rest_system.terms, rest_system.forces, rest_system.dead
+    return rest_system
 
 
 def _traced_scene_at_rest(scene: Scene, w: jax.Array, theta: jax.Array) -> Scene:
@@ -417,15 +417,15 @@ def _traced_scene_at_rest(scene: Scene, w: jax.Array, theta: jax.Array) -> Scene
     object.__setattr__(mesh, "nodes", scene.mesh.nodes + w)
     h = displacement_gradient(scene, w)
     gradients, weights = _shape_functions_at_rest(grid, h)
-    there = replace(grid, mesh=mesh, gradients=gradients, weights=weights)
-    blocks: Blocks = there
+    rest_grid = replace(grid, mesh=mesh, gradients=gradients, weights=weights)
+    blocks: Blocks = rest_grid
     if scene.dilatation == "patch":
         gradients, weights = _shape_functions_at_rest(scene.blocks, scene.blocks.gather(h))
         blocks = replace(scene.blocks, gradients=gradients, weights=weights)
     view = copy.copy(scene)
     for name, value in (
         ("mesh", mesh),
-        ("discretisation", there),
+        ("discretisation", rest_grid),
         ("blocks", blocks),
         ("fibres", fibres),
         ("angles", ()),

@@ -85,8 +85,8 @@ class Ventricle:
         return np.stack(each, axis=1)
 
 
-def ventricle(mesh: Mesh, endocardium: str, held: np.ndarray) -> Ventricle:
-    """The wall around the cavity ``endocardium`` of ``mesh``, whose nodes ``held`` (n,) are fixed.
+def ventricle(mesh: Mesh, endocardium: str, fixed: np.ndarray) -> Ventricle:
+    """The wall around the cavity ``endocardium`` of ``mesh``, whose nodes ``fixed`` (n,) are fixed.
 
     Raises
     ------
@@ -96,15 +96,15 @@ def ventricle(mesh: Mesh, endocardium: str, held: np.ndarray) -> Ventricle:
     if mesh.order != 1:
         raise InputError("its elements are quadratic; expected linear tetrahedra")
     surface = mesh.surface
-    base = held[surface].all(axis=1)
-    inside = mesh.facet_set(endocardium)
+    base = fixed[surface].all(axis=1)
+    endocardial_facets = mesh.facet_set(endocardium)
     inner = np.zeros(len(mesh.nodes), dtype=bool)
-    inner[inside] = True
-    rim = inner & held
+    inner[endocardial_facets] = True
+    rim = inner & fixed
     if not base.any() or not rim.any():
         raise InputError("it has no base: no facets held on all corners that meet the cavity")
     outer = np.zeros(len(mesh.nodes), dtype=bool)
-    outer[surface[~base & ~_among(surface, inside)]] = True
+    outer[surface[~base & ~_among(surface, endocardial_facets)]] = True
     outer &= ~inner
     if not outer.any():
         raise InputError("its surface is all cavity and base; expected an outside")
@@ -127,15 +127,15 @@ def ventricle(mesh: Mesh, endocardium: str, held: np.ndarray) -> Ventricle:
         depth=depth.value,
         normal=depth.normal,
         inner=inner,
-        held=held,
+        held=fixed,
         lean=centroid / np.hypot(np.linalg.norm(centroid), _SMALL),
         volume=nodal / size**3,
     )
 
 
-def _among(facets: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Which of ``facets`` (k, 3) are among ``others`` (l, 3), whatever their order, (k,)."""
-    keys = {tuple(each) for each in np.sort(others, axis=1).tolist()}
+def _among(facets: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Which of ``facets`` (k, 3) are among ``reference`` (l, 3), whatever their order, (k,)."""
+    keys = {tuple(each) for each in np.sort(reference, axis=1).tolist()}
     return np.array([tuple(each) in keys for each in np.sort(facets, axis=1).tolist()])
 
 

@@ -87,8 +87,8 @@ def folded(elements: np.ndarray) -> np.ndarray:
 
 def parts(elements: np.ndarray, nodes: int) -> np.ndarray:
     """Number (n,) of the connected part that each of the ``nodes`` belongs to, from 0."""
-    first, others = np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel()
-    graph = coo_array((np.ones(len(first)), (first, others)), shape=(nodes, nodes))
+    first, neighbours = np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel()
+    graph = coo_array((np.ones(len(first)), (first, neighbours)), shape=(nodes, nodes))
     return connected_components(graph, directed=False)[1]
 
 

@@ -50,7 +50,7 @@ def patchwise(grid: Discretisation, size: int = _SIZE) -> Patches:
     """The linear elements of ``grid`` in :func:`patches` of ``size``."""
     label = patches(grid.mesh, size)
     members, real = _rows(label, np.arange(len(label)))
-    keys, place = np.unique(
+    keys, columns = np.unique(
         label[:, None] * len(grid.mesh.nodes) + grid.connectivity, return_inverse=True
     )
     owner, node = np.divmod(keys, len(grid.mesh.nodes))
@@ -58,7 +58,7 @@ def patchwise(grid: Discretisation, size: int = _SIZE) -> Patches:
     column = np.arange(len(keys)) - np.searchsorted(owner, owner)
     # Each element's gradients at the columns of its patch.
     wide = np.zeros((len(label), connectivity.shape[1], 3))
-    wide[np.arange(len(label))[:, None], column[place.reshape(-1, 4)]] = grid.gradients[:, 0]
+    wide[np.arange(len(label))[:, None], column[columns.reshape(-1, 4)]] = grid.gradients[:, 0]
     return Patches(
         connectivity=frozen_array(connectivity, int),
         gradients=frozen_array(wide[members]),
@@ -137,8 +137,8 @@ def _joined(groups: list[list[int]], neighbours: Sequence[list[int]]) -> list[li
     for patch, group in enumerate(groups):
         adjacent = {owner[j] for k in group for j in neighbours[k]} - {patch}
         if len(group) < _LEAST and adjacent:
-            chosen = min(adjacent, key=lambda other: (len(groups[other]), other))
-            groups[chosen] += group
-            owner |= dict.fromkeys(group, chosen)
+            neighbour = min(adjacent, key=lambda other: (len(groups[other]), other))
+            groups[neighbour] += group
+            owner |= dict.fromkeys(group, neighbour)
             groups[patch] = []
     return [group for group in groups if group]

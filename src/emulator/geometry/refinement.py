@@ -49,14 +49,14 @@ def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
     ends = np.sort(mesh.elements[:, EDGES], axis=2)  # (m, 6, 2)
     edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
     first = len(mesh.nodes)
-    place = mesh.nodes[edges].mean(axis=1) if midpoints is None else midpoints(edges)
+    midpoint_positions = mesh.nodes[edges].mean(axis=1) if midpoints is None else midpoints(edges)
     elements = np.hstack([mesh.elements, first + number.reshape(-1, 6)])
 
     def middle(pairs: np.ndarray) -> np.ndarray:
         """Node on each edge given by its ends (..., 2)."""
         key = edges[:, 0] * first + edges[:, 1]
-        wanted = np.sort(pairs, axis=-1)
-        return first + np.searchsorted(key, wanted[..., 0] * first + wanted[..., 1])
+        edges_sought = np.sort(pairs, axis=-1)
+        return first + np.searchsorted(key, edges_sought[..., 0] * first + edges_sought[..., 1])
 
     def grown(nodes: np.ndarray) -> np.ndarray:
         inside = np.isin(outline, nodes).all(axis=1)
@@ -68,7 +68,7 @@ def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
         name: np.hstack([rows, middle(rows[:, sides])]) for name, rows in mesh.facet_sets.items()
     }
     return Mesh(
-        np.vstack([mesh.nodes, place]),
+        np.vstack([mesh.nodes, midpoint_positions]),
         elements,
         {name: grown(nodes) for name, nodes in mesh.node_sets.items()},
         facets,
@@ -169,24 +169,24 @@ def refined(mesh: Mesh) -> Refinement:
     """The next finer mesh: quadratic elements, or each quadratic element in eight."""
     count = len(mesh.elements)
     if mesh.order == 1:
-        whole = to_quadratic(mesh)
-        parents = corner_parents(whole)
+        quadratic = to_quadratic(mesh)
+        parents = corner_parents(quadratic)
         rows = np.repeat(np.arange(len(parents)), 2)
         halves = csr_matrix((np.full(len(rows), 0.5), (rows, parents.ravel())))
-        return Refinement(mesh, whole, halves, np.broadcast_to(np.eye(4), (count, 1, 4, 4)))
+        return Refinement(mesh, quadratic, halves, np.broadcast_to(np.eye(4), (count, 1, 4, 4)))
     children = _EIGHT[_shortest_diagonal(mesh)]  # (m, 8, 4)
     elements = np.take_along_axis(mesh.elements[:, None], children, axis=2)
     facets = {name: rows[:, _FOUR].reshape(-1, 3) for name, rows in mesh.facet_sets.items()}
-    cut = Mesh(mesh.nodes, elements.reshape(-1, 4), mesh.node_sets, facets)
+    linear = Mesh(mesh.nodes, elements.reshape(-1, 4), mesh.node_sets, facets)
     new: list[csr_matrix] = []
 
     def midpoints(edges: np.ndarray) -> np.ndarray:
         new.append(_middle_of(mesh, children, elements, edges))
         return new[0] @ mesh.nodes
 
-    whole = to_quadratic(cut, midpoints)
+    quadratic = to_quadratic(linear, midpoints)
     prolongation = vstack([identity(len(mesh.nodes)), new[0]], format="csr")
-    return Refinement(mesh, whole, prolongation, _NODES[children])
+    return Refinement(mesh, quadratic, prolongation, _NODES[children])
 
 
 def _shortest_diagonal(mesh: Mesh) -> np.ndarray:

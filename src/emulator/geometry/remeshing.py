@@ -113,10 +113,10 @@ def _cells(gmsh: Any, kind: int, corners: int, dimension: int) -> tuple[np.ndarr
 def _model() -> Iterator[Any]:
     """Gmsh with an empty model; its errors as :class:`InputError`."""
     gmsh = _gmsh()
-    started = not gmsh.isInitialized()
-    if started:
+    owns_session = not gmsh.isInitialized()
+    if owns_session:
         gmsh.initialize(readConfigFiles=False, interruptible=False)
-    before = None if started else gmsh.model.getCurrent()
+    previous_model = None if owns_session else gmsh.model.getCurrent()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.option.setNumber("General.NumThreads", 1)
@@ -128,11 +128,11 @@ def _model() -> Iterator[Any]:
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"gmsh could not mesh it: {reason}") from error
     finally:
-        if started:
+        if owns_session:
             gmsh.finalize()
         else:
             gmsh.model.remove()
-            gmsh.model.setCurrent(before)
+            gmsh.model.setCurrent(previous_model)
 
 
 def _gmsh() -> Any:
@@ -173,9 +173,9 @@ class Flattened:
     def __init__(self, surface: Surface) -> None:
         self.surface = surface
         edges = one_rim(surface)
-        after = dict(edges.tolist())
+        successor = dict(edges.tolist())
         loop = [int(edges[0, 0])]
-        while (next_one := after[loop[-1]]) != loop[0]:
+        while (next_one := successor[loop[-1]]) != loop[0]:
             loop.append(next_one)
         closed = surface.points[[*loop, loop[0]]]
         self._along = np.concatenate([[0.0], np.cumsum(_lengths(closed))])
@@ -250,8 +250,11 @@ class Flattened:
         for _ in range(_HALVINGS):
             share = 0.5 * (low + high)
             points = self.at(one + share[:, None] * (other - one))
-            nearer = np.sum((points - first) ** 2 - (points - last) ** 2, axis=1) < 0.0
-            low, high = np.where(nearer, share, low), np.where(nearer, high, share)
+            closer_to_first = np.sum((points - first) ** 2 - (points - last) ** 2, axis=1) < 0.0
+            low, high = (
+                np.where(closer_to_first, share, low),
+                np.where(closer_to_first, high, share),
+            )
         on_rim = np.all([np.linalg.norm(p, axis=1) > 1.0 - 1e-9 for p in (one, other)], axis=0)
         x, y = (one + other)[on_rim].T
         points[on_rim] = self.rim_at(np.arctan2(y, x))

@@ -137,17 +137,17 @@ def _one_sided(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarr
     same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
     if (same[1:] & same[:-1]).any():
         k = order[1:-1][same[1:] & same[:-1]][0]
-        place = place_of(points[edges[k]].mean(axis=0))
+        position = place_of(points[edges[k]].mean(axis=0))
         raise InputError(
-            f"{name}: more than two triangles meet at the edge at {place}; repair the surface"
+            f"{name}: more than two triangles meet at the edge at {position}; repair the surface"
         )
     one, other = order[:-1][same], order[1:][same]
     agree = edges[one, 0] != edges[other, 0]
     # Two copies of each triangle, one turned: neighbours that disagree join unlike copies.
     count = len(triangles)
-    turned = np.where(agree, 0, count)
+    component = np.where(agree, 0, count)
     first = np.concatenate([owner[one], owner[one] + count])
-    second = np.concatenate([owner[other] + turned, owner[other] + count - turned])
+    second = np.concatenate([owner[other] + component, owner[other] + count - component])
     graph = coo_array((np.ones(len(first)), (first, second)), shape=(2 * count,) * 2)
     parts, label = connected_components(graph, directed=False)
     if parts == 1:
@@ -285,10 +285,10 @@ def inside(surface: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray
         return (v[:, 0] - u[:, 0]) * (w[:, 1] - u[:, 1]) - (v[:, 1] - u[:, 1]) * (w[:, 0] - u[:, 0])
 
     parts = np.stack([area(b, c, p), area(c, a, p), area(a, b, p)], axis=1)
-    met = (parts >= 0.0).all(axis=1) | (parts <= 0.0).all(axis=1)
+    hits = (parts >= 0.0).all(axis=1) | (parts <= 0.0).all(axis=1)
     total = parts.sum(axis=1)
-    met &= total != 0.0
-    weights = parts[met] / total[met, None]
-    height = np.einsum("ka,ka->k", weights, corners[row[met], :, 2])
-    below = height < p[met, 2]
-    return np.bincount(point[met][below], minlength=len(at)) % 2 == 1
+    hits &= total != 0.0
+    weights = parts[hits] / total[hits, None]
+    height = np.einsum("ka,ka->k", weights, corners[row[hits], :, 2])
+    below = height < p[hits, 2]
+    return np.bincount(point[hits][below], minlength=len(at)) % 2 == 1

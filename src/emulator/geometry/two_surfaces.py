@@ -140,23 +140,23 @@ def mesh_wall(
     look_up(UNITS, unit, "unit")
     if smooth < 0:
         raise InputError(f"smooth {smooth}: expected 0 times or more")
-    whole = [
+    intact = [
         _surface(source, name, unit)
         for source, name in ((endocardium, "endocardium"), (epicardium, "epicardium"))
     ]
-    normal, point = _plane(whole, axis, base_height, base_point)
-    below = [cut(each, point, normal) for each in whole]
-    heights = [((each.points - point) @ normal).max() for each in whole]
-    closed = any(not each.rims for each in whole)
+    normal, point = _plane(intact, axis, base_height, base_point)
+    below = [cut(each, point, normal) for each in intact]
+    heights = [((each.points - point) @ normal).max() for each in intact]
+    closed = any(not each.rims for each in intact)
     cut_off = 0.0 if closed else max(heights)
     within = [smoothed(each, smooth) if smooth else each for each in below]
     _check_nested(within[0], within[1], normal)
     thickness = _thickness(within[0], within[1])
     size = _SIZE * thickness.median if size is None else size
-    if not 0.0 < size < whole[1].extent / 4.0:
+    if not 0.0 < size < intact[1].extent / 4.0:
         raise InputError(
             f"size {size} mm: expected edges above 0 and below a quarter of the epicardium's "
-            f"extent, {whole[1].extent:.4g} mm"
+            f"extent, {intact[1].extent:.4g} mm"
         )
     mesh = _mesh([Flattened(each) for each in within], size, order, normal, point)
     cavity, outer = (each.volume / MM3_PER_ML for each in below)
@@ -176,7 +176,7 @@ def mesh_wall(
         thickness=thickness,
         cavity=(Cavity(mesh, "endocardium").rest, cavity),
         wall=(own, outer - cavity),
-        cut_off=float(cut_off) if cut_off > _SAME * whole[1].extent else 0.0,
+        cut_off=float(cut_off) if cut_off > _SAME * intact[1].extent else 0.0,
         moved=max(
             float(np.linalg.norm(one.points - other.points, axis=1).max())
             for one, other in zip(within, below, strict=True)

@@ -150,9 +150,11 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
         raise InputError(
             f"published data: {model} marks {len(interior)} nodes but has {len(nodes)}"
         )
-    held = np.flatnonzero(~interior.astype(bool))
+    fixed_nodes = np.flatnonzero(~interior.astype(bool))
     prescribed = _read_optional(root, model, f"{folder}/disp-add.npy", nodes.shape)
-    displacement = np.zeros((len(held), 3)) if prescribed is None else prescribed[held] * scale
+    displacement = (
+        np.zeros((len(fixed_nodes), 3)) if prescribed is None else prescribed[fixed_nodes] * scale
+    )
     elements = orient(nodes, elements)  # the release does not orient its elements and facets
     fibres = _read_optional(
         root, model, f"{folder}/fibre-field-elementwise.npy", (len(elements), 3, 1)
@@ -160,22 +162,22 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
     if fibres is not None:
         fibres = fibres[:, :, 0].astype(float)
         fibres = fibres / np.linalg.norm(fibres, axis=1, keepdims=True)  # stored in float32
-    mesh = Mesh(nodes, elements, {"held": held}, _pressed_facets(root, model, elements))
+    mesh = Mesh(nodes, elements, {"held": fixed_nodes}, _pressed_facets(root, model, elements))
     return PublishedGeometry(mesh, displacement, fibres)
 
 
 def _pressed_facets(root: str | Path, model: str, elements: np.ndarray) -> dict[str, np.ndarray]:
     """Read the facets under pressure and orient them; nothing where none are released."""
     part = "geometryData/pressure-surface-facets.npy"
-    pressed = _read_optional(root, model, part, (None, 4))
-    if pressed is None:
+    rows = _read_optional(root, model, part, (None, 4))
+    if rows is None:
         return {}
     surface = boundary_facets(elements)
-    wanted = {tuple(row) for row in np.sort(pressed[:, 1:], axis=1).tolist()}
-    inside = [tuple(row) in wanted for row in np.sort(surface, axis=1).tolist()]
-    if sum(inside) < len(wanted):
+    loaded = {tuple(row) for row in np.sort(rows[:, 1:], axis=1).tolist()}
+    inside = [tuple(row) in loaded for row in np.sort(surface, axis=1).tolist()]
+    if sum(inside) < len(loaded):
         raise InputError(
-            f"published data: {len(wanted) - sum(inside)} of the {len(wanted)} pressed facets "
+            f"published data: {len(loaded) - sum(inside)} of the {len(loaded)} pressed facets "
             f"of {model} are not on the surface of its elements"
         )
     return {PRESSURE_SURFACE: surface[inside]}
@@ -220,8 +222,8 @@ def published_tests(model: str, root: str | Path) -> tuple[jax.Array, PublishedT
 # ---- files ---------------------------------------------------------------------------------------
 def folder_of(root: str | Path, model: str) -> Path:
     """Return the folder of ``model`` in the release's folder ``data`` or in a clone of it all."""
-    inside = Path(root) / "data" / model
-    return inside if inside.is_dir() else Path(root) / model
+    subfolder = Path(root) / "data" / model
+    return subfolder if subfolder.is_dir() else Path(root) / model
 
 
 def models_in(root: str | Path) -> tuple[str, ...]:
@@ -254,8 +256,8 @@ def read_array(
         array.ndim != len(shape)
         or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True))
     ):
-        wanted = tuple("any" if length is None else length for length in shape)
-        raise InputError(f"published data: {path} has shape {array.shape}; expected {wanted}")
+        expected = tuple("any" if length is None else length for length in shape)
+        raise InputError(f"published data: {path} has shape {array.shape}; expected {expected}")
     if not np.isfinite(array).all():
         raise InputError(f"published data: {path} has values that are not finite")
     return array

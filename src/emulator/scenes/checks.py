@@ -75,14 +75,14 @@ def check_scene(scene: SceneData, prescribed: Prescribed) -> None:
         raise InputError("no parameter varies, nothing to calibrate")
     if not scene.supports:
         raise InputError("no support, the body could move freely")
-    held, fixed, per_unit = prescribed
+    components, fixed, per_unit = prescribed
     check_motions(scene.mesh, scene.supports)
     for part in (*scene.loads, *scene.supports):
         for name in part.facet_sets:
             scene.mesh.facet_set(name)
     displacement = sum((np.abs(each) for each in per_unit.values()), np.abs(fixed))
     for load in scene.loads:
-        load.check(scene.mesh, held, displacement)
+        load.check(scene.mesh, components, displacement)
     _check_image(scene.loaded_by, load_parameters(scene, prescribed))
 
 

@@ -66,9 +66,9 @@ def leave_out(scene: Scene, names: Iterable[str]) -> Scene:
     return scene
 
 
-def _without(scene: Scene, wanted: str) -> Scene | None:
+def _without(scene: Scene, effect: str) -> Scene | None:
     """Return ``scene`` without the effect; None where it has none of that name, or needs it."""
-    changes = next((changes for name, changes, _ in _changes(scene) if name == wanted), None)
+    changes = next((changes for name, changes, _ in _changes(scene) if name == effect), None)
     return None if changes is None else _changed(scene, **changes)
 
 
@@ -143,16 +143,16 @@ def _changed(scene: Scene, **changes: Any) -> Scene | None:
         changes[kind] = None if reader is None else changes[kind]
     changes["angles"] = effective_angles(scene.angles, changes["fibres"], changes["sheets"])
     parts = (*loads, *changes.get("supports", scene.supports))
-    read = set(law.parameters)
-    read |= {q.name for part in (*parts, *changes["angles"]) for q in part.quantities}
+    names_read = set(law.parameters)
+    names_read |= {q.name for part in (*parts, *changes["angles"]) for q in part.quantities}
     if regions is not None:
-        read |= {name for name in scene.quantities if name.startswith("stiffness_")}
+        names_read |= {name for name in scene.quantities if name.startswith("stiffness_")}
     try:
         return replace(
             scene,
             **changes,
-            parameters=tuple(p for p in scene.parameters if p.name in read),
-            constants={name: v for name, v in scene.constants.items() if name in read},
+            parameters=tuple(p for p in scene.parameters if p.name in names_read),
+            constants={name: v for name, v in scene.constants.items() if name in names_read},
             origin={},
         )
     except InputError:

@@ -172,23 +172,23 @@ def _with_planes(mesh: Mesh, file: SceneFile, source: Source) -> Mesh:
 
 
 def _on_plane(
-    mesh: Mesh, node_sets: Mapping[str, np.ndarray], plane: Plane, wanted: str
+    mesh: Mesh, node_sets: Mapping[str, np.ndarray], plane: Plane, member: str
 ) -> np.ndarray:
-    """Return whether each node (n,) lies on the plane; refuse a plane without any ``wanted``.
+    """Return whether each node (n,) lies on the plane; refuse a plane without any ``member``.
 
-    wanted : what the plane must contain, "node" or "surface triangle".
+    member : what the plane must contain, "node" or "surface triangle".
     """
     coordinate = mesh.nodes[:, _AXES[plane.axis]]
     on_plane = np.abs(coordinate - plane.at) <= _ON_PLANE * mesh.size
     if plane.within is not None:
-        whole = look_up(node_sets, plane.within, "node set")
-        on_plane &= np.isin(np.arange(len(mesh.nodes)), whole)
-    hits = on_plane if wanted == "node" else on_plane[mesh.surface].all(axis=1)
+        parent = look_up(node_sets, plane.within, "node set")
+        on_plane &= np.isin(np.arange(len(mesh.nodes)), parent)
+    hits = on_plane if member == "node" else on_plane[mesh.surface].all(axis=1)
     if not hits.any():
         low, high = coordinate.min(), coordinate.max()
         inside = f" in '{plane.within}'" if plane.within else ""
         raise InputError(
-            f"no {wanted} at {plane.axis} = {plane.at:g} mm{inside}; the body is between {low:g} "
+            f"no {member} at {plane.axis} = {plane.at:g} mm{inside}; the body is between {low:g} "
             f"and {high:g}"
         )
     return on_plane

@@ -111,8 +111,8 @@ def scene_schema() -> dict[str, Any]:
 
 def _takes(law: Law) -> str:
     """Parameters of a law with their units, and the directions it needs."""
-    needs = [name for name in ("fibres", "sheets") if getattr(law, name)]
-    directions = f"; needs {' and '.join(needs)}" if needs else ""
+    needed_directions = [name for name in ("fibres", "sheets") if getattr(law, name)]
+    directions = f"; needs {' and '.join(needed_directions)}" if needed_directions else ""
     return ", ".join(map(_with_unit, law.quantities)) + directions
 
 

@@ -75,9 +75,9 @@ def identity_of(scene: SceneData, prescribed: Prescribed) -> Identity:
     mesh = scene.mesh
     elements = np.sort(mesh.elements, axis=1)
     order = np.lexsort(elements.T)
-    held, fixed, per_unit = prescribed
+    components, fixed, per_unit = prescribed
     facet_sets = sorted({n for part in (*scene.loads, *scene.supports) for n in part.facet_sets})
-    indices = {"elements": elements[order], "held": held}
+    indices = {"elements": elements[order], "held": components}
     indices |= {f"facets {name}": _as_set(mesh.facet_set(name)) for name in facet_sets}
     if scene.regions is not None:
         indices["regions"] = scene.regions[order]

@@ -203,8 +203,8 @@ class Scene(SceneData, TableRepr):
         nodes : numbers (k,) of nodes; all by default.
         level : fraction of the prescribed displacements that is applied.
         """
-        held = self.held if nodes is None else self.held[nodes]
-        return jnp.where(held, level * self.held_at(theta, nodes), u)
+        prescribed = self.held if nodes is None else self.held[nodes]
+        return jnp.where(prescribed, level * self.held_at(theta, nodes), u)
 
     # Identity and summary.
 

@@ -222,11 +222,11 @@ class Fibres:
 
     def some(self, elements: np.ndarray) -> Fibres:
         """Return the fibres of ``elements`` (k,)."""
-        chosen = [
+        angles = [
             FibreAngles(each.axis[elements], {n: s[elements] for n, s in each.shares.items()})
             for each in self.angles
         ]
-        return Fibres(self.directions[elements], tuple(chosen))
+        return Fibres(self.directions[elements], tuple(angles))
 
     @property
     def rows(self) -> Any:

@@ -58,11 +58,14 @@ class Coarse:
     def cache(self, nodes: np.ndarray) -> CachedPart:
         """Return the part over ``nodes`` (k,) of the finer mesh."""
         rows = self.prolongation[nodes]
-        used = np.unique(rows.indices)
-        carry, cached = rows[:, used], [part.cache(used) for part in self.parts.values()]
-        offset = carry @ sum((part.offset for part in cached), np.zeros((len(used), 3)))
+        coarse_nodes = np.unique(rows.indices)
+        carry, cached = (
+            rows[:, coarse_nodes],
+            [part.cache(coarse_nodes) for part in self.parts.values()],
+        )
+        offset = carry @ sum((part.offset for part in cached), np.zeros((len(coarse_nodes), 3)))
         modes = np.concatenate([part.modes for part in cached])
-        flat = carry @ modes.transpose(1, 0, 2).reshape(len(used), -1)
+        flat = carry @ modes.transpose(1, 0, 2).reshape(len(coarse_nodes), -1)
         return CachedPart(
             offset,
             flat.reshape(len(nodes), len(modes), 3).transpose(1, 0, 2),

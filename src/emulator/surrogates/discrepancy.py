@@ -202,20 +202,20 @@ def _project(fields: np.ndarray, derivatives: np.ndarray) -> tuple[np.ndarray, j
     from sklearn.utils.extmath import randomized_svd  # slow to import, and only for a fit
 
     _, size, right = randomized_svd(snapshots, most, n_iter=4, random_state=0)
-    used = size > max(_TRUNCATION * size[0], np.finfo(float).tiny)
-    if not used.any():
+    significant = size > max(_TRUNCATION * size[0], np.finfo(float).tiny)
+    if not significant.any():
         raise InputError("a discrepancy model has nothing to fit: the map meets every FEM run")
-    scale = size[used] / np.sqrt(len(snapshots))
-    both = np.concatenate([fields[:, None], derivatives], axis=1) @ (right[used].T / scale)
-    return right[used] * scale[:, None], jnp.asarray(both.reshape(-1, used.sum()))
+    scale = size[significant] / np.sqrt(len(snapshots))
+    both = np.concatenate([fields[:, None], derivatives], axis=1) @ (right[significant].T / scale)
+    return right[significant] * scale[:, None], jnp.asarray(both.reshape(-1, significant.sum()))
 
 
 def _lengths(features: Features, positions: np.ndarray, observations: jax.Array) -> jax.Array:
     """Return inverse lengths (q,) fitted to a subset of the runs and the leading modes."""
     each = 1 + positions.shape[1]
-    chosen = maximin_subset(positions, max(4, _MOST_OBSERVATIONS // each))
-    rows = (chosen[:, None] * each + np.arange(each)).ravel()
-    some = Features(features.value[chosen], features.derivative[chosen])
+    subset = maximin_subset(positions, max(4, _MOST_OBSERVATIONS // each))
+    rows = (subset[:, None] * each + np.arange(each)).ravel()
+    some = Features(features.value[subset], features.derivative[subset])
     return jnp.asarray(fit_lengths(some, observations[rows][:, :_FITTED_MODES]))
 
 
@@ -246,11 +246,11 @@ def maximin_subset(positions: np.ndarray, count: int) -> np.ndarray:
 
     From the first on, each next row is the one whose least distance from the chosen is greatest.
     """
-    chosen = [0]
+    subset = [0]
     distance = np.full(len(positions), np.inf)
-    while len(chosen) < min(count, len(positions)):
-        distance = np.minimum(distance, np.sum((positions - positions[chosen[-1]]) ** 2, axis=1))
+    while len(subset) < min(count, len(positions)):
+        distance = np.minimum(distance, np.sum((positions - positions[subset[-1]]) ** 2, axis=1))
         if not distance.max() > 0.0:
             break
-        chosen.append(int(np.argmax(distance)))
-    return np.array(chosen)
+        subset.append(int(np.argmax(distance)))
+    return np.array(subset)

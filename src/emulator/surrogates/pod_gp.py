@@ -125,18 +125,20 @@ def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> Reduce
     left, size, right = np.linalg.svd(
         (snapshots - mean).reshape(len(snapshots), -1), full_matrices=False
     )
-    used = size > truncation * size[0]
+    significant = size > truncation * size[0]
     inputs = np.asarray(scene.to_unit(runs.theta))
-    fits = [_fit_one(inputs, column) for column in (left[:, used] * np.sqrt(len(snapshots))).T]
-    modes = right[used] * size[used, None] / np.sqrt(len(snapshots))
+    processes = [
+        _fit_one(inputs, column) for column in (left[:, significant] * np.sqrt(len(snapshots))).T
+    ]
+    modes = right[significant] * size[significant, None] / np.sqrt(len(snapshots))
     return ReducedForward(
         scene=scene,
         nodes=all_nodes(scene),
         mean=jnp.asarray(mean),
         modes=jnp.asarray(modes.reshape(-1, *mean.shape)),
         inputs=jnp.asarray(inputs),
-        lengths=jnp.asarray([lengths for lengths, _ in fits]),
-        weights=jnp.asarray([weights for _, weights in fits]),
+        lengths=jnp.asarray([lengths for lengths, _ in processes]),
+        weights=jnp.asarray([weights for _, weights in processes]),
     )
 
 

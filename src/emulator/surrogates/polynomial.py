@@ -70,13 +70,13 @@ def compressed(degrees: np.ndarray, fields: np.ndarray, error: float) -> Polynom
     flat = fields.reshape(len(fields), -1)
     left, sizes, right = np.linalg.svd(flat, full_matrices=False)
     beyond = np.sqrt(np.cumsum(sizes[::-1] ** 2)[::-1] / fields.shape[1])
-    kept = max(int(np.sum(beyond > error)), 1)
-    modes = sizes[:kept, None] * right[:kept]
+    rank = max(int(np.sum(beyond > error)), 1)
+    modes = sizes[:rank, None] * right[:rank]
     rounded = modes.astype(np.float32).astype(float)
-    off = np.sum((rounded - modes) ** 2) + np.sum(sizes[kept:] ** 2)
+    off = np.sum((rounded - modes) ** 2) + np.sum(sizes[rank:] ** 2)
     if off <= error**2 * fields.shape[1]:
         modes = rounded  # files then take half of the room
-    return Polynomial(degrees, left[:, :kept], modes.reshape(kept, *fields.shape[1:]))
+    return Polynomial(degrees, left[:, :rank], modes.reshape(rank, *fields.shape[1:]))
 
 
 def terms(parameters: int, degree: int) -> int:
@@ -86,12 +86,12 @@ def terms(parameters: int, degree: int) -> int:
 
 def degrees_up_to(parameters: int, degree: int) -> np.ndarray:
     """Return all alpha (m, p) with a sum of ``degree`` or less, sorted by that sum."""
-    chosen = [
+    degrees = [
         np.bincount(np.array(term, dtype=int), minlength=parameters)
         for total in range(degree + 1)
         for term in combinations_with_replacement(range(parameters), total)
     ]
-    return np.array(chosen)
+    return np.array(degrees)
 
 
 def legendre(position: Any, degrees: np.ndarray) -> Any:

@@ -30,16 +30,16 @@ def forward_kind(name: str) -> ForwardKind:
 
 def known_options() -> dict[str, tuple[Option, tuple[str, ...]]]:
     """Return every option of every kind by name, with the names of the kinds that take it."""
-    found: dict[str, tuple[Option, tuple[str, ...]]] = {}
+    owners_by_option: dict[str, tuple[Option, tuple[str, ...]]] = {}
     for kind in FORWARD_MAPS.values():
         for option in kind.options:
-            first, owners = found.get(option.name, (option, ()))
-            found[option.name] = (first, (*owners, kind.name))
-    return found
+            first, owners = owners_by_option.get(option.name, (option, ()))
+            owners_by_option[option.name] = (first, (*owners, kind.name))
+    return owners_by_option
 
 
-def full_options(name: str, given: Mapping[str, Any]) -> dict[str, int]:
-    """Return a value of every option of the kind called ``name``, from ``given`` or by default.
+def full_options(name: str, options: Mapping[str, Any]) -> dict[str, int]:
+    """Return a value of every option of the kind called ``name``, from ``options`` or by default.
 
     Raises
     ------
@@ -47,16 +47,16 @@ def full_options(name: str, given: Mapping[str, Any]) -> dict[str, int]:
         An unknown kind, an option it does not take, or a value out of range.
     """
     kind = forward_kind(name)
-    if not isinstance(given, Mapping):
-        raise InputError(f"options of a forward map are {given!r}; give a value by name")
-    known = known_options()
-    for word in given:
-        if word not in known:
+    if not isinstance(options, Mapping):
+        raise InputError(f"options of a forward map are {options!r}; give a value by name")
+    options_by_name = known_options()
+    for word in options:
+        if word not in options_by_name:
             raise InputError(f"forward map '{name}' has no option '{word}'")
-        option, owners = known[word]
+        option, owners = options_by_name[word]
         if name not in owners:
             raise InputError(f"{option.flag} has no effect without --forward {' or '.join(owners)}")
-    return {o.name: o.checked(given.get(o.name, o.default)) for o in kind.options}
+    return {o.name: o.checked(options.get(o.name, o.default)) for o in kind.options}
 
 
 def check_emulator(name: str, emulator: str | None) -> None:
@@ -73,9 +73,11 @@ def check_scheduler(name: str, scheduler: str | None) -> None:
         raise InputError(f"--scheduler has no effect without --forward {owners}")
 
 
-def build_forward(name: str, ingredients: Ingredients, given: Mapping[str, Any] = {}) -> ForwardMap:
-    """Return the forward map called ``name`` over all nodes, with the options ``given``."""
-    return forward_kind(name).build(ingredients, full_options(name, given))
+def build_forward(
+    name: str, ingredients: Ingredients, options: Mapping[str, Any] = {}
+) -> ForwardMap:
+    """Return the forward map called ``name`` over all nodes, with the ``options`` given."""
+    return forward_kind(name).build(ingredients, full_options(name, options))
 
 
 def keep_forward(forward: ForwardMap, path: str | Path) -> None:
@@ -86,7 +88,7 @@ def keep_forward(forward: ForwardMap, path: str | Path) -> None:
 
 
 def restore_forward(
-    name: str, ingredients: Ingredients, given: Mapping[str, Any], path: str | Path
+    name: str, ingredients: Ingredients, options: Mapping[str, Any], path: str | Path
 ) -> ForwardMap:
     """Return the map that :func:`keep_forward` wrote, or a new one of a kind that writes none.
 
@@ -97,7 +99,7 @@ def restore_forward(
     """
     kind = forward_kind(name)
     if kind.from_arrays is None:
-        return build_forward(name, ingredients, given)
+        return build_forward(name, ingredients, options)
     if not Path(path).is_file():
         raise InputError(f"{path}, the {name} map of the posterior beside it, is missing")
     arrays, metadata = read_arrays(path)

@@ -167,19 +167,19 @@ def sweep_box(
     """
     check_sweeps(simulator.scene, sweeps, at_rest=start is None and beneath is None)
     state = _restored(folder) or _first(simulator, start, beneath)
-    written = time.perf_counter()
+    last_write = time.perf_counter()
     with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
         while state.number < sweeps and not state.done:
             if time.perf_counter() > deadline and state.level == 1.0:
                 break
-            state, shown = _sweep(simulator, state, seed, beneath)
+            state, display = _sweep(simulator, state, seed, beneath)
             if start is not None and state.level == 1.0 and not np.isfinite(state.error):
                 state = replace(_at_rest(simulator), number=state.number, lost=True)
-            bar.set_postfix(shown)
+            bar.set_postfix(display)
             bar.update()
-            if folder is not None and time.perf_counter() - written > _WRITE_EVERY:
+            if folder is not None and time.perf_counter() - last_write > _WRITE_EVERY:
                 _write(folder, state)
-                written = time.perf_counter()
+                last_write = time.perf_counter()
     if folder is not None:
         _write(folder, state)
     _require_answer(simulator.scene, state)
@@ -198,9 +198,9 @@ def check_sweeps(scene: Scene, sweeps: int, *, at_rest: bool) -> None:
 def _require_answer(scene: Scene, state: SweepState) -> None:
     """Raise :class:`SolverError` where equilibria were lost on the way or in a part of the box."""
     if state.level < 1.0:
-        lost = "no step could be taken from where the start says, and from rest " * state.lost
+        cause = "no step could be taken from where the start says, and from rest " * state.lost
         raise SolverError(
-            f"scene '{scene.name}': {lost}{state.number} sweeps followed the equilibria "
+            f"scene '{scene.name}': {cause}{state.number} sweeps followed the equilibria "
             f"to {100 * state.level:.0f} % of the loads; give more of them, or use a recipe with "
             "FEM runs"
         )
@@ -238,8 +238,8 @@ def _at(simulator: Simulator, start: Map) -> SweepState:
     if not np.isfinite(fields).all():
         return replace(rest, lost=True)
     polynomial = fit(Samples(position, fields, np.zeros(len(position))), degree, 1.0)
-    before = 0.0 * polynomial.coefficients
-    return replace(rest, polynomial=polynomial, before=before, level=1.0)
+    zeros = 0.0 * polynomial.coefficients
+    return replace(rest, polynomial=polynomial, before=zeros, level=1.0)
 
 
 def _free_fields(simulator: Simulator, displacement: Map, position: np.ndarray) -> np.ndarray:
@@ -263,25 +263,25 @@ def _sweep(
         count *= 2
     rng = np.random.default_rng([seed, state.number])
     position = qmc.Sobol(parameters, rng=rng).random(count)
-    level, ahead = _next_level(state) if state.rises else (state.level, state.polynomial)
+    level, extrapolation = _next_level(state) if state.rises else (state.level, state.polynomial)
     below = 0.0 if beneath is None else _free_fields(simulator, beneath, position)
-    steps = targets(simulator, below + ahead.at(position), position, level)
+    steps = targets(simulator, below + extrapolation.at(position), position, level)
     usable = np.isfinite(steps.error)
-    taken = float(np.mean(usable & (steps.fraction >= _TAKEN)))
-    shown = {"load": f"{level:.2f}", "taken": f"{taken:.2f}"}
+    usable_share = float(np.mean(usable & (steps.fraction >= _TAKEN)))
+    display = {"load": f"{level:.2f}", "taken": f"{usable_share:.2f}"}
     new = Samples(position, steps.fields - below, steps.error).take(usable)
     lengths = steps.step[usable]
-    if not usable.any() or (state.rises and taken < _ENOUGH):
-        after = _with_smaller_rise(state)
+    if not usable.any() or (state.rises and usable_share < _ENOUGH):
+        next_state = _with_smaller_rise(state)
     elif state.rises:
-        after = _at_level(state, level, new, float(np.median(lengths)))
-        after = replace(after, largest_error=lengths.max())
+        next_state = _at_level(state, level, new, float(np.median(lengths)))
+        next_state = replace(next_state, largest_error=lengths.max())
     else:
-        after = _with_targets(state, new, float(np.median(lengths)))
-        after = replace(after, largest_error=lengths.max())
-        shown["energy gap"] = f"{np.median(steps.gap[usable]):.0e}"
-    shown |= {"degree": f"{after.polynomial.degree}", "error_mm": f"{after.error:.1e}"}
-    return replace(after, number=state.number + 1, taken=taken), shown
+        next_state = _with_targets(state, new, float(np.median(lengths)))
+        next_state = replace(next_state, largest_error=lengths.max())
+        display["energy gap"] = f"{np.median(steps.gap[usable]):.0e}"
+    display |= {"degree": f"{next_state.polynomial.degree}", "error_mm": f"{next_state.error:.1e}"}
+    return replace(next_state, number=state.number + 1, taken=usable_share), display
 
 
 def _next_level(state: SweepState) -> tuple[float, PolynomialFit]:

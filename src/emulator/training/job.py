@@ -108,8 +108,8 @@ class Job:
             discrepancy model can be judged.
         """
         thetas = self.scene.centre[None]
-        stored = None if self.campaign is None else _first_runs(self.campaign, plan)
-        if stored is None and plan.runs:
+        campaign_runs = None if self.campaign is None else _first_runs(self.campaign, plan)
+        if campaign_runs is None and plan.runs:
             draw = design if plan.needs_slopes else sobol
             thetas = jnp.concatenate([thetas, draw(self.scene, plan.runs, plan.seed)])
         runs = run_campaign(
@@ -121,7 +121,7 @@ class Job:
             at_least=FEWEST + 1,
             progress=self.progress,
         )
-        return runs if stored is None else runs.followed_by(stored)
+        return runs if campaign_runs is None else runs.followed_by(campaign_runs)
 
 
 def _first_runs(campaign: StoredRuns, plan: Plan) -> Runs:

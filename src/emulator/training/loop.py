@@ -208,19 +208,19 @@ def steps_within(seconds: float, training: NetworkTraining, total: int) -> int:
     InputError
         Fewer steps fit than a warm-up takes.
     """
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     one = late = _seconds_a_step(training, total)
     if training.freeze is not None:
         late = _seconds_a_step(training, total, *training.frozen(training.initial()[0]))
-    left = 0.98 * seconds - (time.perf_counter() - started)
-    early = left / one
+    remaining = 0.98 * seconds - (time.perf_counter() - start_time)
+    early = remaining / one
     if training.freeze is not None and late < one:
         early = min(early, training.freeze)
-    steps = int(early + max(left - early * one, 0.0) / late)
+    steps = int(early + max(remaining - early * one, 0.0) / late)
     if steps < WARMUP:
         raise InputError(
             f"the budget leaves {max(steps, 0)} training steps of {1e3 * one:.0f} ms after FEM "
-            f"runs and compilation; give at least {WARMUP * one - left:.0f} s more"
+            f"runs and compilation; give at least {WARMUP * one - remaining:.0f} s more"
         )
     return steps
 

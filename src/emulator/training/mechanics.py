@@ -136,11 +136,11 @@ def add_discrepancy(
         for name, bare in sums.items():
             errors[name] = _error(fitted(bare, runs.take(~test)), runs.take(test))
         best = min(errors, key=errors.__getitem__)
-    whole = fitted(sums[best], runs)
-    assert whole.discrepancy is not None, "it was fitted above"
-    modes = len(whole.discrepancy.modes)
+    final_model = fitted(sums[best], runs)
+    assert final_model.discrepancy is not None, "it was fitted above"
+    modes = len(final_model.discrepancy.modes)
     record = {"on": best, "runs": count, "modes": modes, "held_out_err_u_mm": errors}
-    return whole, record
+    return final_model, record
 
 
 def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:
@@ -150,8 +150,8 @@ def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:
     if emulator.coarse is not None:  # on the same body, it has learned from many runs
         candidates = [bare]
     elif emulator.family is not None:
-        alone = replace(bare, taylor=None)
-        candidates = [nothing, replace(nothing, taylor=series), alone, bare]
+        series_only = replace(bare, taylor=None)
+        candidates = [nothing, replace(nothing, taylor=series), series_only, bare]
     else:
         candidates = [nothing, replace(bare, network=None), bare]
     return {" + ".join(sum_.parts) or "nothing": sum_ for sum_ in candidates}

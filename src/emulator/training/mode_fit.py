@@ -313,11 +313,11 @@ class BlockedMatrix(NamedTuple):
         """Return a symmetric ``matrix`` (n, n) in blocks."""
         permutation = reverse_cuthill_mckee(matrix, symmetric_mode=True)
         groups = [permutation[k : k + _ROWS] for k in range(0, len(permutation), _ROWS)]
-        used = [np.unique(matrix[rows].indices) for rows in groups]
-        width = max(map(len, used))
+        column_numbers = [np.unique(matrix[rows].indices) for rows in groups]
+        width = max(map(len, column_numbers))
         columns = np.zeros((len(groups), width), dtype=np.int32)
         values = np.zeros((len(groups), _ROWS, width))
-        for k, (rows, present) in enumerate(zip(groups, used, strict=True)):
+        for k, (rows, present) in enumerate(zip(groups, column_numbers, strict=True)):
             columns[k, : len(present)] = present
             values[k, : len(rows), : len(present)] = matrix[rows][:, present].toarray()
         order = np.argsort(permutation, kind="stable")

@@ -57,8 +57,8 @@ class Plan:
         Counts that the recipe does not have are left out.
         """
         names = {each.name for each in fields(self)}
-        known: dict[str, Any] = {name: n for name, n in counts.items() if name in names}
-        return replace(self, **known)
+        own_counts: dict[str, Any] = {name: n for name, n in counts.items() if name in names}
+        return replace(self, **own_counts)
 
     def record(self, loss: float | None = None) -> Record:
         """Return the entries that every emulator's record has."""

@@ -85,9 +85,9 @@ def targets(
         return Targets(*(np.stack([np.asarray(x) for x in row]) for row in zip(*each, strict=True)))
 
     results: Iterator[Targets] = in_order(of_group, iter(groups), at_once(simulator))
-    joined = [np.concatenate(column) for column in zip(*results, strict=True)]
+    columns = [np.concatenate(column) for column in zip(*results, strict=True)]
     back = np.argsort(np.concatenate(groups))
-    return Targets(*(column[back] for column in joined))
+    return Targets(*(column[back] for column in columns))
 
 
 def _displacement(system: System, v: jax.Array, theta: jax.Array, level: jax.Array) -> jax.Array:

@@ -44,8 +44,8 @@ def solve_rows(
     numbers : the positions of the theta to solve at, in order; all by default.
     starts : called when a task is taken, so that it may use the rows so far.
     """
-    chosen = range(len(thetas)) if numbers is None else numbers
-    tasks = (Task(number, thetas[number], tuple(starts(number))) for number in chosen)
+    rows = range(len(thetas)) if numbers is None else numbers
+    tasks = (Task(number, thetas[number], tuple(starts(number))) for number in rows)
     return execute(solver, tasks)
 
 

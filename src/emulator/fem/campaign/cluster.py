@@ -135,8 +135,8 @@ class Cluster:
             raise self._gone(error) from error
 
     def _gone(self, error: Exception) -> SolverError:
-        said = " ".join(str(error).split())
-        return SolverError(f"campaign: the scheduler {self.address} does not answer ({said})")
+        message = " ".join(str(error).split())
+        return SolverError(f"campaign: the scheduler {self.address} does not answer ({message})")
 
     def forget(self) -> None:
         """Let the workers that are still there forget the solvers."""

@@ -56,17 +56,17 @@ def design(scene: Scene, count: int, seed: int) -> jax.Array:
     "When k-hat cries wolf"). Every fifth theta is a corner, in random order, until all are used;
     with more than 6 parameters there are none. A shorter design is the beginning of a longer one.
     """
-    whole = sobol(scene, count, seed)
+    sequence = sobol(scene, count, seed)
     parameters = len(scene.parameters)
     corners = np.zeros((0, parameters))
     if parameters <= _MOST_CORNERED:
         corners = np.array(list(product((0.0, 1.0), repeat=parameters)))
         corners = np.random.default_rng(seed).permutation(corners)[: count // _CORNER_EVERY]
-    inside = np.asarray(scene.to_unit(whole))
+    unit_positions = np.asarray(scene.to_unit(sequence))
     rows = _CORNER_EVERY * np.arange(1, len(corners) + 1) - 1
     positions = np.zeros((count, parameters))
     positions[rows] = corners
-    positions[np.setdiff1d(np.arange(count), rows)] = inside[: count - len(corners)]
+    positions[np.setdiff1d(np.arange(count), rows)] = unit_positions[: count - len(corners)]
     return scene.from_unit(jnp.asarray(positions))
 
 

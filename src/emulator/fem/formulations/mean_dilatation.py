@@ -93,10 +93,10 @@ class MeanDilatation:
         fraction: jax.Array,
     ) -> jax.Array:
         system, couplings = self.system, equations.couplings
-        after = self.blocks.advance(system.scene, volumes, couplings, step, fraction)
+        trial_volumes = self.blocks.advance(system.scene, volumes, couplings, step, fraction)
         v = u + fraction * step
         force = system.scatter(
-            self.blocks.eliminated_force(system.scene, v, after, theta, couplings)
+            self.blocks.eliminated_force(system.scene, v, trial_volumes, theta, couplings)
         )
         force = system.restrict(force + system.springs_less_loads(v, theta, load))
         remainder = 1.0 - fraction
@@ -104,8 +104,8 @@ class MeanDilatation:
         simplified = system.extend(system.solve(equations.tangent, rhs))
         simplified = simplified + remainder * jnp.where(system.scene.held, step, 0.0)
         valid = jnp.array(True)
-        if isinstance(after, Volumes):
-            valid = jnp.min(after.change) > -1.0
+        if isinstance(trial_volumes, Volumes):
+            valid = jnp.min(trial_volumes.change) > -1.0
         return valid & (_norm(simplified) <= (1.0 - 0.25 * fraction) * _norm(step))
 
     @compiled

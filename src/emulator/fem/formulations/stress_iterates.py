@@ -126,7 +126,7 @@ class StressIterates:
             equations = _equations(system, state.u, state.measures, theta, load, *factors)
             force = equations.residual + equations.offset_force
             # On the way from rest each tangent is unlike the one before.
-            solution, outcome = system.attempt(equations.tangent, -force, near=False)
+            solution, outcome = system.attempt(equations.tangent, -force, may_reuse=False)
             step, definite = _full_step(
                 system, state.u, theta, load, equations.solvable, force, solution, outcome
             )
@@ -231,9 +231,11 @@ def _advanced(
     """Return the displacement (n, 3) mm and measures (m, q, k) after ``fraction`` of the step."""
     scene, point = system.scene, MaterialPoint(system.scene, theta)
     H, change = jax.jvp(lambda v: _seen(scene, v), (u,), (step,))
-    after = at_points(point.at_stress, scene.block_tissue_at(theta), H, change, measures)
+    measures_after = at_points(point.at_stress, scene.block_tissue_at(theta), H, change, measures)
     advances = fraction > 0.0
-    return jnp.where(advances, u + fraction * step, u), jnp.where(advances, after, measures)
+    return jnp.where(advances, u + fraction * step, u), jnp.where(
+        advances, measures_after, measures
+    )
 
 
 def applies(scene: Scene) -> bool:

@@ -77,16 +77,16 @@ class Pattern:
         """Return ``A x`` for ``x`` of shape (size,) or (size, k)."""
         if x.ndim == 2:
             return jax.vmap(lambda column: self.product(values, column), 1, 1)(x)
-        stored = jax.ops.segment_sum(
+        stored_part = jax.ops.segment_sum(
             values * x[self.columns],
             self.rows,
             num_segments=self.size,
             indices_are_sorted=True,
         )
         if not self.upper:
-            return stored
+            return stored_part
         above = jnp.where(self.rows < self.columns, values, 0.0)
-        return stored.at[self.columns].add(above * x[self.rows])
+        return stored_part.at[self.columns].add(above * x[self.rows])
 
     def solvable(self, values: jax.Array) -> jax.Array:
         """Whether ``values`` are finite and leave no row empty, shape ()."""

@@ -136,15 +136,15 @@ class Factor:
         if reason == kinds.NOERROR:
             return
         code, detail = (pc.getFactorMatrix().getMumpsInfog(k) for k in (1, 2))
-        said = f"INFOG(1) = {code}, INFOG(2) = {detail}"
+        codes = f"INFOG(1) = {code}, INFOG(2) = {detail}"
         if reason in (kinds.FACTOR_NUMERIC_ZEROPIVOT, kinds.FACTOR_STRUCT_ZEROPIVOT):
-            raise SingularMatrix(f"petsc: matrix is singular (MUMPS: {said})")
+            raise SingularMatrix(f"petsc: matrix is singular (MUMPS: {codes})")
         if code in _WORKSPACE_TOO_SMALL:
             raise InputError(
-                f"petsc: MUMPS needs more working space than it estimated ({said}); "
+                f"petsc: MUMPS needs more working space than it estimated ({codes}); "
                 "add -mat_mumps_icntl_14 100 to PETSC_OPTIONS"
             )
-        raise ValueError(f"petsc: no factor (MUMPS: {said})")
+        raise ValueError(f"petsc: no factor (MUMPS: {codes})")
 
     def _check_solution(self, residual: float, size: float) -> None:
         reason = self._ksp.getConvergedReason()

@@ -76,8 +76,8 @@ def conjugate_gradients(
     enough = tolerance**2 * begin
 
     def on_pace(k: jax.Array, size: jax.Array) -> jax.Array:
-        allowed = begin * tolerance ** (k / steps)
-        return jnp.array(True) if patience is None else (k < patience) | (size <= allowed)
+        allowance = begin * tolerance ** (k / steps)
+        return jnp.array(True) if patience is None else (k < patience) | (size <= allowance)
 
     def step(state: _State) -> _State:
         image = product(state.direction)
@@ -127,13 +127,13 @@ class KeptFactor:
         return pattern.upper and pattern.size >= _LARGE
 
     def attempt(
-        self, tangent: jax.Array, b: jax.Array, *, near: bool = True
+        self, tangent: jax.Array, b: jax.Array, *, may_reuse: bool = True
     ) -> tuple[jax.Array, jax.Array]:
         """Return ``x`` (f,) with ``K x = b``, and the outcome.
 
-        near : whether the kept factor may serve; otherwise ``tangent`` is factorised and kept.
+        may_reuse : whether the kept factor may serve; otherwise ``tangent`` is factorised and kept.
         """
-        if near and self._factorised is not None:
+        if may_reuse and self._factorised is not None:
             solution = self._solve_beside(tangent, self._factorised, b)
             if bool(solution.convex & (solution.reduction <= TOLERANCE)):
                 return solution.x, jnp.asarray(Outcome.OK, jnp.int32)

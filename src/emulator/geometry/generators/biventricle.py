@@ -86,22 +86,22 @@ def _edge_keys(triangles: np.ndarray) -> np.ndarray:
 
 
 def spread(
-    points: np.ndarray, triangles: np.ndarray, held: np.ndarray, places: np.ndarray
+    points: np.ndarray, triangles: np.ndarray, prescribed: np.ndarray, places: np.ndarray
 ) -> np.ndarray:
-    """``points`` (v, 2) with ``held`` (h,) moved to ``places`` (h, 2) and the others following.
+    """Return ``points`` (v, 2) with ``prescribed`` (h,) moved to ``places`` (h, 2).
 
-    Displacements are harmonic over ``triangles``: they decay away from ``held`` and keep an even
+    Displacements are harmonic over ``triangles``: they decay away from ``prescribed`` and keep an even
     grid even. Points outside the triangles stay.
     """
-    used, local = np.unique(triangles, return_inverse=True)
-    basis = Basis(MeshTri(points[used].T.copy(), local.reshape(-1, 3).T.copy()), ElementTriP1())
+    vertices, local = np.unique(triangles, return_inverse=True)
+    basis = Basis(MeshTri(points[vertices].T.copy(), local.reshape(-1, 3).T.copy()), ElementTriP1())
     stiffness = laplace.assemble(basis)
-    fixed = np.searchsorted(used, held)
+    rows = np.searchsorted(vertices, prescribed)
     result = points.copy()
     for axis in range(2):
         shift = basis.zeros()
-        shift[fixed] = (places - points[held])[:, axis]
-        result[used, axis] += solve(*condense(stiffness, x=shift, D=fixed))
+        shift[rows] = (places - points[prescribed])[:, axis]
+        result[vertices, axis] += solve(*condense(stiffness, x=shift, D=rows))
     return result
 
 
@@ -121,8 +121,8 @@ class RightVentricle:
     thickness: float = 5.0
 
     def __post_init__(self) -> None:
-        sound = 0.0 < self.half_angle < 150.0 and 0.0 < self.apex < 1.0
-        if not (sound and 0.0 < self.bulge < np.inf and 0.0 < self.thickness < np.inf):
+        valid = 0.0 < self.half_angle < 150.0 and 0.0 < self.apex < 1.0
+        if not (valid and 0.0 < self.bulge < np.inf and 0.0 < self.thickness < np.inf):
             raise InputError(
                 f"biventricle: right ventricle {astuple(self)}; expected a half angle below 150 "
                 "degrees, an apex below 1, and positive bulge and thickness in mm"
@@ -306,9 +306,9 @@ def _made_room(
     r[band], phi[band] = septum.foot(xi[band], eta[band], _depths(band.shape[1])[1:])
     share = (np.pi - np.abs(phi[rim])) / (np.pi - half_angle)
     phi[rim] = np.sign(phi[rim]) * (np.pi - share * (np.pi - septum.half_angle))
-    held = np.concatenate([band[:, -1], rim])
-    x, y = spread(points, opened.outer, held, _polar(r[held], phi[held])).T
-    rest = np.setdiff1d(opened.outer, held)
+    fixed = np.concatenate([band[:, -1], rim])
+    x, y = spread(points, opened.outer, fixed, _polar(r[fixed], phi[fixed])).T
+    rest = np.setdiff1d(opened.outer, fixed)
     r[rest], phi[rest] = np.hypot(x[rest], y[rest]), np.arctan2(y[rest], x[rest])
     return r, phi
 

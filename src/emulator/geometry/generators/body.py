@@ -55,12 +55,12 @@ def extrude(columns: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """
     lower, upper = columns[:, :-1], columns[:, 1:]
     a, b, c = np.sort(triangles, axis=1).T
-    cut = (
+    tetrahedra = (
         (lower[a], lower[b], lower[c], upper[c]),
         (lower[a], lower[b], upper[b], upper[c]),
         (lower[a], upper[a], upper[b], upper[c]),
     )
-    return np.stack([np.stack(corners, axis=-1) for corners in cut]).reshape(-1, 4)
+    return np.stack([np.stack(corners, axis=-1) for corners in tetrahedra]).reshape(-1, 4)
 
 
 def stacked(vertices: int, layers: int) -> np.ndarray:

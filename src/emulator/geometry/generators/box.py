@@ -129,7 +129,7 @@ def slab(
         "front": nodes[:, 2] == 0.0,
         "back": nodes[:, 2] > 0.0,
     }
-    surfaces = {name: np.flatnonzero(chosen) for name, chosen in on.items()}
+    surfaces = {name: np.flatnonzero(mask) for name, mask in on.items()}
     mesh = body(nodes, extrude(stacked(len(plane), 1), triangles), surfaces, surfaces, None, order)
     return replace(mesh, node_sets={**mesh.node_sets, "all": np.arange(len(mesh.nodes))})
 

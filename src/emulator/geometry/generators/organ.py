@@ -57,7 +57,7 @@ def organ(
     surface = np.flatnonzero(np.linalg.norm(nodes, axis=1) > 1.0 - 0.5 / shells)
     if not 0.0 <= clustering < 1.0:
         raise InputError(f"organ: clustering {clustering}; expected from 0 to below 1")
-    held = _in_ligament(nodes[surface], ligament_shells, clustering)
+    in_ligament = _in_ligament(nodes[surface], ligament_shells, clustering)
     middle = ball_midpoints(nodes)
 
     def mapped(points: np.ndarray) -> np.ndarray:
@@ -66,8 +66,8 @@ def organ(
     return body(
         mapped(nodes),
         elements,
-        {"surface": surface, "ligament": surface[held]},
-        {"ligament": surface[held]},
+        {"surface": surface, "ligament": surface[in_ligament]},
+        {"ligament": surface[in_ligament]},
         lambda edges: mapped(middle(edges)),
         order,
     )

@@ -43,18 +43,18 @@ def liver(
         (six shells of quadratic elements are 0.5 mm off).
     """
     sizes = {"shells": shells, "clustering": clustering, "ligament_shells": ligament_shells}
-    made = resolved(_SIZES, order, **sizes, ligament=ligament)
-    stiffness = made.pop("ligament")
-    held = Support("ligament") if stiffness is None else ElasticSupport("ligament", stiffness)
+    resolution = resolved(_SIZES, order, **sizes, ligament=ligament)
+    stiffness = resolution.pop("ligament")
+    support = Support("ligament") if stiffness is None else ElasticSupport("ligament", stiffness)
     return Scene(
         name="liver",
-        mesh=organ(**made),
+        mesh=organ(**resolution),
         law=find_law("neo_hookean"),
         parameters=(
             Parameter("lam", "kPa", 3.5, 10.0, "log"),
             Parameter("mu", "kPa", 3.5, 10.0, "log"),
         ),
         loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80),),
-        supports=(held,),
-        origin={"scene": "liver", **made, "ligament": stiffness},
+        supports=(support,),
+        origin={"scene": "liver", **resolution, "ligament": stiffness},
     )

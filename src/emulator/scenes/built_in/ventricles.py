@@ -199,8 +199,8 @@ def biventricle(
     right_pressure : in the right ventricle, kPa.
     order : of the elements; 1, linear, as published.
     """
-    chosen = {"rings": rings, "around": around, "layers": layers, "grading": grading}
-    sizes = resolved(_BIVENTRICLE_SIZES, order, **chosen)
+    mesh_sizes = {"rings": rings, "around": around, "layers": layers, "grading": grading}
+    sizes = resolved(_BIVENTRICLE_SIZES, order, **mesh_sizes)
     mesh = generators.biventricle(**sizes)
     rule = Biventricle(angles)
     return Scene(

@@ -140,11 +140,11 @@ class ActiveTension(Load):
         assert fibres is not None, "a scene with this load has fibres"
         if self.within is None:
             return grid, fibres
-        chosen = np.flatnonzero(self._contracts(grid.mesh))
+        elements = np.flatnonzero(self._contracts(grid.mesh))
         muscle = {
-            name: getattr(grid, name)[chosen] for name in ("connectivity", "gradients", "weights")
+            name: getattr(grid, name)[elements] for name in ("connectivity", "gradients", "weights")
         }
-        return replace(grid, **muscle), fibres.some(chosen)
+        return replace(grid, **muscle), fibres.some(elements)
 
     def _of_elements(self, grid: Discretisation, fibres: Fibres) -> LocalTerm:
         def growth(h: jax.Array, weight: jax.Array, f: jax.Array) -> jax.Array:
@@ -203,8 +203,8 @@ def _springs(grid: Discretisation, fibres: Any, transverse: float) -> tuple[np.n
         )
     one, other = np.triu_indices(grid.connectivity.shape[1], 1)
     ends = np.sort(grid.connectivity[:, np.stack([one, other], axis=1)], axis=2).reshape(-1, 2)
-    pairs, which = np.unique(ends, axis=0, return_inverse=True)
+    pairs, spring_of_pair = np.unique(ends, axis=0, return_inverse=True)
     amounts = stiffness[:, one, other].ravel()
     if traced:
-        return pairs, -jax.ops.segment_sum(amounts, which.ravel(), len(pairs))
-    return pairs, -np.bincount(which.ravel(), amounts, minlength=len(pairs))
+        return pairs, -jax.ops.segment_sum(amounts, spring_of_pair.ravel(), len(pairs))
+    return pairs, -np.bincount(spring_of_pair.ravel(), amounts, minlength=len(pairs))

@@ -179,8 +179,8 @@ class CavityPressure(SurfacePressure):
         """Refuse a cavity whose rim is neither fixed nor slides in a plane through the origin."""
         edges = rim(mesh.facet_set(self.facet_set))
         fixed = held[edges]  # (e, 2 or 3, 3)
-        place = np.where(fixed, mesh.nodes[edges] + displacement[edges], np.nan)
-        in_symmetry_plane = (np.abs(place) <= 1e-9 * mesh.size).all(axis=1).any(axis=1)
+        positions = np.where(fixed, mesh.nodes[edges] + displacement[edges], np.nan)
+        in_symmetry_plane = (np.abs(positions) <= 1e-9 * mesh.size).all(axis=1).any(axis=1)
         loose = np.unique(edges[~(fixed.all(axis=(1, 2)) | in_symmetry_plane)])
         if loose.size:
             raise InputError(

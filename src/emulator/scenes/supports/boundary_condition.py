@@ -87,9 +87,9 @@ def check_motions(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> None:
     for k in range(part.max() + 1):
         free = _free_motions(points[owner == k], directions[owner == k])
         if free:
-            which = _named(mesh.nodes, part, k) if part.any() else "its supports leave"
+            description = _named(mesh.nodes, part, k) if part.any() else "its supports leave"
             raise InputError(
-                f"{which} {free} of the 6 rigid motions free, the body could move "
+                f"{description} {free} of the 6 rigid motions free, the body could move "
                 "or turn; hold more nodes or components"
             )
 

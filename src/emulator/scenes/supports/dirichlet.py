@@ -119,7 +119,7 @@ def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:
     InputError
         Two supports prescribe different values at a node that they share.
     """
-    held = np.zeros(mesh.nodes.shape, dtype=bool)
+    components = np.zeros(mesh.nodes.shape, dtype=bool)
     prescribed = [each for support in supports if (each := support.held(mesh)) is not None]
     amounts = (None, *dict.fromkeys(each.amount for each in prescribed if each.amount))
     totals = {amount: np.zeros(mesh.nodes.shape) for amount in amounts}
@@ -127,7 +127,7 @@ def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:
         for axis in axes:
             for amount, total in totals.items():
                 value = displacement[:, axis] if amount == own else np.zeros(len(nodes))
-                clash = np.flatnonzero(held[nodes, axis] & (total[nodes, axis] != value))
+                clash = np.flatnonzero(components[nodes, axis] & (total[nodes, axis] != value))
                 if len(clash):
                     node, times = nodes[clash[0]], f" times {amount}" if amount else ""
                     raise InputError(
@@ -136,7 +136,7 @@ def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:
                         f"not {value[clash[0]]:g}"
                     )
                 total[nodes, axis] = value
-            held[nodes, axis] = True
+            components[nodes, axis] = True
     fixed = frozen_array(totals.pop(None))
     per_unit = {str(name): frozen_array(total) for name, total in totals.items() if total.any()}
-    return Prescribed(frozen_array(held, bool), fixed, MappingProxyType(per_unit))
+    return Prescribed(frozen_array(components, bool), fixed, MappingProxyType(per_unit))

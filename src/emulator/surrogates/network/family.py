@@ -171,13 +171,13 @@ class FamilyNetwork:
     def cache(self, nodes: np.ndarray) -> CachedPart:
         """Run the processor and keep the modes at ``nodes`` (k,)."""
         modes, mean = jax.jit(self._prepare)()
-        kept = np.asarray(modes, dtype=float)[:, nodes]
+        node_modes = np.asarray(modes, dtype=float)[:, nodes]
         network = nnx.merge(*nnx.split(self._module().branch))
 
         def coefficients(position: jax.Array) -> jax.Array:
             return network(self.normalise(position), mean).astype(jnp.float64)
 
-        return CachedPart(np.zeros((len(nodes), 3)), kept, coefficients)
+        return CachedPart(np.zeros((len(nodes), 3)), node_modes, coefficients)
 
     def arrays(self) -> dict[str, Any]:
         """Return the weights, features and their standard, vectors and shares by name."""

@@ -97,21 +97,21 @@ def hierarchy(
     """Return virtual layers above the nodes at ``positions`` (n, 3), joined by ``edges`` (e, 2)."""
     from sklearn.cluster import KMeans  # slow to import; a cached emulator needs no graph
 
-    joined, parents, offset = [edges], [], 0
+    layer_edges, parents, offset = [edges], [], 0
     while len(positions) // options.cluster >= options.smallest:
         count = len(positions) // options.cluster
         parent = KMeans(count, n_init=1, random_state=0).fit(positions).labels_
         parents.append(parent)
         above = offset + len(positions)
-        joined.append(np.column_stack([offset + np.arange(len(positions)), above + parent]))
+        layer_edges.append(np.column_stack([offset + np.arange(len(positions)), above + parent]))
         positions = _cluster_means(positions, parent, count)
         last = count // options.cluster < options.smallest
         if last:
-            joined.append(above + np.column_stack(np.triu_indices(count, 1)))
+            layer_edges.append(above + np.column_stack(np.triu_indices(count, 1)))
         else:
-            joined.append(above + _nearest(positions, options.neighbours))
+            layer_edges.append(above + _nearest(positions, options.neighbours))
         offset = above
-    pairs = np.unique(np.sort(np.concatenate(joined), axis=1), axis=0)
+    pairs = np.unique(np.sort(np.concatenate(layer_edges), axis=1), axis=0)
     return Hierarchy(pairs, tuple(parents))
 
 

@@ -68,9 +68,9 @@ def describe(scene: Scene) -> BodyFeatures:
     fibres = _fibre_tensor(body, scene)
     shape = _shape(body, fibres)
     local = np.column_stack([_places(body), _along_fibres(body, fibres)])
-    whole = np.array([shape[name] for name in _REPEATED])
+    numbers = np.array([shape[name] for name in _REPEATED])
     layers = hierarchy(body.offset, mesh_edges(scene.mesh.elements))
-    nodes = layers.extend(np.column_stack([local, np.tile(whole, (len(local), 1))]))
+    nodes = layers.extend(np.column_stack([local, np.tile(numbers, (len(local), 1))]))
     receivers, senders = layers.pairs.T
     vectors = body.vectors()
     positions, normals = layers.extend(body.offset), layers.extend(body.normal)
