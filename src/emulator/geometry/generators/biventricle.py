@@ -90,8 +90,8 @@ def spread(
 ) -> np.ndarray:
     """Return ``points`` (v, 2) with ``prescribed`` (h,) moved to ``places`` (h, 2).
 
-    Displacements are harmonic over ``triangles``: they decay away from ``prescribed`` and keep an even
-    grid even. Points outside the triangles stay.
+    Displacements are harmonic over ``triangles``: they decay away from ``prescribed`` and keep an
+    even grid even. Points outside the triangles stay.
     """
     vertices, local = np.unique(triangles, return_inverse=True)
     basis = Basis(MeshTri(points[vertices].T.copy(), local.reshape(-1, 3).T.copy()), ElementTriP1())
