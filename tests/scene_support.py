@@ -56,6 +56,21 @@ def between_plates(order=2, dilatation="pointwise", cells=(2, 2, 2), **changes) 
     return replace(scene, **changes)
 
 
+MU, LAM = Parameter("mu", "kPa", 3.5, 10.0, "log"), Parameter("lam", "kPa", 3.5, 10.0, "log")
+
+
+def hanging_block() -> Scene:
+    """A Neo-Hookean block that hangs under its weight; theta = (mu, lam)."""
+    return Scene(
+        name="hanging",
+        mesh=box((20.0, 10.0, 10.0), (2, 1, 1)),
+        law=find_law("neo_hookean"),
+        parameters=(MU, LAM),
+        loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80),),
+        supports=(Support("left"),),
+    )
+
+
 def rotation(seed: int = 0) -> np.ndarray:
     """A proper rotation, far from the identity."""
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))

@@ -100,9 +100,6 @@ def _draw_joint(axes: Axes, posterior: Posterior, theta: Mapping[str, float]) ->
     axes.legend(loc="upper right", frameon=False)
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 _PRIOR, _POSTERIOR, _DATA = "0.75", "tab:blue", "tab:red"
 
 

@@ -7,28 +7,16 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError
-from emulator.geometry.generators.box import box
-from emulator.mechanics.laws import find_law
 from emulator.released.scenes import published_scene
-from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads import Gravity
+from emulator.scenes import Scene
 from emulator.verify import released as module
 from emulator.verify.released import published_reference
-
-MU, LAM = Parameter("mu", "kPa", 3.5, 10.0, "log"), Parameter("lam", "kPa", 3.5, 10.0, "log")
+from scene_support import MU, hanging_block
 
 
 @pytest.fixture(scope="module")
 def hanging() -> Scene:
-    """A block in mm and kPa, its parameters not in the release's order."""
-    return Scene(
-        name="hanging",
-        mesh=box((20.0, 10.0, 10.0), (2, 1, 1)),
-        law=find_law("neo_hookean"),
-        parameters=(MU, LAM),
-        loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80),),
-        supports=(Support("left"),),
-    )
+    return hanging_block()
 
 
 @pytest.fixture(scope="module")

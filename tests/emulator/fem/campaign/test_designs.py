@@ -12,10 +12,8 @@ from emulator.core.errors import InputError
 from emulator.fem import design, sobol
 from emulator.fem.campaign.designs import fem_reference, outside_reference, sample_outside
 from emulator.fem.solution import Status
-from emulator.geometry.generators.box import box
-from emulator.mechanics.laws import find_law
-from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads import Gravity
+from emulator.scenes import Parameter, Scene
+from scene_support import LAM, MU, hanging_block
 
 
 def test_a_shorter_design_begins_a_longer_one(beam):
@@ -42,20 +40,9 @@ def test_a_design_of_nothing(beam, count, seed):
         sobol(beam, count, seed)
 
 
-MU, LAM = Parameter("mu", "kPa", 3.5, 10.0, "log"), Parameter("lam", "kPa", 3.5, 10.0, "log")
-
-
 @pytest.fixture(scope="module")
 def hanging() -> Scene:
-    """A block in mm and kPa, its parameters not in the release's order."""
-    return Scene(
-        name="hanging",
-        mesh=box((20.0, 10.0, 10.0), (2, 1, 1)),
-        law=find_law("neo_hookean"),
-        parameters=(MU, LAM),
-        loads=(Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80),),
-        supports=(Support("left"),),
-    )
+    return hanging_block()
 
 
 @pytest.fixture(scope="module")
