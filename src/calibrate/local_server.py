@@ -18,13 +18,13 @@ class Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def is_foreign(self) -> bool:
-        """Whether the request is from a page whose own name resolves to this machine.
+        """Return whether the request is from a page whose own name resolves to this machine.
 
         Such a page sends its own name as the host. A server that other machines reach is known by
         other names, and takes every one.
         """
-        named = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-        return self.server.server_address[0] == LOOPBACK and named not in _OF_THIS_MACHINE
+        host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+        return self.server.server_address[0] == LOOPBACK and host not in _OF_THIS_MACHINE
 
     def send(self, code: int, content: bytes, kind: str) -> None:
         """Answer with ``content`` of the media type ``kind``."""

@@ -38,12 +38,12 @@ def as_attributes(values: Mapping[str, Any]) -> dict[str, str | int | float]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package and of those its numbers depend on."""
+    """Return the versions of this package and of those its numbers depend on."""
     return {name: version(name) for name in PACKAGES}
 
 
 def hardware() -> dict[str, Any]:
-    """Processor, cores, and accelerator if JAX uses one."""
+    """Return processor, cores, and the accelerator if JAX uses one."""
     accelerator = None if jax.default_backend() == "cpu" else jax.devices()[0].device_kind
     return {
         "processor": _processor(),
@@ -63,7 +63,7 @@ def _processor() -> str:
 
 
 def commit(folder: str | Path) -> str | None:
-    """Commit checked out at ``folder``, with ``+`` if files were changed; ``None`` without git."""
+    """Return the commit at ``folder``, with ``+`` if files were changed; ``None`` without git."""
     try:
         words = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=12"]
         process = subprocess.run(words, capture_output=True, text=True, check=True)
@@ -73,7 +73,7 @@ def commit(folder: str | Path) -> str | None:
 
 
 def study_header(folder: str | Path, seed: int) -> dict[str, Any]:
-    """The first entries of every study's results.json."""
+    """Return the first entries of every study's results.json."""
     return {
         "hardware": hardware(),
         "versions": versions(),

@@ -17,8 +17,8 @@ from pathlib import Path
 import jax
 
 VARIABLE = "CALIBRATE_CACHE"
-LARGEST = 1 << 30  # bytes; the programs used longest ago go first
-_LEAST_SECONDS = 0.0  # of compilation that are worth a file: a hundred small programs take 2 s
+LARGEST = 1 << 30  # bytes; the least recently used programs are deleted first
+_LEAST_SECONDS = 0.0  # every program is kept: compiling a hundred small ones takes 2 s
 
 
 def keep_programs(environment: Mapping[str, str] = os.environ) -> Path | None:
@@ -51,11 +51,11 @@ def program_folder(environment: Mapping[str, str]) -> Path | None:
     Programs use the instructions of the processor they were compiled on, so that a home directory
     on several machines holds a folder for each kind.
     """
-    named = environment.get(VARIABLE)
-    if named == "":
+    folder_name = environment.get(VARIABLE)
+    if folder_name == "":
         return None
-    if named is not None:
-        base = Path(named).expanduser()
+    if folder_name is not None:
+        base = Path(folder_name).expanduser()
     else:
         home = environment.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
         base = Path(home) / "calibrate"
@@ -63,7 +63,7 @@ def program_folder(environment: Mapping[str, str]) -> Path | None:
 
 
 def _instructions() -> str:
-    """A short name of the processor's instruction set."""
+    """Return a short name of the processor's instruction set."""
     flags = ""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 """Exit codes."""
 
-_UNLIMITED = 1_000_000  # columns of a file or a pipe
+_UNLIMITED = 1_000_000  # columns when the output is a file or a pipe
 
 
 def emit(arguments: argparse.Namespace, result: Any, text: str) -> None:
@@ -31,7 +31,7 @@ def emit(arguments: argparse.Namespace, result: Any, text: str) -> None:
 
 
 def show_progress(arguments: argparse.Namespace) -> bool:
-    """Whether to show progress on standard error: without ``--json``."""
+    """Return whether to show progress on standard error: yes without ``--json``."""
     return not arguments.json
 
 
@@ -81,7 +81,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], width: int | 
 
 
 def _blocks(widths: Sequence[int], width: int) -> list[list[int]]:
-    """Columns after the first that stand side by side, at least one in each block."""
+    """Return the columns after the first that stand side by side, at least one in each block."""
     blocks: list[list[int]] = [[]]
     for k in range(1, len(widths)):
         together = [0, *blocks[-1], k]

@@ -67,7 +67,7 @@ def add_run(parser: argparse.ArgumentParser, more: Sequence[str] = ()) -> None:
 
 
 def _argument(field: Field[Any], word: Word) -> dict[str, Any]:
-    """The arguments of ``add_argument`` for one field of a run."""
+    """Return the arguments of ``add_argument`` for one field of a run."""
     hint, has_default = get_type_hints(Run)[field.name], field.default not in (MISSING, None)
     description = documented(Run)[field.name].removesuffix(".").replace("%", "%%")
     usual = f" (default {field.default})" if has_default else ""
@@ -85,8 +85,8 @@ def _argument(field: Field[Any], word: Word) -> dict[str, Any]:
 
 def entries_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> dict[str, Any]:
     """Return the fields of a run that :func:`add_run` read: those that an option was given for."""
-    measured = arguments.data not in (None, SYNTHETIC)
-    for option in ("truth", "observe") if measured else ():
+    has_data_file = arguments.data not in (None, SYNTHETIC)
+    for option in ("truth", "observe") if has_data_file else ():
         if getattr(arguments, option):
             raise InputError(
                 f"--{option} has no effect beside --data {arguments.data}: it is for synthetic data"
@@ -101,8 +101,8 @@ def entries_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> dict[
         entries["root"] = arguments.root
     else:
         entries["scene"], entries["root"] = scene_words(arguments)
-    given = {name: value for name, value in entries.items() if value is not None and value != {}}
-    return with_absolute_paths(given)
+    nonempty = {name: value for name, value in entries.items() if value is not None and value != {}}
+    return with_absolute_paths(nonempty)
 
 
 def plan_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> Problem | Members:
@@ -114,7 +114,7 @@ def plan_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> Problem 
 
 
 def problem_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> Problem:
-    """:func:`plan_of` where it is one run; :class:`InputError` where it is members."""
+    """Return :func:`plan_of` of one run; :class:`InputError` if it is of members."""
     plan = plan_of(arguments, more)
     if isinstance(plan, Members):
         raise InputError(
@@ -191,14 +191,14 @@ def sampler_options(words: Sequence[str]) -> dict[str, Any]:
                 f"--sampler-options: '{word}' is not NAME=VALUE, as target_accept=0.95"
             )
         options[name] = text
-        for kind in (float, int):  # the last that reads it
+        for kind in (float, int):  # an int where the text is one
             with suppress(ValueError):
                 options[name] = kind(text)
     return options
 
 
 def check_warmup(problem: Problem, arguments: argparse.Namespace) -> None:
-    """:class:`InputError` where ``--warmup`` is given to a sampler that does not adapt."""
+    """Raise :class:`InputError` if ``--warmup`` is given to a sampler that does not adapt."""
     sampler, _ = problem.run.sampling()
     adapts = "warmup" in {field.name for field in fields(sampler.options)}
     if arguments.warmup is not None and not adapts:

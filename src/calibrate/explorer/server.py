@@ -102,8 +102,8 @@ class Explorer:
             raise InputError(f"scene '{self.scene.name}' has no cavity whose pressure varies")
         theta, pressures = self.theta(position), self._curve.pressures
         volumes = np.asarray(self._volumes(theta))
-        here = float(theta[self.scene.parameter_names.index(self._curve.parameter.name)])
-        klotz = klotz_of(self.scene, np.interp(here, pressures, volumes), here)
+        pressure = float(theta[self.scene.parameter_names.index(self._curve.parameter.name)])
+        klotz = klotz_of(self.scene, np.interp(pressure, pressures, volumes), pressure)
         return {
             "pressure": pressures.tolist(),
             "volume": volumes.tolist(),

@@ -26,7 +26,7 @@ def beam_figure(
     certificate: Certificate,
     path: str | Path,
 ) -> None:
-    """The deformed body seen from the side, true and inferred, and the posterior of theta.
+    """Draw the deformed body from the side, true and inferred, and the posterior of theta.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def beam_figure(
 
 
 def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.ndarray) -> Any:
-    """x-z view: reference and truth as lines, posterior mean as points coloured by its sd."""
+    """Draw reference and truth as lines in x-z, the posterior mean as points coloured by sd."""
     from matplotlib.collections import LineCollection
 
     mesh = posterior.model.forward.scene.mesh
@@ -82,7 +82,7 @@ def _draw_side(axes: Axes, posterior: Posterior, truth: np.ndarray, fields: np.n
 
 
 def _draw_joint(axes: Axes, posterior: Posterior, theta: Mapping[str, float]) -> None:
-    """Draws of the first two parameters, the truth, and the box the prior covers."""
+    """Draw the first two parameters' draws, the truth, and the box that the prior covers."""
     scene = posterior.model.forward.scene
     first, second = scene.parameters[:2]
     draws = posterior.draws()
@@ -110,7 +110,7 @@ def ventricle_figure(
     certificate: Certificate,
     path: str | Path,
 ) -> None:
-    """The ventricle cut open with its landmarks, marginals, and the cavity's volume.
+    """Draw the ventricle cut open with its landmarks, marginals, and the cavity's volume.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def ventricle_figure(
 
 
 def _draw_body(figure: Any, posterior: Posterior, fields: np.ndarray) -> None:
-    """The half behind the long axis, at the posterior mean, coloured by its sd; landmarks."""
+    """Draw the half behind the long axis, at the posterior mean, coloured by its sd; landmarks."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     mesh = posterior.model.forward.scene.mesh
@@ -166,7 +166,7 @@ def _draw_body(figure: Any, posterior: Posterior, fields: np.ndarray) -> None:
 
 
 def _draw_marginal(axes: Axes, posterior: Posterior, parameter: Any, truth: float) -> None:
-    """Posterior and prior density of a parameter over its box."""
+    """Draw posterior and prior density of a parameter over its box."""
     edges = np.linspace(parameter.low, parameter.high, 41).tolist()
     values = np.linspace(parameter.low, parameter.high, 200)[1:-1]
     density = np.exp(posterior.model.prior[parameter.name].log_prob(values))
@@ -181,7 +181,7 @@ def _draw_marginal(axes: Axes, posterior: Posterior, parameter: Any, truth: floa
 
 
 def _draw_volume(axes: Axes, posterior: Posterior, truth: np.ndarray, prior: jax.Array) -> None:
-    """Predicted cavity volume, prior and posterior, against the measured one."""
+    """Draw the predicted cavity volume, prior and posterior, against the measured one."""
     model = posterior.model
     volume = model.observe.parts["volume"]
     wall = model.full.at(volume.nodes)

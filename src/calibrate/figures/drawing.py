@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def pyplot() -> Any:
-    """matplotlib.pyplot; :class:`InputError` when it is not installed.
+    """Return matplotlib.pyplot; :class:`InputError` when it is not installed.
 
     It draws to files, unless somebody imported it before and shows figures, as in a notebook.
     """
@@ -49,7 +49,7 @@ def pyplot() -> Any:
 
 
 def displacement_draws(posterior: Posterior) -> np.ndarray:
-    """Full displacement fields (200, n, 3) mm at evenly spaced draws, from the forward map."""
+    """Return displacement fields (200, n, 3) mm of the forward map at evenly spaced draws."""
     thetas = posterior.thetas()
     rows = np.linspace(0, len(thetas) - 1, 200).astype(int)
     chosen = np.asarray(thetas)[rows]
@@ -57,7 +57,7 @@ def displacement_draws(posterior: Posterior) -> np.ndarray:
 
 
 def displacement_part(posterior: Posterior) -> DisplacementPoints:
-    """The observation called ``displacement``; :class:`InputError` when there is none."""
+    """Return the observation called ``displacement``; :class:`InputError` when there is none."""
     parts = posterior.model.observe.parts
     if DISPLACEMENT not in parts:
         raise InputError("figure: the posterior observes no displacements")

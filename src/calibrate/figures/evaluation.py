@@ -30,7 +30,7 @@ _INSIDE, _OUTSIDE = "tab:blue", "tab:orange"
 
 
 def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
-    """Draw all figures into ``folder``; the files written."""
+    """Draw all figures into ``folder``, and return the files."""
     scene, folder = evaluated.forward.scene, Path(folder)
     title = f"{scene.name}: {evaluated.forward.label} against {evaluated.report['reference']}"
     figures = {
@@ -48,7 +48,7 @@ def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
 
 
 def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
-    """Density of each error on a logarithmic axis, its median and 97.5 % quantile marked."""
+    """Return a figure of each error's density, its median and 97.5 % quantile; log axis."""
     names = [name for name in LABELS if name in inside.fields]
     columns = 3 if len(names) > 4 else 2
     figure, grid = pyplot().subplots(
@@ -88,7 +88,7 @@ def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> No
 
 
 def parameter_figure(scene: Scene, inside: Errors, outside: Errors | None, title: str) -> Any:
-    """Median err_u of each case over theta: a map of two parameters, else a panel for each."""
+    """Return a figure of each case's median err_u: a map of two parameters, or panels of each."""
     groups = [(inside, "o", "inside the box")]
     if outside is not None:
         groups.append((outside, "D", "outside"))
@@ -103,7 +103,7 @@ def parameter_figure(scene: Scene, inside: Errors, outside: Errors | None, title
 
 
 def _draw_map(scene: Scene, cases: list[Any]) -> Any:
-    """Cases in the plane of two parameters, coloured by their error."""
+    """Draw cases in the plane of two parameters, coloured by their error."""
     from matplotlib.colors import LogNorm
     from matplotlib.patches import Rectangle
 
@@ -130,7 +130,7 @@ def _draw_map(scene: Scene, cases: list[Any]) -> Any:
 
 
 def _draw_panels(scene: Scene, cases: list[Any]) -> Any:
-    """Error of the cases over each parameter in turn."""
+    """Draw the error of the cases over each parameter in turn."""
     count = len(scene.parameters)
     columns = min(count, 3)
     rows = -(-count // columns)
@@ -171,14 +171,14 @@ def _name(parameter: Parameter) -> str:
 
 
 def _scale(set_scale: Any, axis: Any, parameter: Parameter) -> None:
-    """The parameter's own scale, with plain numbers at its ticks."""
+    """Set the parameter's own scale, with plain numbers at its ticks."""
     if parameter.scale == "log":
         set_scale("log")
         _plain(axis, (1.0, 2.0, 3.0, 5.0, 7.0))
 
 
 def _plain(axis: Any, digits: tuple[float, ...]) -> None:
-    """Ticks of a logarithmic axis at these leading digits, as plain numbers."""
+    """Set ticks of a logarithmic axis at these leading digits, as plain numbers."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     axis.set_major_locator(LogLocator(subs=digits))
@@ -192,7 +192,7 @@ def surface_figure(
     title: str,
     label: str = f"mean err_u of the cases ({UNITS['err_u']})",
 ) -> Any:
-    """The undeformed body's surface coloured by ``values`` (n,) at its nodes, from two sides."""
+    """Return a figure of the surface at rest from two sides, coloured by nodal ``values`` (n,)."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator, NullFormatter

@@ -18,7 +18,7 @@ _INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ 
 
 
 def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> None:
-    """Distribution function of each quantity's ranks less the uniform one, with its band.
+    """Draw each quantity's distribution function of ranks less the uniform one, with its band.
 
     A hump above zero: truths lie low among the draws. Steep ends, flat middle: the posterior is too
     narrow. Flat ends, steep middle: it is too wide.
@@ -56,7 +56,7 @@ def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> 
 def draw_prior_predictive(
     data: dict[str, np.ndarray], units: dict[str, str], title: str, path: str | Path
 ) -> None:
-    """Histogram of each observation over the prior; of its largest size, where it has many."""
+    """Draw a histogram over the prior of each observation, or of its largest size."""
     plt = pyplot()
     figure, grid = plt.subplots(
         1, len(data), figsize=(4.2 * len(data), 3.2), layout="constrained", squeeze=False
@@ -95,7 +95,7 @@ _MOST_MAPS = 9  # more would be too small to see
 
 
 def draw(study: xr.DataTree, scene: Scene, folder: str | Path) -> list[Path]:
-    """Draw the indices, and maps where the field was analysed, into ``folder``; the files."""
+    """Draw the indices into ``folder``, with maps if the field was analysed; return the files."""
     figures = {"sensitivity.png": index_figure(study)}
     if FIELD in study.children:
         figures["sensitivity_on_body.png"] = body_figure(study, scene)
@@ -105,7 +105,7 @@ def draw(study: xr.DataTree, scene: Scene, folder: str | Path) -> list[Path]:
 
 
 def index_figure(study: xr.DataTree) -> Any:
-    """Bars of every factor, one panel for each observation, with 95 % intervals."""
+    """Return a figure of every factor's bars with 95 % intervals, a panel for each observation."""
     plt = pyplot()
     names, bars = list(study.children), _BARS[study.attrs["method"]]
     figure, panels = plt.subplots(
@@ -137,7 +137,7 @@ def _draw_bars(axes: Axes, data: xr.Dataset, bars: tuple[tuple[str, str, str], .
 
 
 def _sd(data: xr.Dataset) -> str:
-    """Standard deviation over the prior, of one number or the root mean square of several."""
+    """Return the sd over the prior, of one number or the root mean square of several."""
     if "variance" not in data:
         return "not estimated"
     unit = "" if data.attrs["unit"] == "1" else f" {data.attrs['unit']}"
@@ -145,7 +145,7 @@ def _sd(data: xr.Dataset) -> str:
 
 
 def body_figure(study: xr.DataTree, scene: Scene) -> Any:
-    """The body at rest, once for each factor, coloured by the factor's index at the nodes."""
+    """Return a figure of the body at rest for each factor, coloured by its nodal index."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection

@@ -28,7 +28,7 @@ class Intervals(NamedTuple):
 
 
 def intervals_of(population: Hierarchy, name: str, probability: float = 0.9) -> Intervals:
-    """Central intervals of ``probability`` of the shared unknown ``name``, in its unit."""
+    """Return central intervals of ``probability`` of the shared unknown ``name``, in its unit."""
     together = np.moveaxis(np.asarray(population.tree["posterior"][name]), -1, 0)
     rows = together.reshape(len(population.members), -1)
     alone, new = np.asarray(population.tree[ALONE][name]), population.new_member()[name]
@@ -38,13 +38,13 @@ def intervals_of(population: Hierarchy, name: str, probability: float = 0.9) -> 
 
 
 def label_of(population: Hierarchy, name: str) -> str:
-    """A shared unknown with its unit."""
+    """Return the label of a shared unknown: its name with its unit."""
     unit = str(population.tree["posterior"][name].attrs.get("units", "1"))
     return name if unit == "1" else f"{name} ({unit})"
 
 
 def draw(population: Hierarchy, path: str | Path, probability: float = 0.9) -> None:
-    """Central intervals of ``probability`` and medians of each shared unknown, a row a member.
+    """Draw central intervals and medians of each shared unknown, one row for each member.
 
     Grey: the member's own data. Blue: with the population. The band is where a member not seen is
     expected, the line its median.
@@ -75,7 +75,7 @@ def draw(population: Hierarchy, path: str | Path, probability: float = 0.9) -> N
 
 
 def _intervals(axes: Any, ends: np.ndarray, rows: np.ndarray, color: str, label: str) -> None:
-    """A line and a dot for each of the intervals ``ends`` (3, n)."""
+    """Draw a line and a dot for each of the intervals ``ends`` (3, n)."""
     low, middle, high = ends
     axes.hlines(rows, low, high, color=color, lw=2.2, label=label)
     axes.plot(middle, rows, "o", color=color, ms=4)

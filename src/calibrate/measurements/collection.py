@@ -88,7 +88,7 @@ class Observations:
         for names in self._groups:
             part, rows = self.parts[names[0]], self._rows[names[0]]
             states = [self.states.index(split(name)[1]) for name in names]
-            if len(states) == 1:  # without a gather
+            if len(states) == 1:  # one state needs no gather
                 state = states[0]
                 data[names[0]] = part(displacement[..., state, rows, :], thetas[..., state, :])
                 continue

@@ -85,7 +85,7 @@ def read_measurements(
 
 
 def _states(files: Files) -> Iterator[tuple[Path, str, DataTable]]:
-    """Return the path, load state and content of each file and state."""
+    """Yield the path, load state and content of each file and state."""
     if not isinstance(files, Mapping):
         for state, table in open_data(Path(files)).states().items():
             yield Path(files), state, table

@@ -32,7 +32,7 @@ from emulator.core.errors import InputError
 from emulator.geometry.discretisation import shapes_at
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 
-_SHORTEST = 1e-6  # of the body's size; the direction of a shorter length is round-off
+_SHORTEST = 1e-6  # in sizes of the body; the direction of a shorter length is round-off
 
 
 @dataclass(frozen=True, eq=False)

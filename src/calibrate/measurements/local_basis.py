@@ -59,7 +59,7 @@ def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
             )
     if not components:
         raise InputError(f"strain: name one component or more of {', '.join(COMPONENTS)}")
-    if tuple(components) == ("fibre",):  # needs no wall
+    if tuple(components) == ("fibre",):  # fibres are defined without a wall
         return scene.fibres_at_points[:, :, None]
     basis = _basis(scene)
     return np.stack([basis[name] for name in components], axis=2)

@@ -25,11 +25,12 @@ from emulator.geometry.mesh import Mesh
 # How far outside the body a point may lie, as a fraction of the body's size. Measured surface
 # points rarely lie on the mesh to the last digit.
 _SLACK = 1e-3
-_SEVERAL, _LEAST, _MOST = 3, 0.003, 5.0  # points; their span as a share of the body's
+_SEVERAL = 3  # points, from which their span is compared with the body's
+_LEAST, _MOST = 0.003, 5.0  # limits of the span, in sizes of the body
 _ON_THE_FACE = 1e-9  # round-off of a barycentric coordinate
-_ELEMENTS = 32  # nearest elements, by their straight-edged shape, in which a point is sought
-_FACETS = 16  # the same for the facets of a surface
-_NEWTON_STEPS = 12  # at most; an element with straight edges takes one
+_ELEMENTS = 32  # nearest straight-edged elements that are searched for a point
+_FACETS = 16  # nearest facets of a surface that are searched for a point
+_NEWTON_STEPS = 12  # largest number of steps; an element with straight edges takes one
 _GAUSS_NEWTON_STEPS = 20  # the distance of a point on the surface converges quadratically
 
 
@@ -53,7 +54,7 @@ def locate_gradients(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.nda
     elements, inside = _find(mesh, points)
     _, slopes = shapes_at(mesh.order, inside)
     jacobian = np.einsum("dai,daj->dij", mesh.nodes[mesh.elements[elements]], slopes)
-    # NumPy, no batched LAPACK of JAX's.
+    # NumPy inverts the matrices, because JAX's batched LAPACK is slow on small ones.
     return elements, inside, np.einsum("daj,dji->dai", slopes, np.linalg.inv(jacobian))
 
 
@@ -102,10 +103,10 @@ def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     xi = np.full((len(X), 3), 0.25)
     for _ in range(1 if order == 1 else _NEWTON_STEPS):
         values, slopes = shapes_at(order, _barycentric(xi))
-        # d xi / d x, the inverse of the element map's Jacobian; NumPy, no batched LAPACK of JAX's.
+        # d xi / d x, the inverse of the element map's Jacobian; JAX's batched LAPACK is slower.
         inverse = np.linalg.inv(np.einsum("cai,caj->cij", X, slopes))
         step = np.einsum("cji,ci->cj", inverse, point - np.einsum("ca,cai->ci", values, X))
-        # The map of a curved element folds far outside it; Newton's method must not go there.
+        # Far outside a curved element its map folds: Newton's method stays close to the element.
         xi = xi + step if order == 1 else np.clip(xi + step, -0.5, 1.5)
         if np.abs(step).max() < 1e-13:
             break

@@ -33,8 +33,8 @@ from emulator.core.errors import InputError
 from emulator.core.minimise import minimise
 
 _DRAWS = 32  # predictions at draws of the prior
-PRIOR_DRAWS = 4096  # whose extremes stand for the ends of a parameter's prior
-_MORE_DRAWS, _DESCENTS, _STEPS = 256, 4, 30  # before data is refused
+PRIOR_DRAWS = 4096  # draws whose extremes approximate the ends of a parameter's prior
+_MORE_DRAWS, _DESCENTS, _STEPS = 256, 4, 30  # effort of the search before data is refused
 _FACTOR = 2.0
 _NOISE_SD = 5.0
 _OVERRULE = "check_scale=False or --no-unit-check overrules"
@@ -129,9 +129,9 @@ def _closest(predict: Predict, name: str, data: np.ndarray, draws: np.ndarray) -
     means, valid = jax.jit(partial(jax.lax.map, predict))(jnp.asarray(rows))
     at_draws = np.asarray(means[name])[valid := np.asarray(valid)]
     nearest = np.argsort([_norm(row - data) for row in at_draws])[:_DESCENTS]
-    both, one = jax.jit(jax.value_and_grad(gap)), jax.jit(predict)
+    value_and_gradient, one = jax.jit(jax.value_and_grad(gap)), jax.jit(predict)
     starts = (rows[valid][nearest] - low) / width
-    ends = [minimise(both, z, low=0.0, high=1.0, iterations=_STEPS).x for z in starts]
+    ends = [minimise(value_and_gradient, z, low=0.0, high=1.0, iterations=_STEPS).x for z in starts]
     answers = [one(jnp.asarray(low + width * z)) for z in ends]
     return np.stack([*at_draws, *(np.asarray(m[name]) for m, fine in answers if bool(fine))])
 
@@ -143,7 +143,7 @@ def complaint(
     y, g = np.ravel(data), predictions.reshape(len(predictions), -1)
     norms = np.array([_norm(row) for row in g])
     if not norms.min() > 0.0:
-        return None  # a body that may be at rest explains data of any size
+        return None  # predictions include 0: there is no scale to compare with
     size = _norm(y)
     along = np.array([row @ y for row in g / norms[:, None]])
     small = (size < norms / _FACTOR) & (norms - along > _NOISE_SD * sd)

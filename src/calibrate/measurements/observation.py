@@ -202,7 +202,7 @@ class Observation(ABC):
 
     def restricted(self, entries: np.ndarray | None) -> Self:
         """Return the observation of these entries alone, of all for None."""
-        part = copy(self)  # not `replace`: what the observation has computed stays
+        part = copy(self)  # unlike `replace`, `copy` keeps what the observation has computed
         part._derive(entries=entries)
         return part
 

@@ -21,7 +21,7 @@ from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
 from emulator.scenes.scene import Scene
 
-# In this order they look for their columns in a file: `node` decides before `x,y,z`.
+# Kinds are tried in this order on a file's columns: `node` comes before `x,y,z`.
 OBSERVATIONS: dict[str, type[Observation]] = {
     kind.kind: kind
     for kind in (

@@ -54,8 +54,8 @@ from emulator.geometry.discretisation import facet_rule
 from emulator.geometry.facets import nodal_areas
 from emulator.scenes.scene import Scene
 
-_SLACK = 1e-3  # of the body's size: how far from the surface its points may lie
-_FARTHEST = 1.0  # of the body's size: how far from it a marker may stand
+_SLACK = 1e-3  # largest distance of a point from the surface, in sizes of the body
+_FARTHEST = 1.0  # largest distance of a marker from the surface, in sizes of the body
 
 
 class OfFacetSet(PointObservation):

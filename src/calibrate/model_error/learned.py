@@ -24,7 +24,7 @@ import numpy as np
 from calibrate.model_error.marginal import Amplitude, ModelError
 
 _MODES = 12
-_WIDTHS = np.geomspace(0.05, 2.0, 12)  # of the kernel, in standardised unknowns
+_WIDTHS = np.geomspace(0.05, 2.0, 12)  # kernel widths in standardised unknowns
 
 
 def fit(

@@ -51,9 +51,10 @@ from emulator.surrogates.protocol import fingerprint_of
 Means = Mapping[str, jax.Array]
 """Data without noise by the observation's name."""
 
-_PLAUSIBLE = 3.0  # scales of a half-normal prior, which hold 99.7 % of its mass
-_VARYING = "varying_"  # before the names of arrays of modes that vary
-_SHARES = "of the prediction"  # recorded beside the arrays; earlier shares were of the data
+_PLAUSIBLE = 3.0  # scales of a half-normal prior that contain 99.7 % of its mass
+_VARYING = "varying_"  # prefix of the arrays of modes that vary
+# Recorded in saved errors, because in earlier versions shares were of the data.
+_SHARES = "of the prediction"
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ from emulator.core.gaussian_process import matern32
 Number = float | jax.Array
 Shapes = Mapping[str, tuple[int, ...]]
 
-_NEGLIGIBLE = 1e-8  # of the largest variance along a curve: no datum could tell it
+_NEGLIGIBLE = 1e-8  # share of the largest variance along a curve that no datum could reveal
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,7 +71,7 @@ class SpatialModes:
             )
         correlation = CORRELATIONS[kernel]
         entries = tuple(np.flatnonzero(sites.component == c) for c in np.unique(sites.component))
-        decompositions: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # by the points' bytes
+        decompositions: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # key: the points' bytes
         modes = []
         for k in entries:
             points = sites.positions[k]
@@ -80,7 +80,7 @@ class SpatialModes:
                 values, Q = np.linalg.eigh(
                     correlation(cdist(points, points, "sqeuclidean") / length**2)
                 )
-                decompositions[key] = np.maximum(values, 0.0), Q  # below 0 by round-off
+                decompositions[key] = np.maximum(values, 0.0), Q  # round-off may be below 0
             modes.append(decompositions[key])
         values = np.concatenate([values for values, _ in modes])
         return cls(entries, tuple(Q for _, Q in modes), values)

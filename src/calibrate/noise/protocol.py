@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from emulator.core import schema
 from emulator.core.errors import InputError
 
-_PLAUSIBLE = 3.0  # scales of a half-normal prior, which hold 99.7 % of its mass
+_PLAUSIBLE = 3.0  # scales of a half-normal prior that contain 99.7 % of its mass
 
 
 class Sites(NamedTuple):

@@ -57,7 +57,7 @@ class StudentTNoise(Noise):
     @property
     def upper_sd(self) -> float:
         """Sd of the Gaussian that has as much mass beyond five of its own sds."""
-        from scipy import stats  # half a second, for this noise alone
+        from scipy import stats  # the import takes half a second, and only this noise needs it
 
         beyond = float(stats.t.isf(stats.norm.sf(_FAR), self.dof))
         return self.scales[0].upper * beyond / _FAR

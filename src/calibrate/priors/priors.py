@@ -85,7 +85,7 @@ def log_normal(
     whole = dist.LogNormal(math.log(median), log_sd)
     if low <= 0.0 and high == math.inf:
         return whole
-    # Nine sd above the median no mass is left in double precision.
+    # Nine sd above the median the remaining mass is 0 in double precision.
     return _cut(whole, low, min(high, median * math.exp(9.0 * log_sd)))
 
 

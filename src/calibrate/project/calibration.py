@@ -114,7 +114,7 @@ def certify_and_keep(
 
 
 def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> dict[str, Any]:
-    """The result as plain JSON: parameter table, diagnostics, verdict."""
+    """Return the result as plain JSON: parameter table, diagnostics, verdict."""
     table = posterior.summary()
     for name, row in table.items() if run.is_synthetic else ():
         if (value := run.truth.get(name, run.truth.get(split(name)[0]))) is not None:

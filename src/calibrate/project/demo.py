@@ -69,13 +69,13 @@ def run_demo(
 ) -> dict[str, Any]:
     """Run the demo of ``scene``, write its files to ``folder`` and return the report."""
     folder = check_folder(folder)
-    pyplot()  # a missing plotting package is reported before the sampling
+    pyplot()  # reports a missing plotting package before the sampling
     demo = DEMOS[scene]
     run = demo.run
     posterior = infer(run, folder, force=True, progress=progress)
     certificate = certify_and_keep(posterior, folder, progress=progress)
-    built = posterior.model.forward.scene
-    truth = simulator_of(built, run.load_steps)(built.theta(**run.truth))
+    body = posterior.model.forward.scene
+    truth = simulator_of(body, run.load_steps)(body.theta(**run.truth))
     demo.figure(posterior, truth, run.truth, certificate, folder / demo.picture)
     result = report(run, posterior, certificate)
     result["picture"] = demo.picture

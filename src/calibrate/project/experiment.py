@@ -78,7 +78,7 @@ class _File:
 
 
 def is_experiment_file(word: str) -> bool:
-    """Whether a word is a TOML file that names a scene or members instead of being a scene."""
+    """Return whether ``word`` is a TOML file that names a scene or members."""
     if not word.endswith(".toml") or not Path(word).is_file():
         return False
     try:
@@ -130,9 +130,11 @@ def _members(file: _File, entries: Mapping[str, Any]) -> Members:
     common = {k: v for k, v in file.entries.items() if k not in (MEMBERS, POPULATION)}
     problems = {}
     for name, table in tables.items():
-        own = {at[2:]: n for at, n in file.lines.items() if at[:2] == (MEMBERS, name) and at[2:]}
+        member_lines = {
+            at[2:]: n for at, n in file.lines.items() if at[:2] == (MEMBERS, name) and at[2:]
+        }
         where = f"{file.name}, member '{name}'"
-        lines = {**file.lines, **own}
+        lines = {**file.lines, **member_lines}
         problems[name] = _problem(file, {**common, **table}, lines, where, entries)
     lines = {at[1:]: n for at, n in file.lines.items() if at[0] == POPULATION}
     shared = schema.read_as(
@@ -149,7 +151,7 @@ def _problem(
     where: str,
     entries: Mapping[str, Any],
 ) -> Problem:
-    """The problem of one table, with ``entries`` in place of the table's own."""
+    """Return the problem of one table, with ``entries`` in place of the table's own."""
     if "data" in table and "observe" in table and table["data"] != SYNTHETIC:
         raise InputError(f"{where}: observe has no effect beside data: it is for synthetic data")
     run = schema.read_as(Run, _without(table, entries), where, lines, toml=True)
@@ -159,7 +161,7 @@ def _problem(
 
 
 def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, Any]:
-    """The table less the entries of a forward map or of data that ``entries`` replace."""
+    """Return the table less the entries of a forward map or of data that ``entries`` replace."""
     replaced = set[str]()
     if "forward" in entries:
         replaced.add("forward_options")

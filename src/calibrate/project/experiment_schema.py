@@ -45,7 +45,7 @@ def experiment_schema() -> dict[str, Any]:
 
 
 def _entries() -> type[Table]:
-    """The table of a run, with the exact type of each entry that a run holds as plain data."""
+    """Return the table of a run, with an exact type for entries that a run holds as plain data."""
     noise = Annotated[Any, OneOf("kind", NOISES)]
     named, in_file = Literal[BOX, *POPULATIONS], Annotated[str, Field(pattern=r"\.json$")]
     discrepancy: Any = create_model("Discrepancy", __base__=table_of(DiscrepancyNoise))
@@ -65,7 +65,7 @@ def _entries() -> type[Table]:
 
 
 def _forward_options() -> type[Table]:
-    """The options of all forward maps: each member may choose a map of its own."""
+    """Return the options of all forward maps: each member may choose its own map."""
     entries: dict[str, Any] = {}
     for name, (option, _) in known_options().items():
         shown: dict[str, Any] = {"default": option.default}
@@ -75,6 +75,6 @@ def _forward_options() -> type[Table]:
 
 
 def _required(key: str) -> dict[str, Any]:
-    """The schema of a file that has the entry for all members, or in each member's table."""
+    """Return the schema of a file with the entry at the top, or in each member's table."""
     each = {MEMBERS: {"additionalProperties": {"required": [key]}}}
     return {"anyOf": [{"required": [key]}, {"required": [MEMBERS], "properties": each}]}

@@ -105,7 +105,7 @@ class Members:
         return next(iter(self.members.values()))
 
     def problem(self, name: str) -> Problem:
-        """The problem of one member."""
+        """Return the problem of one member."""
         return self.problems[name] if name in self.problems else read_problem(self.members[name])
 
 
@@ -140,14 +140,16 @@ def infer_members(
             (folder / name).unlink(missing_ok=True)
         runs = {name: asdict(run) for name, run in plan.members.items()}
         write_json(folder / RUN, {MEMBERS: runs, POPULATION: asdict(plan.population)})
-        alone: dict[str, Posterior] = {}
+        posteriors: dict[str, Posterior] = {}
         verdicts: dict[str, str] = {}
         for name, run in plan.members.items():
-            own = folder / MEMBERS / name
-            alone[name] = _posterior_of(plan.problem(name), own, force=force, progress=progress)
+            member_folder = folder / MEMBERS / name
+            posteriors[name] = _posterior_of(
+                plan.problem(name), member_folder, force=force, progress=progress
+            )
             if certify:
-                verdicts[name] = _verdict(alone[name], own, run, progress=progress)
-        hierarchy = _sample_together(plan, alone, folder / SAMPLING, progress=progress)
+                verdicts[name] = _verdict(posteriors[name], member_folder, run, progress=progress)
+        hierarchy = _sample_together(plan, posteriors, folder / SAMPLING, progress=progress)
         shrinkage.draw(hierarchy, folder / SHRINKAGE)
         hierarchy.save(folder / POSTERIOR)
     return hierarchy, verdicts
@@ -166,9 +168,11 @@ def read_members(folder: str | Path) -> tuple[Members, Hierarchy]:
         raise InputError(f"{folder} holds a single run; calibrate.load reads it")
     plan, path = _read_plan(folder / RUN), folder / POSTERIOR
     if not path.exists():
-        ready = [name for name in plan.members if (folder / MEMBERS / name / POSTERIOR).exists()]
+        sampled_members = [
+            name for name in plan.members if (folder / MEMBERS / name / POSTERIOR).exists()
+        ]
         raise InputError(
-            f"{folder} holds a population without {POSTERIOR}: {len(ready)} of its "
+            f"{folder} holds a population without {POSTERIOR}: {len(sampled_members)} of its "
             f"{len(plan.members)} members are sampled; repeat calibrate infer, which goes on"
         )
     hierarchy = read_hierarchy(path)
@@ -191,7 +195,7 @@ def _read_plan(path: Path) -> Members:
 
 
 def verdicts_in(plan: Members, folder: str | Path) -> dict[str, str]:
-    """What FEM says of members in ``folder``, by name; those without a certificate are missing."""
+    """Return FEM's verdicts on members in ``folder``, by name; some may have no certificate."""
     verdicts = {
         name: _written_verdict(run, Path(folder) / MEMBERS / name)
         for name, run in plan.members.items()
@@ -200,7 +204,7 @@ def verdicts_in(plan: Members, folder: str | Path) -> dict[str, str]:
 
 
 def _posterior_of(problem: Problem, folder: Path, *, force: bool, progress: bool) -> Posterior:
-    """The posterior of a member by itself: the one in ``folder`` if it is of this problem."""
+    """Return a member's own posterior: the one in ``folder`` if it is of this problem."""
     if (folder / POSTERIOR).exists() and not force:
         run, posterior = read_posterior(folder)
         if run == problem.run and is_of(posterior, with_data(problem)):
@@ -213,7 +217,7 @@ def _posterior_of(problem: Problem, folder: Path, *, force: bool, progress: bool
 
 
 def _verdict(posterior: Posterior, folder: Path, run: Run, *, progress: bool) -> str:
-    """What FEM says of a member, from its certificate if there is one."""
+    """Return FEM's verdict on a member, from its certificate if there is one."""
     if (verdict := _written_verdict(run, folder)) is not None:
         return verdict
     certificate = certify_and_keep(posterior, folder, load_steps=run.load_steps, progress=progress)
@@ -228,19 +232,19 @@ def _written_verdict(run: Run, folder: Path) -> str | None:
 
 
 def _sample_together(
-    plan: Members, alone: Mapping[str, Posterior], checkpoint: Path, *, progress: bool
+    plan: Members, posteriors: Mapping[str, Posterior], checkpoint: Path, *, progress: bool
 ) -> Hierarchy:
     run, population = plan.first, plan.population
-    own = run.sampler_options if run.sampler == NUTS.name else {}
+    first_options = run.sampler_options if run.sampler == NUTS.name else {}
     options = options_from(
         NUTS,
-        {"target_accept": TARGET_ACCEPT, **own},
+        {"target_accept": TARGET_ACCEPT, **first_options},
         warmup=run.warmup,
         draws=run.draws,
         chains=run.chains,
     )
     model = population_model(
-        _models(alone),
+        _models(posteriors),
         shared=population.shared,
         median=population.medians,
         spread=population.spread,
@@ -248,28 +252,28 @@ def _sample_together(
     )
     return sample_population(
         model,
-        {name: posterior.data for name, posterior in alone.items()},
+        {name: posterior.data for name, posterior in posteriors.items()},
         options=options,
-        alone={name: posterior.draws() for name, posterior in alone.items()},
+        alone={name: posterior.draws() for name, posterior in posteriors.items()},
         seed=run.seed,
         progress=progress,
         checkpoint=checkpoint,
     )
 
 
-def _models(alone: Mapping[str, Posterior]) -> dict[str, Model]:
-    """Each member's model; one object for all that differ in their data only."""
+def _models(posteriors: Mapping[str, Posterior]) -> dict[str, Model]:
+    """Return each member's model; one object for all that differ in their data only."""
     models: dict[tuple[Any, ...], Model] = {}
     return {
         name: models.setdefault(
             tuple(posterior.tree.attrs.get(key) for key in _SAME_MODEL), posterior.model
         )
-        for name, posterior in alone.items()
+        for name, posterior in posteriors.items()
     }
 
 
 def members_report(hierarchy: Hierarchy, verdicts: Mapping[str, str]) -> dict[str, Any]:
-    """The result as plain JSON: the population, each member alone and together with the others."""
+    """Return the result as plain JSON: the population, each member alone and with the others."""
     shrinkages = hierarchy.shrinkage()
     return {
         "population": hierarchy.summary(),

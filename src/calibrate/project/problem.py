@@ -60,7 +60,7 @@ class Simulators:
         self._simulators: OrderedDict[tuple[str, int], Simulator] = OrderedDict()
 
     def of(self, scene: Scene, load_steps: int) -> Simulator:
-        """The simulator of ``scene`` whose solves take ``load_steps`` load steps."""
+        """Return the simulator of ``scene`` whose solves take ``load_steps`` load steps."""
         key = (scene.fingerprint, load_steps)
         simulator = self._simulators.pop(key, None)
         if simulator is None:
@@ -75,7 +75,7 @@ _SIMULATORS = Simulators(size=2)
 
 
 def simulator_of(scene: Scene, load_steps: int = 1) -> Simulator:
-    """The simulator of a scene, compiled once a process (:class:`Simulators`)."""
+    """Return the simulator of a scene, compiled once a process (:class:`Simulators`)."""
     return _SIMULATORS.of(scene, load_steps)
 
 
@@ -102,7 +102,7 @@ class Problem:
         return simulator_of(self.scene, self.run.load_steps)
 
     def change(self, **entries: Any) -> Problem:
-        """The problem with other entries of its run, of the same scene and data."""
+        """Return the problem with other entries of its run, of the same scene and data."""
         return replace(self, run=replace(self.run, **entries).named(self.observe))
 
 
@@ -151,7 +151,7 @@ def naming(where: str) -> Iterator[None]:
 
 
 def _agreed(known: Mapping[str, float], in_files: Mapping[str, float]) -> dict[str, float]:
-    """The known parameters of a run and of its data files."""
+    """Return the known parameters of a run and of its data files."""
     for name, value in in_files.items():
         if known.get(name, value) != value:
             raise InputError(
@@ -162,13 +162,13 @@ def _agreed(known: Mapping[str, float], in_files: Mapping[str, float]) -> dict[s
 
 
 def _synthetic_observations(run: Run, scene: Scene) -> Observations:
-    """The observations of synthetic data, in every load state that truth and known name."""
+    """Return the observations of synthetic data in every load state of truth and known."""
     states = dict.fromkeys(state for _, state in map(split, {**run.known, **run.truth}) if state)
     return parse_observation(scene, run.observe, run.seed, tuple(states) or ("",))
 
 
 def with_data(problem: Problem) -> Problem:
-    """The problem with its data: FEM at the truth plus noise where the run asks for synthetic data.
+    """Return the problem with its data; FEM at the truth plus noise if the data is synthetic.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def with_data(problem: Problem) -> Problem:
 
 
 def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarray]]:
-    """The observations and the data of a run by name, in ``scene`` in place of the run's own."""
+    """Return the observations and the data of a run, in ``scene`` instead of the run's own."""
     if not run.is_synthetic:
         observe, data, _ = read_measurements(scene, run.data)
         return observe, data
@@ -202,13 +202,13 @@ def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarra
 
 
 def build_forward(problem: Problem, *, progress: bool = False) -> ForwardMap:
-    """The forward map of a problem, over all nodes."""
+    """Return the forward map of a problem, over all nodes."""
     ingredients = _ingredients(problem.run, problem.scene, progress=progress)
     return registry.build_forward(problem.run.forward, ingredients, problem.run.forward_options)
 
 
 def restore_forward(run: Run, scene: Scene, path: Path) -> ForwardMap:
-    """The forward map that was written to ``path`` with the results of ``run``."""
+    """Return the forward map that was written to ``path`` with the results of ``run``."""
     return registry.restore_forward(
         run.forward, _ingredients(run, scene), run.forward_options, path
     )
@@ -222,49 +222,51 @@ def _ingredients(run: Run, scene: Scene, *, progress: bool = False) -> Ingredien
 def model_of(
     run: Run, forward: ForwardMap, observe: Observations, *, check_scale: bool = True
 ) -> Model:
-    """The statistical model of a run, without the errors that depend on its data."""
+    """Return the statistical model of a run, without the errors that depend on its data."""
     noises, prior = run.noises(observe), prior_of(run.prior, forward.scene)
     return model(forward, observe, noises, prior, known=run.known, check_scale=check_scale)
 
 
 def model_before_data(run: Run | Problem, *, progress: bool = False) -> Model:
-    """The statistical model of a run that needs no data yet."""
+    """Return the statistical model of a run that needs no data yet."""
     problem = read_problem(run)
     run = problem.run
     forward = build_forward(problem, progress=progress)
-    built = model_of(run, forward, problem.observe, check_scale=run.check_scale)
+    run_model = model_of(run, forward, problem.observe, check_scale=run.check_scale)
     if not run.systematic:
-        return built
-    # Some of these errors depend on where a body is seen: at a draw of the prior.
-    draw = {name: each[0] for name, each in built.prior_draws(jax.random.key(run.seed), 1).items()}
-    means = {name: np.asarray(mean) for name, mean in built.predict(draw)[0].items()}
-    return with_described_errors(built, means, run.systematic)[0]
+        return run_model
+    # Some of these errors depend on the deformed body, which is taken at a draw of the prior.
+    draw = {
+        name: each[0] for name, each in run_model.prior_draws(jax.random.key(run.seed), 1).items()
+    }
+    means = {name: np.asarray(mean) for name, mean in run_model.predict(draw)[0].items()}
+    return with_described_errors(run_model, means, run.systematic)[0]
 
 
 def build_model(problem: Problem, *, progress: bool = False) -> tuple[Model, Mapping[str, Any]]:
-    """The statistical model of a problem with data, and the data that it is sampled with."""
+    """Return the statistical model of a problem with data, and the data that it is sampled with."""
     run = problem.run
     assert problem.data is not None, "with_data comes first"
     data: Mapping[str, Any] = problem.data
     forward = build_forward(problem, progress=progress)
-    built = model_of(run, forward, problem.observe, check_scale=run.check_scale)
+    run_model = model_of(run, forward, problem.observe, check_scale=run.check_scale)
     if run.systematic:
-        built, data = with_described_errors(built, data, run.systematic)
+        run_model, data = with_described_errors(run_model, data, run.systematic)
     if runs := run.error_runs or run.mesh_error_runs:
-        built, data = built.given(data)
-        built = with_error(
-            replace(built, check_scale=False),  # the data has been checked
+        run_model, data = run_model.given(data)
+        run_model = with_error(
+            replace(run_model, check_scale=False),  # the data has been checked
             problem.simulator,
             runs,
             of_mesh=bool(run.mesh_error_runs),
             seed=run.seed,
             progress=progress,
         )
-    return built, data
+    return run_model, data
 
 
 def by_fem(model: Model, load_steps: int = 1) -> Model:
-    """``model`` with FEM as its forward map, to make the data that the model is checked with."""
+    """Return ``model`` with FEM as its forward map, to make data for checks of the model."""
     whole = fem_forward(simulator_of(model.forward.scene, load_steps), model.full)
     error = model.error if model.error is not None and model.error.of_fem else None
     return replace(model, full=whole, forward=whole.at(model.observe.nodes), error=error)

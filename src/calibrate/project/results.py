@@ -44,13 +44,17 @@ from emulator.surrogates.protocol import ForwardMap
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
 FORWARD, ERROR = "forward.safetensors", "error.safetensors"
 REPORT = "report.html"
-SAMPLING = "sampling.safetensors"  # of a run under way, or killed
-MEMBERS = "members"  # of a population: their entry in run.json, and the folder of their runs
+SAMPLING = "sampling.safetensors"  # checkpoint of a run that has not ended
+MEMBERS = "members"  # entry of a population's members in run.json, and folder of their runs
 
-_RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # of a run that has ended
-_PLACES = ("scene", "root", "emulator")  # paths may change; fingerprints tell what they name
+_RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # files of a run that has ended
+_PLACES = (
+    "scene",
+    "root",
+    "emulator",
+)  # paths may change, because fingerprints identify the content
 _DESCRIPTION = "systematic"  # metadata of a file of systematic errors
-_SHOWN = 4  # files of a folder that an error names
+_SHOWN = 4  # largest number of a folder's files that an error names
 
 
 @contextmanager
@@ -152,18 +156,18 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     _check_forward(path, tree, forward)
     observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
     # The data was checked when it was sampled, or the check was overruled.
-    built = model_of(run, forward, observe, check_scale=False)
+    run_model = model_of(run, forward, observe, check_scale=False)
     if run.error_runs or run.mesh_error_runs or run.systematic:
-        built = replace(built, error=_read_error(folder / ERROR, path, tree))
+        run_model = replace(run_model, error=_read_error(folder / ERROR, path, tree))
     observed = tree["observed_data"]
-    data = built.check_data(
+    data = run_model.check_data(
         {n: np.asarray(observed[n]).reshape(part.shape) for n, part in observe.parts.items()}
     )
-    return run, Posterior(tree, built, data)
+    return run, Posterior(tree, run_model, data)
 
 
 def holds_population(folder: str | Path) -> bool:
-    """Whether ``folder`` has the results of a population instead of one run's.
+    """Return whether ``folder`` has the results of a population instead of one run's.
 
     Raises
     ------
@@ -181,7 +185,7 @@ def holds_population(folder: str | Path) -> bool:
 
 
 def _content(folder: Path) -> str:
-    """What stands in place of a folder of results, in a few words."""
+    """Return a few words on what is in ``folder`` instead of results."""
     if not folder.is_dir():
         return f"{folder} is a file" if folder.exists() else "there is no such folder"
     names = sorted(path.name for path in folder.iterdir())
@@ -190,7 +194,7 @@ def _content(folder: Path) -> str:
 
 
 def is_of(posterior: Posterior, problem: Problem) -> bool:
-    """Whether a posterior was sampled with the observations and the data of ``problem``."""
+    """Return whether a posterior was sampled with the observations and the data of ``problem``."""
     assert problem.data is not None
     reduced, present = leave_out_missing(problem.observe, problem.data)
     return _same_observations(posterior, reduced) and all(
@@ -238,7 +242,7 @@ def _save_error(path: Path, error: ModelError) -> None:
 
 
 def _read_error(path: Path, posterior: Path, tree: xr.DataTree) -> ModelError:
-    """The errors besides noise that the likelihood of a posterior allows for."""
+    """Return the errors besides noise that the likelihood of a posterior allows for."""
     if not path.is_file():
         raise InputError(f"{path}, the error in the likelihood of the posterior, is missing")
     arrays, metadata = read_arrays(path)

@@ -131,7 +131,7 @@ class Run:
         return self.data == SYNTHETIC
 
     def sampling(self) -> tuple[Sampler, Any]:
-        """The sampler and its options.
+        """Return the sampler and its options.
 
         Raises
         ------
@@ -143,7 +143,7 @@ class Run:
         return sampler, options_from(sampler, self.sampler_options, **length)
 
     def named(self, observe: Observations) -> Run:
-        """The run with every noise by the observation's name, the defaults filled in."""
+        """Return the run with every noise by the observation's name, the defaults filled in."""
         scales = _by_name(self.noise_scale, observe, "noise-scale")
         noise = _by_name(self.noise, observe, "noise")
         expanded = observe.expand(noise, "noise")
@@ -155,7 +155,7 @@ class Run:
         return replace(self, noise={**defaults, **noise}, noise_scale=scales)
 
     def noises(self, observe: Observations) -> dict[str, Noise]:
-        """The noise of each observation in the likelihood."""
+        """Return the noise of each observation in the likelihood."""
         run = self.named(observe)
         assert isinstance(run.noise, Mapping)
         assert isinstance(run.noise_scale, Mapping)
@@ -166,22 +166,22 @@ class Run:
             scale_source, scale = scales.get(name, (source, None))
             discrepancy_source, discrepancy = discrepancies.get(name, (source, None))
             # An entry that names one load state gives that state a noise of its own.
-            own = name in (source, scale_source, discrepancy_source)
+            has_own_noise = name in (source, scale_source, discrepancy_source)
             noise = _noise(name, observe, description, scale, discrepancy)
-            noises[name if own else source] = noise
+            noises[name if has_own_noise else source] = noise
         return noises
 
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
-        """The noise of each observation of synthetic data."""
-        named = replace(self, noise_scale={}, discrepancy={}).noises(observe)
-        each = {name: noise for name, (_, noise) in observe.expand(named, "noise").items()}
+        """Return the noise of each observation of synthetic data."""
+        noises = replace(self, noise_scale={}, discrepancy={}).noises(observe)
+        each = {name: noise for name, (_, noise) in observe.expand(noises, "noise").items()}
         return at_sites(each, observe)
 
 
 def _by_name[T](
     values: Mapping[str, T] | float, observe: Observations, what: str
 ) -> dict[str, T | float]:
-    """Values by the observation's name; a bare one is a single observation's or displacements'.
+    """Return values by name; a bare one is a single observation's or the displacements'.
 
     A name without its load state stands for every state.
     """

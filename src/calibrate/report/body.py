@@ -16,13 +16,13 @@ from emulator.geometry.facets import surface_mesh
 from emulator.scenes.scene import Scene
 
 _DRAWS = 20
-_MOMENTS = 100  # draws for mean and sd
-_FIBRES = 400  # drawn, at most
+_MOMENTS = 100  # draws from which mean and sd are computed
+_FIBRES = 400  # largest number of fibres that are drawn
 _DIGITS = 4
 
 
 def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
-    """The deformed surface with a slider over draws and a menu of colours.
+    """Return the deformed surface with a slider over draws and a menu of colours.
 
     simulator : to compare with at the mean theta; None leaves that out.
     """
@@ -69,7 +69,7 @@ def _colours(
     mean: np.ndarray,
     theta: jax.Array,
 ) -> dict[str, np.ndarray]:
-    """Values (n,) at the nodes, by what they are."""
+    """Return the values (n,) at the nodes by which the surface can be coloured, by their labels."""
     colours = {
         "mean displacement (mm)": np.linalg.norm(mean, axis=1),
         "sd of displacement (mm)": np.sqrt(fields.var(axis=0).sum(axis=1)),
@@ -83,7 +83,7 @@ def _colours(
 
 
 def _error(posterior: Posterior, theta: jax.Array, simulator: Simulator) -> dict[str, np.ndarray]:
-    """The map's error (n,) at ``theta`` (p,); nothing where FEM does not converge."""
+    """Return the map's error (n,) at ``theta`` (p,); nothing where FEM does not converge."""
     solution = simulator.solve(theta)
     if not solution.converged:
         return {}
@@ -92,7 +92,7 @@ def _error(posterior: Posterior, theta: jax.Array, simulator: Simulator) -> dict
 
 
 def _nodal(scene: Scene, values: np.ndarray) -> np.ndarray:
-    """Element values (m,) as means at the nodes, weighted by volume, (n,)."""
+    """Return the means (n,) at the nodes of element values (m,), weighted by volume."""
     elements, weights = scene.mesh.elements, scene.discretisation.weights.sum(axis=1)
     ends = np.broadcast_to(weights[:, None], elements.shape)
     total = np.bincount(elements.ravel(), (ends * values[:, None]).ravel())
@@ -113,7 +113,7 @@ def _coloured(values: np.ndarray, title: str) -> dict[str, Any]:
 
 
 def _fibres(scene: Scene, mean: np.ndarray, theta: jax.Array) -> go.Scatter3d:
-    """Short lines along the deformed fibres of some elements."""
+    """Return short lines along the deformed fibres of some elements."""
     directions = element_fields(scene, jnp.asarray(mean), theta)["deformed_fibres"]
     some = np.linspace(0, len(directions) - 1, min(len(directions), _FIBRES)).astype(int)
     middle = (scene.mesh.nodes + mean)[scene.mesh.elements[some, :4]].mean(axis=1)
@@ -128,7 +128,7 @@ def _fibres(scene: Scene, mean: np.ndarray, theta: jax.Array) -> go.Scatter3d:
 
 
 def _add_controls(figure: go.Figure, names: list[str], colours: dict[str, np.ndarray]) -> None:
-    """A slider over the shapes and a menu of the colours."""
+    """Add a slider over the shapes and a menu of the colours."""
     at_once = {"mode": "immediate", "frame": {"duration": 0, "redraw": True},
                "transition": {"duration": 0}}  # fmt: skip
     steps = [{"label": n, "method": "animate", "args": [[n], at_once]} for n in names]

@@ -22,8 +22,8 @@ from calibrate.state_names import split
 from emulator.scenes.loads import KPA_PER_MMHG
 
 _CHAINS = COLOURS[:6]
-_MOST_TRACED = 500  # draws of a chain in a trace
-_MOST_PAIRED = 800  # draws in a pair plot
+_MOST_TRACED = 500  # largest number of a chain's draws in a trace
+_MOST_PAIRED = 800  # largest number of draws in a pair plot
 _CURVES = 60  # draws of a pressure-volume band
 _VOLUMES = 400  # draws of volumes
 _CLOSER_AT_REST = (
@@ -32,21 +32,21 @@ _CLOSER_AT_REST = (
 
 
 def translucent(colour: str, opacity: float) -> str:
-    """The colour ``#rrggbb`` with an opacity from 0 to 1, for what fills an area."""
+    """Return the colour ``#rrggbb`` with an opacity from 0 to 1, for filled areas."""
     return f"rgba({int(colour[1:3], 16)}, {int(colour[3:5], 16)}, {int(colour[5:], 16)}, {opacity})"
 
 
-def inside(values: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Which of the data that is there lies within the central 90 % of predictions, (m,).
+def inside(values: np.ndarray, data: np.ndarray) -> np.ndarray:
+    """Return whether each present datum (m,) lies within the central 90 % of its predictions.
 
-    ``values`` (s, n) predicted, noise included; ``measured`` (n,), NaN where missing.
+    ``values`` (s, n) predicted, noise included; ``data`` (n,), NaN where missing.
     """
     low, high = np.nanquantile(values, [0.05, 0.95], axis=0)
-    return ((measured >= low) & (measured <= high))[np.isfinite(measured)]
+    return ((data >= low) & (data <= high))[np.isfinite(data)]
 
 
 def names_with_units(posterior: Posterior) -> dict[str, str]:
-    """Label of each unknown, its unit included."""
+    """Return the label of each unknown, its unit included."""
     units = {p.name: p.unit for p in posterior.model.forward.scene.parameters}
     labels = {}
     for name in posterior.model.names:
@@ -56,48 +56,46 @@ def names_with_units(posterior: Posterior) -> dict[str, str]:
 
 
 def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
-    """For each observation, what was measured against what the posterior predicts."""
+    """Yield a chart for each observation: the data against what the posterior predicts."""
     tree = posterior.tree
     if "posterior_predictive" not in tree.children:
         return
     for name, part in posterior.model.observe.parts.items():
         values = np.asarray(tree["posterior_predictive"][name])
         values = values.reshape(values.shape[0] * values.shape[1], -1)
-        measured = np.ravel(np.asarray(posterior.data[name]))
+        data = np.ravel(np.asarray(posterior.data[name]))
         if values.shape[1] == 1:
-            yield name, _one_number(name, part, values[:, 0], float(measured[0]))
+            yield name, _one_number(name, part, values[:, 0], float(data[0]))
         else:
-            yield name, _many_numbers(name, part, values, measured)
+            yield name, _many_numbers(name, part, values, data)
 
 
-def _one_number(name: str, part: Observation, values: np.ndarray, measured: float) -> go.Figure:
+def _one_number(name: str, part: Observation, values: np.ndarray, datum: float) -> go.Figure:
     figure = go.Figure(
         go.Histogram(
             x=values, histnorm="probability density", marker_color=BLUE, opacity=0.75,
             name="predicted, with noise",
         )
     )  # fmt: skip
-    figure.add_vline(x=measured, line={"color": VERMILION, "width": 3}, annotation_text="measured")
+    figure.add_vline(x=datum, line={"color": VERMILION, "width": 3}, annotation_text="measured")
     figure.update_layout(
         xaxis_title=f"predicted {name} ({part.unit})", yaxis={"showticklabels": False}
     )
     return figure
 
 
-def _many_numbers(
-    name: str, part: Observation, values: np.ndarray, measured: np.ndarray
-) -> go.Figure:
+def _many_numbers(name: str, part: Observation, values: np.ndarray, data: np.ndarray) -> go.Figure:
     low, middle, high = np.nanquantile(values, [0.05, 0.5, 0.95], axis=0)
-    present = np.isfinite(measured)
-    share = 100.0 * inside(values, measured).mean()
-    ends = [float(np.nanmin(measured)), float(np.nanmax(measured))]
+    present = np.isfinite(data)
+    share = 100.0 * inside(values, data).mean()
+    ends = [float(np.nanmin(data)), float(np.nanmax(data))]
     figure = go.Figure()
     figure.add_scatter(
         x=ends, y=ends, mode="lines", line={"color": "grey", "dash": "dot"}, name="equal",
         hoverinfo="skip",
     )  # fmt: skip
     figure.add_scatter(
-        x=measured[present],
+        x=data[present],
         y=middle[present],
         mode="markers",
         marker={"color": BLUE, "size": 6},
@@ -117,7 +115,7 @@ def _many_numbers(
 
 
 def traces(posterior: Posterior) -> go.Figure:
-    """Each unknown's draws by chain: their densities, their order, and their ranks."""
+    """Return each unknown's draws by chain: their densities, their order, and their ranks."""
     labels = names_with_units(posterior)
     draws = {name: np.asarray(posterior.tree["posterior"][name]) for name in labels}
     return traces_of(labels, draws, posterior.model.sampled_priors)
@@ -128,7 +126,7 @@ def traces_of(
     every: Mapping[str, np.ndarray],
     priors: Mapping[str, dist.Distribution],
 ) -> go.Figure:
-    """:func:`traces` of the draws (chains, draws) of those names that have labels."""
+    """Return :func:`traces` of the draws (chains, draws) of those names that have labels."""
     figure = make_subplots(
         len(labels), 3, column_titles=["posterior", "trace", "ranks by chain"],
         horizontal_spacing=0.06, vertical_spacing=0.25 / max(len(labels), 2),
@@ -146,7 +144,6 @@ def traces_of(
                 "legendgroup": str(chain),
                 "showlegend": False,
             }
-            density = {"histnorm": "probability density", "opacity": 0.5, "nbinsx": 40}
             counts = np.histogram(ranks[chain], edges)[0]
             line = {"mode": "lines", **style}
             density = go.Histogram(
@@ -155,8 +152,8 @@ def traces_of(
             )  # fmt: skip
             trace = go.Scatter(y=values[::step], line_width=1, **line)
             rank = go.Scatter(x=edges, y=[*counts, counts[-1]], line_shape="hv", **line)
-            for column, drawn in enumerate((density, trace, rank), start=1):
-                figure.add_trace(drawn, row, column)
+            for column, panel in enumerate((density, trace, rank), start=1):
+                figure.add_trace(panel, row, column)
         _add_prior(figure, priors.get(name), draws, row)
         even = draws.shape[1] / 20.0
         figure.add_hline(y=even, line={"color": "grey", "dash": "dot"}, row=row, col=3)
@@ -169,23 +166,23 @@ def traces_of(
 def _add_prior(
     figure: go.Figure, prior: dist.Distribution | None, draws: np.ndarray, row: int
 ) -> None:
-    """The prior's density over the range of the draws, behind them."""
+    """Add the prior's density over the range of the draws, behind them."""
     if prior is None or prior.shape():
         return
     x = np.linspace(draws.min(), draws.max(), 100)
     density = np.exp(np.asarray(prior.log_prob(x)))
     line = {"color": "grey", "width": 2, "dash": "dash"}
-    shown = {"name": "prior", "legendgroup": "prior", "showlegend": row == 1}
-    figure.add_trace(go.Scatter(x=x, y=density, mode="lines", line=line, **shown), row, 1)
+    style = {"name": "prior", "legendgroup": "prior", "showlegend": row == 1}
+    figure.add_trace(go.Scatter(x=x, y=density, mode="lines", line=line, **style), row, 1)
 
 
 def pairs(posterior: Posterior) -> go.Figure:
-    """Draws of every two unknowns."""
+    """Return the scatter of the draws of every two unknowns."""
     return pairs_of(names_with_units(posterior), posterior.draws())
 
 
 def pairs_of(labels: Mapping[str, str], draws: Mapping[str, np.ndarray]) -> go.Figure:
-    """Draws (s,) of every two names that have labels."""
+    """Return the scatter of the draws (s,) of every two names that have labels."""
     count = len(next(iter(draws.values())))
     rows = np.linspace(0, count - 1, min(count, _MOST_PAIRED)).astype(int)
     marker = {"size": 3, "color": BLUE, "opacity": 0.35}
@@ -208,7 +205,7 @@ def pairs_of(labels: Mapping[str, str], draws: Mapping[str, np.ndarray]) -> go.F
 
 
 def stress(posterior: Posterior) -> go.Figure:
-    """The stress that a stretch takes, 90 % band."""
+    """Return the stress that a stretch takes, with its 90 % band."""
     figure = go.Figure()
     fibres = posterior.model.forward.scene.law.fibres
     for direction, colour in (("fibre", BLUE), ("cross-fibre", VERMILION))[: 2 if fibres else 1]:
@@ -227,7 +224,7 @@ def stress(posterior: Posterior) -> go.Figure:
 
 
 def volume_band(posterior: Posterior) -> go.Figure | None:
-    """Cavity volume over the range of its pressure; None without such a parameter or cavity."""
+    """Return the cavity volume over its pressure; None without such a parameter or cavity."""
     model = posterior.model
     curve = pressure_volume(model.full)
     if curve is None:
@@ -237,9 +234,9 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
     volumes = jax.jit(lambda t: jax.lax.map(curve.volumes, t))(thetas[rows])
     low, middle, high = np.nanquantile(np.asarray(volumes), [0.05, 0.5, 0.95], axis=0)
     p, name = curve.pressures, curve.parameter.name
-    measured = _measured_volumes(posterior, curve)
+    data_volumes = _measured_volumes(posterior, curve)
     figure = go.Figure()
-    _add_klotz(figure, curve, middle, measured)
+    _add_klotz(figure, curve, middle, data_volumes)
     figure.add_scatter(
         x=[*low, *high[::-1]], y=[*p, *p[::-1]], fill="toself",
         fillcolor=translucent(BLUE, 0.22), line_width=0, name="90 % of the posterior",
@@ -254,8 +251,8 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
         marker={"color": BLUE, "size": 8, "symbol": "circle-open"}, mode="lines+markers",
         name="without load, as the mesh is",
     )  # fmt: skip
-    for seen, (volume, pressures) in measured.items():
-        _add_measured(figure, seen, volume, pressures)
+    for label, (volume, pressures) in data_volumes.items():
+        _add_measured(figure, label, volume, pressures)
     figure.update_layout(
         xaxis_title="cavity volume (mL)",
         yaxis_title=f"{name} (kPa; 1 kPa is {1.0 / KPA_PER_MMHG:.1f} mmHg)",
@@ -264,7 +261,7 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
 
 
 def state_volumes(posterior: Posterior) -> dict[str, np.ndarray]:
-    """Cavity volumes (s,) in mL at draws, by load state; none of one state, or without a cavity."""
+    """Return cavity volumes (s,) in mL by load state; none without a cavity or for one state."""
     model = posterior.model
     curve = pressure_volume(model.full)
     if curve is None or len(model.states.states) < 2:
@@ -281,23 +278,23 @@ def state_volumes(posterior: Posterior) -> dict[str, np.ndarray]:
 def _measured_volumes(
     posterior: Posterior, curve: PressureVolume
 ) -> dict[str, tuple[float, np.ndarray]]:
-    """By the observation's name, the cavity's measured volume in mL, and its pressure at draws."""
+    """Return each measured cavity volume in mL with its pressure at draws, by observation."""
     volumes, model = {}, posterior.model
     column = model.forward.scene.parameter_names.index(curve.parameter.name)
-    for seen, part in model.observe.parts.items():
+    for observation, part in model.observe.parts.items():
         if part.to_json() == curve.volume.to_json():
-            pressures = np.asarray(posterior.thetas(split(seen)[1])[:, column])
-            volumes[seen] = float(posterior.data[seen]), pressures
+            pressures = np.asarray(posterior.thetas(split(observation)[1])[:, column])
+            volumes[observation] = float(posterior.data[observation]), pressures
     return volumes
 
 
-def _add_measured(figure: go.Figure, seen: str, volume: float, pressures: np.ndarray) -> None:
-    """The measured volume at the pressure of its load state, inferred or known."""
+def _add_measured(figure: go.Figure, name: str, volume: float, pressures: np.ndarray) -> None:
+    """Add the measured volume at the pressure of its load state, inferred or known."""
     figure.add_scatter(
         x=[volume], y=[float(pressures.mean())], mode="markers",
         marker={"color": VERMILION, "size": 11, "symbol": "x"},
         error_y={"type": "data", "array": [float(pressures.std())]},
-        name=f"{seen} measured; pressure {'known' if pressures.std() == 0.0 else 'inferred'}",
+        name=f"{name} measured; pressure {'known' if pressures.std() == 0.0 else 'inferred'}",
     )  # fmt: skip
 
 
@@ -305,10 +302,10 @@ def _add_klotz(
     figure: go.Figure,
     curve: PressureVolume,
     median: np.ndarray,
-    measured: dict[str, tuple[float, np.ndarray]],
+    data_volumes: dict[str, tuple[float, np.ndarray]],
 ) -> None:
-    """Klotz's curve through the volume measured at the highest pressure, else the median there."""
-    points = [(float(pressures.mean()), volume) for volume, pressures in measured.values()]
+    """Add Klotz's curve through the volume at the highest measured pressure, or the median."""
+    points = [(float(pressures.mean()), volume) for volume, pressures in data_volumes.values()]
     pressure, volume = max(points, default=(curve.pressures[-1], median[-1]))
     klotz = klotz_of(curve.volume.scene, volume, pressure)
     if klotz is None:

@@ -58,7 +58,7 @@ def _page_of_posterior(folder: Path, *, fem: bool) -> str:
     run, posterior = read_posterior(folder)
     path = folder / CERTIFICATE
     certificate = read_json(path) if path.is_file() else None
-    return html_of(run, posterior, certificate, fem=fem, made=_day(path))
+    return html_of(run, posterior, certificate, fem=fem, certificate_day=_day(path))
 
 
 def html_of(
@@ -67,9 +67,9 @@ def html_of(
     certificate: dict[str, Any] | None,
     *,
     fem: bool = True,
-    made: str = "",
+    certificate_day: str = "",
 ) -> str:
-    """Return the page of a posterior as HTML; ``made`` is the day of the certificate."""
+    """Return the page of a posterior as HTML; ``certificate_day`` is the day of the certificate."""
     scene = posterior.model.forward.scene
     simulator = simulator_of(scene, run.load_steps) if fem else None
     sections = [
@@ -81,7 +81,9 @@ def html_of(
         ("Where this comes from, and how to repeat it", _provenance(run, posterior)),
     ]
     title = f"{scene.name}: posterior of {', '.join(posterior.model.names)}"
-    return parts.render(title, scene.name, _verdict(run, posterior, certificate, made), sections)
+    return parts.render(
+        title, scene.name, _verdict(run, posterior, certificate, certificate_day), sections
+    )
 
 
 def _verdict(

@@ -34,17 +34,17 @@ from calibrate.report.parts import Block, Paragraph, Table, Verdict
 
 _GREY = "#8c8c8c"
 _COLUMNS = 3  # parameters beside each other, at most
-_ROW, _MARGIN = 34, 110  # pixels: of a member, and around a row of parameters
+_ROW, _MARGIN = 34, 110  # heights in pixels: of a member, and around a row of parameters
 
 
 def shrinkage(population: Hierarchy) -> go.Figure:
-    """Medians and central 90 % intervals of each shared unknown, a row a member.
+    """Return medians and central 90 % intervals of each shared unknown, a row a member.
 
     Grey: by the member's own data. Blue: with the others. The band is a member not seen.
     """
     names, members = population.shared, population.members
     lines = math.ceil(len(names) / _COLUMNS)
-    columns = math.ceil(len(names) / lines)  # four are two by two
+    columns = math.ceil(len(names) / lines)  # four names make two rows of two
     height = _ROW * len(members) + _MARGIN
     figure = make_subplots(
         lines, columns, shared_yaxes=True, horizontal_spacing=0.04,
@@ -66,7 +66,7 @@ def shrinkage(population: Hierarchy) -> go.Figure:
 def _traces(
     intervals: Intervals, members: tuple[str, ...], edges: tuple[float, float]
 ) -> Iterator[go.Scatter]:
-    """Band and median of a member not seen, then the intervals of all members."""
+    """Yield band and median of a member not seen, then the intervals of all members."""
     low, middle, high = intervals.new
     yield go.Scatter(
         x=[low, high, high, low], y=[edges[0], edges[0], edges[1], edges[1]], fill="toself",
@@ -85,7 +85,7 @@ def _traces(
 def _interval_trace(
     ends: np.ndarray, rows: np.ndarray, members: tuple[str, ...], colour: str, name: str
 ) -> go.Scatter:
-    """A dot and a line for each of the intervals ``ends`` (3, n), at the heights ``rows`` (n,)."""
+    """Return a dot and a line for each interval ``ends`` (3, n), at the heights ``rows`` (n,)."""
     low, middle, high = ends
     texts = [f"{m}, {name}: {b:.4g} ({a:.4g} to {c:.4g})" for m, (a, b, c) in zip(
         members, ends.T, strict=True
@@ -102,7 +102,7 @@ _FORM = ".4g"
 _OMITTED = ("members", "alone")  # attributes: fingerprints, and what every population has
 
 
-def html_of(plan: Members, population: Hierarchy, folder: Path, beside: Path) -> str:
+def html_of(plan: Members, population: Hierarchy, folder: Path, page_folder: Path) -> str:
     """Return the page of a population as HTML.
 
     Parameters
@@ -110,13 +110,13 @@ def html_of(plan: Members, population: Hierarchy, folder: Path, beside: Path) ->
     plan : the runs of the members.
     population : the posterior of the population.
     folder : the population's folder, where its members' certificates, posteriors and pages are.
-    beside : the folder that the page is written to, from which links start.
+    page_folder : the folder that the page is written to, from which links start.
     """
     verdicts = dict.fromkeys(population.members, NOT_CERTIFIED) | verdicts_in(plan, folder)
     table, warnings = population.summary(), population.warnings()
     sections = [
         ("The population", _population(population, table)),
-        ("Members beside the population", _members(population, folder, beside, verdicts)),
+        ("Members beside the population", _members(population, folder, page_folder, verdicts)),
         ("A member not seen", _new_member(population)),
         ("How sampling went", _sampling(population, table, warnings)),
         ("Where this comes from, and how to repeat it", _provenance(plan, population)),
@@ -170,17 +170,23 @@ def _population(population: Hierarchy, table: Mapping[str, Mapping[str, float]])
 
 
 def _members(
-    population: Hierarchy, folder: Path, beside: Path, verdicts: Mapping[str, str]
+    population: Hierarchy, folder: Path, page_folder: Path, verdicts: Mapping[str, str]
 ) -> list[Block]:
     """Return the chart of the members, its numbers, each member's checks and its misfits."""
     draws = population.draws()
     numbers, checks, misfit_sentences = [], [], []
     for member in population.members:
-        own = folder / MEMBERS / member
-        tree = read_tree(own / POSTERIOR) if (own / POSTERIOR).exists() else xr.DataTree()
+        member_folder = folder / MEMBERS / member
+        tree = (
+            read_tree(member_folder / POSTERIOR)
+            if (member_folder / POSTERIOR).exists()
+            else xr.DataTree()
+        )
         values = [draws[f"{name}[{member}]"] for name in population.shared]
         numbers.append((member, *(parts.median_and_range(v, _FORM) for v in values)))
-        checks.append((member, verdicts[member], _share(tree), _page(own / REPORT, beside)))
+        checks.append(
+            (member, verdicts[member], _share(tree), _page(member_folder / REPORT, page_folder))
+        )
         misfit_sentences += [f"{member}: {sentence}" for sentence in misfits(tree)]
     labels = [label_of(population, name) for name in population.shared]
     return [
@@ -214,11 +220,11 @@ def _share(tree: xr.DataTree) -> str:
     return f"{100.0 * inside.mean():.0f} % of {len(inside)}"
 
 
-def _page(path: Path, beside: Path) -> str:
-    """Return a link to a member's page from the folder ``beside``, or an empty text."""
+def _page(path: Path, page_folder: Path) -> str:
+    """Return a link to a member's page from ``page_folder``, or an empty text."""
     if not path.is_file():
         return ""
-    relative = Path(os.path.relpath(path.resolve(), beside.resolve())).as_posix()
+    relative = Path(os.path.relpath(path.resolve(), page_folder.resolve())).as_posix()
     return Markup('<a href="{}">open</a>').format(quote(relative))
 
 
@@ -258,15 +264,17 @@ def _provenance(plan: Members, population: Hierarchy) -> list[Block]:
     runs = {name: parts.changed_settings(run) for name, run in plan.members.items()}
     first = next(iter(runs.values()))
     common = {k: v for k, v in first.items() if all(run.get(k) == v for run in runs.values())}
-    own = {name: {k: v for k, v in run.items() if k not in common} for name, run in runs.items()}
-    defaults, chosen = asdict(Shared()), asdict(plan.population)
-    shared = {k: v for k, v in chosen.items() if v != defaults[k]}
+    member_settings = {
+        name: {k: v for k, v in run.items() if k not in common} for name, run in runs.items()
+    }
+    defaults, population_settings = asdict(Shared()), asdict(plan.population)
+    shared = {k: v for k, v in population_settings.items() if v != defaults[k]}
     program = (
         "from calibrate.project.members import infer_members, read_members\n\n"
         'members, _ = read_members("THIS FOLDER")\n'
         'infer_members(members, "ANOTHER FOLDER")  # the same draws'
     )
-    settings = common | {MEMBERS: own, POPULATION: shared}
+    settings = common | {MEMBERS: member_settings, POPULATION: shared}
     return [
         parts.attributes(population.tree.attrs, _OMITTED),
         *parts.how_to_repeat(settings, "The runs of the members and what these share", program),

@@ -72,7 +72,7 @@ def test_the_verdict_comes_first_and_all_sections_follow(page):
 
 def test_the_verdict_says_by_what(ventricle_posterior):
     run = Run("left_ventricle", data="u.csv")
-    text = html_of(run, ventricle_posterior, CERTIFICATE, fem=False, made="2026-01-02.")
+    text = html_of(run, ventricle_posterior, CERTIFICATE, fem=False, certificate_day="2026-01-02.")
     assert "Judged by 200 FEM runs, 0 failed, and 9 on a finer mesh. Pareto k 0.10, at most" in text
     assert "Limits: 0.25 sd for a mean, 0.5 on a finer mesh, 20 % for an sd." in text
     assert "Data: u.csv. 2026-01-02." in text

@@ -212,7 +212,7 @@ def run_prior(arguments: argparse.Namespace) -> int:
 
 
 def _klotz(model: Model, seed: int) -> KlotzBand | None:
-    """The share of the prior's pressure-volume curves in the band of Klotz's relation.
+    """Return the share of the prior's pressure-volume curves in the band of Klotz's relation.
 
     None without a resting cavity whose pressure varies, and where each prediction is a FEM solve.
     """
@@ -257,7 +257,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
 
 
 def _rows(names: list[str]) -> list[Benchmark]:
-    """The rows of the cases called ``names``, or of all."""
+    """Return the rows of the cases called ``names``, or of all."""
     from emulator.verify import CASES, verify_published
 
     if names and names[0] == "published":

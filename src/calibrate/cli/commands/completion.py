@@ -35,7 +35,7 @@ def run_completion(arguments: argparse.Namespace) -> int:
 
 
 def completion(shell: str) -> str:
-    """The script for a shell, from the parsers of all commands."""
+    """Return the script for a shell, from the parsers of all commands."""
     import shtab
 
     from calibrate.cli import build_parser
@@ -67,13 +67,17 @@ def completion(shell: str) -> str:
 
 
 def _words(names: list[str], suffix: str = "") -> str:
-    """A command of any shell that prints names, and files here that end in ``suffix``."""
-    printed = f"printf '%s\\n' {' '.join(sorted(names))}"
-    return f"{printed}; ls | grep '\\.{suffix}$'" if suffix else f"{printed}; ls -d */ 2>/dev/null"
+    """Return a command of any shell that prints names, and files here that end in ``suffix``."""
+    print_names = f"printf '%s\\n' {' '.join(sorted(names))}"
+    return (
+        f"{print_names}; ls | grep '\\.{suffix}$'"
+        if suffix
+        else f"{print_names}; ls -d */ 2>/dev/null"
+    )
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Every argument of a parser and of its commands."""
+    """Yield every argument of a parser and of its commands."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):

@@ -91,7 +91,7 @@ def run_predict(arguments: argparse.Namespace) -> int:
 
 
 def anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
-    """Theta (p,) from named finite values, which may lie outside the box."""
+    """Return theta (p,) from named finite values, which may lie outside the box."""
     import jax.numpy as jnp
 
     for name, value in values.items():
@@ -107,7 +107,7 @@ def anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
 
 
 def error_of(estimate: ErrorEstimate) -> dict[str, Any]:
-    """The error bar as plain JSON; without numbers where it is not valid."""
+    """Return the error bar as plain JSON; without numbers where it is not valid."""
     if not estimate.valid:
         return {"valid": False}
     gap, least = float(estimate.energy_gap), float(estimate.least_energy)
@@ -124,7 +124,7 @@ def error_of(estimate: ErrorEstimate) -> dict[str, Any]:
 
 
 def prediction_summary(result: dict[str, Any]) -> str:
-    """The result as text."""
+    """Return the result as text."""
     largest = result["max_displacement"]
     lines = [
         f"{result['scene']}: largest displacement {largest:.6g} mm"
@@ -201,7 +201,7 @@ def save_evaluation(evaluated: Evaluated, folder: str | Path) -> list[Path]:
 
 
 def evaluation_summary(report: Mapping[str, Any]) -> str:
-    """The tables of errors as text."""
+    """Return the tables of errors as text."""
     lines = [_table(report, f"{report['cases']} cases")]
     lines.append(f"forward map: {report['label']}, reference: {report['reference']}")
     if report["invalid"]:

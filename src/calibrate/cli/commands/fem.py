@@ -60,8 +60,8 @@ def run_simulate(arguments: argparse.Namespace) -> int:
     solution = simulator.solve(theta)
     status = Status(int(solution.status))
     J = np.asarray(jax.jit(partial(volume_ratio, scene))(solution.displacement))
-    # A follower pressure on an open patch has no potential energy; that of a body whose mesh is
-    # loaded, its stresses and reactions belong to the scene at rest (calibrate unload).
+    # A follower pressure on an open patch has no potential energy. Where the mesh is the loaded
+    # shape, energy, stresses and reactions belong to the scene at rest (calibrate unload).
     at_rest = not scene.loaded_by
     open_patch = not (at_rest and all(load.has_potential for load in scene.loads))
     energy = None
@@ -112,7 +112,7 @@ def run_simulate(arguments: argparse.Namespace) -> int:
 
 
 MESH, LOADED = "unloaded.vtu", "loaded.vtu"
-_TOLERANCE = 1e-6  # of the body's size, between the mesh and the shape that was loaded again
+_TOLERANCE = 1e-6  # largest distance of mesh and reloaded shape, in sizes of the body
 
 
 def add_unload(commands: Any) -> None:
@@ -167,7 +167,7 @@ def run_unload(arguments: argparse.Namespace) -> int:
 def _reload(
     scene: Scene, unloaded: Unloaded, theta: Any, result: dict[str, Any], lines: list[str]
 ) -> bool:
-    """Whether the shape, loaded from rest, is the mesh again; ``result`` and ``lines`` say so."""
+    """Return whether the shape, loaded from rest, is the mesh; extend ``result`` and ``lines``."""
     import numpy as np
 
     from emulator.fem import Simulator, Status

@@ -201,7 +201,7 @@ def _text(rows: list[dict[str, Any]]) -> str:
 
 
 def _wrapped(name: str, entries: list[str]) -> list[str]:
-    """``entries`` after ``name``, on lines that fit a terminal, no entry on two."""
+    """Return ``entries`` after ``name``, on lines that fit a terminal, no entry on two."""
     indent, joined = f"  {name}  ", ", ".join(each.replace(" ", "\0") for each in entries)
     rest = " " * len(indent)
     lines = textwrap.wrap(joined, _WIDTH, initial_indent=indent, subsequent_indent=rest)
@@ -209,7 +209,7 @@ def _wrapped(name: str, entries: list[str]) -> list[str]:
 
 
 def _parameters(parameters: list[dict[str, Any]]) -> list[str]:
-    """Names with their ranges; numbered ones of one range are given by the first and the last."""
+    """Return names with their ranges; of numbered ones of one range, the first and the last."""
     groups: dict[tuple[str, str], list[str]] = {}
     for p in parameters:
         about = f"{p['low']:g} to {p['high']:g} {p['unit']}".strip()

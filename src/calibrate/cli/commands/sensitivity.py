@@ -160,7 +160,7 @@ def write(indices: xr.DataTree, scene: Scene, folder: Path) -> None:
 
 
 def sensitivity_summary(indices: xr.DataTree) -> str:
-    """A table for each observation."""
+    """Return a table for each observation."""
     lines = []
     for name, node in indices.children.items():
         data = node.to_dataset()
@@ -181,7 +181,7 @@ def sensitivity_summary(indices: xr.DataTree) -> str:
 
 
 def _active(data: xr.Dataset) -> str:
-    """The direction of theta along which the observation changes most, in words."""
+    """Return the direction of theta along which the observation changes most, in words."""
     values, vectors = data["active_value"].values, data["active_direction"].values
     if not values.sum() > 0.0:
         return "nothing changes along any direction"
@@ -194,7 +194,7 @@ def _active(data: xr.Dataset) -> str:
 
 
 def _plain(data: xr.Dataset) -> dict[str, Any]:
-    """Indices of all numbers together, and of each where they are few, as plain JSON."""
+    """Return indices of all numbers together, and of each where they are few, as plain JSON."""
     few = data.sizes["output"] <= 100
     result: dict[str, Any] = {"unit": data.attrs["unit"], "evaluations": data.attrs["evaluations"]}
     for name, values in data.variables.items():

@@ -79,27 +79,27 @@ def run_train(arguments: argparse.Namespace) -> int:
 
     scene = scene_of(arguments)
     check_folder(arguments.out)
-    given = _plan_entries(arguments)
+    entries = _plan_entries(arguments)
     start = load(arguments.start) if arguments.start else None
-    plan = _plan(arguments.recipe or _default_recipe(start), given, arguments.budget)
+    plan = _plan(arguments.recipe or _default_recipe(start), entries, arguments.budget)
     campaign = None
     if arguments.campaign:
         from emulator.fem.campaign.store import read_runs
 
         campaign = read_runs(arguments.campaign, scene)
-        if "simulations" not in given:
+        if "simulations" not in entries:
             plan = plan.with_counts(simulations=len(campaign.runs.theta))
-    # Without a network its FEM runs are all that a plan has: only a budget that was asked for
-    # makes them fewer.
-    whole = not plan.trains_network and arguments.budget is None
-    fixed = arguments.resume or "steps" in given or whole
+    # A plan without a network has nothing but FEM runs: all are solved unless --budget limits them.
+    runs_all = not plan.trains_network and arguments.budget is None
+    time = "10m" if arguments.budget is None else arguments.budget
+    ignores_budget = arguments.resume or "steps" in entries or runs_all
     result = train_emulator(
         scene,
         plan,
         arguments.out,
         start=start,
         campaign=campaign,
-        budget=None if fixed else seconds("10m" if arguments.budget is None else arguments.budget),
+        budget=None if ignores_budget else seconds(time),
         resume=arguments.resume,
         progress=show_progress(arguments),
     )
@@ -115,7 +115,7 @@ def run_train(arguments: argparse.Namespace) -> int:
     remove_checkpoint(arguments.out)
     runs = record["plan"].get("simulations", 0)
     text = _training_summary(arguments.out, scene.name, record)
-    if not fixed and plan.runs > runs:
+    if not ignores_budget and plan.runs > runs:
         text += f"\n{runs} of {plan.runs} FEM runs fit into the budget: more time, smaller errors"
     text += f"\nwritten to {arguments.out}; next: calibrate infer {arguments.scene} "
     text += f"--emulator {arguments.out} --data measured.csv --out RUN"
@@ -124,7 +124,7 @@ def run_train(arguments: argparse.Namespace) -> int:
 
 
 def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str:
-    """What was done, and how far the emulator is from FEM runs that it did not see."""
+    """Return a text on the training, and on the error at FEM runs that were held out."""
     plan = record["plan"]
     counts = [f"{plan['simulations']} FEM runs"] if plan.get("simulations") else []
     if "sweeps" in record:
@@ -142,26 +142,26 @@ def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str
 
 
 def _default_recipe(start: Any) -> str:
-    """The recipe where none is asked for, by what training starts from."""
+    """Return the default recipe, which depends on what training starts from."""
     if start is None:
         return "hybrid"
     return "network" if start.family is None else "family"
 
 
 def _plan_entries(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Fields of the plan given on the command line; with ``--resume`` there may be none."""
+    """Return the plan's fields from the command line; ``--resume`` allows none."""
     names = ("objective", "steps", "simulations", "sweeps", "batch", "seed")
-    given = {name: getattr(arguments, name) for name in names}
-    given = {name: value for name, value in given.items() if value is not None}
-    others = [n for n in ("recipe", "budget") if getattr(arguments, n) is not None]
-    if arguments.resume and (given or others):
-        option = next(iter([*given, *others]))
+    entries = {name: getattr(arguments, name) for name in names}
+    entries = {name: value for name, value in entries.items() if value is not None}
+    further_options = [n for n in ("recipe", "budget") if getattr(arguments, n) is not None]
+    if arguments.resume and (entries or further_options):
+        option = next(iter([*entries, *further_options]))
         raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
-    return given
+    return entries
 
 
-def _plan(name: str, given: Mapping[str, Any], budget: str | None) -> Plan:
-    """Return the recipe called ``name`` with the options ``given``; refuse one without effect.
+def _plan(name: str, entries: Mapping[str, Any], budget: str | None) -> Plan:
+    """Return the recipe called ``name`` with the options ``entries``; refuse one without effect.
 
     Zero steps are what a recipe without a network takes.
     """
@@ -169,11 +169,11 @@ def _plan(name: str, given: Mapping[str, Any], budget: str | None) -> Plan:
 
     plan: Plan = recipe(name)
     names = {each.name for each in fields(plan)}
-    if "steps" not in names and given.get("steps") == 0:
-        given = {word: value for word, value in given.items() if word != "steps"}
-    plan = replace(plan, **{word: value for word, value in given.items() if word in names})
+    if "steps" not in names and entries.get("steps") == 0:
+        entries = {word: value for word, value in entries.items() if word != "steps"}
+    plan = replace(plan, **{word: value for word, value in entries.items() if word in names})
     unused = _unused(plan)
-    for word in [*given, *([] if budget is None else ["budget"])]:
+    for word in [*entries, *([] if budget is None else ["budget"])]:
         if word in unused:
             raise InputError(
                 f"--{word} has no effect with recipe '{plan.recipe}', which {unused[word]}; "
@@ -183,7 +183,7 @@ def _plan(name: str, given: Mapping[str, Any], budget: str | None) -> Plan:
 
 
 def _unused(plan: Plan) -> dict[str, str]:
-    """The options that change nothing under ``plan``, and why."""
+    """Return the options that change nothing under ``plan``, and why."""
     names = {each.name for each in fields(plan)}
     network = "takes all FEM runs at every step" if plan.trains_network else "trains no network"
     reasons = {
@@ -202,7 +202,7 @@ def _unused(plan: Plan) -> dict[str, str]:
 
 
 def command_line(scene: str, record: Mapping[str, Any]) -> str:
-    """The command that repeats a training exactly, with the steps and runs it really took."""
+    """Return the command that repeats a training exactly, with its actual steps and runs."""
     from emulator.training.trainer import plan_of
 
     names = ("recipe", "objective", "steps", "simulations", "sweeps", "batch", "seed")
