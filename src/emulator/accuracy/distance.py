@@ -109,7 +109,7 @@ def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
 
 
 def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Distance:
-    """Iterate by FEM from ``u`` until steps are short beside the whole way; return that way."""
+    """Iterate by FEM from ``u`` until steps are short beside the distance covered; return it."""
     system = simulator.system
     stepping = LoadStepping(system, simulator.options, theta)
 

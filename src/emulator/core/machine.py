@@ -11,14 +11,14 @@ from emulator.core.errors import InputError
 
 
 def cores() -> int:
-    """Cores."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def memory() -> float:
-    """Bytes of memory; without bounds where the machine does not say."""
+    """Return the memory of the machine in bytes; infinity where the machine does not say."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
@@ -26,7 +26,7 @@ def memory() -> float:
 
 
 def require_cpu(what: str) -> None:
-    """:class:`InputError` where JAX computes on an accelerator by default."""
+    """Raise :class:`InputError` where JAX computes on an accelerator by default."""
     platform = _platform()
     if platform != "cpu":
         raise InputError(
@@ -37,13 +37,13 @@ def require_cpu(what: str) -> None:
 
 
 def _platform() -> str:
-    """That JAX computes on in this thread by default."""
+    """Return the platform of the default JAX device of the calling thread."""
     device = jax.config.jax_default_device
     return jax.default_backend() if device is None else getattr(device, "platform", device)
 
 
 def inherited[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """``function`` for other threads, which compute where this one does by default."""
+    """Return ``function`` for other threads, run on the calling thread's default device."""
     device = jax.config.jax_default_device
 
     def there(*arguments: P.args, **named: P.kwargs) -> R:

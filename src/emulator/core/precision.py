@@ -14,7 +14,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 def require_float64(what: str) -> None:
-    """:class:`InputError` where somebody has switched float64 off; costs nothing inside ``jit``."""
+    """Raise :class:`InputError` where float64 is switched off; costs nothing inside ``jit``."""
     if jnp.result_type(float) != jnp.float64:
         raise InputError(
             f"{what} needs float64: leave jax_enable_x64 on, as importing emulator did"

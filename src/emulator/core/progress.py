@@ -14,7 +14,7 @@ EVERY = 10.0  # seconds between two lines; shorter work says nothing
 
 
 class Lines(tqdm):
-    """tqdm that prints lines, such as ``FEM check: 120 of 200 runs, 65 s``."""
+    """A tqdm bar that prints lines, such as ``FEM check: 120 of 200 runs, 65 s``."""
 
     disable: bool
 
@@ -23,7 +23,7 @@ class Lines(tqdm):
         self._told = 0.0
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:  # noqa: ARG002
-        """Print where the work is, if the last line is long enough ago."""
+        """Print the progress, if the last line is older than ``EVERY`` seconds."""
         seconds = self._time() - self.start_t
         if seconds - self._told < EVERY:
             return
@@ -35,7 +35,7 @@ class Lines(tqdm):
               file=self.fp, flush=True)  # fmt: skip
 
     def close(self) -> None:
-        """The last line, of work that printed others."""
+        """Print the last line, if earlier ones were printed."""
         if self.disable:
             return
         if self._told:
@@ -46,5 +46,5 @@ class Lines(tqdm):
 
 
 def counting(*arguments: Any, **options: Any) -> tqdm:
-    """Tqdm's bar where standard error is a terminal, else :class:`Lines`."""
+    """Return tqdm's bar where standard error is a terminal, else :class:`Lines`."""
     return (tqdm if sys.stderr.isatty() else Lines)(*arguments, **options)

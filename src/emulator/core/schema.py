@@ -120,7 +120,7 @@ class OneOf:
 
     @cached_property
     def _tables(self) -> tuple[type[Table], ...]:
-        """A table of each choice, made once: a schema then has one definition of it."""
+        """Return a table of each choice, made once, so that a schema defines it once."""
         return tuple(table_of(choice, self.key, name) for name, choice in self.choices.items())
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -139,7 +139,7 @@ class OneOf:
     def __get_pydantic_json_schema__(
         self, core: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        """One of the tables; each but the default's needs its ``key``."""
+        """Return the schema of the tables, each of which but the default's needs its ``key``."""
         schema = handler(core)
         for name, member in zip(self.choices, schema["oneOf"], strict=True):
             table = handler.resolve_ref_schema(member)
@@ -172,7 +172,7 @@ class Source:
     toml: bool = True
 
     def error(self, problem: str, path: Path = (), table: Path = ()) -> InputError:
-        """``problem`` with file, line of ``path``, and name of ``table``."""
+        """Return ``problem`` as an error with file, line of ``path`` and name of ``table``."""
         line = line_of(self.lines, path)
         where = self.name if line is None else f"{self.name}, line {line}"
         named = f"{self.written(table)}: " if table else ""
@@ -180,14 +180,14 @@ class Source:
 
     @contextmanager
     def at(self, *path: str | int, table: Path = ()) -> Iterator[None]:
-        """Errors raised inside are about the entry at ``path``."""
+        """Point errors raised inside the context at the entry ``path``."""
         try:
             yield
         except InputError as error:
             raise self.error(str(error), path, table) from error
 
     def written(self, path: Path) -> str:
-        """The name of a table as the file's author writes it."""
+        """Return the name of a table as the file's author writes it."""
         if not self.toml:
             steps = (f"[{k}]" if isinstance(k, int) else f".{k}" for k in path)
             return "".join(steps).removeprefix(".")
@@ -204,7 +204,7 @@ def parse[Model: BaseModel](
     *,
     toml: bool = True,
 ) -> Model:
-    """Plain data of the file ``where`` as a model.
+    """Return plain data of the file ``where`` as a model.
 
     Raises
     ------
@@ -219,7 +219,7 @@ def parse[Model: BaseModel](
 
 
 def read_json_as[Kind](kind: type[Kind], path: str | FilePath) -> Kind:
-    """The dataclass ``kind`` from a JSON file; mistakes as in :func:`parse`."""
+    """Return the dataclass ``kind`` from a JSON file; errors as in :func:`parse`."""
     data = read_json(path)
     lines = json_lines(FilePath(path).read_text(encoding="utf-8"))
     return read_as(kind, data, str(path), lines)
@@ -233,7 +233,7 @@ def read_as[Kind](
     *,
     toml: bool = False,
 ) -> Kind:
-    """The dataclass ``kind`` from plain data of ``where``; mistakes as in :func:`parse`."""
+    """Return the dataclass ``kind`` from plain data of ``where``; errors as in :func:`parse`."""
     table = parse(table_of(kind), mapping, where, lines, toml=toml)
     try:
         return _builder(kind)(table)
@@ -273,7 +273,7 @@ def restore[Kind](
 
 
 def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:
-    """The model with the fields of a dataclass, and ``key`` whose only value is ``tag``.
+    """Return the model with the fields of a dataclass, and ``key`` with the only value ``tag``.
 
     Fields with ``compare=False`` are left out: the program sets them, not a file.
     """
@@ -293,7 +293,7 @@ def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:
 
 
 def json_schema(model: type[Table]) -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of a file, for editors: keys, types, defaults, descriptions.
+    """Return the JSON Schema (draft 2020-12) of a file, from which editors complete and check it.
 
     It admits all that :func:`parse` admits. ``parse`` is stricter where a schema cannot say it.
     """
@@ -302,14 +302,14 @@ def json_schema(model: type[Table]) -> dict[str, Any]:
 
 
 def _shown_default(entry: Field[Any]) -> dict[str, Any] | None:
-    """The dataclass's default, for a schema."""
+    """Return the dataclass's default as the schema shows it."""
     if entry.default is MISSING or entry.default is None:
         return None
     return {"default": json.loads(json.dumps(entry.default))}
 
 
 def _for_files(node: Any) -> Any:
-    """A schema without null, which no file of ours has, and without titles made of keys."""
+    """Return a schema without null, which no file has, and without titles made of keys."""
     if isinstance(node, list):
         return [_for_files(each) for each in node if each != {"type": "null"}]
     if not isinstance(node, dict):
@@ -325,7 +325,7 @@ def _for_files(node: Any) -> Any:
 
 
 def expectation(annotation: Any) -> str | None:
-    """What a value of this type looks like, in words; None for tables and lists of them."""
+    """Return an expected value of this type, in words; None for tables and lists of them."""
     origin, args = get_origin(annotation), get_args(annotation)
     if annotation in _SCALARS:
         return f"a {_SCALARS[annotation]}"
@@ -343,7 +343,7 @@ def expectation(annotation: Any) -> str | None:
 
 
 def _builder(kind: type, key: str = "") -> Any:
-    """From a table to the dataclass whose fields it has."""
+    """Return the function that builds the dataclass from its table."""
     return lambda table: kind(
         **{name: getattr(table, name) for name in table.model_fields_set if name != key}
     )
@@ -356,7 +356,7 @@ def _mistake(expected: str = "", *, problem: str = "", key: str = "") -> Pydanti
 
 
 def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
-    """The line about one of pydantic's errors."""
+    """Return the line about one of pydantic's errors."""
     path, value_found = _found(source.data, error["loc"])
     context: dict[str, Any] = error.get("ctx", {})
     if error["type"] == "value_error":  # the dataclass refused its values
@@ -382,7 +382,7 @@ def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
 
 
 def _found(data: Any, loc: Path) -> tuple[Path, Any]:
-    """Path and value an error is about; ``loc`` also has the names of a union's members."""
+    """Return the path and the value of an error; ``loc`` also names the members of a union."""
     path: Path = ()
     for step in loc:
         inside = isinstance(data, dict) and step in data

@@ -26,7 +26,7 @@ from emulator.core.errors import InputError
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary file beside ``path`` to write to; it replaces ``path`` if nothing raises.
+    """Yield a temporary file beside ``path``, which it replaces if nothing raises.
 
     Folders are made as needed. The temporary name keeps the suffix, from which some writers take
     the format.
@@ -64,7 +64,7 @@ def write_netcdf(path: str | Path, content: Any) -> None:
 
 
 def to_json(content: Any) -> str:
-    """``content`` as indented, valid JSON: numbers that are not finite become null."""
+    """Return ``content`` as indented, valid JSON: numbers that are not finite become null."""
     return json.dumps(_finite(content), indent=2, allow_nan=False)
 
 
@@ -84,7 +84,7 @@ def write_json(path: str | Path, content: Any) -> None:
 
 
 def check_folder(path: str | Path) -> Path:
-    """``path``; :class:`InputError` if it cannot be a writable folder. Call before long work."""
+    """Return ``path``; raise :class:`InputError` unless it can be a writable folder."""
     path = Path(path)
     existing = path
     while not existing.exists() and existing != existing.parent:
@@ -96,7 +96,7 @@ def check_folder(path: str | Path) -> Path:
 
 @contextmanager
 def exclusive(path: str | Path, what: str) -> Iterator[Path]:
-    """``path``, which no other process that asks the same has meanwhile.
+    """Yield ``path``, locked against every other process that locks it.
 
     Its folder is made, and goes again if it stays empty.
 
@@ -125,7 +125,7 @@ def exclusive(path: str | Path, what: str) -> Iterator[Path]:
 
 
 def read_json(path: str | Path) -> Any:
-    """Content of a JSON file; :class:`InputError` when missing or malformed."""
+    """Return the content of a JSON file; :class:`InputError` when missing or malformed."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} does not exist")
@@ -136,13 +136,13 @@ def read_json(path: str | Path) -> Any:
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """Leaves of a pytree by their path, e.g. ``rounds/0/edge/kernel``."""
+    """Return the leaves of a pytree by their path, e.g. ``rounds/0/edge/kernel``."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {"/".join(filter(None, map(_word, path))): leaf for path, leaf in leaves}
 
 
 def _word(key: Any) -> str:
-    """One step of a leaf's path: a dictionary's key, a list index, or an attribute."""
+    """Return one step of a leaf's path: a dictionary's key, a list index, or an attribute."""
     for attribute in ("key", "idx", "name"):
         if hasattr(key, attribute):
             word = str(getattr(key, attribute))
@@ -153,7 +153,7 @@ def _word(key: Any) -> str:
 def save_arrays(
     path: str | Path, arrays: Mapping[str, Any], metadata: Mapping[str, str] = {}
 ) -> str:
-    """Write named arrays; returns the SHA-256 of the file."""
+    """Write named arrays; return the SHA-256 of the file."""
     ordered = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     content = save(ordered, metadata=dict(metadata))
     write_atomically(path, content)
@@ -161,7 +161,7 @@ def save_arrays(
 
 
 def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Arrays and metadata of a safetensors file; :class:`InputError` if missing or unreadable."""
+    """Return arrays and metadata of a safetensors file; :class:`InputError` if unreadable."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"weights file {path} does not exist")
@@ -176,7 +176,7 @@ def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]
 
 
 def fill_tree[Tree](template: Tree, arrays: Mapping[str, np.ndarray], what: str) -> Tree:
-    """``template`` with its leaves replaced by ``arrays`` (:func:`named_leaves`), shapes equal.
+    """Return ``template`` with leaves from ``arrays`` (:func:`named_leaves`), of equal shapes.
 
     what : where the arrays come from, for the error message.
     """
@@ -193,6 +193,6 @@ def fill_tree[Tree](template: Tree, arrays: Mapping[str, np.ndarray], what: str)
 
 
 def inside(arrays: Mapping[str, np.ndarray], folder: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin with ``folder/``, keyed by the rest of the name."""
+    """Return the arrays whose names begin with ``folder/``, keyed by the rest of the name."""
     start = f"{folder}/"
     return {name.removeprefix(start): a for name, a in arrays.items() if name.startswith(start)}

@@ -29,7 +29,7 @@ class Blocks:
     weights: np.ndarray
 
     def gather[A: (jax.Array, np.ndarray)](self, field: A) -> A:
-        """Values (b, q, ...) at the blocks' points of a ``field`` (m, q, ...) at the elements'."""
+        """Return a ``field`` (m, q, ...) of the elements at the blocks' points, (b, q, ...)."""
         return field
 
 
@@ -45,7 +45,7 @@ class Discretisation(Blocks):
     values: np.ndarray
 
     def laplacian(self) -> csc_matrix:
-        """Products of the shape functions' gradients, integrated over the body, (n, n) in mm."""
+        """The integrals (n, n) in mm of the products of the shape functions' gradients."""
         nodes, count = self.connectivity, len(self.mesh.nodes)
         local = np.einsum("mq,mqai,mqbi->mab", self.weights, self.gradients, self.gradients)
         rows, columns = np.broadcast_arrays(nodes[:, :, None], nodes[:, None])
@@ -67,7 +67,7 @@ class FacetRule:
 
 
 def discretise(mesh: Mesh) -> Discretisation:
-    """Linear elements with one quadrature point, quadratic ones with four.
+    """Return the discretisation: one quadrature point in linear elements, four in quadratic ones.
 
     The rule integrates the small-strain stiffness of a straight element exactly.
 
@@ -95,13 +95,13 @@ def discretise(mesh: Mesh) -> Discretisation:
 
 
 def quadrature_points(order: int) -> np.ndarray:
-    """Barycentric coordinates (q, 4) of the quadrature points of an element of ``order`` 1 or 2."""
+    """Return barycentric coordinates (q, 4) of the quadrature points of elements of ``order``."""
     _, points, _ = _rule(order)
     return np.column_stack([1.0 - points.sum(axis=0), *points])
 
 
 def from_quadrature_points(order: int, barycentric: np.ndarray) -> np.ndarray:
-    r"""Weights (d, q) that give a field at ``barycentric`` (d, 4) from its quadrature points.
+    r"""Return weights (d, q) from values at quadrature points to values at ``barycentric`` (d, 4).
 
     The field is linear in an element: its corner values :math:`c` and its values at the points,
     whose barycentric coordinates are the rows of :math:`B`, are related by :math:`v = B c`, so that
@@ -111,7 +111,7 @@ def from_quadrature_points(order: int, barycentric: np.ndarray) -> np.ndarray:
 
 
 def shapes_at(order: int, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shape functions (d, a) of an element of ``order`` at ``barycentric`` (d, 4), and derivatives.
+    """Return shape functions (d, a) at ``barycentric`` (d, 4), and their derivatives.
 
     These are (d, a, 3), in the last three coordinates.
     """
@@ -119,7 +119,7 @@ def shapes_at(order: int, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def facet_rule(order: int, degree: int) -> FacetRule:
-    """Quadrature exact for polynomials of ``degree`` on facets with 3 or 6 nodes."""
+    """Return quadrature exact for polynomials of ``degree`` on facets with 3 or 6 nodes."""
     element = ElementTriP1() if order == 1 else ElementTriP2()
     points, weights = get_quadrature(element.refdom, degree)
     values, slopes = _tabulate(element, points)
@@ -127,13 +127,13 @@ def facet_rule(order: int, degree: int) -> FacetRule:
 
 
 def _rule(order: int) -> tuple[Any, np.ndarray, np.ndarray]:
-    """Reference element, quadrature points (3, q) and their weights (q,)."""
+    """Return the reference element, quadrature points (3, q) and their weights (q,)."""
     element, degree = (ElementTetP1(), 1) if order == 1 else (ElementTetP2(), 2)
     return element, *get_quadrature(element.refdom, degree)
 
 
 def _tabulate(element: Any, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shape functions (q, a) and their derivatives (q, a, d) at ``points`` (d, q)."""
+    """Return the shape functions (q, a) and their derivatives (q, a, d) at ``points`` (d, q)."""
     count = len(element.doflocs)
     shapes = [element.lbasis(points, k) for k in range(count)]
     values = np.stack([np.broadcast_to(value, points.shape[1]) for value, _ in shapes], axis=1)

@@ -39,28 +39,28 @@ _QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 
 
 def area_vectors[A: (jax.Array, np.ndarray)](x: A, rule: FacetRule) -> A:
-    """``n`` at each quadrature point of facets ``x`` (..., a, 3) mm, shape (..., q, 3) in mm2."""
+    """Return the normal ``n`` (..., q, 3) mm2 at the points of facets ``x`` (..., a, 3) mm."""
     xp = x.__array_namespace__()
     along = xp.einsum("qad,...ai->...qdi", rule.derivatives, x)
     return xp.cross(along[..., 0, :], along[..., 1, :])
 
 
 def nodal_areas[A: (jax.Array, np.ndarray)](corners: A, rule: FacetRule) -> A:
-    """Integral of each shape function over the facets ``corners`` (..., a, 3), (..., a) in mm2."""
+    """Return the integral (..., a) mm2 of each shape function over ``corners`` (..., a, 3) mm."""
     xp = corners.__array_namespace__()
     area = xp.sqrt(xp.sum(area_vectors(corners, rule) ** 2, axis=-1))
     return xp.einsum("q,...q,qa->...a", rule.weights, area, rule.values)
 
 
 def nodal_area_vectors[A: (jax.Array, np.ndarray)](corners: A, rule: FacetRule) -> A:
-    """Integral of each shape function times the normal over ``corners`` (..., a, 3), likewise."""
+    """Return the integrals (..., a, 3) mm2 of shape functions times the normal over ``corners``."""
     xp = corners.__array_namespace__()
     normals = area_vectors(corners, rule)
     return xp.einsum("q,...qi,qa->...ai", rule.weights, normals, rule.values)
 
 
 def cone_volume[A: (jax.Array, np.ndarray)](x: A) -> A:
-    """Signed volume (...) between the origin and facets ``x`` (..., 3 or 6, 3), mm3; exact."""
+    """Return the signed volume (...) mm3 between the origin and facets ``x`` (..., 3 or 6, 3)."""
     xp = x.__array_namespace__()
     if x.shape[-2] == 3:
         return xp.sum(x[..., 0, :] * xp.cross(x[..., 1, :], x[..., 2, :]), axis=-1) / 6.0
@@ -70,25 +70,25 @@ def cone_volume[A: (jax.Array, np.ndarray)](x: A) -> A:
 
 
 def mean_normal(corners: np.ndarray) -> np.ndarray:
-    """Unit normal (3,) of facets ``corners`` (k, 3 or 6, 3) together, by their corners' areas."""
+    """Return the unit normal (3,) of all facets ``corners`` (k, 3 or 6, 3) together."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v).sum(axis=0)
     return normal / np.linalg.norm(normal)
 
 
 def flat_triangles(facets: np.ndarray) -> np.ndarray:
-    """Facets (k, 3 or 6) as flat triangles (k', 3), four for each quadratic one."""
+    """Return facets (k, 3 or 6) as flat triangles (k', 3), four for each quadratic one."""
     return facets if facets.shape[1] == 3 else facets[:, _QUARTERS].reshape(-1, 3)
 
 
 def surface_mesh(facets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (s,) of ``facets``, and flat triangles (k, 3) by their places among these."""
+    """Return the nodes (s,) of ``facets``, and flat triangles (k, 3) as rows of these nodes."""
     nodes, places = np.unique(flat_triangles(facets), return_inverse=True)
     return nodes, places.reshape(-1, 3)
 
 
 def rim(facets: np.ndarray) -> np.ndarray:
-    """Edges that belong to one facet only, oriented along it: (e, 2), or (e, 3) with midpoints."""
+    """Return the edges of one facet only, oriented along it: (e, 2), or (e, 3) with midpoints."""
     sides = [[0, 1], [1, 2], [2, 0]] if facets.shape[1] == 3 else [[0, 1, 3], [1, 2, 4], [2, 0, 5]]
     edges = np.concatenate([facets[:, side] for side in sides])
     _, first, counts = np.unique(
@@ -98,7 +98,7 @@ def rim(facets: np.ndarray) -> np.ndarray:
 
 
 def openings(facets: np.ndarray) -> list[np.ndarray]:
-    """Rim edges of ``facets``, one array (e, 2 or 3) for each opening."""
+    """Return the rim edges of ``facets``, one array (e, 2 or 3) for each opening."""
     edges = rim(facets)
     if not len(edges):
         return []
@@ -110,7 +110,7 @@ def openings(facets: np.ndarray) -> list[np.ndarray]:
 
 
 def enclosed_volume[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[[A], A]:
-    r"""``x -> V`` in mm3: the volume that ``facets`` (k, 3 or 6) and lids on its openings enclose.
+    r"""Return ``x -> V`` in mm3, the volume within ``facets`` (k, 3 or 6) and lids on openings.
 
     .. math:: V = \frac13 \oint x \cdot n \, da
 
@@ -130,7 +130,7 @@ def enclosed_volume[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[
 
 
 def _lids[A: (jax.Array, np.ndarray)](edges: A, middle: A) -> A:
-    """Facets between rim edges (e, 2 or 3, 3) and ``middle`` (3,), against the wall's facing."""
+    """Return facets between rim edges (e, 2 or 3, 3) and ``middle`` (3,), opposite to the wall."""
     xp = edges.__array_namespace__()
     start, end = edges[:, 0], edges[:, 1]
     middle = xp.broadcast_to(middle, start.shape)
@@ -178,7 +178,7 @@ class Cavity:
         self._factor = float(np.sign(signed)) / MM3_PER_ML
 
     def __call__(self, displacement: jax.Array) -> jax.Array:
-        """Volume (...) in mL where the nodes of the wall move by ``displacement`` (..., k, 3) mm.
+        """Return the volume (...) in mL at the displacement (..., k, 3) mm of the wall's nodes.
 
         Differentiable; ``displacement[..., cavity.nodes, :]`` restricts a full field.
         """
@@ -195,7 +195,7 @@ class Cavity:
 
 
 def encloses(mesh: Mesh, facet_set: str) -> bool:
-    """Whether ``facet_set`` is the wall of a cavity; a plane patch encloses nothing."""
+    """Return whether ``facet_set`` is the wall of a cavity; a plane patch encloses nothing."""
     mesh.facet_set(facet_set)  # a set that is not there is an error
     try:
         Cavity(mesh, facet_set)

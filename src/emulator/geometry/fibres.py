@@ -56,23 +56,23 @@ _DAMPING = 1e-3  # of the slope along a direction in which an element has no nei
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) at length one; a zero vector, as where depth is constant, becomes e_x."""
+    """Return vectors (..., 3) at length one; zero, as where depth is constant, becomes e_x."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 0.0, vectors / np.where(length > 0.0, length, 1.0), np.eye(3)[0])
 
 
 def across(sheets: np.ndarray, fibres: np.ndarray) -> np.ndarray:
-    """``sheets`` (..., 3) turned to be orthogonal to ``fibres`` (..., 3), both of length 1."""
+    """Return ``sheets`` (..., 3) made orthogonal to ``fibres`` (..., 3), both of length 1."""
     return unit(sheets - np.sum(sheets * fibres, axis=-1, keepdims=True) * fibres)
 
 
 def of_elements(directions: np.ndarray) -> np.ndarray:
-    """Mean direction (m, 3) of each element from (m, 3) or (m, q, 3)."""
+    """Return the mean direction (m, 3) of each element from (m, 3) or (m, q, 3)."""
     return directions if directions.ndim == 2 else unit(directions.mean(axis=1))
 
 
 def from_nodes(mesh: Mesh, at_nodes: np.ndarray, order: int) -> np.ndarray:
-    """Unit directions at the quadrature points of elements of ``order``, (m, q, 3).
+    """Return unit directions (m, q, 3) at the quadrature points of elements of ``order``.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def from_nodes(mesh: Mesh, at_nodes: np.ndarray, order: int) -> np.ndarray:
 
 
 def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
-    """Unit directions at the quadrature points of quadratic elements, (m, 4, 3), from (m, 3).
+    """Return unit directions (m, 4, 3) at the points of quadratic elements from one each, (m, 3).
 
     ``mesh`` is quadratic, or linear and about to be.
     """
@@ -114,20 +114,20 @@ def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
 
 
 def _summed(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Sums (count, 3, 3) of ``values`` (k, 3, 3) by row."""
+    """Return the sums (count, 3, 3) of ``values`` (k, 3, 3) by row."""
     flat = values.reshape(len(values), 9)
     return np.stack([np.bincount(rows, each, count) for each in flat.T], axis=1).reshape(-1, 3, 3)
 
 
 def check_across(sheets: np.ndarray, fibres: np.ndarray) -> None:
-    """:class:`InputError` unless ``sheets`` (m, q, 3) are orthogonal to ``fibres`` (m, q, 3)."""
+    """Raise :class:`InputError` unless ``sheets`` are orthogonal to ``fibres``, both (m, q, 3)."""
     along = np.abs(np.einsum("mqi,mqi->mq", fibres, sheets)).max()
     if not along < 1e-6:
         raise InputError(f"sheets are not across the fibres (cosine {along:.2g})")
 
 
 def checked_directions(vectors: np.ndarray, mesh: Mesh, kind: str) -> np.ndarray:
-    """Unit vectors (m, q, 3), or (m, 3), of each element of ``mesh``, frozen.
+    """Return unit vectors (m, q, 3), or (m, 3), of each element of ``mesh``, frozen.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def rule_based_directions(
     angles: Angles = (90.0, -90.0),
     axis: Axis = (0.0, 0.0, 1.0),
 ) -> Directions:
-    """Fibres, and sheets along the transmural direction.
+    """Return the fibres, and the sheets along the transmural direction.
 
     Parameters
     ----------
@@ -192,19 +192,19 @@ def rule_based_fibres(
     angles: Angles = (90.0, -90.0),
     axis: Axis = (0.0, 0.0, 1.0),
 ) -> np.ndarray:
-    """The fibres of :func:`rule_based_directions`, (m, 3) or (m, q, 3)."""
+    """Return the fibres of :func:`rule_based_directions`, (m, 3) or (m, q, 3)."""
     return rule_based_directions(mesh, endocardium, epicardium, angles, axis).fibres
 
 
 def biventricular_directions(
     mesh: Mesh, angles: Angles = (90.0, -90.0), axis: Axis = (0.0, 0.0, 1.0)
 ) -> Directions:
-    """The rule for two ventricles; directions jump where the walls meet."""
+    """Return the directions in two ventricles, which jump where the walls meet."""
     return turned(biventricular_depth(mesh), angles, axis)
 
 
 def biventricular_depth(mesh: Mesh) -> Depth:
-    """Depth in the walls of two ventricles; the left one's governs the septum.
+    """Return the depth in the walls of two ventricles; the left one's governs the septum.
 
     Three harmonic fields, each 1 on one of lv_endocardium, rv_endocardium, epicardium and 0 on
     the other two, add up to one. Where the field of lv_endocardium is the smallest of the three,
@@ -226,7 +226,7 @@ def biventricular_depth(mesh: Mesh) -> Depth:
 
 
 def wall_depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Depth:
-    """Harmonic depth, 0 on the facet sets ``inside`` and 1 on ``outside``."""
+    """Return the harmonic depth, 0 on the facet sets ``inside`` and 1 on ``outside``."""
     low, high = _nodes(mesh, inside), _nodes(mesh, outside)
     if np.isin(low, high).any():
         between = " and ".join(f"'{name}'" for name in (*inside, *outside))
@@ -241,7 +241,7 @@ def wall_depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) ->
 
 
 def nodal_depth(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Depth:
-    """The harmonic function of a linear mesh that is 0 at the nodes ``low`` and 1 at ``high``.
+    """Return the harmonic function (n,) that is 0 at the nodes ``low`` and 1 at ``high``.
 
     Gradients are averaged at the nodes: an element's own is one order less accurate.
     """
@@ -255,7 +255,7 @@ def nodal_depth(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Depth:
 
 
 def _harmonic(grid: Discretisation, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The harmonic function (n,) that is 0 at the nodes ``low`` and 1 at ``high``."""
+    """Return the harmonic function (n,) that is 0 at the nodes ``low`` and 1 at ``high``."""
     stiffness, count = grid.laplacian(), len(grid.mesh.nodes)
     value = np.zeros(count)
     value[high] = 1.0
@@ -268,7 +268,7 @@ def _harmonic(grid: Discretisation, low: np.ndarray, high: np.ndarray) -> np.nda
 def turned(
     wall: Depth, angles: Angles, axis: Axis, sheet_angles: Angles = (0.0, 0.0)
 ) -> Directions:
-    """Directions in a wall of known depth, by the rule in the module docstring.
+    """Return the directions in a wall of known depth, by the rule in the module docstring.
 
     The axis may have any length.
     """
@@ -285,13 +285,13 @@ def turned(
 
 
 def _across(wall: Depth, angles: Angles) -> np.ndarray:
-    """Angle in radians that goes from one side of the wall to the other, with a last axis of 1."""
+    """Return the angle in radians at each depth, from one side of the wall to the other."""
     first, last = np.radians(angles)
     return (first + wall.value * (last - first))[..., None]
 
 
 def circumferential(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Unit vectors (..., 3) around ``axis`` (3,) of length 1, across the ``normals`` (..., 3).
+    """Return unit vectors (..., 3) around the unit ``axis`` (3,), across ``normals`` (..., 3).
 
     Where a normal is along the axis, as at the apex, an arbitrary direction across it.
     """
@@ -302,5 +302,5 @@ def circumferential(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 def _nodes(mesh: Mesh, names: tuple[str, ...]) -> np.ndarray:
-    """Nodes of facet sets."""
+    """Return the nodes of facet sets."""
     return np.unique(np.concatenate([mesh.facet_set(name) for name in names], axis=None))

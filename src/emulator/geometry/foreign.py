@@ -22,7 +22,7 @@ _VTK = {1: "vertex", 3: "line", 5: "triangle", 10: "tetra", 22: "triangle6", 24:
 
 
 def as_meshio(source: Any) -> meshio.Mesh:
-    """A mesh of another library with its sets and its data.
+    """Return a mesh of another library with its sets and its data.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ Sets = dict[str, np.ndarray]
 
 
 def read_sets(source: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> tuple[Sets, Sets]:
-    """Node sets and facet sets of a mesh file.
+    """Return the node sets and facet sets of a mesh file.
 
     Groups of triangles become facet sets, their normals turned out of the body, and node sets of
     the same name. Groups of points and lines become node sets. Groups of volumes are left out.
@@ -123,7 +123,7 @@ def read_sets(source: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> 
 
 
 def own_node_sets(mesh: Mesh) -> Sets:
-    """Node sets that do not follow from the facet set of the same name."""
+    """Return the node sets that do not follow from the facet set of the same name."""
     implied = {name: np.unique(facets) for name, facets in mesh.facet_sets.items()}
     return {
         name: nodes
@@ -133,7 +133,7 @@ def own_node_sets(mesh: Mesh) -> Sets:
 
 
 def _groups(source: meshio.Mesh) -> dict[tuple[str, int], np.ndarray]:
-    """``(name, dimension)`` -> corner nodes (k, dimension + 1) of the group's cells."""
+    """Return ``(name, dimension)`` -> corner nodes (k, dimension + 1) of the group's cells."""
     parts: dict[tuple[str, int], list[np.ndarray]] = {}
     for k, block in enumerate(source.cells):
         if block.dim < 3:
@@ -145,7 +145,7 @@ def _groups(source: meshio.Mesh) -> dict[tuple[str, int], np.ndarray]:
 
 
 def _named_cells(source: meshio.Mesh, k: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Name and members of every group in cell block ``k``."""
+    """Return the name and the members of every group in cell block ``k``."""
     for name, members in source.cell_sets.items():
         if name != "gmsh:bounding_entities" and members[k] is not None:
             yield name, np.asarray(members[k], dtype=np.int64)
@@ -177,7 +177,7 @@ def _point_sets(source: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _on_surface(groups: Sets, elements: np.ndarray) -> Sets:
-    """Each triangle as ``boundary_facets`` lists it: facing out, with its mid-edge nodes."""
+    """Return each triangle as ``boundary_facets`` lists it: facing out, with mid-edge nodes."""
     if not groups:
         return {}
     surface = {tuple(sorted(row[:3])): row for row in boundary_facets(elements).tolist()}

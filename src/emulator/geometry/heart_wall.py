@@ -77,7 +77,7 @@ class Ventricle:
         return np.cross(self.axis, self.normal)
 
     def vectors(self) -> np.ndarray:
-        """Vectors (n, 7, 3) that turn with the body: n, c, k, x, k x x, g, k x g."""
+        """The vectors (n, 7, 3) that turn with the body: n, c, k, x, k x x, g, k x g."""
         k, count = np.broadcast_to(self.axis, self.normal.shape), len(self.normal)
         lean = np.broadcast_to(self.lean, (count, 3))
         around = np.cross(self.axis, self.across)
@@ -86,7 +86,7 @@ class Ventricle:
 
 
 def ventricle(mesh: Mesh, endocardium: str, fixed: np.ndarray) -> Ventricle:
-    """The wall around the cavity ``endocardium`` of ``mesh``, whose nodes ``fixed`` (n,) are fixed.
+    """Return the wall around the cavity ``endocardium``, whose nodes ``fixed`` (n,) are fixed.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def ventricle(mesh: Mesh, endocardium: str, fixed: np.ndarray) -> Ventricle:
 
 
 def _among(facets: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Which of ``facets`` (k, 3) are among ``reference`` (l, 3), whatever their order, (k,)."""
+    """Return whether each of ``facets`` (k, 3) is in ``reference`` (l, 3), in any order, (k,)."""
     keys = {tuple(each) for each in np.sort(reference, axis=1).tolist()}
     return np.array([tuple(each) in keys for each in np.sort(facets, axis=1).tolist()])
 
@@ -151,7 +151,7 @@ def aha_segments(
     through: Axis = (0.0, 0.0, 0.0),
     anterior: Axis = (0.0, 1.0, 0.0),
 ) -> np.ndarray:
-    """Segment (m,), 1 to 17, that the centroid of each element lies in.
+    """Return the segment (m,), 1 to 17, that the centroid of each element lies in.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def aha_segments(
 
 
 def _sector(turn: np.ndarray, count: int) -> np.ndarray:
-    """Sector 0 to ``count - 1`` of each ``turn`` (m,), a full turn being 1; 0 is centred at 0."""
+    """Return the sector 0 to ``count - 1`` of each ``turn`` (m,), full turns; 0 is centred at 0."""
     return np.floor(np.round(turn * count + 0.5, _DIGITS)).astype(int) % count
 
 

@@ -44,7 +44,7 @@ class Body:
 
 
 def read_mesh(source: str | Path | Any) -> Mesh:
-    """Tetrahedra and named sets from any file meshio reads, lengths taken as mm.
+    """Return tetrahedra and named sets from any file meshio reads, lengths taken as mm.
 
     Or from a mesh of scikit-fem, PyVista or meshio (:mod:`emulator.geometry.foreign`).
 
@@ -61,7 +61,7 @@ def read_mesh(source: str | Path | Any) -> Mesh:
 
 
 def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
-    """The mesh as :func:`read_mesh` returns it, with its ``fibres`` and ``sheets``.
+    """Return the mesh as :func:`read_mesh` returns it, with its ``fibres`` and ``sheets``.
 
     Both are data of points, or of cells: (m, 3), or (m, 3 q) for all quadrature points. Point and
     cell data are interpolated at the quadrature points (:mod:`emulator.geometry.fibres`); cell
@@ -80,7 +80,7 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
 
 
 def read_regions(path: str | Path, name: str) -> np.ndarray:
-    """Whole number (m,) of each element from cell data ``name``; :class:`InputError` if none."""
+    """Return the whole number (m,) of each element from cell data ``name``."""
     content = read_cells(Path(path))
     if name not in content.cell_data:
         names = ", ".join(f"'{key}'" for key in content.cell_data) or "none"
@@ -163,7 +163,7 @@ def _write_vtu(path: str | Path, mesh: Mesh, **data: Any) -> None:
 
 
 def read_cells(path: Path) -> meshio.Mesh:
-    """Whatever meshio finds in a file; :class:`InputError` in one line where it cannot."""
+    """Return the content of a file as meshio reads it; :class:`InputError` where it cannot."""
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "does not exist"
         raise InputError(f"mesh file {path} {what}")
@@ -203,7 +203,7 @@ def _convert(source: str | Path | Any, *, directions: bool, quadratic: bool = Fa
 
 
 def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
-    """The mesh, and the file's number (n,) of each of its nodes."""
+    """Return the mesh, and the file's number (n,) of each of its nodes."""
     kind = _tetrahedra(content)
     elements = np.concatenate([block.data for block in content.cells if block.type == kind])
     used, points = np.unique(elements), np.asarray(content.points, dtype=float)
@@ -225,7 +225,7 @@ def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
 
 
 def _tetrahedra(content: meshio.Mesh) -> str:
-    """The one type of tetrahedra in the file; :class:`InputError` names any other cells."""
+    """Return the one type of tetrahedra in the file; :class:`InputError` names any other cells."""
     kinds = sorted({block.type for block in content.cells if len(block.data)})
     solid = [kind for kind in kinds if kind in ("tetra", "tetra10")]
     other = [kind for kind in kinds if kind not in _LOWER | {"tetra", "tetra10"}]
@@ -247,7 +247,7 @@ def _tetrahedra(content: meshio.Mesh) -> str:
 def _directions(
     content: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str, order: int
 ) -> np.ndarray | None:
-    """Unit vectors at the points of elements of ``order`` from cell or point data ``name``."""
+    """Return unit vectors at the elements' points from cell or point data ``name``."""
     kind = _CELLS[mesh.order][0]
     if name in content.cell_data:
         blocks = zip(content.cells, content.cell_data[name], strict=True)
@@ -266,7 +266,7 @@ def _directions(
 
 
 def _checked(values: np.ndarray, name: str, where: str) -> np.ndarray:
-    """Vectors (k, 3) at length one; :class:`InputError` unless they are so but for round-off."""
+    """Return vectors (k, 3) scaled to length one; refuse lengths off by more than round-off."""
     values = np.asarray(values, dtype=float)
     if values.ndim != 2 or values.shape[1] != 3:
         raise InputError(f"'{name}' have shape {values.shape}; expected 3 components")
@@ -300,7 +300,7 @@ def _check_format(path: str | Path, mesh: Mesh, directions: Mapping[str, np.ndar
 
 
 def _with_tags(mesh: Mesh) -> meshio.Mesh:
-    """Sets as gmsh's physical groups; a facet or node in two sets is written twice."""
+    """Return the sets as gmsh's physical groups; a facet or node in two sets is written twice."""
     solid, triangle = _CELLS[mesh.order]
     groups = [(2, triangle, name, rows) for name, rows in mesh.facet_sets.items()]
     groups += [(0, "vertex", name, n[:, None]) for name, n in own_node_sets(mesh).items()]
@@ -318,7 +318,7 @@ def _with_tags(mesh: Mesh) -> meshio.Mesh:
 
 
 def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh:
-    """Sets as data of 0 and 1 on triangles and points."""
+    """Return the sets as data of 0 and 1 on triangles and points."""
     solid, triangle = _CELLS[mesh.order]
     blocks = [(solid, mesh.elements)]
     marks: dict[str, np.ndarray] = {}
@@ -340,5 +340,5 @@ def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh
 
 
 def _padded(values: np.ndarray, blocks: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
-    """Cell data of every block: ``values`` (m, k) on the tetrahedra, zeros elsewhere."""
+    """Return the cell data of every block: ``values`` (m, k) on the tetrahedra, zeros elsewhere."""
     return [values, *(np.zeros((len(rows), values.shape[1])) for _, rows in blocks[1:])]

@@ -29,7 +29,7 @@ FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 
 
 def _with_midpoints(face: tuple[int, ...]) -> tuple[int, ...]:
-    """Local nodes of a quadratic face: its corners, then the midpoints of 01, 12 and 20."""
+    """Return the local nodes of a quadratic face: corners, then midpoints of 01, 12 and 20."""
     pairs = [(face[k], face[(k + 1) % 3]) for k in range(3)]
     return face + tuple(4 + EDGES.index((min(pair), max(pair))) for pair in pairs)
 
@@ -38,14 +38,14 @@ QUADRATIC_FACES = tuple(_with_midpoints(face) for face in FACES)
 
 
 def signed_volumes(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """Signed volume of each tetrahedron's corners in mm3, shape (m,); negative when inverted."""
+    """Return the signed volume (m,) mm3 of each tetrahedron's corners, negative when inverted."""
     corner = nodes[elements[:, :4]]
     a, b, c = (corner[:, k] - corner[:, 0] for k in (1, 2, 3))
     return np.einsum("mi,mi->m", a, np.cross(b, c)) / 6.0
 
 
 def orient(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """``elements`` (m, 4 or 10), corners 2 and 3 swapped wherever the volume is negative."""
+    """Return ``elements`` (m, 4 or 10), corners 2 and 3 swapped where the volume is negative."""
     elements = np.array(elements, dtype=np.int64)
     swapped = [0, 1, 3, 2]
     if elements.shape[1] == 10:
@@ -57,7 +57,7 @@ def orient(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
 
 
 def boundary_facets(elements: np.ndarray) -> np.ndarray:
-    """Surface triangles (k, 3 or 6) of positively oriented tetrahedra, their normals pointing out.
+    """Return the surface triangles (k, 3 or 6) of oriented tetrahedra, normals pointing out.
 
     Quadratic ones list their corners, then the midpoints of edges 01, 12 and 20.
     """
@@ -70,7 +70,7 @@ def boundary_facets(elements: np.ndarray) -> np.ndarray:
 
 
 def folded(elements: np.ndarray) -> np.ndarray:
-    """Pairs (k, 2) of positively oriented tetrahedra on the same side of a face that they share.
+    """Return pairs (k, 2) of oriented tetrahedra on the same side of a common face.
 
     Neighbours list their common face in opposite senses. Where a mesh is tangled they do not,
     though every element has a positive volume. Of three at one face, two are on the same side.
@@ -86,14 +86,14 @@ def folded(elements: np.ndarray) -> np.ndarray:
 
 
 def parts(elements: np.ndarray, nodes: int) -> np.ndarray:
-    """Number (n,) of the connected part that each of the ``nodes`` belongs to, from 0."""
+    """Return the number (n,), from 0, of the connected part of each of the ``nodes``."""
     first, neighbours = np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel()
     graph = coo_array((np.ones(len(first)), (first, neighbours)), shape=(nodes, nodes))
     return connected_components(graph, directed=False)[1]
 
 
 def coincident(nodes: np.ndarray) -> np.ndarray:
-    """Pairs (k, 2) of ``nodes`` at the same place: elements that touch there are not joined."""
+    """Return pairs (k, 2) of ``nodes`` at the same place: elements touch there, not joined."""
     tolerance = _COINCIDENT * np.ptp(nodes, axis=0).max()
     return cKDTree(nodes).query_pairs(tolerance, output_type="ndarray")
 
@@ -104,7 +104,7 @@ _FLAT = 1e-10
 
 
 def indices(values: object, what: str) -> np.ndarray:
-    """``values`` as frozen whole numbers; :class:`InputError` where one has a fraction."""
+    """Return ``values`` as frozen whole numbers; :class:`InputError` where one has a fraction."""
     array = np.asarray(values)
     if array.dtype.kind == "f" and not (array == np.floor(array)).all():
         raise InputError(f"mesh: {what} has numbers with a fraction; give node indices")
@@ -112,7 +112,7 @@ def indices(values: object, what: str) -> np.ndarray:
 
 
 def frozen_array(values: object, dtype: type = float) -> np.ndarray:
-    """A read-only copy of ``values``: a function compiled from it stays valid."""
+    """Return a read-only copy of ``values``: a function compiled from it stays valid."""
     array: np.ndarray = np.array(values, dtype=dtype)
     array.flags.writeable = False
     return array
@@ -250,21 +250,21 @@ class Mesh:
         return float(np.linalg.norm(np.ptp(self.nodes, axis=0)))
 
     def node_set(self, name: str) -> np.ndarray:
-        """Indices of the nodes in set ``name``; :class:`InputError` lists the mesh's sets."""
+        """Return the nodes (k,) in set ``name``; :class:`InputError` lists the mesh's sets."""
         if name not in self.node_sets:
             known = ", ".join(sorted(self.node_sets)) or "none"
             raise InputError(f"node set '{name}' is not in the mesh; its sets: {known}")
         return self.node_sets[name]
 
     def facet_set(self, name: str) -> np.ndarray:
-        """Nodes (k, 3 or 6) of the facets in set ``name``; :class:`InputError` lists the sets."""
+        """Return the facets (k, 3 or 6) in set ``name``; :class:`InputError` lists the sets."""
         if name not in self.facet_sets:
             known = ", ".join(sorted(self.facet_sets)) or "none"
             raise InputError(f"facet set '{name}' is not in the mesh; its sets: {known}")
         return self.facet_sets[name]
 
     def elements_behind(self, facets: np.ndarray) -> np.ndarray:
-        """The element (k,) each surface facet (k, 3 or 6) belongs to."""
+        """Return the element (k,) that each surface facet (k, 3 or 6) belongs to."""
         owner: dict[tuple[int, ...], int] = {}
         for corners in combinations(range(4), 3):
             for k, row in enumerate(np.sort(self.elements[:, corners], axis=1).tolist()):
@@ -272,6 +272,6 @@ class Mesh:
         return np.array([owner[tuple(row)] for row in np.sort(facets[:, :3], axis=1).tolist()])
 
     def to_skfem(self) -> MeshTet:
-        """A linear mesh for scikit-fem (corner order kept, hence no sorting)."""
+        """Return a linear mesh for scikit-fem, whose elements keep the order of their corners."""
         self.require_linear("scikit-fem's MeshTet")
         return MeshTet(self.nodes.T.copy(), self.elements.T.copy(), sort_t=False)

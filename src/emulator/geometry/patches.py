@@ -42,12 +42,12 @@ class Patches(Blocks):
     members: np.ndarray
 
     def gather[A: (jax.Array, np.ndarray)](self, field: A) -> A:
-        """Values (b, q, ...) at the patches' points of a ``field`` (m, 1, ...)."""
+        """Return the values (b, q, ...) at the patches' points of a ``field`` (m, 1, ...)."""
         return field[self.members, 0]
 
 
 def patchwise(grid: Discretisation, size: int = _SIZE) -> Patches:
-    """The linear elements of ``grid`` in :func:`patches` of ``size``."""
+    """Return the linear elements of ``grid`` in :func:`patches` of ``size``."""
     label = patches(grid.mesh, size)
     members, real = _rows(label, np.arange(len(label)))
     keys, columns = np.unique(
@@ -68,7 +68,7 @@ def patchwise(grid: Discretisation, size: int = _SIZE) -> Patches:
 
 
 def _rows(label: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values of each label as a row, its first one repeated to fill it; which are not repeats."""
+    """Return the values of each label as a row, filled with its first, and which are no fill."""
     order = np.argsort(label, kind="stable")
     counts = np.bincount(label)
     first = np.cumsum(counts) - counts
@@ -78,7 +78,7 @@ def _rows(label: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def patches(mesh: Mesh, size: int = _SIZE) -> np.ndarray:
-    """The patch of each linear tetrahedron, (m,) from 0 up.
+    """Return the patch of each linear tetrahedron, (m,) from 0 up.
 
     A patch grows from the first tetrahedron that is in none, over faces, to ``size``; what is left
     over and small joins the smallest patch beside it, so that none is alone to lock.
@@ -94,7 +94,7 @@ def patches(mesh: Mesh, size: int = _SIZE) -> np.ndarray:
 
 
 def _neighbours(corners: np.ndarray) -> list[list[int]]:
-    """Elements across the faces of each, from sorted ``corners`` (m, 4)."""
+    """Return the elements across the faces of each element, from sorted ``corners`` (m, 4)."""
     faces = np.concatenate([np.sort(corners[:, face], axis=1) for face in FACES])
     order = np.lexsort(faces.T)
     same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
@@ -109,7 +109,7 @@ def _neighbours(corners: np.ndarray) -> list[list[int]]:
 def _grown(
     corners: Sequence[list[int]], neighbours: Sequence[list[int]], size: int
 ) -> list[list[int]]:
-    """Elements of each patch, grown over faces to at most ``size``."""
+    """Return the elements of each patch, grown over faces to at most ``size``."""
     assigned, groups = [False] * len(corners), []
 
     def order(k: int, nodes: set[int]) -> tuple[int, int, int]:
@@ -132,7 +132,7 @@ def _grown(
 
 
 def _joined(groups: list[list[int]], neighbours: Sequence[list[int]]) -> list[list[int]]:
-    """The same with each patch of fewer than ``_LEAST`` elements in the smallest beside it."""
+    """Join each patch below ``_LEAST`` elements to its smallest neighbour; return the patches."""
     owner = {k: patch for patch, group in enumerate(groups) for k in group}
     for patch, group in enumerate(groups):
         adjacent = {owner[j] for k in group for j in neighbours[k]} - {patch}

@@ -37,7 +37,7 @@ class MeshQuality(NamedTuple):
     jacobian: float
 
     def sentence(self) -> str:
-        """All of it, in one line."""
+        """Return all numbers of the quality in one line."""
         place = ", ".join(f"{x:.4g}" for x in self.place)
         pieces = "1 part" if self.parts == 1 else f"{self.parts} parts"
         text = f"{pieces}; smallest dihedral angle {self.angle:.3g} degrees, at ({place})"
@@ -49,7 +49,7 @@ class MeshQuality(NamedTuple):
 
 
 def mesh_quality(mesh: Mesh) -> MeshQuality:
-    """The quality of a mesh, from its corners, and from quadrature points where it is curved."""
+    """Return the quality of a mesh from its corners and, where curved, its quadrature points."""
     angles = dihedral_angles(mesh)
     smallest = angles.min(axis=1)
     worst = int(np.argmin(smallest))
@@ -65,7 +65,7 @@ def mesh_quality(mesh: Mesh) -> MeshQuality:
 
 
 def dihedral_angles(mesh: Mesh) -> np.ndarray:
-    """The six dihedral angles of each element, by its corners, (m, 6) degrees."""
+    """Return the six dihedral angles of each element, by its corners, (m, 6) degrees."""
     corners = mesh.nodes[mesh.elements[:, :4]]
     normals = []
     for a, b, c in FACES:

@@ -31,7 +31,7 @@ Midpoints = Callable[[np.ndarray], np.ndarray]
 
 
 def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
-    """``mesh`` with ten nodes an element; the corners keep their numbers.
+    """Return ``mesh`` with ten nodes an element; the corners keep their numbers.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
     elements = np.hstack([mesh.elements, first + number.reshape(-1, 6)])
 
     def middle(pairs: np.ndarray) -> np.ndarray:
-        """Node on each edge given by its ends (..., 2)."""
+        """Return the node on each edge given by its ends (..., 2)."""
         key = edges[:, 0] * first + edges[:, 1]
         edges_sought = np.sort(pairs, axis=-1)
         return first + np.searchsorted(key, edges_sought[..., 0] * first + edges_sought[..., 1])
@@ -76,7 +76,7 @@ def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
 
 
 def to_linear(mesh: Mesh) -> Mesh:
-    """The linear tetrahedra between the corners of quadratic ones, its nodes numbered anew."""
+    """Return the linear tetrahedra between the corners of quadratic ones, nodes renumbered."""
     if mesh.order != 2:
         raise InputError("mesh: its tetrahedra are linear already")
     corners, elements = np.unique(mesh.elements[:, :4], return_inverse=True)
@@ -93,7 +93,7 @@ def to_linear(mesh: Mesh) -> Mesh:
 
 
 def corner_parents(mesh: Mesh) -> np.ndarray:
-    """Nodes of :func:`to_linear` of ``mesh`` that each of its nodes lies between, (n, 2).
+    """Return the two nodes (n, 2) of :func:`to_linear` that each node of ``mesh`` lies between.
 
     Both are the same for a corner.
     """
@@ -114,7 +114,7 @@ _NODES = np.concatenate([np.eye(4), [0.5 * (np.eye(4)[a] + np.eye(4)[b]) for a, 
 
 
 def _upright(corners: tuple[int, ...]) -> tuple[int, ...]:
-    """Local nodes of a child, the last two swapped where its volume would be negative."""
+    """Return the local nodes of a child, the last two swapped if its volume would be negative."""
     sides = np.diff(_NODES[list(corners), 1:], axis=0)
     a, b, c, d = corners
     return corners if np.linalg.det(sides) > 0.0 else (a, b, d, c)
@@ -149,11 +149,11 @@ class Refinement:
         return self.corners.shape[1]
 
     def carry(self, u: np.ndarray) -> np.ndarray:
-        """A nodal field (n, 3) on the finer mesh, the same function of place."""
+        """Return a nodal field (n, 3) on the finer mesh, equal to the given one at every point."""
         return self.prolongation @ np.asarray(u)
 
     def directions(self, directions: np.ndarray) -> np.ndarray:
-        """Unit directions (m, 3) or (m, q, 3) at the finer mesh's quadrature points.
+        """Return unit directions (m, 3) or (m, q, 3) at the finer mesh's quadrature points.
 
         One direction an element is continued linearly first
         (:func:`~emulator.geometry.fibres.from_elements`).
@@ -166,7 +166,7 @@ class Refinement:
 
 
 def refined(mesh: Mesh) -> Refinement:
-    """The next finer mesh: quadratic elements, or each quadratic element in eight."""
+    """Return the next finer mesh: quadratic elements, or each quadratic element in eight."""
     count = len(mesh.elements)
     if mesh.order == 1:
         quadratic = to_quadratic(mesh)
@@ -190,7 +190,7 @@ def refined(mesh: Mesh) -> Refinement:
 
 
 def _shortest_diagonal(mesh: Mesh) -> np.ndarray:
-    """Which diagonal (m,) to cut the inner octahedron along: the shortest gives the best shapes."""
+    """Return the shortest diagonal (m,) of the inner octahedron, which gives the best shapes."""
     ends = mesh.nodes[mesh.elements[:, [diagonal for diagonal, _ in _DIAGONALS]]]
     return np.argmin(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2), axis=1)
 
@@ -198,7 +198,7 @@ def _shortest_diagonal(mesh: Mesh) -> np.ndarray:
 def _middle_of(
     mesh: Mesh, children: np.ndarray, elements: np.ndarray, edges: np.ndarray
 ) -> csr_matrix:
-    """Old shape functions (e, n) at the middle of each of the children's ``edges`` (e, 2).
+    """Return the old shape functions (e, n) at the middle of the children's ``edges`` (e, 2).
 
     children : (m, 8, 4) local nodes. elements : (m, 8, 4) their nodes.
     """

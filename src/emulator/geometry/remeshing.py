@@ -38,7 +38,7 @@ _TRIANGLE, _TETRAHEDRON = 2, 4  # Gmsh's numbers of element types
 def triangulate(
     loops: Sequence[np.ndarray], size: float | Callable[[float, float], float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A plane region between polygons, whose corners stay the only nodes on them.
+    """Mesh a plane region between polygons, whose corners stay the only nodes on them.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def triangulate(
 def tetrahedralise(
     points: np.ndarray, triangles: np.ndarray, size: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The space within a closed surface, whose triangles stay.
+    """Mesh the space within a closed surface, whose triangles stay.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def tetrahedralise(
 
 
 def _cells(gmsh: Any, kind: int, corners: int, dimension: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes in the order of their tags, which are those given first, and elements."""
+    """Return the nodes in the order of their tags, those given first, and the elements."""
     tags, places, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(tags)
     _, rows = gmsh.model.mesh.getElementsByType(kind)
@@ -111,7 +111,7 @@ def _cells(gmsh: Any, kind: int, corners: int, dimension: int) -> tuple[np.ndarr
 
 @contextmanager
 def _model() -> Iterator[Any]:
-    """Gmsh with an empty model; its errors as :class:`InputError`."""
+    """Yield Gmsh with an empty model; its errors become :class:`InputError`."""
     gmsh = _gmsh()
     owns_session = not gmsh.isInitialized()
     if owns_session:
@@ -194,19 +194,19 @@ class Flattened:
         return LinearNDInterpolator(self.places, self.surface.points)
 
     def rim_at(self, turn: np.ndarray) -> np.ndarray:
-        """Points (..., 3) mm of the rim at angles ``turn`` (...) of the circle."""
+        """Return points (..., 3) mm of the rim at angles ``turn`` (...) of the circle."""
         along = np.mod(turn / (2.0 * np.pi), 1.0) * self.length
         return np.stack([np.interp(along, self._along, x) for x in self._rim.T], axis=-1)
 
     def at(self, places: np.ndarray) -> np.ndarray:
-        """Points (k, 3) mm of the surface at ``places`` (k, 2) in the disc; off it, of the rim."""
+        """Return points (k, 3) mm of the surface at ``places`` (k, 2); off the disc, of the rim."""
         points = self._inside(places)
         off = np.isnan(points).any(axis=1)
         points[off] = self.rim_at(np.arctan2(places[off, 1], places[off, 0]))
         return points
 
     def remeshed(self, size: float) -> tuple[Surface, np.ndarray]:
-        """Triangles with edges of about ``size`` mm, and the places (n, 2) of their points.
+        """Return triangles with edges of about ``size`` mm, and their points (n, 2) in the disc.
 
         Points of the rim come first, in its order.
         """
@@ -224,7 +224,7 @@ class Flattened:
         ), places
 
     def _stretch(self) -> np.ndarray:
-        """Lengths on the surface over those in the disc, (n,), from areas around each point."""
+        """Return lengths on the surface over those in the disc, (n,), from areas around points."""
         rows = self.surface.triangles
         areas = [
             np.bincount(rows.ravel(), np.repeat(each, 3), len(self.places))
@@ -239,7 +239,7 @@ class Flattened:
         return self.places[self.surface.triangles]
 
     def middles(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Points (k, 3) mm on the surface, each as far from one place (k, 2) as from the other.
+        """Return points (k, 3) mm on the surface, equally far from both given places (k, 2).
 
         Along the straight line between them in the disc; between two places on the circle, along
         the rim.
@@ -262,7 +262,7 @@ class Flattened:
 
 
 def _mean_value_weights(surface: Surface) -> coo_array:
-    """Weights (n, n) of each point's neighbours."""
+    """Return the weights (n, n) of each point's neighbours."""
     x, rows = surface.points, surface.triangles
     first, last, values = [], [], []
     for k in range(3):
@@ -284,12 +284,12 @@ def _lengths(points: np.ndarray) -> np.ndarray:
 
 
 def _areas(corners: np.ndarray) -> np.ndarray:
-    """Areas (t,) of triangles (t, 3, 3)."""
+    """Return the areas (t,) of triangles (t, 3, 3)."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return 0.5 * np.linalg.norm(np.cross(u, v), axis=1)
 
 
 def _signed(corners: np.ndarray) -> np.ndarray:
-    """Areas (t,) of triangles (t, 3, 2) in the plane, positive anticlockwise."""
+    """Return the areas (t,) of triangles (t, 3, 2) in the plane, positive anticlockwise."""
     (ux, uy), (vx, vy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     return 0.5 * (ux * vy - uy * vx)

@@ -38,16 +38,16 @@ class Bodies:
     body: np.ndarray
 
     def elements(self, name: str) -> np.ndarray:
-        """Indices (k,) of the elements of body ``name``; :class:`InputError` lists the bodies."""
+        """Return the elements (k,) of body ``name``; :class:`InputError` lists the bodies."""
         index = look_up({n: k for k, n in enumerate(self.names)}, name, "body")
         return np.flatnonzero(self.body == index)
 
     def nodes(self, name: str) -> np.ndarray:
-        """Indices (k,) of all nodes of body ``name``, in its own order."""
+        """Return all nodes (k,) of body ``name``, in its own order."""
         return np.unique(self.mesh.elements[self.elements(name)])
 
     def stacked(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Values at the elements of each body, (k, ...) by its name, as those of the mesh (m, ...).
+        """Return values (m, ...) at the mesh's elements from those of each body, by its name.
 
         Fibres and sheets (k, 3) or (k, q, 3), or regions (k,).
 
@@ -72,7 +72,7 @@ class Bodies:
 
 
 def side_by_side(meshes: Mapping[str, Mesh], *, gap: float | None = None) -> Bodies:
-    """``meshes`` as one, by the bodies' names; a body's set ``top`` becomes ``body.top``.
+    """Return ``meshes`` as one; a body's set ``top`` becomes ``body.top``.
 
     Parameters
     ----------
@@ -118,12 +118,12 @@ def side_by_side(meshes: Mapping[str, Mesh], *, gap: float | None = None) -> Bod
 
 
 def shifted(mesh: Mesh, shift: tuple[float, float, float]) -> Mesh:
-    """``mesh`` moved by ``shift`` mm."""
+    """Return ``mesh`` moved by ``shift`` mm."""
     return Mesh(mesh.nodes + np.asarray(shift), mesh.elements, mesh.node_sets, mesh.facet_sets)
 
 
 def check_name(name: str) -> None:
-    """:class:`InputError` unless ``name`` can be a body's: letters, digits, _ and -."""
+    """Raise :class:`InputError` unless ``name`` can be a body's: letters, digits, _ and -."""
     if not _NAME.fullmatch(name):
         raise InputError(
             f"body '{name}': a name has letters, digits, _ and -, and begins with a letter"
@@ -131,7 +131,7 @@ def check_name(name: str) -> None:
 
 
 def _apart(meshes: list[Mesh], gap: float) -> list[Mesh]:
-    """The first where it is, each next one ``gap`` beyond the one before along x."""
+    """Return the meshes, each moved ``gap`` beyond the one before along x."""
     placed = meshes[:1]
     for mesh in meshes[1:]:
         beyond = placed[-1].nodes[:, 0].max() + gap - mesh.nodes[:, 0].min()

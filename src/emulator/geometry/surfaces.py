@@ -64,7 +64,7 @@ class Surface:
 
 
 def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
-    """A surface from STL, PLY, OBJ or another file of triangles that meshio reads.
+    """Return a surface from STL, PLY, OBJ or another file of triangles that meshio reads.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
 
 
 def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
-    """The surface of ``triangles`` (t, 3) between ``points`` (n, 3) mm, in any sense.
+    """Return the surface of ``triangles`` (t, 3) between ``points`` (n, 3) mm, in any sense.
 
     Points at one place are merged, triangles without area dropped, and the others turned to face
     out.
@@ -115,7 +115,7 @@ def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
 
 
 def _merged(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One point at each place that triangles use, and the triangles whose corners differ."""
+    """Return one point for each position, and the triangles whose corners differ."""
     tolerance = _MERGE * np.linalg.norm(np.ptp(points, axis=0))
     pairs = cKDTree(points, balanced_tree=False).query_pairs(tolerance, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
@@ -129,7 +129,7 @@ def _merged(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _one_sided(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The triangles turned so that neighbours list a common edge in opposite senses."""
+    """Return the triangles turned so that neighbours list a common edge in opposite senses."""
     edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     owner = np.repeat(np.arange(len(triangles)), 3)
     low, high = edges.min(axis=1), edges.max(axis=1)
@@ -163,12 +163,12 @@ def _one_sided(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarr
 
 
 def place_of(point: np.ndarray) -> str:
-    """A point or a direction (3,) in words."""
+    """Return a point or a direction (3,) in words."""
     return "(" + ", ".join(f"{x:.4g}" for x in np.round(point, 6) + 0.0) + ")"
 
 
 def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
-    """What lies below the plane through ``point`` (3,) mm, on the side ``normal`` (3,) leaves.
+    """Return the part below the plane through ``point`` (3,) mm with upward ``normal`` (3,).
 
     Raises
     ------
@@ -222,7 +222,7 @@ def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
 
 
 def one_rim(surface: Surface) -> np.ndarray:
-    """The edges (e, 2) of the only opening; :class:`InputError` names the others by place."""
+    """Return the edges (e, 2) of the only opening; :class:`InputError` locates the others."""
     rims = sorted(surface.rims, key=len)
     if len(rims) == 1:
         return rims[0]
@@ -239,7 +239,7 @@ def one_rim(surface: Surface) -> np.ndarray:
 
 
 def smoothed(surface: Surface, times: int) -> Surface:
-    """``given`` after ``times`` of Taubin's filter; a rim is smoothed along itself.
+    """Return the surface after ``times`` passes of Taubin's filter, rims smoothed as curves.
 
     A flat rim stays in its plane.
     """
@@ -260,7 +260,7 @@ def smoothed(surface: Surface, times: int) -> Surface:
 
 
 def inside(surface: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Which ``points`` (k, 3) mm are enclosed, (k,) bool, for a surface whose lid is above them.
+    """Return whether each of ``points`` (k, 3) mm is enclosed; the lid must be above them.
 
     A ray from an enclosed point against ``axis`` (3,), away from the lid, crosses the surface an
     odd number of times.

@@ -52,7 +52,7 @@ class Thickness(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A meshed wall, and what was found on the way.
+    """A meshed wall, and measurements of it.
 
     mesh : facet and node sets endocardium, epicardium and base, and the node sets
         apex_endocardium and apex_epicardium of one node each; at the surfaces' own place.
@@ -75,13 +75,13 @@ class Wall:
     quality: MeshQuality
 
     def local_thickness(self) -> np.ndarray:
-        """Distance to the endocardium plus that to the epicardium, (n,) mm at the nodes."""
+        """Return the distance (n,) mm to the endocardium plus that to the epicardium, at nodes."""
         nodes = self.mesh.nodes
         walls = (nodes[self.mesh.node_set(name)] for name in ("endocardium", "epicardium"))
         return sum(cKDTree(each, balanced_tree=False).query(nodes)[0] for each in walls)
 
     def sentences(self) -> list[str]:
-        """What was found, a line each."""
+        """Return the measurements, a line each."""
         cavity, own = self.cavity
         lines = [
             f"{len(self.mesh.nodes)} nodes, {len(self.mesh.elements)} tetrahedra of order "
@@ -113,7 +113,7 @@ def mesh_wall(
     smooth: int = 0,
     unit: str = "mm",
 ) -> Wall:
-    """Tetrahedra between two surfaces, closed or open at the base.
+    """Mesh the space between two surfaces, closed or open at the base, with tetrahedra.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _plane(
     height: float | None,
     point: Sequence[float] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normal (3,) and a point (3,) of the base plane."""
+    """Return the normal (3,) and a point (3,) of the base plane."""
     if height is not None and point is not None:
         raise InputError("base plane: give a height or a point, not both")
     has_plane = height is not None or point is not None
@@ -273,7 +273,7 @@ def _thickness(endocardium: Surface, epicardium: Surface) -> Thickness:
 def _mesh(
     maps: Sequence[Flattened], size: float, order: int, normal: np.ndarray, point: np.ndarray
 ) -> Mesh:
-    """The wall between two surfaces, the inner one first, with flat rims in one plane."""
+    """Return the wall between two surfaces, the inner one first, with flat rims in one plane."""
     (inner, in_disc), (outer, out_disc) = (each.remeshed(size) for each in maps)
     within = inside(outer, inner.points, normal)
     if not within.all():
@@ -326,6 +326,6 @@ def _mesh(
 
 
 def _among(edges: np.ndarray, triangles: np.ndarray, count: int) -> np.ndarray:
-    """Which ``edges`` (e, 2), lower node first, are sides of the ``triangles``, (e,) bool."""
+    """Return whether each of ``edges`` (e, 2), lower node first, is a side of ``triangles``."""
     sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.isin(edges @ [count, 1], sides @ [count, 1])

@@ -37,7 +37,7 @@ class Barriers:
     I4f_start: float = 8.0
 
     def limit_J(self, J: jax.Array) -> jax.Array:
-        """``J`` above ``J_start``, below it a positive exponential tail (Eq. 21); shape kept."""
+        """Return ``J``, below ``J_start`` a positive exponential tail (Eq. 21); shape kept."""
         width = self.J_start - self.J_min
         # Clipping keeps the unused branch of the where finite: its gradient is zero, not NaN.
         below = jnp.minimum(J, self.J_start)
@@ -45,11 +45,11 @@ class Barriers:
         return jnp.where(self.J_start < J, J, tail)
 
     def limit_I1(self, I1: jax.Array) -> jax.Array:
-        """``I1`` below ``I1_start``, above it a saturating tanh (Eq. 22); shape kept."""
+        """Return ``I1``, above ``I1_start`` a saturating tanh (Eq. 22); shape kept."""
         return _saturate(I1, self.I1_start)
 
     def limit_I4f(self, I4f: jax.Array) -> jax.Array:
-        """``I4f`` below ``I4f_start``, above it a saturating tanh (Eq. 23); shape kept."""
+        """Return ``I4f``, above ``I4f_start`` a saturating tanh (Eq. 23); shape kept."""
         return _saturate(I4f, self.I4f_start)
 
 
@@ -58,7 +58,7 @@ def _saturate(value: jax.Array, start: float) -> jax.Array:
 
 
 def determinant(A: jax.Array) -> jax.Array:
-    """Determinant of one 3x3 matrix by the triple product of its rows, shape ()."""
+    """Return the determinant () of one 3x3 matrix by the triple product of its rows."""
     return jnp.dot(A[0], jnp.cross(A[1], A[2]))
 
 
@@ -162,5 +162,5 @@ class Strain:
 
 
 def cofactor(A: jax.Array) -> jax.Array:
-    """Cofactor matrix ``det(A) A^-T`` of one 3x3 matrix by cross products of its rows."""
+    """Return the cofactor matrix ``det(A) A^-T`` of a 3x3 matrix by cross products of its rows."""
     return jnp.stack([jnp.cross(A[1], A[2]), jnp.cross(A[2], A[0]), jnp.cross(A[0], A[1])])

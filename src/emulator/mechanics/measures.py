@@ -37,7 +37,7 @@ _IN_CLOSED_FORM = set(_SHAPES) - {"green_lagrange"}
 
 
 def _metric(name: str, strain: Strain) -> jax.Array:
-    """The matrix (3, 3) that makes an isochoric measure."""
+    """Return the matrix (3, 3) that makes an isochoric measure."""
     if name == "isochoric_I1_minus_3":
         return jnp.eye(3)
     one = strain.sheet if name == "isochoric_I4s_minus_1" else strain.fibre
@@ -47,7 +47,7 @@ def _metric(name: str, strain: Strain) -> jax.Array:
 
 
 class _GradientRead(Exception):
-    """The law read the displacement gradient itself."""
+    """The error raised where the law reads the displacement gradient itself."""
 
 
 def _given(name: str) -> property:
@@ -74,7 +74,7 @@ class GivenStrain(Strain):
 
     @property
     def H(self) -> jax.Array:
-        """Unknown here: reading it raises."""
+        """Raise, because the displacement gradient is unknown here."""
         raise _GradientRead
 
     J_minus_1 = _given("J_minus_1")
@@ -106,7 +106,7 @@ class _Notes(Mapping[str, jax.Array]):
 
 @lru_cache(maxsize=64)
 def measures_read(law: Law) -> tuple[str, ...] | None:
-    """Names of the measures that ``law`` reads; ``None`` if it reads H or another measure.
+    """Return the names of the measures that ``law`` reads; ``None`` if it reads anything else.
 
     Found by tracing the law once.
     """
@@ -142,7 +142,7 @@ class Measures:
         return np.repeat(np.eye(len(self.names)), self._sizes, axis=1)
 
     def of(self, H: jax.Array, directions: jax.Array | None) -> jax.Array:
-        """Measures (size,) of a displacement gradient (3, 3)."""
+        """Return the measures (size,) of a displacement gradient (3, 3)."""
         strain = Strain(H, None, directions)
         return jnp.concatenate([jnp.ravel(getattr(strain, name)) for name in self.names])
 
@@ -199,7 +199,7 @@ class Measures:
     def _differentiated(
         self, H: jax.Array, directions: jax.Array | None, s: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """:meth:`derivatives` of any measures."""
+        """Return :meth:`derivatives` of any measures, by automatic differentiation."""
 
         def measures(H: jax.Array) -> jax.Array:
             return self.of(H, directions)
@@ -212,7 +212,7 @@ class Measures:
     def energy(
         self, constitutive: Callable[[Strain], jax.Array], directions: jax.Array | None
     ) -> Callable[[jax.Array], jax.Array]:
-        """The energy density (kPa) as a function of the measures (size,)."""
+        """Return the energy density (kPa) as a function of the measures (size,)."""
         ends = np.cumsum(self._sizes)[:-1]
 
         def phi(xi: jax.Array) -> jax.Array:

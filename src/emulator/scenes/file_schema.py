@@ -89,7 +89,7 @@ class SceneFile(Table):
 
 
 def scene_schema() -> dict[str, Any]:
-    """Draft 2020-12. It admits what the reader admits, and knows neither the mesh nor its sets."""
+    """Return the JSON Schema (draft 2020-12) of scene files, without the sets of the mesh."""
     schema = json_schema(SceneFile)
     keys = schema["properties"]
     keys["law"] |= {
@@ -110,7 +110,7 @@ def scene_schema() -> dict[str, Any]:
 
 
 def _takes(law: Law) -> str:
-    """Parameters of a law with their units, and the directions it needs."""
+    """Return the parameters of a law with their units, and the directions it needs."""
     needed_directions = [name for name in ("fibres", "sheets") if getattr(law, name)]
     directions = f"; needs {' and '.join(needed_directions)}" if needed_directions else ""
     return ", ".join(map(_with_unit, law.quantities)) + directions
@@ -121,7 +121,7 @@ def _with_unit(quantity: Quantity) -> str:
 
 
 def _texts() -> dict[str, str]:
-    """Unit and laws of every parameter that some law has, by its name."""
+    """Return the unit and the laws of every parameter that some law has, by its name."""
     takers: dict[str, dict[str, list[str]]] = {}
     for law in LAWS.values():
         for quantity in law.quantities:
@@ -133,7 +133,7 @@ def _texts() -> dict[str, str]:
 
 
 def _units(law: Law) -> dict[str, Any]:
-    """Parameters of this law have its units; where it has none, none is given."""
+    """Return the rule that a file gives the units of this law's parameters, and no others."""
     parameters = {}
     for quantity in law.quantities:
         unit = {"properties": {"unit": {"const": quantity.unit}}}

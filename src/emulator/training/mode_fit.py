@@ -65,7 +65,7 @@ _ROWS = 32  # rows of a block of the product, by trial
 
 
 class BranchTargets(NamedTuple):
-    """What the branch is fitted to.
+    """The coefficients to which the branch is fitted.
 
     modes : the frozen modes, (r, n, 3) in units of the network's scale.
     values, slopes : the snapshots' coefficients in them, (c, r) and (c, p, r).

@@ -33,7 +33,7 @@ FORMS: dict[str, tuple[int, Literal["pointwise", "mean"]]] = {
 
 
 def block(form: str) -> Scene:
-    """A clamped block of 2 x 3 x 4 mm, heavy enough to bend, in one of ``FORMS``."""
+    """Return a clamped block of 2 x 3 x 4 mm, heavy enough to bend, in one of ``FORMS``."""
     order, dilatation = FORMS[form]
     mesh = box((2.0, 3.0, 4.0), (2, 2, 2))
     return Scene(

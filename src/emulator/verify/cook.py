@@ -30,7 +30,7 @@ _INCOMPRESSIBLE = (
 
 
 def membrane(cells: int, form: Literal["P1", "P2", "mean"]) -> Scene:
-    """One layer of cells, fixed at its left edge and everywhere in z."""
+    """Return one layer of cells, fixed at its left edge and everywhere in z."""
     thickness = 48.0 / cells  # the width of a cell, for well-shaped tetrahedra
     if form == "P1":
         mesh = _parallel_diagonals(cells, thickness)

@@ -241,7 +241,7 @@ def verify_homogeneous(laws: Sequence[str] = tuple(PARAMETERS)) -> list[Benchmar
 
 
 def cube_scene(law: str, kind: str, stretch: float) -> Scene:
-    """A cube of 1 mm on three planes of symmetry, stretched along x, and along y if equibiaxial."""
+    """Return a cube of 1 mm on three planes of symmetry, stretched along x, or along x and y."""
     displacement = stretch - 1.0
     supports = [
         Support("left", components="x"),

@@ -33,7 +33,7 @@ _BISECTIONS = 40
 
 
 def beam(cells: tuple[int, int, int]) -> Scene:
-    """Half of the 10 x 1 x 1 mm beam, which is symmetric in y, with a pressure from below."""
+    """Return half of the 10 x 1 x 1 mm beam, symmetric in y, with a pressure from below."""
     return _scene(
         "Land's beam",
         to_quadratic(box((10.0, 0.5, 1.0), cells)),
@@ -44,7 +44,7 @@ def beam(cells: tuple[int, int, int]) -> Scene:
 
 
 def ventricle(rings: int, around: int, layers: int) -> Scene:
-    """The truncated ellipsoid at a cavity pressure of 10 kPa, its base fixed."""
+    """Return the truncated ellipsoid at a cavity pressure of 10 kPa, its base fixed."""
     return _scene(
         "Land's ventricle",
         land_ventricle(rings, around, layers, order=2),
@@ -55,7 +55,7 @@ def ventricle(rings: int, around: int, layers: int) -> Scene:
 
 
 def contraction(rings: int, around: int, layers: int) -> Scene:
-    """The ellipsoid with fibres, at 15 kPa and an active tension of 60 kPa, its base fixed."""
+    """Return the ellipsoid with fibres, at 15 kPa and an active tension of 60 kPa, base fixed."""
     mesh = land_ventricle(rings, around, layers, order=2)
     return _scene(
         "Land's contracting ventricle",

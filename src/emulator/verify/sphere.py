@@ -45,7 +45,7 @@ def pressure_at(stretch: float) -> float:
 
 
 def sphere_scene(cells: tuple[int, int], order: int = 2) -> Scene:
-    """One eighth of the sphere, fixed normal to its planes of symmetry."""
+    """Return one eighth of the sphere, fixed normal to its planes of symmetry."""
     return Scene(
         name="thick sphere",
         mesh=sphere_octant(INNER, OUTER, cells, grading=1.5, order=order),

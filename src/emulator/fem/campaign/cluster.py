@@ -172,7 +172,7 @@ def connected(address: str, *, within: float | None = None) -> Iterator[Cluster]
 
 
 def check_address(address: str) -> None:
-    """:class:`InputError` unless ``address`` looks like the address of a scheduler."""
+    """Raise :class:`InputError` unless ``address`` looks like the address of a scheduler."""
     if not _ADDRESS.fullmatch(address):
         raise InputError(f"scheduler '{address}' is no address; give e.g. tcp://127.0.0.1:8786")
 

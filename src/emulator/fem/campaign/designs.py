@@ -107,7 +107,7 @@ def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
 
 
 def _admissible(scene: Scene, thetas: np.ndarray) -> np.ndarray:
-    """Whether law, loads and regions admit every entry of each theta (c, p), (c,) bool."""
+    """Return whether law, loads and regions admit every entry of each theta (c, p), (c,) bool."""
     quantities = [scene.quantities[name] for name in scene.parameter_names]
     return np.array(
         [

@@ -69,7 +69,7 @@ class Pattern:
         return np.lexsort((self.rows, self.columns))
 
     def is_symmetric(self, values: jax.Array) -> jax.Array:
-        """Whether ``values`` of both triangles are mirror images, shape ()."""
+        """Return whether ``values`` of both triangles are mirror images, shape ()."""
         difference = jnp.max(jnp.abs(values - values[self._mirror]))
         return difference <= _ASYMMETRY * jnp.max(jnp.abs(values))
 
@@ -89,7 +89,7 @@ class Pattern:
         return stored_part.at[self.columns].add(above * x[self.rows])
 
     def solvable(self, values: jax.Array) -> jax.Array:
-        """Whether ``values`` are finite and leave no row empty, shape ()."""
+        """Return whether ``values`` are finite and leave no row empty, shape ()."""
         rows = jax.ops.segment_sum(jnp.abs(values), self.rows, num_segments=self.size)
         rows += jax.ops.segment_sum(jnp.abs(values), self.columns, num_segments=self.size)
         return jnp.all(jnp.isfinite(values)) & jnp.all(rows >= _EMPTY_ROW)

@@ -90,7 +90,7 @@ class Factor:
         self.factorisations = 0
 
     def serves(self, pattern: Pattern) -> bool:
-        """Whether matrices of ``pattern`` have this factor's structure."""
+        """Return whether matrices of ``pattern`` have this factor's structure."""
         own = self._pattern
         return pattern is own or (
             (pattern.size, pattern.upper) == (own.size, own.upper)

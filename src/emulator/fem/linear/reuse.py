@@ -123,7 +123,7 @@ class KeptFactor:
 
     @staticmethod
     def pays(pattern: Pattern) -> bool:
-        """Whether the matrices are large enough for a kept factor to save time."""
+        """Return whether the matrices are large enough for a kept factor to save time."""
         return pattern.upper and pattern.size >= _LARGE
 
     def attempt(

@@ -253,7 +253,7 @@ def api_version() -> tuple[int, int]:
 
 
 def check_api() -> None:
-    """:class:`InputError` unless the structs below have XLA's layout.
+    """Raise :class:`InputError` unless the structs below have XLA's layout.
 
     A new minor version of the interface only adds fields at the ends of structs; a new major
     version may move any.

@@ -80,7 +80,7 @@ _KEY = 1 << 31
 
 
 def _edge_keys(triangles: np.ndarray) -> np.ndarray:
-    """One number for each edge of triangles, whichever triangle it is seen from."""
+    """Return one number for each edge of triangles, the same from either triangle."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(edges[:, 0] * _KEY + edges[:, 1])
 
@@ -145,11 +145,11 @@ class Septum:
         return float(self.foot(np.ones(1), np.ones(1), np.ones(1))[1][0])
 
     def foot(self, xi: np.ndarray, eta: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates ``r, phi`` on the epicardium of the septum, widened for depth ``s``."""
+        """Return ``r, phi`` on the septum's epicardium, widened for depth ``s``."""
         return self._widened(*_half_disc(xi, eta), s)
 
     def sheet(self, xi: np.ndarray, eta: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """The point of the free wall in mm, (..., 3)."""
+        """Return the point of the free wall in mm, (..., 3)."""
         across, down = _half_disc(xi, eta)
         rho = np.hypot(across, down)
         along = np.sinc(0.5 * rho) * 0.5 * np.pi  # sin(pi rho / 2) / rho: even steps along the arc
@@ -161,7 +161,7 @@ class Septum:
     def _widened(
         self, across: np.ndarray, down: np.ndarray, s: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``r, phi`` of points in the half disc, its edge moved out by ``s`` thicknesses."""
+        """Return ``r, phi`` of points in the half disc, its edge moved out by ``s`` thicknesses."""
         thickness = s * self.right.thickness
         step = np.array([-5e-5, 5e-5])
         below, above = self._epicardium(self.right.apex + step, np.zeros(2))
@@ -175,7 +175,7 @@ class Septum:
 
 
 def _half_disc(xi: np.ndarray, eta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rectangle of ``xi`` and ``eta`` mapped to the half disc: ``across`` and ``down``.
+    """Return ``across`` and ``down`` in the half disc, the image of a rectangle ``xi``, ``eta``.
 
     A sheet over a rectangle would lie flat in its corners; on the disc's edge it stands up
     everywhere. Squares go to circles (Shirley and Chiu 1997), so a triangle in a corner stays a
@@ -198,7 +198,7 @@ def biventricle(
     order: int = 1,
     grading: float = 1.0,
 ) -> Mesh:
-    """Both ventricles; the right one lies towards positive x.
+    """Return the mesh of both ventricles; the right one lies towards positive x.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ class _Flat:
 
 
 def _laid_out(septum: Septum, rings: int, around: int, strips: int, grading: float) -> _Flat:
-    """The disc opened around the septum, which takes half of ``around`` on every full ring."""
+    """Return the disc opened around the septum, which takes half of ``around`` on full rings."""
     radius, angle, triangles = disc(rings, around)
     angle = np.angle(np.exp(1j * angle))  # from -pi to pi
     columns, ring = around // 4, -(-around // 6)
@@ -298,7 +298,7 @@ def _made_room(
     r: np.ndarray,
     phi: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """New ``r``, ``phi``: septum and band at their places, the other vertices moved smoothly."""
+    """Return ``r``, ``phi`` with septum and band in place, the other vertices moved smoothly."""
     points = _polar(r, phi)
     r, phi = r.copy(), phi.copy()
     septal, band = np.unique(opened.inner), opened.levels[:, 1:]
@@ -314,7 +314,7 @@ def _made_room(
 
 
 def _sheet(flat: _Flat, wall: np.ndarray, strips: int) -> tuple[np.ndarray, np.ndarray]:
-    """The free wall's columns (v, strips + 1) of nodes, -1 outside the septum, and its coordinates.
+    """Return the columns (v, strips + 1) of the free wall's nodes, -1 off it, and coordinates.
 
     Along the line it stands on, its nodes are the left wall's outermost. Coordinates (n, 3) have a
     row for every node of the body, zero off the free wall.
@@ -328,7 +328,7 @@ def _sheet(flat: _Flat, wall: np.ndarray, strips: int) -> tuple[np.ndarray, np.n
 
 
 def _in_columns(columns: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Coordinates (n, 3) of nodes in columns (v, layers + 1): ``first``, ``second`` and depth."""
+    """Return coordinates (n, 3) of nodes in columns: ``first``, ``second`` and depth."""
     coordinates = np.zeros((columns.max() + 1, 3))
     coordinates[columns, 0], coordinates[columns, 1] = first[:, None], second[:, None]
     coordinates[columns, 2] = _depths(columns.shape[1] - 1)
@@ -336,7 +336,7 @@ def _in_columns(columns: np.ndarray, first: np.ndarray, second: np.ndarray) -> n
 
 
 def _midpoints(septum: Septum, in_wall: np.ndarray, in_sheet: np.ndarray) -> Midpoints:
-    """Midpoints of edges in the left wall's coordinates, or in the sheet's for sheet edges."""
+    """Return the function of midpoints in the left wall's or, on it, the sheet's coordinates."""
     on_wall = wall_midpoints(septum.left, *in_wall.T)
 
     def midpoints(edges: np.ndarray) -> np.ndarray:

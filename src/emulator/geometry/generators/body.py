@@ -19,7 +19,7 @@ def body(
     midpoints: Midpoints | None,
     order: int,
 ) -> Mesh:
-    """The mesh of a body, its elements oriented.
+    """Return the mesh of a body, its elements oriented.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def body(
 
 
 def extrude(columns: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Three tetrahedra for each prism between two layers of a triangulation.
+    """Return three tetrahedra for each prism between two layers of a triangulation.
 
     A prism's corners are taken in the order of their 2D numbers, so the two prisms that share a
     side cut it along the same diagonal: from the lower number below to the higher number above.
@@ -64,5 +64,5 @@ def extrude(columns: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def stacked(vertices: int, layers: int) -> np.ndarray:
-    """Columns (vertices, layers + 1) of nodes numbered layer by layer."""
+    """Return columns (vertices, layers + 1) of nodes numbered layer by layer."""
     return np.arange(vertices * (layers + 1)).reshape(layers + 1, vertices).T

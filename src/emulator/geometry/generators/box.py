@@ -22,7 +22,7 @@ _FACES = (
 
 
 def toward_ends(count: int, grading: float, ends: tuple[str, ...]) -> np.ndarray:
-    """Ends (count + 1,) of cells on [0, 1], closer at some of its ends.
+    """Return the ends (count + 1,) of cells on [0, 1], closer at some of its ends.
 
     Cell k of n ends at :math:`(k/n)^g` where ``left`` is to be fine; likewise from the ``right``,
     and from both ends to the middle.
@@ -52,7 +52,7 @@ def box(
     order: int = 1,
     along: np.ndarray | None = None,
 ) -> Mesh:
-    """Structured box ``[0, lengths]`` of six tetrahedra a cell, nodes numbered x first, then y, z.
+    """Return the box ``[0, lengths]`` of six tetrahedra a cell, nodes numbered x first, then y, z.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def slab(
     thickness: float = 1.0,
     order: int = 1,
 ) -> Mesh:
-    """A convex quadrilateral extruded along z, for plane strain with u_z held on node set all.
+    """Return a convex quadrilateral extruded along z, for plane strain if set all has u_z = 0.
 
     Each cell is cut in four by both diagonals, which favours no direction, and each of the four
     prisms in three tetrahedra.
@@ -135,12 +135,12 @@ def slab(
 
 
 def cooks_membrane(cells: tuple[int, int] = (8, 8), thickness: float = 1.0, order: int = 1) -> Mesh:
-    """Cook's membrane: :func:`slab` of ``COOKS_MEMBRANE``."""
+    """Return Cook's membrane: :func:`slab` of ``COOKS_MEMBRANE``."""
     return slab(COOKS_MEMBRANE, cells, thickness, order)
 
 
 def _checked(corners: tuple[Corner, ...]) -> np.ndarray:
-    """The corners as (4, 2), convex and anticlockwise."""
+    """Return the corners as (4, 2); refuse any that are not convex and anticlockwise."""
     points = np.asarray(corners, dtype=float)
     if points.shape != (4, 2) or not np.isfinite(points).all():
         raise InputError(f"slab: corners {corners}; expected four finite points (x, y)")
@@ -155,14 +155,14 @@ def _checked(corners: tuple[Corner, ...]) -> np.ndarray:
 
 
 def _bilinear(corners: np.ndarray, square: np.ndarray) -> np.ndarray:
-    """Points (v, 2) of the quadrilateral at coordinates (v, 2) of the unit square."""
+    """Return the points (v, 2) of the quadrilateral at coordinates (v, 2) of the unit square."""
     across, up = square.T
     weights = [(1 - across) * (1 - up), across * (1 - up), across * up, (1 - across) * up]
     return np.stack(weights, axis=1) @ corners
 
 
 def _crossed_square(across: int, up: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit square of cells cut by both diagonals: points (v, 2), triangles (k, 3)."""
+    """Return the unit square of cells cut by both diagonals: points (v, 2), triangles (k, 3)."""
     i, j = np.meshgrid(np.arange(across + 1), np.arange(up + 1), indexing="ij")
     grid = np.column_stack([i.ravel() / across, j.ravel() / up])
     number = np.arange(len(grid)).reshape(across + 1, up + 1)

@@ -21,14 +21,14 @@ from emulator.geometry.refinement import Midpoints
 
 
 def ring_counts(rings: int, around: int) -> np.ndarray:
-    """Points on each ring, (rings,): six more than on the one before, up to ``around``."""
+    """Return the points on each ring, (rings,): six more each time, up to ``around``."""
     if rings < 2 or around < 6:
         raise InputError(f"disc: {rings} rings of {around} points; expected at least 2 and 6")
     return np.minimum(6 * np.arange(1, rings + 1), around)
 
 
 def disc(rings: int, around: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rings of points with the centre as vertex 0.
+    """Return rings of points with the centre as vertex 0.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def disc(rings: int, around: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _zip(first_inner: int, inner: int, first_outer: int, outer: int) -> np.ndarray:
-    """Triangles between two rings; whichever ring's next point has the smaller angle advances.
+    """Return triangles between two rings, always advancing to the point of smaller angle.
 
     Between rings of equal size, where all next points tie, the inner goes first on one half of the
     disc and the outer on the other: the triangulation is its own mirror image in the line of angle
@@ -103,7 +103,7 @@ class EllipsoidalWall:
             )
 
     def position(self, r: np.ndarray, phi: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """The point X(r, phi, t) in mm, (..., 3)."""
+        """Return the point X(r, phi, t) in mm, (..., 3)."""
         short = self.short_endocardium + t * (self.short_epicardium - self.short_endocardium)
         long = self.long_endocardium + t * (self.long_epicardium - self.long_endocardium)
         u = r * np.arccos(-self.base / long)
@@ -123,7 +123,7 @@ class EllipsoidalWall:
 
 
 def _volume_below(height: float, short: float, long: float) -> float:
-    """Integral of ``pi short^2 (1 - z^2 / long^2)`` from the apex to ``height``."""
+    """Return the integral of ``pi short^2 (1 - z^2 / long^2)`` from the apex to ``height``."""
     return np.pi * short**2 * (height + long - (height**3 + long**3) / (3.0 * long**2))
 
 
@@ -136,7 +136,7 @@ HUMAN = EllipsoidalWall(23.0, 58.0, 34.0, 65.0, base=20.0)
 
 
 def toward_base(radius: np.ndarray, grading: float) -> np.ndarray:
-    """Radii in the disc, from 0 to 1, moved towards 1, the base, where ``grading`` is above 1."""
+    """Return radii on [0, 1] moved towards the base, 1, where ``grading`` is above 1."""
     if not 0.0 < grading < np.inf:
         raise InputError(f"ellipsoid: grading {grading} of the rings; expected above 0")
     return 1.0 - (1.0 - np.minimum(radius, 1.0)) ** grading
@@ -151,7 +151,7 @@ def truncated_ellipsoid(
     thicker: tuple[float, float] = (0.0, 0.0),
     grading: float = 1.0,
 ) -> Mesh:
-    r"""The wall, meshed by prisms through a disc of rings; each prism is cut in three.
+    r"""Return the wall, meshed by prisms through a disc of rings, each cut in three tetrahedra.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def truncated_ellipsoid(
 
 
 def _thickness(r: np.ndarray, phi: np.ndarray, more: float, angle: float) -> np.ndarray:
-    """Thickness of the wall at ``r`` and ``phi``, 1 at the apex; linear in x and y there."""
+    """Return the relative thickness of the wall at ``r`` and ``phi``, 1 at the apex."""
     if not 0.0 <= more <= _MOST_UNEVEN or not np.isfinite(angle):
         raise InputError(
             f"ellipsoid: a wall thicker by {more} towards {angle} degrees; expected a fraction of "
@@ -208,7 +208,7 @@ def _thickness(r: np.ndarray, phi: np.ndarray, more: float, angle: float) -> np.
 def wall_midpoints(
     wall: EllipsoidalWall, r: np.ndarray, phi: np.ndarray, t: np.ndarray
 ) -> Midpoints:
-    """Midpoints of edges between nodes at ``r``, ``phi``, ``t``, each (n,).
+    """Return the midpoints of edges between nodes at ``r``, ``phi``, ``t``, each (n,).
 
     Halfway in the disc with polar coordinates r and phi, where the apex is no special point; for
     edges on the disc's rim, which is the base, halfway along the rim.
@@ -225,12 +225,12 @@ def wall_midpoints(
 
 
 def land_ventricle(rings: int = 10, around: int = 24, layers: int = 2, order: int = 1) -> Mesh:
-    """The ellipsoid of Land et al. (2015), problem 2: :func:`truncated_ellipsoid` of ``LAND``."""
+    """Return the ellipsoid ``LAND`` of Land et al. (2015), problem 2."""
     return truncated_ellipsoid(LAND, rings, around, layers, order)
 
 
 def human_ventricle(
     rings: int = 15, around: int = 30, layers: int = 3, order: int = 1, grading: float = 1.0
 ) -> Mesh:
-    """A human-sized left ventricle for daily use: :func:`truncated_ellipsoid` of ``HUMAN``."""
+    """Return the human-sized left ventricle ``HUMAN`` for daily use."""
     return truncated_ellipsoid(HUMAN, rings, around, layers, order, grading=grading)

@@ -31,7 +31,7 @@ def organ(
     clustering: float = 0.0,
     ligament_shells: int = 6,
 ) -> Mesh:
-    """A liver-like body; its dimensions are our choice.
+    """Return a liver-like body; its dimensions are our choice.
 
     Parameters
     ----------
@@ -74,13 +74,13 @@ def organ(
 
 
 def volume(half_axes: tuple[float, float, float]) -> float:
-    """Volume of the true body in mm3."""
+    """Return the volume of the true body in mm3."""
     a, b, c = half_axes
     return 4.0 / 3.0 * np.pi * a * b * c * (1.0 + _TAPER_Y * _TAPER_Z / 5.0)
 
 
 def _in_ligament(directions: np.ndarray, shells: int, clustering: float) -> np.ndarray:
-    """Which unit vectors (k, 3) of the ball before its map meet the ligament, (k,) bool."""
+    """Return whether each unit vector (k, 3) meets the ligament before the map, (k,) bool."""
     nodes, elements = ball(shells)
     triangles = boundary_facets(orient(nodes, elements))
     inside = _clustered(nodes, clustering) @ _LIGAMENT_DIRECTION > np.cos(_LIGAMENT_HALF_ANGLE)
@@ -91,7 +91,7 @@ def _in_ligament(directions: np.ndarray, shells: int, clustering: float) -> np.n
 
 
 def _clustered(points: np.ndarray, clustering: float) -> np.ndarray:
-    r"""The Moebius map of the unit ball that takes its centre to :math:`a = c\, d`, (k, 3).
+    r"""Return the Moebius map of the unit ball that takes its centre to :math:`a = c\, d`, (k, 3).
 
     .. math:: T(x) = \frac{(1 + 2 a \cdot x + |x|^2)\, a + (1 - |a|^2)\, x}
                           {1 + 2 a \cdot x + |a|^2 |x|^2}
@@ -105,7 +105,7 @@ def _clustered(points: np.ndarray, clustering: float) -> np.ndarray:
 
 
 def _shape(points: np.ndarray, half_axes: tuple[float, float, float]) -> np.ndarray:
-    """The map of this module, (k, 3) of the unit ball to (k, 3) in mm."""
+    """Return the map of this module, (k, 3) of the unit ball to (k, 3) in mm."""
     x, y, z = points.T
     a, b, c = half_axes
     return np.column_stack(

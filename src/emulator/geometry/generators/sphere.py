@@ -13,7 +13,7 @@ from emulator.geometry.refinement import Midpoints
 
 
 def triangle_lattice(divisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """A triangle cut into ``divisions**2``: barycentric coordinates (v, 3), triangles (k, 3)."""
+    """Return a triangle cut into ``divisions**2``: barycentric points (v, 3), triangles (k, 3)."""
     n = divisions
     corners = [(i, j) for i in range(n + 1) for j in range(n + 1 - i)]
     number = {corner: k for k, corner in enumerate(corners)}
@@ -29,13 +29,13 @@ def triangle_lattice(divisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) at length one; the zero vector stays zero."""
+    """Return vectors (..., 3) at length one; the zero vector stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)
 
 
 def ball_midpoints(nodes: np.ndarray) -> Midpoints:
-    """Midpoints of edges between ``nodes`` (n, 3): the mean direction at the mean radius.
+    """Return midpoints of edges between ``nodes`` (n, 3), at the mean direction and radius.
 
     On an edge from the centre, which has no direction, the midpoint lies halfway along it.
     """
@@ -49,7 +49,7 @@ def ball_midpoints(nodes: np.ndarray) -> Midpoints:
 
 
 def ball(shells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit ball of tetrahedra in ``shells`` shells, each a subdivided icosahedron.
+    """Return the unit ball of tetrahedra in ``shells`` shells, each a subdivided icosahedron.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def ball(shells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
-    """Corners (12, 3) on the unit sphere and faces (20, 3)."""
+    """Return the corners (12, 3) on the unit sphere and the faces (20, 3)."""
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     half = np.array([(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
     corners = unit(np.concatenate([np.roll(half, turn, axis=1) for turn in range(3)]))
@@ -83,7 +83,7 @@ def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _kuhn_lattice(divisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """The simplex ``divisions >= x >= y >= z >= 0`` in unit steps: points (v, 3), cells (c, 4).
+    """Return points (v, 3), cells (c, 4) of ``divisions >= x >= y >= z >= 0`` in unit steps.
 
     Kuhn's six tetrahedra of each unit cube, those inside the simplex. They cut its faces into
     regular lattices, so simplices glued face to face fit.
@@ -103,7 +103,7 @@ def _kuhn_lattice(divisions: int) -> tuple[np.ndarray, np.ndarray]:
 def sphere_octant(
     inner: float, outer: float, cells: tuple[int, int], grading: float = 1.0, order: int = 1
 ) -> Mesh:
-    """The part of the shell ``inner <= |X| <= outer`` with x, y, z >= 0.
+    """Return the part of the shell ``inner <= |X| <= outer`` with x, y, z >= 0.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def sphere_octant(
 
 
 def _radii(inner: float, outer: float, through: int, grading: float) -> np.ndarray:
-    """Radii of the layers, (through + 1,) mm."""
+    """Return the radii of the layers, (through + 1,) mm."""
     thickness = grading ** np.linspace(0.0, 1.0, through)
     within = np.concatenate([[0.0], np.cumsum(thickness)]) / thickness.sum()
     return inner + (outer - inner) * within

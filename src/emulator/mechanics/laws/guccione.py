@@ -30,7 +30,7 @@ def energy(
     b_fs: jax.Array,
     kappa: jax.Array,
 ) -> jax.Array:
-    """Strain energy density in kPa; ``C`` and ``kappa`` in kPa."""
+    """Return the strain energy density in kPa; ``C`` and ``kappa`` in kPa."""
     E, f = strain.green_lagrange, strain.fibre
     Ef = E @ f
     along, shear = jnp.vdot(f, Ef), jnp.vdot(Ef, Ef)

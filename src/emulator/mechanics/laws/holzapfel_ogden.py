@@ -30,7 +30,7 @@ from emulator.mechanics.laws.volumetric import quadratic_logarithmic
 def energy(
     strain: Strain, a: jax.Array, b: jax.Array, a_f: jax.Array, b_f: jax.Array, kappa: jax.Array
 ) -> jax.Array:
-    """Strain energy density in kPa, textbook form; ``a``, ``a_f``, ``kappa`` in kPa."""
+    """Return the strain energy density in kPa, textbook form; ``a``, ``a_f``, ``kappa`` in kPa."""
     stretch = jnp.maximum(strain.isochoric_I4f_minus_1, 0.0)
     return energy_isotropic(strain, a, b, kappa) + energy_of_fibres(stretch, a_f, b_f)
 
@@ -38,7 +38,7 @@ def energy(
 def energy_released(
     strain: Strain, a: jax.Array, b: jax.Array, a_f: jax.Array, b_f: jax.Array, kappa: jax.Array
 ) -> jax.Array:
-    """Strain energy density in kPa as in the paper's released code."""
+    """Return the strain energy density in kPa as in the paper's released code."""
     matrix = a / b * jnp.expm1(b * strain.isochoric_I1_minus_3)
     fibres = a_f / b_f * jnp.expm1(b_f * strain.isochoric_I4f_minus_1**2)
     return matrix + fibres + quadratic_logarithmic(strain, kappa)
@@ -47,19 +47,19 @@ def energy_released(
 def energy_unswitched(
     strain: Strain, a: jax.Array, b: jax.Array, a_f: jax.Array, b_f: jax.Array, kappa: jax.Array
 ) -> jax.Array:
-    """Strain energy density in kPa of fibres that resist compression, too."""
+    """Return the strain energy density in kPa of fibres that resist compression, too."""
     stretch = strain.isochoric_I4f_minus_1
     return energy_isotropic(strain, a, b, kappa) + energy_of_fibres(stretch, a_f, b_f)
 
 
 def energy_isotropic(strain: Strain, a: jax.Array, b: jax.Array, kappa: jax.Array) -> jax.Array:
-    """Strain energy density in kPa without fibres."""
+    """Return the strain energy density in kPa without fibres."""
     matrix = a / (2.0 * b) * jnp.expm1(b * strain.isochoric_I1_minus_3)
     return matrix + quadratic_logarithmic(strain, kappa)
 
 
 def energy_of_fibres(stretch: jax.Array, a_f: jax.Array, b_f: jax.Array) -> jax.Array:
-    """Strain energy density in kPa of fibres at ``stretch``, squared and less 1, shape ()."""
+    """Return the energy density () in kPa of fibres at ``stretch``, squared and less 1."""
     return a_f / (2.0 * b_f) * jnp.expm1(b_f * stretch**2)
 
 
@@ -99,10 +99,10 @@ LAWS = (
 
 
 def textbook_from_released(a: float, a_f: float) -> tuple[float, float]:
-    """Textbook ``(a, a_f)`` from the released variant's; equal energies in fibre tension."""
+    """Return textbook ``(a, a_f)`` of equal energies in fibre tension from the released ones."""
     return 2.0 * a, 2.0 * a_f
 
 
 def released_from_textbook(a: float, a_f: float) -> tuple[float, float]:
-    """Inverse of :func:`textbook_from_released`."""
+    """Return the inverse of :func:`textbook_from_released`."""
     return 0.5 * a, 0.5 * a_f

@@ -38,7 +38,7 @@ def energy(
     dispersion: jax.Array,
     kappa: jax.Array,
 ) -> jax.Array:
-    """Strain energy density in kPa; ``a``, ``a_f`` and ``kappa`` in kPa."""
+    """Return the strain energy density in kPa; ``a``, ``a_f`` and ``kappa`` in kPa."""
     stretch = jnp.maximum(mean_stretch(strain, dispersion), 0.0)
     return energy_isotropic(strain, a, b, kappa) + energy_of_fibres(stretch, a_f, b_f)
 
@@ -52,13 +52,13 @@ def energy_unswitched(
     dispersion: jax.Array,
     kappa: jax.Array,
 ) -> jax.Array:
-    """Strain energy density in kPa of fibres that resist compression, too."""
+    """Return the strain energy density in kPa of fibres that resist compression, too."""
     stretch = mean_stretch(strain, dispersion)
     return energy_isotropic(strain, a, b, kappa) + energy_of_fibres(stretch, a_f, b_f)
 
 
 def mean_stretch(strain: Strain, dispersion: jax.Array) -> jax.Array:
-    r"""The fibres' mean :math:`\bar E`, stretch squared and less 1, shape ()."""
+    r"""Return the fibres' mean :math:`\bar E`, stretch squared and less 1, shape ()."""
     along = (1.0 - 3.0 * dispersion) * strain.isochoric_I4f_minus_1
     return dispersion * strain.isochoric_I1_minus_3 + along
 

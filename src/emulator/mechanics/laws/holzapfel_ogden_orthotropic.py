@@ -33,7 +33,7 @@ def energy(
     b_fs: jax.Array,
     kappa: jax.Array,
 ) -> jax.Array:
-    """Strain energy density in kPa; ``a``, ``a_f``, ``a_s``, ``a_fs`` and ``kappa`` in kPa."""
+    """Return the strain energy density in kPa; all moduli and ``kappa`` are in kPa."""
     stretch = jnp.maximum(strain.isochoric_I4s_minus_1, 0.0)
     sheets = a_s / (2.0 * b_s) * jnp.expm1(b_s * stretch**2)
     shear = a_fs / (2.0 * b_fs) * jnp.expm1(b_fs * strain.isochoric_I8fs**2)

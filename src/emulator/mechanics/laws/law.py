@@ -45,7 +45,7 @@ class Quantity:
     low_admitted: bool = False
 
     def unit_fault(self, unit: str, owner: str) -> str | None:
-        """Message if ``owner`` cannot take a value in ``unit``, else ``None``."""
+        """Return a message if ``owner`` cannot take a value in ``unit``, else ``None``."""
         if unit == self.unit:
             return None
         given_unit = f"in {unit}" if unit else "given no unit"
@@ -54,7 +54,7 @@ class Quantity:
         return f"parameter '{self.name}' is {given_unit}; {owner} takes {expected}{hint}"
 
     def range_fault(self, low: float, high: float) -> str | None:
-        """Message if the range from ``low`` to ``high`` is not admissible, else ``None``."""
+        """Return a message if the range ``low`` to ``high`` is not admissible, else ``None``."""
         if not self._high_enough(low):
             least = "not go below" if self.low_admitted else "stay above"
             return f"{self._with_unit('ranges down to', low)}; it must {least} {self.low:g}"
@@ -63,7 +63,7 @@ class Quantity:
         return None
 
     def value_fault(self, value: float) -> str | None:
-        """Message if ``value`` is not admissible, else ``None``."""
+        """Return a message if ``value`` is not admissible, else ``None``."""
         if not math.isfinite(value):
             return f"{self._with_unit('is', value)}; it must be finite"
         if not self._high_enough(value):
@@ -81,12 +81,12 @@ class Quantity:
 
 
 def modulus(name: str) -> Quantity:
-    """A stiffness in kPa, above 0."""
+    """Return a quantity that is a stiffness in kPa, above 0."""
     return Quantity(name, "kPa")
 
 
 def number(name: str, low: float = 0.0, high: float = math.inf) -> Quantity:
-    """A dimensionless parameter between ``low`` and ``high``."""
+    """Return a dimensionless quantity between ``low`` and ``high``."""
     return Quantity(name, "", low, high)
 
 
@@ -136,7 +136,7 @@ _LARGEST = 0.25  # bound of a probe's displacement gradient, entry by entry
 
 @lru_cache(maxsize=64)
 def law_identity(law: Law) -> str:
-    """Name of the law and a hash of its parameters and of its energy at the probes."""
+    """Return the name of the law and a hash of its parameters and of its energy at the probes."""
     parameters = [[q.name, q.unit, q.low, q.high] for q in law.quantities]
     values = [np.format_float_scientific(w, precision=_DIGITS - 1) for w in probed(law)]
     content = json.dumps([parameters, list(law.shape_moduli), values])
@@ -144,7 +144,7 @@ def law_identity(law: Law) -> str:
 
 
 def probed(law: Law) -> np.ndarray:
-    """Energies (kPa) of the law at the probes, (24,); NaN where undefined."""
+    """Return the energies (kPa) of the law at the probes, (24,); NaN where undefined."""
     rng = np.random.default_rng(20_231)
     gradients = _LARGEST * rng.uniform(-1.0, 1.0, (_PROBES, 3, 3))
     positions = rng.random((_PROBES, len(law.quantities)))
@@ -159,7 +159,7 @@ def probed(law: Law) -> np.ndarray:
 
 
 def _value(quantity: Quantity, position: np.ndarray) -> np.ndarray:
-    """Admissible values of a parameter at ``position`` in (0, 1)."""
+    """Return admissible values of a parameter at ``position`` in (0, 1)."""
     low = quantity.low if np.isfinite(quantity.low) else -1.0
     high = quantity.high if np.isfinite(quantity.high) else low + 4.0
     return low + (high - low) * (0.1 + 0.8 * position)

@@ -32,39 +32,39 @@ from emulator.mechanics.laws.volumetric import quadratic_logarithmic
 
 
 def energy_lame(strain: Strain, mu: jax.Array, lam: jax.Array) -> jax.Array:
-    """Strain energy density in kPa from shear modulus ``mu`` and Lamé's first parameter ``lam``."""
+    """Return the strain energy density in kPa from Lamé's parameters ``mu`` and ``lam`` (kPa)."""
     ln_J = strain.ln_J
     return 0.5 * mu * strain.I1_minus_3 - mu * ln_J + 0.5 * lam * ln_J**2
 
 
 def lame_from_engineering(E: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """``(mu, lam)`` in the unit of Young's modulus ``E``; Poisson's ratio ``nu`` in (-1, 1/2)."""
+    """Return ``(mu, lam)`` in the unit of Young's modulus ``E``; ``nu`` in (-1, 1/2)."""
     return E / (2.0 * (1.0 + nu)), E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
 
 def energy_engineering(strain: Strain, E: jax.Array, nu: jax.Array) -> jax.Array:
-    """Strain energy density in kPa from Young's modulus ``E`` (kPa) and Poisson's ratio ``nu``."""
+    """Return the strain energy density in kPa from ``E`` (kPa) and Poisson's ratio ``nu``."""
     return energy_lame(strain, *lame_from_engineering(E, nu))
 
 
 def energy_split(strain: Strain, mu: jax.Array, kappa: jax.Array) -> jax.Array:
-    """Strain energy density in kPa from shear modulus ``mu`` and bulk modulus ``kappa``."""
+    """Return the strain energy density in kPa from shear and bulk modulus ``mu``, ``kappa``."""
     return 0.5 * mu * strain.isochoric_I1_minus_3 + quadratic_logarithmic(strain, 0.25 * kappa)
 
 
 def bulk_modulus(mu: float, nu: float) -> float:
-    """``kappa`` in the unit of ``mu``; Poisson's ratio ``nu`` in (-1, 1/2)."""
+    """Return ``kappa`` in the unit of ``mu``; Poisson's ratio ``nu`` in (-1, 1/2)."""
     return 2.0 * mu * (1.0 + nu) / (3.0 * (1.0 - 2.0 * nu))
 
 
 def energy_small(strain: Strain, mu: jax.Array, lam: jax.Array) -> jax.Array:
-    """Strain energy density in kPa of small strains, Hooke's law."""
+    """Return the strain energy density in kPa of small strains, Hooke's law."""
     small = strain.small
     return mu * jnp.sum(small * small) + 0.5 * lam * jnp.trace(small) ** 2
 
 
 def energy_small_engineering(strain: Strain, E: jax.Array, nu: jax.Array) -> jax.Array:
-    """:func:`energy_small` from Young's modulus ``E`` (kPa) and Poisson's ratio ``nu``."""
+    """Return :func:`energy_small` from Young's modulus ``E`` (kPa) and Poisson's ratio ``nu``."""
     return energy_small(strain, *lame_from_engineering(E, nu))
 
 
