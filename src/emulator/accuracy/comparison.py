@@ -63,12 +63,12 @@ def field_errors(
 ) -> dict[str, jax.Array]:
     """Return the errors of one field ``u`` (n, 3) against ``reference`` (n, 3).
 
-    err_u : (n,) distance in mm at each node.
-    err_F : (m, q) Frobenius norm of the error in the deformation gradient.
-    err_I1 : (m, q) error in the first invariant.
-    err_Pi : () error in the potential energy, percent; absent where the mesh is the loaded shape
+    err_u : the distance (n,) in mm at each node.
+    err_F : the Frobenius norm (m, q) of the error in the deformation gradient.
+    err_I1 : the error (m, q) in the first invariant.
+    err_Pi : the error () in the potential energy, percent; absent where the mesh is the loaded
         (``Scene.loaded_by``), since the energy needs displacements from rest.
-    err_V : (v,) error in the volume of each of the ``cavities``, percent; absent without any.
+    err_V : the error (v,) in the volume of each of the ``cavities``, percent; absent without any.
     """
     H, H_reference = displacement_gradient(scene, u), displacement_gradient(scene, reference)
     I1, I1_reference = (
@@ -96,7 +96,7 @@ def _percent(value: jax.Array, exact: jax.Array) -> jax.Array:
 class Errors:
     """Errors of each test case for which the forward map returns a valid prediction.
 
-    thetas : (c, p).
+    thetas : the theta of the test cases, (c, p).
     fields : name -> (c, ...), as in :func:`field_errors`, with ``max_u`` and ``mean_u`` (c,), the
         size of the reference.
     invalid : the number of cases left out.
@@ -154,8 +154,8 @@ def evaluate(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) -> di
     Parameters
     ----------
     forward : a map over all nodes of its scene.
-    thetas : (c, p).
-    reference : (c, n, 3) mm.
+    thetas : the theta of the test cases, (c, p).
+    reference : the reference displacements, (c, n, 3) mm.
 
     Returns
     -------

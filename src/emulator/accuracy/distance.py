@@ -27,22 +27,30 @@ LARGEST_U = 1e100  # mm; larger displacements count as not finite: J, their cube
 # Largest contraction of an accepted step (docs/experiments.md, "An error bar from the forces out of
 # balance").
 _CONTRACTION = 0.25
-_LEAST_SHARE = 0.2  # of the smallest J that a step or a replacement state keeps
+_LEAST_SHARE = 0.2  # least share of the smallest J after a step or in a replacement state
 _ROUND_OFF = 1e-9  # errors below this fraction of the displacement are round-off: not checked
 _GOOD_STEP = 0.1  # the iteration stops only after a step that leaves at most this much residual
 _MOST_ITERATIONS = 30
-_FRACTIONS = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of the line from the centre's solution
+_FRACTIONS = (
+    1.0,
+    0.9,
+    0.75,
+    0.5,
+    0.25,
+    0.1,
+    0.0,
+)  # along the line from the centre's solution
 
 
 class Distance(NamedTuple):
     """The distance of a field from equilibrium, by one of the two methods.
 
-    error : (n, 3) mm, the field less the equilibrium.
-    gap : () mN mm, the field's potential energy less the equilibrium's.
-    contraction : () about the relative error of ``error``.
-    iterations : () the number of FEM's iterations.
-    indefinite : () whether the tangent is known to be indefinite.
-    accepted : () whether the method's own check accepts the result.
+    error : the field less the equilibrium, (n, 3) mm.
+    gap : the field's potential energy less the equilibrium's, () mN mm.
+    contraction : the estimated relative error of ``error``, ().
+    iterations : the number of FEM iterations, ().
+    indefinite : whether the tangent is known to be indefinite, ().
+    accepted : whether the method's own check accepts the result, ().
     """
 
     error: jax.Array

@@ -74,14 +74,14 @@ from emulator.surrogates.protocol import ForwardMap
 class Guard(NamedTuple):
     """Reasons not to trust a prediction; every field gains leading axes under ``vmap``.
 
-    theta : (p,) where the prediction was made.
-    outside : (p,) bool, entries of theta outside the scene's box.
-    finite : () whether theta and the prediction are finite numbers.
-    least_J : () smallest volume ratio; not above 0 if an element is inverted.
+    theta : the parameters (p,) of the prediction.
+    outside : whether each entry of theta is outside its range, (p,) bool.
+    finite : whether theta and the prediction are finite numbers, ().
+    least_J : the smallest volume ratio (); not above 0 if an element is inverted.
     barrier : () whether a training barrier on J, I1 or I4f would act somewhere, so that training
         did not see the exact energy of this state (see :mod:`emulator.mechanics.kinematics`).
-    indefinite : () whether the tangent at the prediction is known to be indefinite.
-    unsettled : () whether no equilibrium was found near the prediction.
+    indefinite : whether the tangent at the prediction is known to be indefinite, ().
+    unsettled : whether no equilibrium was found near the prediction, ().
     """
 
     theta: jax.Array
@@ -179,17 +179,17 @@ def invariants(
 class ErrorEstimate(NamedTuple):
     """The error of one prediction; every field gains leading axes under ``vmap``, all are finite.
 
-    displacement : (n, 3) mm, the prediction; the centre's solution if it is not finite.
-    field : (n, 3) mm, the prediction less the equilibrium.
+    displacement : the prediction (n, 3) mm; the centre's solution if it is not finite.
+    field : the prediction less the equilibrium, (n, 3) mm.
     err_u : (n,) mm, length of ``field`` at each node. median, mean, max : () of ``err_u``.
     energy_gap : () mN mm, the prediction's potential energy less ``least_energy``. If the
         prediction is inverted, its energy is infinite; the first valid state's is taken.
     least_energy : () mN mm, potential energy of the equilibrium. Both energies are meaningless
         without a potential.
-    contraction : () about the relative error of ``field``.
-    iterations : () of FEM that replaced the single step; 0 where the step was accepted.
-    valid : () whether ``field`` is reliable. It may be where the prediction itself is not.
-    guard : reasons not to trust the prediction.
+    contraction : the estimated relative error of ``field``, ().
+    iterations : the FEM iterations () that replaced the single step; 0 where it was accepted.
+    valid : whether ``field`` is reliable, (). It may be where the prediction is not.
+    guard : the reasons not to trust the prediction.
     """
 
     displacement: jax.Array
@@ -217,7 +217,7 @@ class ErrorEstimate(NamedTuple):
 class ErrorBar:
     """Error estimates of ``forward``; made by :func:`error_bar`.
 
-    centre : (n, 3) mm, FEM solution at the centre of the box.
+    centre : the FEM solution at the centre of the box, (n, 3) mm.
     """
 
     forward: ForwardMap

@@ -39,10 +39,10 @@ from emulator.scenes.scene import Scene
 LARGEST = 60_000
 """Nodes of the largest finer mesh that is solved on; beyond, a factorisation takes a minute."""
 
-_TOLERANCE = 1e-7  # of a solve on the finer mesh: far below the difference between the meshes
-_CONTRACTION = 0.1  # of the last step: larger ones ask for another step
-_DIVERGENCE = 0.5  # contraction of any step from which FEM solves instead
-_STEPS = 3  # at most
+_TOLERANCE = 1e-7  # solves on the finer mesh: far below the meshes' difference
+_CONTRACTION = 0.1  # largest contraction of the last step; above it, another step follows
+_DIVERGENCE = 0.5  # contraction of a step above which FEM solves instead
+_STEPS = 3  # largest number of steps
 
 Quantity = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -101,7 +101,7 @@ class MeshError:
 
         Parameters
         ----------
-        start : (n, 3) mm, where the solve on the mesh begins; at rest by default.
+        start : the start of the solve on the mesh, (n, 3) mm; the state at rest by default.
         neighbour : the estimate at a nearby theta, whose difference between the meshes begins the
             iteration.
 
@@ -122,7 +122,7 @@ class MeshError:
             return MeshErrorEstimate(theta, coarse, stepped, solved=False)
         with self._alone:
             solution = self.fine.solve(theta, begin)
-            if not solution.converged:  # strains of locked elements may be too rough to begin with
+            if not solution.converged:  # strains of locked elements may be too rough a start
                 solution = self.fine.solve(theta)
         fine = solution.require_converged(f"{what}, on the finer one").displacement
         return MeshErrorEstimate(theta, coarse, fine, solved=True)

@@ -49,7 +49,7 @@ from emulator.core.line_index import Path, json_lines, line_of
 from emulator.core.store import read_json
 
 _SCALARS = {float: "number", int: "whole number", str: "string"}
-# What pydantic calls a value of the wrong type, where no field of a table says what is right.
+# Pydantic's codes of a wrong type, where no field of a table has an expectation.
 _EXPECTED = {
     "float_type": "a number",
     "finite_number": "a number",
@@ -145,7 +145,7 @@ class OneOf:
             table = handler.resolve_ref_schema(member)
             table["properties"][self.key] = {"const": name, "description": table["description"]}
             if name != self.default:
-                # A table that stands in several places passes here as often.
+                # A table that occurs in several places is visited several times.
                 table["required"] = list(dict.fromkeys([self.key, *table.get("required", ())]))
         return schema
 
@@ -238,7 +238,7 @@ def read_as[Kind](
     try:
         return _builder(kind)(table)
     except InputError as error:
-        first_word = str(error).split(" ", 1)[0]  # often the field
+        first_word = str(error).split(" ", 1)[0]  # the message often begins with the field
         raise Source(where, mapping, lines or {}, toml).error(str(error), (first_word,)) from error
 
 

@@ -120,7 +120,7 @@ def exclusive(path: str | Path, what: str) -> Iterator[Path]:
         Path(lock.lock_file).unlink(missing_ok=True)
         lock.release()
         if new:
-            with suppress(OSError):  # it has something in it
+            with suppress(OSError):  # raises where the folder is not empty
                 path.parent.rmdir()
 
 

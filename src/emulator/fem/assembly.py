@@ -60,7 +60,7 @@ from emulator.fem.material_point import stress_and_moduli
 from emulator.scenes.part import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
-_LAST_BITS = 1e-15  # of prescribed displacements, which two programs may round differently
+_LAST_BITS = 1e-15  # relative difference of prescribed displacements between programs
 
 
 class Balance(NamedTuple):

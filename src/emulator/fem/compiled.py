@@ -60,8 +60,8 @@ def compiled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
 def _name(function: Any) -> str:
     """Return the name under which XLA logs the program: that of the innermost function."""
-    function = getattr(function, "fun", function)  # of a function with a rule of its own
-    function = getattr(function, "func", function)  # of a partial one
+    function = getattr(function, "fun", function)  # the function inside a custom derivative rule
+    function = getattr(function, "func", function)  # the function inside functools.partial
     return str(getattr(function, "__name__", "program"))
 
 
@@ -83,7 +83,7 @@ class _Program:
         self.own: Any = jax.jit(evaluate)
         self.shared: Any = None
         self.arrays = traced.consts
-        self.inside = is_traced(self.arrays)  # a larger trace
+        self.inside = is_traced(self.arrays)  # whether this is part of a larger trace
         if not self.inside:
             with jax.ensure_compile_time_eval():  # as jnp.asarray, without a program a shape
                 self.arrays = jax.device_put(self.arrays)

@@ -82,7 +82,7 @@ class Condensed(NamedTuple):
     """The linearisation with the volumes eliminated.
 
     force : the nodal forces of the blocks, (b, a, 3) mN.
-    tangent : their stiffness, (b, pairs, 3, 3) mN/mm.
+    tangent : the stiffness of the blocks, (b, pairs, 3, 3) mN/mm.
     couplings : the coefficients of the elimination.
     """
 
@@ -114,7 +114,7 @@ def block_derivatives(
     u : the displacement, (n, 3) mm.
     stress, moduli : the first (b, q, 3, 3) and second (b, q, 3, 3, 3, 3) derivatives of the energy
         density in the displacement gradients that the law sees, kPa.
-    known : the stress whose geometric stiffness the tangents have, if it is not ``stress``.
+    known : the stress whose geometric stiffness the tangents have; by default ``stress``.
     """
     if scene.dilatation == "pointwise":
         return nodal_vectors(scene.blocks, stress), pair_matrices(scene.blocks, moduli)

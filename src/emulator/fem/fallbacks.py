@@ -43,9 +43,9 @@ class Strategy(NamedTuple):
     """A strategy, as numbers that one compiled loop reads.
 
     first_load : the first load factor of the stress iterates.
-    load_increment : their load increment.
-    most_steps : the most steps they take.
-    steep : whether their loads rise fast. A steep schedule's next increment is twice as long after
+    load_increment : the load increment of the stress iterates.
+    most_steps : the largest number of stress iterates.
+    steep : whether its loads rise fast. A steep schedule's next increment is twice as long after
         an easy step, and a second indefinite tangent in a row ends it; the others recover.
     newton_load : the first load factor and increment of Newton's method.
     largest_indefinite : the largest load increment that Newton's method still tries after an
@@ -82,7 +82,7 @@ _SCHEDULES_OF_MOVING_SUPPORTS = 2
 # Relative residual below which the load of a schedule rises (docs/experiments.md, "Stresses as
 # iterates").
 _BALANCED = 0.9
-_MOST_AT_LEVEL = 12  # steps at a load factor of a schedule; where more are needed, none suffice
+_MOST_AT_LEVEL = 12  # steps at one load factor; schedules that need more do not converge
 # Relative residual after an easy step, and indefinite tangents in a row that end a steep schedule
 # (docs/experiments.md, "Ramps: sooner lost, sooner up").
 _EASY = 0.3
@@ -90,7 +90,7 @@ _TOO_STEEP = 2
 # Relative residual up to which a start is used; that of rest is about 1 (docs/experiments.md,
 # "Rough starts").
 _FARTHEST = 0.9
-_SHORT = 15  # iterations that Newton's method may take, unless the strategy is the last
+_SHORT = 15  # largest number of Newton iterations, except in the last strategy
 
 
 def strategies(system: System, options: NewtonOptions) -> tuple[Strategy, ...]:
@@ -117,8 +117,8 @@ class SearchState(NamedTuple):
     by_stress : whether the next step is of the stress iterates.
     load : the load factor of the stress iterates.
     steps : the steps that the stress iterates have taken in this strategy.
-    level_steps : the steps they have taken at this load factor.
-    stress_steps : the steps they have taken in all strategies.
+    level_steps : the steps of the stress iterates at this load factor.
+    stress_steps : the steps of the stress iterates in all strategies.
     """
 
     newton: NewtonState
@@ -204,7 +204,7 @@ class EquilibriumSearch:
         load_stiffness, geometric = _stiffness_factors(
             state.load, state.strategy, state.steps, state.newton.relative_residual
         )
-        # A start whose tangent is indefinite is left for rest; later strategies try again.
+        # Strategy 0 ends at an indefinite tangent; later ones solve again without extra stiffness.
         stress = self._stress_iterates(state.load).step(
             state.stress, load_stiffness, geometric, state.strategy != 0
         )

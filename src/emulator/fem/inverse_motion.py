@@ -198,7 +198,7 @@ class Condensed(NamedTuple):
     """The linearisation of the blocks, volumes eliminated where they share one.
 
     force : the nodal forces, (b, a, 3) mN.
-    tangent : their derivatives in w, (b, 3a, 3a) mN/mm.
+    tangent : the derivatives of the forces in w, (b, 3a, 3a) mN/mm.
     couplings : the coefficients of the elimination; None without shared volumes.
     """
 

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 
 from emulator.fem.compiled import while_loop
 
-ARMIJO = 1e-4  # textbook value; the energy is hardly ever near this bound
-_ROUND_OFF = 1e-13  # of the energy's parts, in which a decrease near the solution drowns
+ARMIJO = 1e-4  # textbook value; the energy rarely comes close to this bound
+_ROUND_OFF = 1e-13  # relative to the energy's parts; smaller decreases are round-off
 
 Admissible = Callable[[jax.Array], jax.Array]
 """Whether no element is near inversion after a fraction of the step."""
@@ -36,7 +36,7 @@ class Trial(NamedTuple):
 
     fraction : the fraction of the full step, ().
     energy : the potential there, () in mN mm.
-    accepted : whether it is admissible and makes progress.
+    accepted : whether the fraction is admissible and makes progress.
     admissible : whether no element is near inversion.
     inverting : whether twice the fraction was not admissible.
     """

@@ -29,23 +29,23 @@ from emulator.fem.newton import Direction, Newton, NewtonOptions, Step
 from emulator.fem.solution import Status
 from emulator.fem.state import LoadHistory, NewtonState, RoundOff
 
-# Steps shortened by inverting elements after which a level leads nowhere: a lower load finds out
-# sooner.
+# Shortened steps after which a load level ends: elements that keep inverting show that the
+# increment is too large, and a lower load is cheaper.
 _MOST_INVERSIONS = 8
 # Iterations of a level where a saddle point is sought; a load step that works takes about ten
 # (docs/experiments.md, "Mean dilatation from far away").
 _SADDLE_ITERATIONS = 20
-_EASY = 8  # iterations of a level that earns twice the increment
-_SLOW = 0.3  # of the residual left by a step with its own tangent: round-off, or far away
-_ROUND_OFF = 1e-15  # strain that floating point cannot tell from none
-_STILL = 1e-12  # of the body's size: a correction that may be round-off
+_EASY = 8  # iterations up to which a level doubles the next increment
+_SLOW = 0.3  # ratio of residuals after and before a step from which the step is slow
+_ROUND_OFF = 1e-15  # strain below the resolution of floating point
+_SMALLEST_CORRECTION = 1e-12  # correction that may be round-off, over the body's size
 _STRETCH = 1e-6  # small enough for the forces to be linear in it
 
 
 class _Verdict(NamedTuple):
     """Whether a level has converged or is given up; neither where its iteration goes on.
 
-    round_off : whether it counts as converged because the residual may be round-off.
+    round_off : whether the level counts as converged because the residual may be round-off.
     """
 
     converged: jax.Array
@@ -85,7 +85,7 @@ class LoadStepping:
             stretched = system.balance(_STRETCH * X, theta, 0.0).internal
             size, extent = _ROUND_OFF / _STRETCH * stretched, jnp.ptp(X, axis=0).max()
             size = jnp.where(jnp.isfinite(size), size, 0.0)
-            round_off = RoundOff(size, _STILL * extent)
+            round_off = RoundOff(size, _SMALLEST_CORRECTION * extent)
         residual, relative = system.admissible_balance(start, theta, jnp.ones(()))
         state = _first_state(
             theta,

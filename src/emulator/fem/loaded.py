@@ -39,7 +39,7 @@ from emulator.fem.solution import Solution
 from emulator.fem.unloading import Unloaded, Unloader, system_at_rest
 from emulator.scenes.scene import Scene
 
-_RECENT = 16  # stress-free shapes that are kept for the derivatives asked for after a solve
+_RECENT = 16  # stress-free shapes kept for derivatives after a solve
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,7 +78,7 @@ class MaterialPoint:
             s = jax.grad(phi)(own)
             return s, s
 
-        # Derivatives with their values beside them are traced once less.
+        # Derivatives that return their values as well save one trace.
         C, s = jax.jacfwd(stresses, has_aux=True)(own)
         at_rest = jax.grad(phi)(jnp.zeros_like(own))
         known = at_rest + geometric * (s - at_rest)

@@ -47,7 +47,7 @@ _LEAST_MONOTONE = 2.0**-6
 # Least fraction that is halved because the potential falls further; below, the search has found a
 # valley (docs/experiments.md, "Fewer factorisations from rest").
 _SMALLEST_HALVED = 0.02
-_SINGULAR = 1e13  # a step this much longer than force over stiffness comes of a singular tangent
+_SINGULAR = 1e13  # ratio of step to force over stiffness from which the tangent is singular
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Direction(NamedTuple):
 
     step : the displacement increment, (n, 3) mm.
     equations : the linear equations that it solves.
-    slope : residual . step in mN mm, before the step was reversed.
+    slope : the product residual . step in mN mm, before a reversal of the step.
     on_supports : whether the prescribed displacements are met.
     singular : whether the tangent is singular.
     definite : whether its factorisation found it positive definite.
@@ -129,7 +129,7 @@ class Step(NamedTuple):
 
     u : the displacement after it, (n, 3) mm.
     residual : the residual there, (f,) mN.
-    relative_residual : its norm relative to the forces.
+    relative_residual : the norm of the residual relative to the forces.
     fraction : the fraction of the full step; 0 where none makes progress.
     inverting : whether inverting elements forbade twice the fraction.
     """
@@ -246,7 +246,7 @@ class Newton:
             return floor < system.least_volume_ratio(u + fraction * step)  # False for NaN
 
         if test is not None:
-            # Where only round-off remains, it cannot be told from progress.
+            # Round-off cannot be distinguished from progress, so it passes the test.
             unclear = state.relative_residual <= self.options.round_off
             trial = backtrack(
                 admissible, lambda f: (unclear | test(f), jnp.zeros(())), _LEAST_MONOTONE

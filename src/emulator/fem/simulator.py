@@ -153,7 +153,7 @@ class Simulator(TableRepr):
         ) -> tuple[tuple[jax.Array, jax.Array], Solution]:
             u, u_before = last_two
             extrapolation = self.scene.on_supports(2.0 * u - u_before, theta)
-            # Nothing can be extrapolated at rest, and supports that jump alone invert elements.
+            # From rest the start stays at rest: supports that jump alone would invert elements.
             solution = self.solve(theta, jnp.where(jnp.any(u != 0.0), extrapolation, self.rest))
             return (solution.displacement, u), solution
 

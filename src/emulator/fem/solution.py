@@ -43,7 +43,7 @@ class Solution(NamedTuple):
     """The result of a simulation; every field gains leading axes under ``vmap``.
 
     displacement : the displacement, (n, 3) mm; when not converged, the one at ``load_reached``.
-    status : how the solve ended, a :class:`Status` as an integer.
+    status : the outcome of the solve, a :class:`Status` as an integer.
     iterations : the iterations of Newton's method and of the stress iterates, over all fallbacks
         and load levels.
     factorisations : the tangents assembled; the other iterations kept the last one. Each is

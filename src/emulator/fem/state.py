@@ -54,7 +54,7 @@ class NewtonState(NamedTuple):
     load : the load factor that is being solved for.
     residual : the residual (f,) in mN at ``u`` and ``load``; not evaluated before a level's first
         iteration.
-    relative_residual : its norm relative to the forces; infinite until the prescribed displacements
+    relative_residual : the norm relative to the forces; infinite until the prescribed displacements
         are met.
     round_off : the residual and correction that may be round-off.
     tangent : the last tangent, (nnz,) mN/mm.

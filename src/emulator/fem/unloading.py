@@ -56,11 +56,11 @@ from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
 
-# Of the fixed-point iteration.
+# Constants of the fixed-point iteration.
 _MOST_CORRECTIONS = 100
-_TOLERANCE = 1e-11  # of the body's size: largest distance of the loaded shape from the mesh
-_SHORTEST = 2.0**-6  # fraction of a correction
-_RELAXATION = (0.1, 2.0)  # bounds of Aitken's
+_TOLERANCE = 1e-11  # largest distance from the loaded shape to the mesh, over the body's size
+_SHORTEST = 2.0**-6  # least fraction of a correction
+_RELAXATION = (0.1, 2.0)  # bounds of Aitken's relaxation
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,10 +310,10 @@ class _FixedPointState(NamedTuple):
 
     w : the displacement to the trial shape, (n, 3) mm.
     u : the displacement that loads it, (n, 3) mm.
-    distance : R of the last correction, (n, 3) mm.
-    relaxation : its beta, ().
+    distance : the distance R at the last correction, (n, 3) mm.
+    relaxation : the relaxation beta of the last correction, ().
     corrections : the number of corrections.
-    iterations, factorisations : those of the solves.
+    iterations, factorisations : the totals over all solves.
     status : a :class:`Status`.
     """
 

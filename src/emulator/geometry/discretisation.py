@@ -19,9 +19,9 @@ from emulator.geometry.mesh import Mesh, frozen_array
 class Blocks:
     """Groups of quadrature points that share nodes; ``b`` blocks, ``q`` points, ``a`` nodes each.
 
-    connectivity : (b, a) node of each local shape function.
-    gradients : (b, q, a, 3) reference gradients of the shape functions, 1/mm.
-    weights : (b, q) quadrature weights times volume, mm3.
+    connectivity : the node (b, a) of each local shape function.
+    gradients : the reference gradients (b, q, a, 3) of the shape functions, 1/mm.
+    weights : the quadrature weights (b, q) times volume, mm3.
     """
 
     connectivity: np.ndarray
@@ -38,7 +38,7 @@ class Discretisation(Blocks):
     """A mesh with its shape functions; each of its ``m`` elements is a block.
 
     mesh : linear or quadratic tetrahedra.
-    values : (q, a) shape functions at the quadrature points.
+    values : the shape functions (q, a) at the quadrature points.
     """
 
     mesh: Mesh
@@ -56,7 +56,7 @@ class Discretisation(Blocks):
 class FacetRule:
     """Quadrature on a reference triangle; ``q`` points, ``a`` nodes of the facet.
 
-    values : (q, a) shape functions.
+    values : the shape functions, (q, a).
     derivatives : (q, a, 2) derivatives of the shape functions along the two reference directions.
     weights : (q,) summing to 1/2, the reference triangle's area.
     """

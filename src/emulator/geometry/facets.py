@@ -149,13 +149,13 @@ class Cavity:
 
     Parameters
     ----------
-    mesh : with the wall among its facet sets.
+    mesh : the mesh that has the wall among its facet sets.
     facet_set : the wall.
 
     Attributes
     ----------
-    nodes : (k,) the nodes of the wall, in the order :meth:`__call__` wants them.
-    rest : volume of the undeformed cavity, mL, above 0.
+    nodes : the nodes (k,) of the wall, in the order in which :meth:`__call__` takes them.
+    rest : the volume of the undeformed cavity, mL, above 0.
 
     Raises
     ------

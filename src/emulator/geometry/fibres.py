@@ -50,9 +50,9 @@ from emulator.geometry.discretisation import (
 )
 from emulator.geometry.mesh import Mesh, frozen_array
 
-# Neighbours further off in direction, as across the seam of two walls, say nothing of the slope.
+# Neighbours of another direction, as across the seam of two walls, do not enter the slope.
 _ALIKE = np.cos(np.radians(60.0))
-_DAMPING = 1e-3  # of the slope along a direction in which an element has no neighbours
+_DAMPING = 1e-3  # regularises the slope along directions without neighbours
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def from_nodes(mesh: Mesh, at_nodes: np.ndarray, order: int) -> np.ndarray:
     Parameters
     ----------
     mesh : linear or quadratic; ``order`` may be higher, for a mesh that is made quadratic.
-    at_nodes : (n, 3) of its nodes.
+    at_nodes : the directions (n, 3) at its nodes.
     """
     local = at_nodes[mesh.elements]
     side = np.where(np.einsum("mai,mi->ma", local, local[:, 0]) < 0.0, -1.0, 1.0)
@@ -105,10 +105,10 @@ def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
     moment = _summed(one, weight[:, None, None] * step[:, :, None] * change[:, None, :], count)
     damping = _DAMPING * np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-300)
     gram = gram + damping[:, None, None] * np.eye(3)
-    slope = np.linalg.solve(gram, moment)  # NumPy, no batched LAPACK of JAX's
+    slope = np.linalg.solve(gram, moment)  # by NumPy, because JAX's batched LAPACK is avoided
     away = np.einsum("qa,mai->mqi", quadrature_points(2), corners) - centre[:, None]
     at_points = unit(directions[:, None] + np.einsum("mqj,mji->mqi", away, slope))
-    # A slope that would turn a direction by more than its neighbours differ is not believed.
+    # Slopes that turn a direction by more than its neighbours differ are discarded.
     alike = np.einsum("mqi,mi->mq", at_points, directions) > _ALIKE
     return np.where(alike[:, :, None], at_points, directions[:, None])
 
@@ -159,7 +159,7 @@ class Directions(NamedTuple):
 class Depth(NamedTuple):
     """Depth in a wall at the quadrature points, (m,) or (m, q), or at the nodes, (n,).
 
-    value : from 0 to 1. normal : of length 1, with a last axis of 3.
+    value : the depth, 0 to 1. normal : the unit normal of the wall, with a last axis of 3.
     """
 
     value: np.ndarray

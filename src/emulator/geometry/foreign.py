@@ -98,7 +98,7 @@ def read_sets(source: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> 
     Parameters
     ----------
     source : the file as meshio reads it.
-    number : (n,) new number of each of its nodes, -1 for those that were dropped.
+    number : the new number (n,) of each of its nodes, -1 for dropped nodes.
     elements : (m, 4 or 10) tetrahedra in the new numbers, positively oriented.
 
     Raises

@@ -193,7 +193,7 @@ def _convert(source: str | Path | Any, *, directions: bool, quadratic: bool = Fa
             _directions(content, mesh, used, name, order) for name in ("fibres", "sheets")
         )
         if fibres is not None and sheets is not None and fibres.ndim == 3:
-            # What was orthogonal where it was given need not be where it was interpolated.
+            # Interpolation does not preserve orthogonality.
             skew = np.quantile(np.abs(np.sum(fibres * sheets, axis=-1)), 0.9)
             sheets = across(sheets, fibres) if skew < _SKEW else sheets
         return Body(mesh if order == mesh.order else to_quadratic(mesh), fibres, sheets)

@@ -26,7 +26,7 @@ from emulator.geometry.discretisation import Blocks, Discretisation
 from emulator.geometry.mesh import FACES, Mesh, frozen_array
 
 _SIZE = 6  # tetrahedra in a patch; the cavity of a ventricle grows as much with 8 or 12
-_LEAST = 3  # what is left between patches and smaller than this joins one of them
+_LEAST = 3  # least elements of a patch; smaller remainders join a neighbour
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Patches(Blocks):
     Smaller patches than the largest repeat a node with gradients of zero, and a tetrahedron with a
     weight of zero.
 
-    members : (b, q) the element at each point.
+    members : the element (b, q) at each point.
     """
 
     members: np.ndarray
@@ -113,7 +113,7 @@ def _grown(
     assigned, groups = [False] * len(corners), []
 
     def order(k: int, nodes: set[int]) -> tuple[int, int, int]:
-        # Compact patches, and first what few neighbours are left to take.
+        # Prefer compact patches, then elements with few free neighbours.
         return len(nodes.union(corners[k])), sum(not assigned[j] for j in neighbours[k]), k
 
     for seed in range(len(corners)):

@@ -23,7 +23,7 @@ FLAT = 3.0
 class MeshQuality(NamedTuple):
     """Shapes of a mesh's elements.
 
-    parts : disconnected ones.
+    parts : the number of disconnected parts.
     angle : smallest dihedral angle, degrees. flat : elements with one below :data:`FLAT`.
     place : mm, middle of the element with the smallest angle.
     jacobian : least ratio of an element's smallest Jacobian to its mean, at quadrature points; 1

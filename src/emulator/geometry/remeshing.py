@@ -158,11 +158,11 @@ class Flattened:
 
     Parameters
     ----------
-    surface : in mm.
+    surface : the surface, in mm.
 
     Attributes
     ----------
-    places : (n, 2) of the surface's points in the disc.
+    places : the positions (n, 2) of the surface's points in the disc.
 
     Raises
     ------
@@ -230,7 +230,7 @@ class Flattened:
             np.bincount(rows.ravel(), np.repeat(each, 3), len(self.places))
             for each in (_areas(self.surface.points[rows]), np.abs(_signed(self._corners)))
         ]
-        # Of two rings of neighbours: a rough surface has some triangles that stand upright.
+        # Areas over two rings of neighbours, because rough surfaces have upright triangles.
         around = [np.bincount(rows.ravel(), each[rows].sum(1).repeat(3)) for each in areas]
         return np.sqrt(around[0] / np.maximum(around[1], 1e-30))
 

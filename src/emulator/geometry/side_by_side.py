@@ -28,9 +28,9 @@ class Bodies:
 
     Parameters
     ----------
-    mesh : all bodies; elements and nodes in the bodies' order.
-    names : of the bodies.
-    body : (m,) index of each element's body.
+    mesh : the mesh of all bodies; elements and nodes in the bodies' order.
+    names : the names of the bodies.
+    body : the index (m,) of each element's body.
     """
 
     mesh: Mesh

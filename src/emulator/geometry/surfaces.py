@@ -68,7 +68,7 @@ def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
 
     Parameters
     ----------
-    name : of the surface, for messages.
+    name : the name of the surface in messages.
     scale : mm in one unit of the file.
 
     Raises
@@ -265,7 +265,7 @@ def inside(surface: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray
     A ray from an enclosed point against ``axis`` (3,), away from the lid, crosses the surface an
     odd number of times.
     """
-    # Tilted as no grid is, so that rays meet edges only by chance.
+    # Rays are tilted against any grid, so that they practically never meet an edge.
     up = axis + _TILT * np.array([0.618, 0.733, 0.285])
     up /= np.linalg.norm(up)
     across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])

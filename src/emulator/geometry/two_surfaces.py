@@ -60,7 +60,7 @@ class Wall:
     size : edge length aimed at, mm. thickness : of the wall.
     cavity, wall : volumes in mL, of the mesh and of the surfaces below the base plane.
     cut_off : height of what was cut off above the base plane, mm; 0 for closed surfaces.
-    moved : by smoothing, at most, mm.
+    moved : the largest displacement of a point by smoothing, mm.
     """
 
     mesh: Mesh
@@ -122,11 +122,11 @@ def mesh_wall(
     order : 2 for quadratic elements with curved edges on both surfaces, or 1.
     axis : the base plane's normal, from apex to base, of any length; found from the rims by
         default. Closed surfaces need it.
-    base_height : of the base plane, mm along ``axis`` from the origin of the coordinates.
+    base_height : the height of the base plane, mm along ``axis`` from the coordinates' origin.
     base_point : a point (3,) mm of the plane instead.
     smooth : times of Taubin's filter on both surfaces; 10 to 30 take the steps off surfaces of
         voxels.
-    unit : of the files, ``mm``, ``cm`` or ``m``; size and base plane are in mm.
+    unit : the unit of the files, ``mm``, ``cm`` or ``m``; size and base plane are in mm.
 
     Raises
     ------

@@ -20,7 +20,7 @@ from emulator.released.scenes import folder_of, read_array, units
 
 _PICKLE = "emulationResults/trainedParameters/{model}/trainedNetworkParams.pkl"
 _FIRST = "params/"
-_DEPTH = 8  # dictionaries within each other; the released ones have four
+_DEPTH = 8  # largest nesting of dictionaries; the released ones have four
 
 
 class ReleasedNetwork(NamedTuple):

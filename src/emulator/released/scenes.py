@@ -155,7 +155,7 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
     displacement = (
         np.zeros((len(fixed_nodes), 3)) if prescribed is None else prescribed[fixed_nodes] * scale
     )
-    elements = orient(nodes, elements)  # the release does not orient its elements and facets
+    elements = orient(nodes, elements)  # elements and facets of the release are not oriented
     fibres = _read_optional(
         root, model, f"{folder}/fibre-field-elementwise.npy", (len(elements), 3, 1)
     )

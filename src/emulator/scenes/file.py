@@ -31,7 +31,7 @@ Regions = np.ndarray | None
 _AXES = {"x": 0, "y": 1, "z": 2}
 # A node this far from a plane, as a fraction of the body's size, is on it.
 _ON_PLANE = 1e-8
-_BODY = "body"  # the word for regions that are the bodies, where there are several
+_BODY = "body"  # the name of the regions where each body is one
 
 
 def read_scene(path: str | Path) -> Scene:

@@ -98,6 +98,6 @@ def _made_by(rule: FibreRule, scene: Scene) -> bool:
         return False
     try:
         fibres = rule.directions(scene.mesh)[0]
-    except InputError:  # another mesh, without the rule's facet sets
+    except InputError:  # the mesh was replaced and lacks the rule's facet sets
         return False
     return fibres.shape == scene.fibres.shape and np.allclose(fibres, scene.fibres, atol=1e-9)

@@ -78,7 +78,7 @@ class Discrepancy(ArrayPart):
     known : the features of the runs, (c, q).
     value_weights, derivative_weights : the weights (c, r) and (c, q, r) of the Gaussian processes,
         from :func:`~emulator.core.gaussian_process.fold`.
-    offset, modes : (n, 3) mm and (r, n, 3) mm.
+    offset, modes : the offset (n, 3) mm and the modes (r, n, 3) mm.
     """
 
     warp: Warp

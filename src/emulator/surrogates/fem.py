@@ -28,7 +28,7 @@ class FEMForward(SolvingMap):
 
     simulator, nodes : the simulator, and the nodes (k,) whose displacement is returned.
     start : the map that predicts where Newton's method begins; ``None`` for the body at rest.
-    execute : solves many theta; by default in this process.
+    execute : the executor that solves at many theta; by default in this process.
     """
 
     simulator: Simulator

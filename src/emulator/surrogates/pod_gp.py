@@ -111,7 +111,7 @@ def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> Reduce
 
     Parameters
     ----------
-    truncation : modes whose singular value is below this fraction of the largest are left out.
+    truncation : the fraction of the largest singular value below which modes are left out.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
         kernel, alpha=_JITTER, n_restarts_optimizer=1, random_state=0
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # a bound reached is no failure here
+        warnings.simplefilter("ignore", ConvergenceWarning)  # lengths may reach their bounds
         process.fit(inputs, values)
     fitted = process.kernel_
     return np.atleast_1d(fitted.k2.length_scale), fitted.k1.constant_value * process.alpha_

@@ -40,7 +40,7 @@ class Polynomial(ArrayPart):
 
     degrees : the degrees alpha of each term, (m, p).
     weights : the weight of each term in each coefficient, (m, r).
-    modes : (r, n, 3) mm.
+    modes : the modes, (r, n, 3) mm.
     """
 
     degrees: np.ndarray
@@ -75,7 +75,7 @@ def compressed(degrees: np.ndarray, fields: np.ndarray, error: float) -> Polynom
     rounded = modes.astype(np.float32).astype(float)
     off = np.sum((rounded - modes) ** 2) + np.sum(sizes[rank:] ** 2)
     if off <= error**2 * fields.shape[1]:
-        modes = rounded  # files then take half of the room
+        modes = rounded  # which halves the file
     return Polynomial(degrees, left[:, :rank], modes.reshape(rank, *fields.shape[1:]))
 
 
@@ -146,12 +146,12 @@ class PolynomialFit(NamedTuple):
 def fit(samples: Samples, degree: int, own_error: float) -> PolynomialFit:
     """Return the polynomial of ``degree``, or of the largest one for which there are samples.
 
-    own_error : about the error of the polynomial itself, mm.
+    own_error : the estimated error of the polynomial itself, mm.
     """
     while degree > 0 and terms(samples.position.shape[1], degree) > len(samples.position):
         degree -= 1
     degrees = degrees_up_to(samples.position.shape[1], degree)
-    own_error = max(own_error, np.finfo(float).tiny)  # it is 0 where every field is a polynomial's
+    own_error = max(own_error, np.finfo(float).tiny)  # 0 for exact polynomials
     weight = (own_error / (samples.error + own_error))[:, None]
     rows = weight * legendre(samples.position, degrees)
     q, r = scipy.linalg.qr(rows, mode="economic")

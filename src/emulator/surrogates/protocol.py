@@ -272,7 +272,7 @@ class ForwardKind:
     """A kind of forward map.
 
     name, help : the name, and the words of the command line.
-    build : makes the map over all nodes from ingredients and a value of every option.
+    build : the function from ingredients and a value of every option to the map over all nodes.
     options : the options of ``build``.
     to_arrays, from_arrays : write and read the arrays of a map that is fitted while it is built,
         because a second fit may give another map; they are kept with results. ``from_arrays``

@@ -40,7 +40,7 @@ from emulator.surrogates.part import ArrayPart, CachedPart
 Terms = dict[tuple[int, ...], jax.Array]
 """Derivatives (n, 3) mm by the parameters in which they are taken, in order."""
 
-_MOST_TERMS = 200  # in one order; 18 parameters have 171 of the second and 1140 of the third
+_MOST_TERMS = 200  # in one order; 18 parameters have 171 of order 2 and 1140 of order 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +143,8 @@ def expand(
 
     Parameters
     ----------
-    simulator : or an ``Unloader``, for the series of the stress-free shape.
-    order : 1 to 4; the series stops before an order with more than 200 terms.
+    simulator : the simulator, or an ``Unloader`` for the series of the stress-free shape.
+    order : the order, 1 to 4; the series stops before an order with more than 200 terms.
 
     Raises
     ------
@@ -210,7 +210,7 @@ def _forces(
     degree, last = len(terms[0]), chain[-1]
     scene = last.system.scene
     # The path holds one term for every proper subset of the multi-index, and those of the
-    # displacements before one for the whole, too.
+    # displacements also one for the full multi-index.
     proper = [s for size in range(1, degree) for s in combinations(range(degree), size)]
     whole = [*proper, tuple(range(degree))]
     subsets = [whole if each is not last else proper for each in chain]

@@ -57,16 +57,16 @@ from emulator.training.checkpoint import SWEEPS
 from emulator.training.targets import targets
 
 _LEVELS = 15  # least number of levels of the loads
-# A step counts as taken from this fraction of it on; a level is reached where so many are.
-_TAKEN, _ENOUGH = 0.25, 0.9
+# Least fraction of a step that counts as a success, and least share of successes at a level.
+_LEAST_FRACTION, _LEAST_SHARE = 0.25, 0.9
 # Relative error of the displacement up to which the loads rise, and the most sweeps at a level.
 _ROUGH, _PATIENCE = 0.01, 4
 _LEAST_RISE = 1.0 / 500.0
 _FIRST_DEGREE = 2
 _FEWEST = 32  # least number of theta in a sweep
-_KEPT = 3  # targets kept for each term of the next degree
-_DONE = 1e-10  # relative error of the displacement at which the sweeps end
-_ROUNDED = 1e-2  # part of the error bar that leaving out modes may add
+_TARGETS_PER_TERM = 3  # targets kept for each term of the next degree
+_CONVERGED = 1e-10  # relative error of the displacement at which the sweeps end
+_ROUNDED = 1e-2  # largest error of truncated modes, over the error bar
 _WRITE_EVERY = 30.0  # seconds
 _NUMBERS = (
     "number", "here", "level", "rise", "gap", "error", "largest_error", "taken", "lost"
@@ -81,7 +81,7 @@ class SweepState:
     """The state between two sweeps.
 
     polynomial : the polynomial of the free displacements.
-    before : its coefficients at the load level that lies ``gap`` below.
+    before : the polynomial's coefficients at the load level that lies ``gap`` below.
     values : the targets that are kept.
     number, here : the number of sweeps done, and of those at this load level.
     level, rise : the load level, and by how much it rises next.
@@ -107,7 +107,7 @@ class SweepState:
     @property
     def done(self) -> bool:
         """Whether the error bar is round-off."""
-        return self.level == 1.0 and self.error <= _DONE * self._size
+        return self.level == 1.0 and self.error <= _CONVERGED * self._size
 
     @property
     def record(self) -> dict[str, Any]:
@@ -188,7 +188,7 @@ def sweep_box(
 
 def check_sweeps(scene: Scene, sweeps: int, *, at_rest: bool) -> None:
     """Refuse what cannot be swept, with the :class:`InputError` of :func:`sweep_box`."""
-    potential_energy(scene)  # refuses a scene that has none
+    potential_energy(scene)  # raises InputError for a scene without one
     if at_rest and sweeps <= _LEVELS:
         raise InputError(
             f"training: {sweeps} sweeps; the loads rise over {_LEVELS}, give {_LEVELS + 1} or more"
@@ -204,7 +204,7 @@ def _require_answer(scene: Scene, state: SweepState) -> None:
             f"to {100 * state.level:.0f} % of the loads; give more of them, or use a recipe with "
             "FEM runs"
         )
-    if state.taken < _ENOUGH:
+    if state.taken < _LEAST_SHARE:
         raise SolverError(
             f"scene '{scene.name}': {state.number} sweeps know no equilibrium at "
             f"{100 * (1.0 - state.taken):.0f} % of the box; give more of them, or use a recipe "
@@ -256,7 +256,7 @@ def _sweep(
     simulator: Simulator, state: SweepState, seed: int, beneath: Map | None
 ) -> tuple[SweepState, dict[str, Any]]:
     """Return the state after one sweep, and what the progress bar shows of it."""
-    from scipy.stats import qmc  # half a second, which only this needs
+    from scipy.stats import qmc  # slow to import, and only for sweeps
 
     parameters, count = len(simulator.scene.parameters), _FEWEST
     while count < 2 * terms(parameters, _first_degree(parameters)):
@@ -267,11 +267,11 @@ def _sweep(
     below = 0.0 if beneath is None else _free_fields(simulator, beneath, position)
     steps = targets(simulator, below + extrapolation.at(position), position, level)
     usable = np.isfinite(steps.error)
-    usable_share = float(np.mean(usable & (steps.fraction >= _TAKEN)))
+    usable_share = float(np.mean(usable & (steps.fraction >= _LEAST_FRACTION)))
     display = {"load": f"{level:.2f}", "taken": f"{usable_share:.2f}"}
     new = Samples(position, steps.fields - below, steps.error).take(usable)
     lengths = steps.step[usable]
-    if not usable.any() or (state.rises and usable_share < _ENOUGH):
+    if not usable.any() or (state.rises and usable_share < _LEAST_SHARE):
         next_state = _with_smaller_rise(state)
     elif state.rises:
         next_state = _at_level(state, level, new, float(np.median(lengths)))
@@ -320,7 +320,7 @@ def _with_targets(state: SweepState, new: Samples, error: float) -> SweepState:
     """Return the state after targets ``new`` at its level; ``error`` is the median step to them."""
     degree = best_degree(state.values, new, state.polynomial.degree, error)
     parameters = new.position.shape[1]
-    most = _KEPT * min(terms(parameters, degree + 1), MOST_TERMS)
+    most = _TARGETS_PER_TERM * min(terms(parameters, degree + 1), MOST_TERMS)
     known = state.values.followed_by(new).take(slice(-max(most, 4 * len(new.position)), None))
     polynomial = fit(known, degree, error)
     return replace(

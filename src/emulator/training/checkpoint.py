@@ -48,7 +48,7 @@ class Session:
     began : the time it began, on the performance counter, less the time spent before it was
         resumed.
     start : the record of the emulator from which training started; empty when afresh.
-    arrays, loss : those of the checkpoint that it resumes from; no arrays when it begins.
+    arrays, loss : the arrays and loss of the checkpoint to resume from; no arrays at the beginning.
     """
 
     path: Path
@@ -121,7 +121,7 @@ def open_session(
     ----------
     folder : the folder of the checkpoint.
     fingerprint, name : the fingerprint of what is emulated, and its name for messages.
-    plan, architecture : those of a training that begins; a checkpoint has its own.
+    plan, architecture : the plan and the sizes of a new training; a checkpoint has its own.
     plan_kinds : the classes of plans by the name of their recipe, to read a checkpoint's.
     resume : whether to read the checkpoint.
 

@@ -32,7 +32,7 @@ from emulator.training.step import cosine
 
 _SAMPLES = 400  # positions over which a mode's energy is averaged
 _TRUNCATION = 1e-12  # least energy of a mode, relative to the largest
-_STEP = 0.1  # a unit of the network's output, in root mean squares of a mode's coefficient
+_STEP = 0.1  # unit of the network's output, over the rms of a mode's coefficient
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def mechanical_modes(simulator: Simulator, series: Expansion, most: int) -> np.n
     energies, vectors = np.linalg.eigh(_energies(simulator, series, fields))
     order = np.argsort(energies)[::-1][:most]
     order = order[energies[order] > _TRUNCATION * energies.max()]
-    # Each is a unit vector in K_c times the root of its energy, the rms of its coefficient.
+    # Scale each K_c-unit vector by the root of its energy, the rms of its coefficient.
     return _STEP * np.tensordot(vectors[:, order].T, fields, axes=1)
 
 

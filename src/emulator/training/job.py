@@ -69,8 +69,8 @@ class Job:
     scene : the scene to emulate.
     architecture : the sizes of the network; ``None`` for those of the recipe.
     start : the emulator to begin from, or ``None``.
-    campaign : FEM runs that are there already; only the one at the centre is then solved.
-    folder : where sweeps are kept and taken up again; ``None`` for nowhere.
+    campaign : the stored FEM runs to use; only the one at the centre is then solved.
+    folder : the folder of the sweeps' checkpoint, from which they resume; ``None`` for none.
     budget : the time for everything; ``None`` for as long as it takes.
     progress : whether progress bars are shown.
     """
@@ -103,7 +103,7 @@ class Job:
 
         Parameters
         ----------
-        predictor : predicts where Newton's method starts.
+        predictor : the function that predicts the start of Newton's method.
         deadline : the time after which no further run begins, except the fewest by which a
             discrepancy model can be judged.
         """

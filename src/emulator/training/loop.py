@@ -28,7 +28,7 @@ Hook = Callable[[State, int], int]
 """Called after each step with the state and the total; returns the total from there on."""
 
 _SHOW_EVERY = 50  # steps; reading the loss waits for the step to end
-_AIM_EVERY = 200  # steps between two estimates of the time that is left
+_AIM_EVERY = 200  # steps between two estimates of the remaining time
 _TIMED = 8  # steps that are timed before a training
 
 
@@ -41,10 +41,10 @@ class NetworkTraining:
     """How a network is trained.
 
     network : the untrained network.
-    optimiser, step : as :func:`~emulator.training.step.make_step` takes and gives them.
+    optimiser, step : the optimiser and its step (:func:`~emulator.training.step.make_step`).
     freeze : the step at which the modes of a separable decoder are frozen, so that only its branch
         is trained from there on; ``None`` for never.
-    frozen : from weights to the arrays that later steps take, the modes first.
+    frozen : the function from weights to the arrays that later steps take, the modes first.
     finish : from the weights after the last step, and whether to show progress, to the trained
         weights.
     """

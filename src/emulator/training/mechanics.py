@@ -147,7 +147,7 @@ def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:
     """Return the sums of parts to which a discrepancy model may be added, by name."""
     bare = replace(emulator, discrepancy=None)
     nothing = replace(bare, taylor=None, network=None, family=None)
-    if emulator.coarse is not None:  # on the same body, it has learned from many runs
+    if emulator.coarse is not None:  # the coarse emulator has learned from many runs of this body
         candidates = [bare]
     elif emulator.family is not None:
         series_only = replace(bare, taylor=None)

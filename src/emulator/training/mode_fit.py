@@ -57,8 +57,8 @@ from emulator.training.objectives import Scales
 from emulator.training.step import Weights, in_branch
 
 _SLOPES = 0.1  # gamma: positions have a variance of 1/12 in the unit box
-_RIDGE = 1e-9  # of the mean square of the hidden layer; weights beyond are noise in float32
-_ZERO = 1e-12  # of the sum of the modes' squares
+_RIDGE = 1e-9  # over the hidden layer's mean square; larger weights are noise in float32
+_ZERO = 1e-12  # relative to the sum of the modes' squares
 _MEMORY = 20  # steps that L-BFGS remembers
 _AT_ONCE = 50  # iterations of L-BFGS between two evaluations of the misfit
 _ROWS = 32  # rows of a block of the product, by trial
@@ -86,7 +86,7 @@ class ModeFit:
     ----------
     scene, network : the scene, and its untrained network.
     runs : the runs that the network is fitted to, the one at the centre first.
-    scales : s and s_F of the inner product; s is the network's scale, too.
+    scales : the scales s and s_F of the inner product; s is the network's scale, too.
     slopes : the weight gamma of the slopes.
     """
 
@@ -202,7 +202,7 @@ class ModeFit:
             return value, gradient, weights
         H, back = jax.vjp(self._hidden, weights)
         W, misfit, derivative = self._project(H)
-        # The gradient of the logarithm: the misfit falls by many decades, and so would its own.
+        # The logarithm's gradient keeps its size while the misfit falls by many decades.
         (gradient,) = back(derivative / misfit)
         return misfit, gradient, self._with_last_layer(weights, W)
 
@@ -300,7 +300,7 @@ class BlockedMatrix(NamedTuple):
     tenth of a block is nonzero and the product runs at the speed of dense ones.
 
     columns : the columns of each block, (b, w), filled up with 0.
-    values : their entries, (b, rows, w).
+    values : the entries of the blocks, (b, rows, w).
     order : the position of each row among those of the blocks, (n,).
     """
 

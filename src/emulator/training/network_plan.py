@@ -37,7 +37,7 @@ class Problem:
     emulator : the emulator whose network is untrained.
     runs : the FEM solutions, or what sweeps give in their place, the one at the centre first.
     training : the training of the network.
-    record : entries of the emulator's record.
+    record : the entries of the emulator's record.
     """
 
     plan: Plan

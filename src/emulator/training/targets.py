@@ -27,8 +27,8 @@ from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
 
 _GROUP = 8  # theta that share a factor
-_MIDDLES = 3  # members of a group whose tangents are tried, the middle first
-_STEPS, _TOLERANCE = 4, 1e-8  # of conjugate gradients
+_MIDDLES = 3  # members of a group whose tangents may be factorised, the middle first
+_STEPS, _TOLERANCE = 4, 1e-8  # steps and tolerance of conjugate gradients
 _LEAST_J = 0.05
 _LEAST_FRACTION = 2.0**-7
 

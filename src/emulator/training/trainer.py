@@ -103,7 +103,7 @@ def train(
     digest = "" if campaign is None else campaign.digest
     if resume:
         _check_same(session, digest, source)
-        budget = None  # it is in the checkpoint
+        budget = None  # the checkpoint has the budget
     else:
         trained = replace(trained, campaign=digest)
         session = replace(session, plan=trained, start=source)

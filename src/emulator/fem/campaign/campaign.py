@@ -42,7 +42,7 @@ def solve_rows(
     Parameters
     ----------
     numbers : the positions of the theta to solve at, in order; all by default.
-    starts : called when a task is taken, so that it may use the rows so far.
+    starts : the function that proposes starts; it is called only when a task begins.
     """
     rows = range(len(thetas)) if numbers is None else numbers
     tasks = (Task(number, thetas[number], tuple(starts(number))) for number in rows)
@@ -54,7 +54,7 @@ def solve_together(
 ) -> Solution:
     """Return solutions at every theta (c, p), converged or not; fields gain a leading axis.
 
-    starts : (c, n, 3) mm, the start of each solve; from rest by default.
+    starts : the start of each solve, (c, n, 3) mm; the state at rest by default.
     """
     if starts is not None and len(thetas) != len(starts):
         raise InputError(f"campaign: {len(thetas)} theta, but {len(starts)} starts")
@@ -93,9 +93,9 @@ class Field(NamedTuple):
 class Neighbours:
     """Proposes starts: the solution at the nearest theta so far, and two extrapolations.
 
-    thetas : (c, p) the whole design.
+    thetas : the theta of the whole design, (c, p).
     solutions : the converged solutions so far by the number of their theta; grows meanwhile.
-    predictor : proposes another start, or None.
+    predictor : the function that proposes another start, or None.
     """
 
     scene: Scene
@@ -139,8 +139,8 @@ class Runs(NamedTuple):
     """Converged FEM solutions.
 
     theta : (c, p). displacement : (c, n, 3) mm.
-    energy : (c,) mN mm; NaN for a scene whose mesh is the loaded shape.
-    sensitivities : (c, p, n, 3), du/dtheta in mm per unit of each parameter; None unless requested.
+    energy : the potential energies, (c,) mN mm; NaN for a scene whose mesh is the loaded shape.
+    sensitivities : du/dtheta (c, p, n, 3) in mm per unit of each parameter; None unless requested.
     """
 
     theta: jax.Array

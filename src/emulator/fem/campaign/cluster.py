@@ -43,7 +43,7 @@ CONNECT_S = 10.0
 WORKERS_S = 60.0
 """Seconds after which a campaign without any worker ends."""
 _POLL_S = 2.0  # between two checks that there are workers
-_TASKS_A_WORKER = 2  # one being solved, one waiting on the worker
+_TASKS_A_WORKER = 2  # one is solved while the next waits on the worker
 _ADDRESS = re.compile(r"(tcp|tls|ucx|ws|wss)://[^/\s]+:\d+")
 
 
@@ -66,7 +66,7 @@ class Cluster:
         """
         try:
             yield from self._rows(self._name(solver), tasks)
-        except (OSError, CancelledError) as error:  # an error of the solve itself is neither
+        except (OSError, CancelledError) as error:  # errors of the solve itself have other types
             raise self._gone(error) from error
 
     def _name(self, solver: Solver) -> str:
@@ -90,7 +90,7 @@ class Cluster:
             for future in self._finished(pending):
                 try:
                     row = _result(future)
-                except TimeoutError:  # its worker was lost, and Dask solves it again
+                except TimeoutError:  # the worker was lost; Dask solves the task again
                     continue
                 number = pending.pop(future)
                 if row is None:

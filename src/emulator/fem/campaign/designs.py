@@ -19,7 +19,7 @@ from emulator.scenes.scene import Scene
 
 TEST_SEED = 90_210  # separate test points: training and reduced models use small seeds
 _CORNER_EVERY = 5  # every fifth theta of a design is a corner of the box
-_MOST_CORNERED = 6  # parameters; the box of more has too many corners, and none is used
+_MOST_CORNERED = 6  # parameters up to which the box's corners are used; more have too many
 
 
 def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
@@ -90,7 +90,7 @@ def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
 
     Values that law or loads do not admit are left out.
 
-    fraction : by which each side of the box is widened both ways, on its parameter's scale.
+    fraction : the fraction of each range by which it is widened at both ends, on its scale.
     """
     if not 0.0 < fraction < np.inf:
         raise InputError(f"outside is {fraction}; give a fraction above 0, e.g. 0.25")

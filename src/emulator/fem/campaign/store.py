@@ -59,7 +59,7 @@ class Campaign:
     """The description of a campaign: a solve at every theta of a design.
 
     solver : the solver of the scene, with its options. thetas : (c, p).
-    about : how the design was made, versions and the like, as plain JSON.
+    about : the origin of the design, versions and the like, as plain JSON.
     """
 
     solver: Solver

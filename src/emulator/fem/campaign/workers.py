@@ -26,8 +26,8 @@ from emulator.fem.linear.suitesparse import FACTORS
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
 
-_BYTES_A_NODE = 100_000  # of one more solve at the same time; 54 000 measured at 33 605 nodes
-_MEMORY_SHARE = 0.5  # of the machine's memory that solves may take
+_BYTES_A_NODE = 100_000  # memory of a concurrent solve; 54 000 measured at 33 605 nodes
+_MEMORY_SHARE = 0.5  # share of the machine's memory that solves may take
 
 
 # ---- one solve -----------------------------------------------------------------------------------
@@ -35,7 +35,7 @@ class Task(NamedTuple):
     """One solve to do.
 
     number : the position of theta in its design. theta : (p,).
-    starts : displacements (n, 3) mm to choose a start from; none for the start at rest.
+    starts : the displacements (n, 3) mm to choose a start from; empty for the start at rest.
     """
 
     number: int
@@ -47,10 +47,10 @@ class Row(NamedTuple):
     """The result of one solve.
 
     number : the position of theta in its design. theta : (p,).
-    energy : mN mm; NaN unless requested and converged.
+    energy : the potential energy, mN mm; NaN unless requested and converged.
     sensitivities : (p, n, 3), du/dtheta in mm per unit of each parameter, NaN where not converged;
         None unless requested.
-    seconds : wall time.
+    seconds : the wall time.
     """
 
     number: int

@@ -15,11 +15,11 @@ class Linearised(NamedTuple):
     """The linear equations of a step.
 
     tangent : the nonzeros (nnz,) of the tangent, mN/mm.
-    solvable : whether it can be factorised.
+    solvable : whether the tangent can be factorised.
     residual : the residual, (f,) mN.
     offset_force : the change of the residual as the prescribed displacements go to their values,
         (f,) mN.
-    couplings : what :meth:`Formulation.advance` needs to update the other unknowns, or None.
+    couplings : the data by which :meth:`Formulation.advance` updates other unknowns, or None.
     """
 
     tangent: jax.Array

@@ -59,7 +59,7 @@ class StressState(NamedTuple):
     fraction : the fraction of the last step that was taken; below 1 where elements would have been
         inverted, 0 where there was no step.
     definite : whether the tangent of the last step was positive definite.
-    refused : the number of steps in a row whose first tangent was not, and that were solved again.
+    refused : the number of steps in a row solved again because their tangent was indefinite.
     """
 
     u: jax.Array
@@ -111,11 +111,11 @@ class StressIterates:
 
         Parameters
         ----------
-        state : the state before it.
+        state : the state before the iteration.
         load_stiffness : the factor of the loads' stiffness in the tangent.
         geometric : the fraction of the stresses' change since rest that has a geometric stiffness.
             With neither stiffness the tangent is definite for most laws, however rough the field.
-        again : whether to solve again with neither where the tangent is not definite.
+        again : whether to solve again with neither stiffness where the tangent is not definite.
         """
         system, theta, load = self.system, self.theta, self.load
         first = _FullStep(state.u, jnp.array(False), jnp.array(0))
@@ -125,7 +125,7 @@ class StressIterates:
             factors = known * load_stiffness, known * geometric
             equations = _equations(system, state.u, state.measures, theta, load, *factors)
             force = equations.residual + equations.offset_force
-            # On the way from rest each tangent is unlike the one before.
+            # Tangents change so much from rest that the last factor does not help.
             solution, outcome = system.attempt(equations.tangent, -force, may_reuse=False)
             step, definite = _full_step(
                 system, state.u, theta, load, equations.solvable, force, solution, outcome
@@ -213,7 +213,7 @@ def _full_step(
     force : the force (f,) in mN that the ``solution`` (f,) of the equations balances.
     """
     definite = outcome == Outcome.OK
-    if system.forces:  # not symmetric: at least the step goes down
+    if system.forces:  # the tangent is not symmetric, so check that the step descends
         definite &= jnp.vdot(force, solution) <= 0.0
     step = system.extend(solution) + system.support_offset(u, theta, load)
     return jnp.where(solvable, step, jnp.nan), definite

@@ -21,9 +21,9 @@ _ASYMMETRY = 1e-13  # of the largest entry: mirror images whose sums are rounded
 class Pattern:
     """Nonzeros of a matrix over the free degrees of freedom, row by row, fixed for a mesh.
 
-    rows, columns : (nnz,) int32 position of each nonzero.
-    source : (k,) indices of the entries of the flattened element blocks that are used.
-    target : (k,) index of the nonzero to which each of these entries is added.
+    rows, columns : the position of each nonzero, (nnz,) int32.
+    source : the indices (k,) of the entries of the flattened element blocks that are used.
+    target : the index (k,) of the nonzero to which each of these entries is added.
     size : the number of free degrees of freedom.
     upper : whether only the upper triangle of a symmetric matrix is stored.
     """
@@ -109,7 +109,7 @@ class Pattern:
 class Entries(NamedTuple):
     """Positions of the entries of dense blocks, in the order of the flattened blocks.
 
-    rows, columns : (e,) global degrees of freedom.
+    rows, columns : the global degrees of freedom of each entry, (e,).
     mirrored : (e,) whether an entry of a symmetric block also stands for its mirror image, which
         the block does not store.
     spare : (e,) whether the mirror image of an entry is stored and stands for it.
@@ -150,8 +150,8 @@ def block_pattern(groups: Sequence[Entries], free_index: np.ndarray, *, symmetri
     Parameters
     ----------
     groups : the entries of each group of blocks, in the order in which they are flattened.
-    free_index : (n_dofs,) position among the free degrees of freedom, -1 where prescribed.
-    symmetric : store only the upper triangle.
+    free_index : the position (n_dofs,) among the free degrees of freedom, -1 where prescribed.
+    symmetric : whether to store only the upper triangle.
     """
     size = int(free_index.max()) + 1
     rows, columns, mirrored, spare = map(np.concatenate, zip(*groups, strict=True))

@@ -43,7 +43,7 @@ def petsc_module() -> Any:
     with suppress(ModuleNotFoundError):
         importlib.import_module("mpi4py.MPI")  # some wheels find their MPI only this way
     try:
-        # PETSc's handler of signals would end the process its own way.
+        # PETSc's signal handler would end the process without Python's clean-up.
         importlib.import_module("petsc4py").init(["petsc", "-no_signal_handler"])
         PETSc = importlib.import_module("petsc4py.PETSc")
     except ModuleNotFoundError:
@@ -160,7 +160,7 @@ class Factor:
 class LastFactor:
     """The one factor that a process keeps, because a factor may take all of its memory.
 
-    lock : serialises the threads that solve.
+    lock : the lock that lets one thread solve at a time.
     """
 
     factor: Factor | None = None
@@ -169,7 +169,7 @@ class LastFactor:
     def of(self, pattern: Pattern, values: np.ndarray) -> Factor:
         """Return the factor of a matrix; the one before is overwritten or freed."""
         if self.factor is None or not self.factor.serves(pattern):
-            self.factor = None  # freed before another is made
+            self.factor = None  # freed before the next one is allocated
             self.factor = Factor(pattern)
         try:
             self.factor.factorise(values)

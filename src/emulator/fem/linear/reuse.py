@@ -19,7 +19,7 @@ from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.solve import Direct, Outcome
 from emulator.fem.linear.suitesparse import FACTORS
 
-TOLERANCE = 1e-10  # of the residual, in the norm of the inverse of the factorised tangent
+TOLERANCE = 1e-10  # relative residual, in the norm of the inverse factorised tangent
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
 # Unknowns from which conjugate gradients beside a factor beat a factorisation by CHOLMOD, and the
 # iterations that then take as long. Times grow as n^2 and n^(4/3) (studies/large_meshes).
@@ -30,8 +30,8 @@ _ITERATIONS_OF_LARGE = 25
 class Gradients(NamedTuple):
     """The result of conjugate gradients.
 
-    x : (f,) the solution. reduction : () of the residual, in the norm of the preconditioner.
-    convex : () whether every direction had positive curvature.
+    x : the solution, (f,). reduction : the relative residual (), in the preconditioner's norm.
+    convex : whether every direction had positive curvature, ().
     """
 
     x: jax.Array
@@ -43,7 +43,7 @@ class _State(NamedTuple):
     """State of conjugate gradients.
 
     x, residual, direction : (f,). size : () residual . preconditioned residual.
-    convex : () whether the last direction had positive curvature.
+    convex : whether the last direction had positive curvature, ().
     """
 
     k: jax.Array
@@ -67,7 +67,7 @@ def conjugate_gradients(
     Parameters
     ----------
     steps : the largest number of iterations.
-    tolerance : of the residual relative to ``b``, both in the norm of ``precondition``.
+    tolerance : the largest residual relative to ``b``, both in the norm of ``precondition``.
     patience : the number of iterations after which they end as soon as the residual is larger than
         a constant rate to ``tolerance`` in ``steps`` allows; None never ends them for that.
     """
@@ -112,7 +112,7 @@ class KeptFactor:
 
     def __init__(self, direct: Direct, pattern: Pattern) -> None:
         self._pattern = pattern
-        self._factorised: jax.Array | None = None  # the tangent whose factor is kept
+        self._factorised: jax.Array | None = None  # the tangent that the kept factor belongs to
         affordable = int(_ITERATIONS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
         self._iterations = max(_PATIENCE, affordable)
         program = (lambda function: function) if direct.on_host else compiled
@@ -138,7 +138,7 @@ class KeptFactor:
             if bool(solution.convex & (solution.reduction <= TOLERANCE)):
                 return solution.x, jnp.asarray(Outcome.OK, jnp.int32)
         self._factorised = None
-        with FACTORS.keep(1):  # two of such a mesh may not fit into memory
+        with FACTORS.keep(1):  # two factors of a large mesh may not fit into memory
             x, outcome = jax.block_until_ready(self._solve(tangent, b))
         self.factorisations += 1
         if int(outcome) == Outcome.OK:

@@ -59,7 +59,7 @@ class Direct(Protocol):
 
         definite : report INDEFINITE unless ``A``, given by its upper triangle, is positive
             definite.
-        transposed : solve with the transpose of ``A``.
+        transposed : whether to solve with the transpose of ``A``.
         """
         ...
 

@@ -39,7 +39,7 @@ from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.solve import Outcome
 
 _CHOLMOD, _UMFPACK = "calibrate_cholmod", "calibrate_umfpack"
-_FACTORS = 2  # of each pattern that are kept where nobody asks for another number
+_FACTORS = 2  # factors of each pattern that are kept by default
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ def register(target: str, capsule: Any, classify: Classify) -> None:
             frame.result(0).fill()
             status[0] = INTERRUPTED
             if isinstance(error, KeyboardInterrupt):
-                Timer(_REPEAT_S, interrupt_main).start()  # once the program has ended
+                Timer(_REPEAT_S, interrupt_main).start()  # raises once the program has ended
             else:
                 sys.excepthook(type(error), error, error.__traceback__)
             return None

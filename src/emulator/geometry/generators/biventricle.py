@@ -110,9 +110,9 @@ class RightVentricle:
     """Dimensions of the right ventricle; the defaults are our choice.
 
     half_angle : degrees from the middle of the septum to the cavity's edge at the base.
-    apex : of the cavity, as a fraction of the way from the left apex to the base.
-    bulge : of the cavity at the base, mm.
-    thickness : of the free wall, mm.
+    apex : the height of the cavity's apex, as a fraction of that from the left apex to the base.
+    bulge : the bulge of the cavity at the base, mm.
+    thickness : the thickness of the free wall, mm.
     """
 
     half_angle: float = 72.0
@@ -202,10 +202,10 @@ def biventricle(
 
     Parameters
     ----------
-    left, right : dimensions.
+    left, right : the dimensions of the ventricles.
     rings, around, grading : of the left ventricle, as in
         :func:`~emulator.geometry.generators.ellipsoid.truncated_ellipsoid`.
-    layers : through the left wall and through the right free wall.
+    layers : the number of layers through the left wall and through the right free wall.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the true surfaces.
 
     Returns

@@ -156,9 +156,9 @@ def truncated_ellipsoid(
     Parameters
     ----------
     wall : dimensions in mm.
-    rings : from apex to base.
-    around : points on a full ring; rings nearer the apex have fewer.
-    layers : from endocardium to epicardium.
+    rings : the number of rings from apex to base.
+    around : the points on a full ring; rings nearer the apex have fewer.
+    layers : the number of layers from endocardium to epicardium.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the true surfaces.
     thicker : by which fraction the wall is thicker at the base towards an angle :math:`\phi_0`, in
         degrees; at ``t`` = 1 lies what would lie at

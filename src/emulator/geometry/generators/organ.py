@@ -36,7 +36,7 @@ def organ(
     Parameters
     ----------
     half_axes : a, b, c in mm.
-    shells : of the ball that is mapped; 6 give 923 nodes.
+    shells : the number of shells of the ball that is mapped; 6 give 923 nodes.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the true surface.
     clustering : above 0, below 1: elements at the ligament are smaller, by (1 - c) / (1 + c), and
         larger on the other side, none distorted: the ball is moved by a Moebius map.

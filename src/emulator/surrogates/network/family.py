@@ -31,7 +31,7 @@ from emulator.surrogates.network.pignn import Architecture, Processor, branch, t
 from emulator.surrogates.network.ventricle_graph import BodyFeatures, describe
 from emulator.surrogates.part import CachedPart
 
-_SLACK = 1e-9  # of a parameter's range, for round-off
+_SLACK = 1e-9  # round-off allowed, as a fraction of a parameter's range
 _BEYOND = 0.1  # part of the family's range by which a body may lie outside it
 
 VECTORS = 7
@@ -59,7 +59,7 @@ class FamilyModule(nnx.Module):
     ) -> tuple[jax.Array, jax.Array]:
         """Return the modes (r, n, 3) in units of ``vectors`` (n, 7, 3), and the mean state (2M,).
 
-        shares : (n,) of the wall's volume, at the nodes.
+        shares : the share of the wall's volume at each node, (n,).
         """
         states = self.processor(graph)
         weights = self.trunk(states).reshape(len(states), -1, VECTORS)
@@ -104,7 +104,7 @@ class Learned(NamedTuple):
     standard : the means and deviations of the features.
     scale : the scale s of displacements over the body's size.
     parameters : the entries of theta, and the box from which they were drawn.
-    physics : law, constants and loads.
+    physics : the law, constants and loads that the network has learned.
     shapes : the range of each number of ``BodyFeatures.shape`` over the family.
     """
 
@@ -240,7 +240,7 @@ def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNet
     if strict:
         _check_shape(learned, scene, body.shape)
     graph = learned.standard.graph(body)
-    # Rounded as a file stores them, so that an emulator read again predicts the same.
+    # Rounded as in a file, so that a reloaded emulator makes equal predictions.
     vectors, shares = body.vectors.astype(np.float32), body.shares.astype(np.float32)
     return FamilyNetwork(learned, scene.space, graph, vectors, shares)
 

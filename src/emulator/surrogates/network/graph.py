@@ -23,9 +23,9 @@ from emulator.scenes.scene import Scene
 class AugmentedGraph:
     """Inputs of the processor. Each pair of joined nodes is stored once, from sender to receiver.
 
-    node_features : (N, d) normalised, real nodes first (Eq. 24-25).
-    edge_features : (E, 4) normalised relative position and distance, receiver minus sender.
-    senders, receivers : (E,) node indices, sender > receiver.
+    node_features : the normalised features (N, d), mesh nodes first (Eq. 24-25).
+    edge_features : the normalised relative position and distance (E, 4), receiver minus sender.
+    senders, receivers : the node indices (E,) of each edge, sender > receiver.
     real : number of mesh nodes.
     """
 
@@ -45,9 +45,9 @@ class AugmentedGraph:
 class GraphOptions:
     """Shape of the virtual layers.
 
-    cluster : nodes of a layer for each node of the layer above it, on average.
-    smallest : fewest nodes of a layer. All nodes of the last layer are joined to each other.
-    neighbours : kappa, nearest neighbours each virtual node is joined to.
+    cluster : the mean number of nodes of a layer for each node of the layer above it.
+    smallest : the least number of nodes of a layer; the last layer is joined completely.
+    neighbours : the number kappa of nearest neighbours that each virtual node is joined to.
     """
 
     cluster: int = 4
@@ -76,8 +76,8 @@ def augment(scene: Scene, options: GraphOptions = GraphOptions()) -> AugmentedGr
 class Hierarchy:
     """Mesh nodes and the virtual layers above them.
 
-    pairs : (E, 2) joined nodes, receiver < sender, each pair once.
-    parents : of each layer but the last, the cluster above that each of its nodes lies in.
+    pairs : the joined nodes (E, 2), receiver < sender, each pair once.
+    parents : the cluster that each node lies in, for each layer but the last.
     """
 
     pairs: np.ndarray

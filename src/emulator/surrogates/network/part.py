@@ -61,7 +61,7 @@ class Network:
     weights : the state of the network, an NNX ``State``.
     scale : the scale of the network's output by component, (3,) mm.
     basis : the modes given to a separable decoder, (f, n, 3) in units of ``scale``.
-    standardisation : that of theta, for a network that takes theta in place of its position.
+    standardisation : the standardisation of theta, for a network whose input is theta itself.
     """
 
     architecture: Architecture

@@ -70,11 +70,11 @@ class MLP(nnx.Module):
 
     Parameters
     ----------
-    parts : width of each part of the input.
-    hidden : widths of the hidden layers.
-    out : width of the output.
-    layer_norm : normalise the output (encoders and processor; not decoders).
-    zero_last : start the last layer at zero.
+    parts : the width of each part of the input.
+    hidden : the widths of the hidden layers.
+    out : the width of the output.
+    layer_norm : whether to normalise the output (encoders and processor; not decoders).
+    zero_last : whether the last layer starts at zero.
     """
 
     def __init__(

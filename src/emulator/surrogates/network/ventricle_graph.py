@@ -19,7 +19,7 @@ from emulator.scenes.cavities import find_cavity
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network.graph import hierarchy, mesh_edges
 
-_NEAREST = 1e-3  # of L: a shorter distance counts as this much in a logarithm
+_NEAREST = 1e-3  # least distance over L in a logarithm
 
 
 class BodyFeatures(NamedTuple):
