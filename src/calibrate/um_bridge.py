@@ -91,7 +91,7 @@ def serve(
     Parameters
     ----------
     forward : the forward map.
-    observe : what of its displacement is returned.
+    observe : the observations that the server returns.
     port : the port to listen on; 0 takes a free one.
     host : the loopback address, or one that other machines reach, without a password.
 

@@ -33,13 +33,16 @@ _WORD = re.compile(r"([0-9.+-]+(?:[eE][+-]?[0-9]+)?)\s*(\S*)")
 
 @dataclass(frozen=True)
 class Measured:
-    """What a scene without some effects gives and takes.
+    """The errors and the cost of a scene without some effects.
 
-    changes : of each observation, the largest over theta and points; infinite where FEM failed.
-    seconds : of processor time, median of a solve from rest. ratio : median over theta of that time
-    over the whole scene's, solved just before it, so that other work on the machine hits both.
-    first_s : of the first solve, compilation included. operations : floating-point, of the energy
-    and its gradient; None for a load without a potential.
+    changes : the largest change of each observation over theta and points; infinite where FEM
+        failed.
+    seconds : the median processor time of a solve from rest.
+    ratio : the median over theta of that time over the whole scene's, which is solved just before,
+        so that other work on the machine slows both.
+    first_s : the processor time of the first solve in seconds, compilation included.
+    operations : the floating-point operations of the energy and its gradient; None for a load
+        without a potential.
     """
 
     left_out: tuple[str, ...]
@@ -58,11 +61,14 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Recommendation:
-    """The effects to leave out of a scene, and what was measured.
+    """The effects to leave out of a scene, and the measurements behind the recommendation.
 
-    tolerance : of each observation, in its unit. whole : of the scene as it is. alone : of each
-    effect left out alone. chosen : of all that is recommended, at theta that had no part in the
-    choice. scene : without them. effects : that the scene can do without, by name.
+    tolerance : the tolerance of each observation, in its unit.
+    whole : the measurement of the scene as it is.
+    alone : the measurements with each effect left out by itself.
+    chosen : the measurement of the recommended scene, at theta that were not used for the choice.
+    scene : the recommended scene.
+    effects : the effects that can be left out of the scene, by name.
     """
 
     tolerance: Mapping[str, float]
@@ -180,7 +186,7 @@ def tolerances(words: Sequence[str], observe: Observations) -> dict[str, float]:
 class Comparison:
     """Solves simpler scenes at the theta of one design and compares them with the whole one.
 
-    simulators : to take from and add to, by the effects left out.
+    simulators : the simulators so far, by the effects left out; new ones are added.
     """
 
     def __init__(

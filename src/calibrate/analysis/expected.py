@@ -43,7 +43,8 @@ from calibrate.statistical_model.errors import errors_of_data
 from emulator.core.errors import InputError
 
 _DATA_SETS = 64
-_FROM_PRIOR, _AROUND = 3072, 512  # draws of the prior, for all data sets; of Student's t, for each
+_FROM_PRIOR = 3072  # draws of the prior that all data sets share
+_AROUND = 512  # draws of Student's t for each data set
 _ROUNDS = 2  # fits of Student's t to the draws before
 _BATCH = 128
 _EFFECTIVE = 30.0  # effective draws; below, the covariance of the linear map and a normal prior
@@ -63,19 +64,19 @@ def expected_precision(
 
     Parameters
     ----------
-    at : unknowns by name where the map is taken as linear and the prior as normal; posteriors of
-        ``data_sets`` draws of the prior and its data by default.
+    at : the unknowns by name at which the map is linearised, with a normal prior; by default the
+        posteriors of ``data_sets`` data sets, made at draws of the prior, are averaged.
     systematic : errors that many numbers share, by name, as in an experiment file
         (:mod:`~calibrate.model_error.kinds`), made for each data set. Those of
         :func:`calibrate.with_systematic` are the model's already, the same for all data.
 
     Returns
     -------
-    sd : per unknown, its expected posterior sd relative to the prior's, in log theta where all
+    sd : the expected posterior sd of each unknown relative to the prior's, in log theta where all
         unknowns are positive.
-    combinations : as of :func:`~calibrate.analysis.identifiability.identify`, of the mean posterior
-        covariance, those of which something would be learned; empty where an unknown may be 0 or
-        below.
+    combinations : the combinations of :func:`~calibrate.analysis.identifiability.identify` that
+        the data would inform, from the mean posterior covariance; empty where an unknown may be 0
+        or below.
 
     Raises
     ------

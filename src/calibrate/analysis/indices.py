@@ -42,15 +42,16 @@ from scipy.stats import norm, qmc
 from calibrate.priors import Prior, bisect, bounds, dependence_of
 from emulator.core.errors import InputError, check_known, check_seed
 
-_EDGE = 1e-9  # of the unit interval; beyond, a distribution without ends has infinite quantiles
+_EDGE = 1e-9  # cut off the unit interval, because unbounded priors have infinite quantiles at 0
 
 
 @dataclass(frozen=True, eq=False)
 class Factors:
     """Parameters by name, varied together where they form a group.
 
-    names : of the parameters, (p,). groups : names of a group's parameters, by the group's name;
-    a parameter of no group is one of its own.
+    names : the names of the parameters, (p,).
+    groups : the names of each group's parameters, by the group's name; a parameter that is in none
+        is a group of its own.
 
     Raises
     ------
@@ -140,9 +141,9 @@ Derivative = Callable[[np.ndarray], np.ndarray]
 """Points (n, p) of the unit cube to derivatives (n, m, p)."""
 
 CONFIDENCE = 0.95
-_DEVIATIONS = norm.ppf(0.5 * (1.0 + CONFIDENCE))  # of a normal distribution, to either side
+_DEVIATIONS = norm.ppf(0.5 * (1.0 + CONFIDENCE))  # half-width of the interval of a normal, in sd
 _RESAMPLES = 100
-_LEVELS = 4  # of Morris' grid
+_LEVELS = 4  # levels of Morris' grid
 
 
 def analyse(

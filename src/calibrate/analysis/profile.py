@@ -26,8 +26,8 @@ from emulator.core.errors import InputError
 from emulator.core.minimise import minimise
 
 DROP_95 = 1.92
-_BOUND = 12.0  # of the unconstrained coordinate of an interval: within 1e-5 of its ends
-_WIDTH = 4.0  # posterior sd on each side of the median
+_BOUND = 12.0  # bound of an unconstrained coordinate, within 1e-5 of its interval's ends
+_WIDTH = 4.0  # posterior sd that the grid covers on each side of the median
 
 LogLikelihood = Callable[[jax.Array], jax.Array]
 """Unconstrained coordinates (q,) to the log likelihood, ``-inf`` where there is no answer."""

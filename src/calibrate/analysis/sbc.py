@@ -206,11 +206,11 @@ def sbc(
     ----------
     truth : the model that makes the data: ``model`` itself by default. A model with FEM as its
         forward map tests the emulator too; one with another noise or prior must fail.
-    draws : of each posterior that are ranked, evenly spaced along the chains; draws that depend on
-        each other would make the ranks too even or too extreme.
-    draw : draws of a posterior, instead of a sampler's.
-    scheduler : address of a Dask scheduler whose workers make the data, where ``truth`` has FEM as
-        its forward map.
+    draws : the number of draws of each posterior that are ranked, evenly spaced along the chains,
+        because draws that depend on each other make the ranks too even or too extreme.
+    draw : the function that draws from a posterior instead of a sampler.
+    scheduler : the address of a Dask scheduler whose workers make the data, for a ``truth`` with
+        FEM as its forward map.
 
     Raises
     ------

@@ -42,12 +42,13 @@ def sensitivity(
 
     Parameters
     ----------
-    forward : over all nodes.
-    prior : of independent parameters; uniform over the scene's box, on its scales, by default.
-    method, samples : as in :func:`~calibrate.analysis.indices.analyse`.
-    groups : parameters varied together, by the group's name.
-    field : analyse the size of every node's displacement, too.
-    scheduler : address of a Dask scheduler whose workers solve, for a map that is FEM.
+    forward : the forward map over all nodes.
+    prior : the prior of independent parameters; by default uniform over the scene's box, on its
+        scales.
+    method, samples : the arguments of :func:`~calibrate.analysis.indices.analyse`.
+    groups : the parameters that vary together, by the group's name.
+    field : whether the size of every node's displacement is analysed, too.
+    scheduler : the address of a Dask scheduler whose workers solve, for a map that is FEM.
 
     Returns
     -------

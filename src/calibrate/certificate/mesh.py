@@ -41,7 +41,7 @@ from emulator.fem import Simulator
 from emulator.fem.campaign import at_once, in_order
 
 MOST_RUNS = 15
-_FEWEST = 4  # points
+_FEWEST = 4  # least number of points at which both meshes are solved
 _ROUNDS = 12  # steps of the pool towards a posterior that may be many sd away
 
 Differences = Callable[[np.ndarray], Iterable[np.ndarray | None]]

@@ -38,12 +38,13 @@ from calibrate.samplers.diagnostics import effective, normalised
 ENOUGH = 800.0  # effective points at which the pool is good
 MOST_TEMPERED = 300.0  # effective points that the kernels of the next step are put on, at most
 _TEMPERED_SHARE = 0.15  # that number at most, as a share of the pool's points
-_NEAR, _FREEDOM = 2048, 5.0  # points of the proposal that follows the draws, degrees of freedom
+_FOLLOWING = 2048  # points of the proposal that follows the draws
+_FREEDOM = 5.0  # degrees of freedom of the kernels
 _WIDE, _WIDE_WIDTHS, _WIDE_FREEDOM = 512, (1.0, 2.0), 3.0
 _PRIOR = 512
 _STEP, _SEARCH_ROUNDS, _POLISH_ROUNDS = 512, 8, 4
 _CENTRES = 192  # kernels of a proposal
-_FITTED = 1024  # points that the straightening is fitted to
+_FITTED = 1024  # points to which the straightening is fitted
 # Shares of the testing points: from the corrected posterior, from the draws' smoothed density, from
 # where FEM may find the data likely, from the surroundings of the draws, and from the whole pool.
 _CORRECTED, _DRAWS, _EXPLORED, _AROUND, _EVEN = 0.55, 0.15, 0.1, 0.1, 0.1
@@ -164,7 +165,7 @@ class Pool:
                 break
             pool = pool.stepped(pool.log_explored, rng)
         pool = replace(pool, follower=len(pool.proposals))
-        pool = pool.extended(Kernels.following(draws, rng), _NEAR, rng)
+        pool = pool.extended(Kernels.following(draws, rng), _FOLLOWING, rng)
         pool = pool.extended(Kernels.surrounding(draws, rng), _WIDE, rng)
         for points in modes:
             pool = pool.extended(Kernels.following(points, rng), _STEP, rng)

@@ -45,7 +45,7 @@ from calibrate.samplers.density import Density, density_of
 from calibrate.statistical_model import Data, Model
 from emulator.core.gaussian_process import squared_exponential
 
-_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # in sd of the prior
+_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, in prior sd
 _NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
 _TREND = 1e2
 _NEGLIGIBLE = 1e-3  # leave-one-out error, in noise sd, that changes no posterior

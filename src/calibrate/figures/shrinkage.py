@@ -12,7 +12,7 @@ from calibrate.population import Hierarchy
 from calibrate.population.posterior import ALONE
 
 _ALONE, _TOGETHER, _POPULATION = "0.55", BLUE, VERMILION
-APART = 0.16  # of the rows' distance, between a member's two intervals
+APART = 0.16  # offset of a member's two intervals, in distances of rows
 
 
 class Intervals(NamedTuple):

@@ -87,8 +87,8 @@ class Observation(ABC):
 
     kind : its name in the registry, in JSON and on the command line.
     usage : the words that ask for it, for help and errors.
-    hint : what an error adds to the usage.
-    quantity : what is measured, such as ``displacement``.
+    hint : the text that an error adds to the usage.
+    quantity : the measured quantity, such as ``displacement``.
     unit : the unit of the data; ``1`` where it has none.
     other_units : units the data may be in by mistake, each with the factor that converts it.
     usual_sd : the standard deviation of the noise where none is given; None if it must be given.
@@ -189,7 +189,7 @@ class Observation(ABC):
 
     @property
     def default_noise(self) -> GaussianNoise:
-        """Noise assumed where none is given; :class:`InputError` where it must be given."""
+        """The noise of an observation that names none; :class:`InputError` if it must."""
         if self.usual_sd is None:
             name = self.names[0]
             raise InputError(f"{name} has no usual noise; give --noise {name}=SD, in {self.unit}")

@@ -202,7 +202,7 @@ def check_table(places: np.ndarray, values: np.ndarray, what: str, components: i
     Parameters
     ----------
     places : the places, (d,) or (d, 3); they must be finite.
-    values : what was measured, (d, components); each value must be finite or, where missing, NaN.
+    values : the data, (d, components); each value must be finite or, where missing, NaN.
     what : the word for what was measured, for errors.
     components : the number of components that are expected.
     """

@@ -226,7 +226,7 @@ class SegmentStrain(Strains):
 
         Parameters
         ----------
-        components : as in :meth:`Strain.of`.
+        components : the components, see :meth:`Strain.of`.
         segments : numbers of segments from 1 on; by default all 17.
 
         Raises

@@ -18,7 +18,7 @@ from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 
-_PRESSURES = 12  # points of a curve
+_PRESSURES = 12  # number of pressures of a curve
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,14 +34,14 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """The observations and data that errors are of.
+    """The observations and data that systematic errors disturb.
 
     Attributes
     ----------
     observe : the observations, without missing values.
     data : their data by name.
-    theta : by load state, the entry of theta of each parameter: its known value, or a name where it
-        is inferred.
+    theta : the entry of theta for each parameter, by load state: the known value, or the name of an
+        unknown.
     """
 
     observe: Observations

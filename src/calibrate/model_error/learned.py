@@ -60,7 +60,7 @@ def fit(
 
 
 def _left_out(x: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
-    """Return each of ``values`` (n,) at ``x`` (n, q) as kernel regression on the others has it."""
+    """Return leave-one-out predictions of ``values`` (n,) at ``x`` (n, q) by kernel regression."""
     squared = np.sum((x[:, None] - x[None]) ** 2, axis=-1) / width**2
     np.fill_diagonal(squared, np.inf)
     weights = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)))

@@ -322,7 +322,7 @@ def diagonal(modes: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, ..
 
     Returns
     -------
-    weights, strength, modes, mixing : as in :class:`ModelError`.
+    weights, strength, modes, mixing : the fields of :class:`ModelError`.
     """
     strength, mixing = np.linalg.eigh(modes @ information @ modes.T)
     visible = strength > 1e-12 * max(float(strength.max(initial=0.0)), 1e-300)

@@ -47,11 +47,12 @@ class Systematic:
     Attributes
     ----------
     names : names of its s unknowns, each a standard normal.
-    modes : by the observation's name, the change of its data for one standard deviation of each
-        unknown, (s, *shape).
-    size : where the size of the error is inferred, its name in the posterior and the scale of its
-        half-normal prior; modes are then those of size 1. Errors with one name have one size.
-    shares : as ``modes``, but each as a share of the predicted data; the change is the sum of both.
+    modes : the change of each observation's data for one standard deviation of each unknown,
+        (s, *shape), by the observation's name.
+    size : the name of an inferred size of the error and the scale of its half-normal prior, or
+        None; modes are then those of size 1. Errors with one name have one size.
+    shares : the modes that are shares of the predicted data, in the shape of ``modes``; the change
+        is the sum of both.
     """
 
     names: tuple[str, ...]
@@ -160,8 +161,8 @@ def rigid_motion(
     Parameters
     ----------
     name : the beginning of the unknowns' names, ``camera shift x`` to ``camera turn z``.
-    positions : by the observation's name, where its points were seen, (d, 3) mm; displacements of
-        these points are measured.
+    positions : the positions of each observation's points in that frame, (d, 3) mm, by the
+        observation's name; displacements of these points are measured.
     shift : standard deviation along x, y and z in mm, or one for all.
     turn : standard deviation about x, y and z in degrees, or one for all.
     about : the point that only shifts, (3,) mm; by default the mean of all positions.

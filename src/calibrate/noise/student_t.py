@@ -23,7 +23,7 @@ import numpyro.distributions as dist
 from calibrate.noise.protocol import Noise, Scale, check_positive
 
 NOISE_SCALE = "noise_scale"
-_FAR = 5.0  # sds of a Gaussian, at which data is judged (`calibrate.measurements.magnitude`)
+_FAR = 5.0  # sds beyond which data counts as far off (`calibrate.measurements.magnitude`)
 
 
 @dataclass(frozen=True)

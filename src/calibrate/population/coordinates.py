@@ -45,8 +45,8 @@ from jax.typing import ArrayLike
 
 from emulator.core.small_matrices import eliminated
 
-_LEAST = 1e-300  # a mass of which ndtri is finite
-_FARTHEST = 30.0  # sd, beyond which a value's score is taken to be that of 30 sd
+_LEAST = 1e-300  # least mass at which ndtri is finite
+_FARTHEST = 30.0  # sd to which values farther from the mean are clipped
 
 
 class Information(NamedTuple):

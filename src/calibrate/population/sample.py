@@ -54,7 +54,7 @@ def hierarchy(
 
     Parameters
     ----------
-    members : by name, ``(model, data)``; the data of a member that was not measured is ``None``.
+    members : the ``(model, data)`` of each member, by name; data is ``None`` without measurements.
     shared : the unknowns that follow the population; by default all that every member has and that
         are no parameters of its loads.
     median : the prior of the population's median, by shared name, in the parameter's unit.

@@ -38,21 +38,21 @@ import xarray as xr
 from calibrate.arviz import stats
 from emulator.core.errors import InputError
 
-SURE = 2.0  # standard errors of a difference that is taken for one
-FEW = 4.0  # elpd: below, normal errors of a difference are not to be relied on (Sivula et al. 2020)
+SURE = 2.0  # standard errors beyond which two models differ
+FEW = 4.0  # elpd below which a difference's error is not normal (Sivula et al. 2020)
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One of the models compared.
+    """One model of a comparison.
 
-    name : of the model.
-    elpd, se : expected log predictive density of left-out data, and its standard error.
+    name : the name of the model.
+    elpd, se : the expected log predictive density of left-out data, and its standard error.
     difference, difference_se : elpd less the best model's, at most 0, and its standard error.
-    weight : in the mixture of the models that predicts best (stacking), in [0, 1].
-    parameters : effective number of parameters.
-    unreliable : number of data whose influence is too large for the estimate.
-    log_evidence, log_evidence_error : natural logarithm of Z where the sampler estimates it.
+    weight : the model's weight in [0, 1] in the mixture that predicts best (stacking).
+    parameters : the effective number of parameters.
+    unreliable : the number of data whose influence is too large for the estimate.
+    log_evidence, log_evidence_error : log Z and its error, if the sampler estimates them.
     """
 
     name: str

@@ -41,8 +41,8 @@ _LARGEST_K = 0.7  # Vehtari et al. (2024)
 _LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
 _MANY = 100.0
-_MARKED = 0.5  # of a standard deviation
-_NAMED = 3  # parameters at most, those where divergences are farthest off
+_MARKED = 0.5  # standard deviations from which a shift of divergences is reported
+_NAMED = 3  # largest number of parameters that a sentence names
 
 
 def diagnose(
@@ -55,9 +55,9 @@ def diagnose(
 
     Parameters
     ----------
-    draws, statistics : (chains, draws) by name.
-    summary : of each parameter, with ``r_hat``, ``ess_bulk`` and ``ess_tail``.
-    attributes : of the run, e.g. ``pareto_k``.
+    draws, statistics : the draws and the sampler's statistics by name, each (chains, draws).
+    summary : the summary of each parameter, with ``r_hat``, ``ess_bulk`` and ``ess_tail``.
+    attributes : the attributes of the run, e.g. ``pareto_k``.
     """
     sentences = [
         _divergences(draws, statistics.get("diverging")),

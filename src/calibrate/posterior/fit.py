@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 
 SMALLEST_P = 0.005
-OUTLYING = 4.0  # sds; of 100 Gaussian data 0.6 % have one beyond
+OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
 _FEWEST = 200  # replicates from which such a small p can be estimated
 
 
@@ -29,8 +29,8 @@ _FEWEST = 200  # replicates from which such a small p can be estimated
 class Misfit:
     """Discrepancies of one observation.
 
-    p, p_worst : posterior predictive p of the whole (T_1) and of its worst datum (T_2).
-    outlying : data beyond 4 sd, each with its mean distance in sd, the farthest first.
+    p, p_worst : the posterior predictive p of the whole (T_1) and of its worst datum (T_2).
+    outlying : the data beyond 4 sd, each with its mean distance in sd, the farthest first.
     """
 
     p: float

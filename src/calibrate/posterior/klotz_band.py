@@ -59,10 +59,10 @@ def klotz_band(
     ----------
     point : the relation through a measured volume; by default each draw's own, at its largest
         pressure.
-    band : half-width in kPa; by default 3 mmHg, which the published root mean square errors of the
-        relation stay below.
-    state : whose parameters a curve has, but for the pressure, in a model with several load states;
-        by default the last. Muscle must be at rest there.
+    band : the half-width of the band in kPa; by default 3 mmHg, which is above the published root
+        mean square errors of the relation.
+    state : the load state whose parameters, but for the pressure, a curve has; by default the last.
+        Muscle must be at rest there.
 
     Raises
     ------

@@ -37,7 +37,7 @@ class Posterior(TableRepr):
         predictions also log_likelihood (of each datum at each draw), posterior_predictive, prior
         and prior_predictive (at about 500 draws). Variables have units; attributes hold the
         provenance.
-    model, data : what the posterior was conditioned on; data by the observation's name.
+    model, data : the model, and the data by the observation's name that it is conditioned on.
     """
 
     tree: xr.DataTree

@@ -25,7 +25,7 @@ from calibrate.noise.correlated import SpatialNormal
 from calibrate.statistical_model import Data, Model
 from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, evaluate_all
 
-REPLICATES = 500  # draws of the posterior, and of the prior, that data is replicated at
+REPLICATES = 500  # draws of the posterior, and of the prior, at which data is replicated
 
 Draws = Mapping[str, Any]
 """Draws by the model's names, each (chains, draws)."""
@@ -34,8 +34,8 @@ Draws = Mapping[str, Any]
 class Prior(NamedTuple):
     """Draws of the prior where the forward map has an answer, and data replicated there.
 
-    draws : by the model's names, each (s,).
-    data : by the observation's name, each (s, *shape).
+    draws : the draws by the model's names, each (s,).
+    data : the replicated data by the observation's name, each (s, *shape).
     """
 
     draws: dict[str, np.ndarray]
@@ -189,7 +189,7 @@ def _site(name: str) -> str:
 
 
 def _pointwise(distribution: Any, value: jax.Array) -> jax.Array:
-    """Log density of each datum: given all the others, where they are not independent."""
+    """Return each datum's log density, conditional on the other data where they correlate."""
     if isinstance(distribution, SpatialNormal):
         return distribution.log_conditionals(value)
     while isinstance(distribution, dist.Independent):

@@ -34,9 +34,9 @@ def make_tree(
     Parameters
     ----------
     means : data without noise at the draws, (chains, draws, *shape) by the observation's name,
-        where these are of FEM's posterior; by the model's forward map otherwise.
-    rng_key : for replicated data; ``None`` leaves out the predictions (``log_likelihood``,
-        ``posterior_predictive``, ``prior``, ``prior_predictive``).
+        for draws of FEM's posterior; by default the model's forward map gives them.
+    rng_key : the random key of replicated data; ``None`` leaves out the predictions
+        (``log_likelihood``, ``posterior_predictive``, ``prior``, ``prior_predictive``).
     """
     constants, dims, coords = labels_of(model.observe)
     # ArviZ wants a dimension of every observation: a single number gets one of length 1.

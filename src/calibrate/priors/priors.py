@@ -296,7 +296,7 @@ def dependence_of(prior: Mapping[str, dist.Distribution] | None) -> Dependence |
 class Conditional(dist.Distribution):
     """One parameter given those before it: its marginal, its score normal(``centre``, ``width``).
 
-    support : of the marginal, in the coordinates samplers use.
+    support : the support of the marginal, in the samplers' coordinates.
     """
 
     arg_constraints: dict = {}  # noqa: RUF012

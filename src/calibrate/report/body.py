@@ -24,7 +24,7 @@ _DIGITS = 4
 def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     """Return the deformed surface with a slider over draws and a menu of colours.
 
-    simulator : to compare with at the mean theta; None leaves that out.
+    simulator : FEM, which the map is compared with at the mean theta; None for no comparison.
     """
     model = posterior.model
     scene = model.forward.scene

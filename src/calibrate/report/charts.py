@@ -24,8 +24,8 @@ from emulator.scenes.loads import KPA_PER_MMHG
 _CHAINS = COLOURS[:6]
 _MOST_TRACED = 500  # largest number of a chain's draws in a trace
 _MOST_PAIRED = 800  # largest number of draws in a pair plot
-_CURVES = 60  # draws of a pressure-volume band
-_VOLUMES = 400  # draws of volumes
+_CURVES = 60  # largest number of draws in a pressure-volume band
+_VOLUMES = 400  # largest number of draws of a volume
 _CLOSER_AT_REST = (
     3  # power by which pressures of Klotz's curve, which rises from 0, lie closer there
 )

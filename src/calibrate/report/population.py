@@ -1,4 +1,4 @@
-"""The page of a population: FEM's verdict on each member, medians and spreads, each member beside.
+"""The page of a population: FEM's verdict on each member, medians and spreads, and the members.
 
 A certificate belongs to a member, so the page repeats the members' verdicts and solves nothing.
 """
@@ -99,7 +99,7 @@ def _interval_trace(
 
 
 _FORM = ".4g"
-_OMITTED = ("members", "alone")  # attributes: fingerprints, and what every population has
+_OMITTED = ("members", "alone")  # attributes that the page leaves out
 
 
 def html_of(plan: Members, population: Hierarchy, folder: Path, page_folder: Path) -> str:

@@ -39,7 +39,7 @@ from emulator.core.progress import counting
 _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
 _PILOT, _FINAL = 0, 1  # runs
-_PILOT_DRAWS = 1000  # of all chains, that a map is fitted to; more for maps of many coefficients
+_PILOT_DRAWS = 1000  # draws of all chains to which a map is fitted; large maps take more
 _PATHS = 4  # Pathfinder's paths of a chain
 _SAMPLES = 20  # samples of a path's Gaussian
 _ITERATIONS = 30
@@ -195,7 +195,7 @@ def pathfinder_start(
     candidates, heights : points (c, p), c of 4 or more, and their log densities (c,). Paths begin
         at the first ones with a finite density.
     """
-    from blackjax.vi.multipathfinder import multi_approximate  # here: others need not wait for it
+    from blackjax.vi.multipathfinder import multi_approximate  # only this start needs the import
 
     path_key, choice_key = jax.random.split(rng_key)
     finite_first = jnp.argsort(~jnp.isfinite(heights), stable=True)

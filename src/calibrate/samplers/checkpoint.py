@@ -31,7 +31,7 @@ class Checkpoint:
     Parameters
     ----------
     path : a safetensors file; ``None`` for no checkpoint.
-    identity : what the run depends on, by name: a file with another identity is refused.
+    identity : the values by name that the run depends on; a file with others is refused.
     every : the seconds between two writes.
     """
 

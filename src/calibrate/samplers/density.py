@@ -26,7 +26,7 @@ from emulator.surrogates.protocol import ForwardMap
 
 
 class Target(Protocol):
-    """What Markov chains need of a density.
+    """The interface of a density that Markov chains sample.
 
     log_density : (z (p,), data) -> ().
     dimension : the number of coordinates, p.
@@ -78,7 +78,7 @@ class Density(NamedTuple):
 
     @property
     def piloted(self) -> bool:
-        """Whether a pilot run straightens it: a single coordinate has no other to depend on."""
+        """Whether a pilot run straightens the density: one coordinate has no other to depend on."""
         return self.dimension > 1
 
 

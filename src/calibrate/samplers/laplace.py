@@ -44,19 +44,19 @@ from calibrate.statistical_model import Data
 from emulator.core.errors import InputError, SolverError
 from emulator.core.minimise import minimise
 
-# Attributes of a run: log of the draws' mass over the missed mode's, infinite where none is missed;
-# and, only where one is missed, its coordinates in words.
+# Attributes of a run: the log of the draws' mass over the missed mode's, infinite if none is
+# missed; and the coordinates of the missed mode in words, if there is one.
 MISSED_BY, MISSED_AT = "missed_mode_nats", "missed_mode"
 
 _STARTS = 8  # draws of the prior from which modes are searched
 _MOST = 500  # iterations of the optimiser
 _STEP = 1e-4  # step of central differences of the gradient; coordinates are about 1 wide
-_AWAY = 0.05  # sd from the mode that the optimiser may stop, for a Gaussian there
-_AWAY_OF_MASS = 0.3  # likewise, for the mass at a mode
-_LIGHTER = 3.0  # nats: a mode of a twentieth of the draws' mass
-_BESIDE = 0.5  # sd from the nearest draw, within which a mode is not missed
-_VALLEY = 2.0  # nats below both ends
-_ON_THE_WAY = 16  # points between mode and draw
+_AWAY = 0.05  # largest distance from the mode, in sd, at which the optimiser may stop
+_AWAY_OF_MASS = 0.3  # the same limit where only the mass at a mode is computed
+_LIGHTER = 3.0  # nats by which a missed mode may be lighter than the draws: a twentieth
+_BESIDE = 0.5  # distance to the nearest draw, in sd, below which a mode is not missed
+_VALLEY = 2.0  # nats by which a valley is lower than both its ends
+_ON_THE_WAY = 16  # points between mode and draw that are searched for a valley
 _SAMPLE = 64  # draws from which the mean log density is computed
 
 

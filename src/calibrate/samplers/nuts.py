@@ -77,7 +77,7 @@ def numpyro_kernel(log_density: Callable[..., jax.Array], options: NUTSOptions) 
 
 def blackjax_kernel(log_density: Callable[..., jax.Array], options: BlackJAXNUTSOptions) -> Kernel:
     """Return BlackJAX's kernel; ``init`` runs the whole window adaptation."""
-    import blackjax  # here: other samplers need not wait for it
+    import blackjax  # only some samplers need this import
     from blackjax.adaptation.base import get_filter_adapt_info_fn
 
     transition = blackjax.nuts.build_kernel()

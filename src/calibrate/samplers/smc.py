@@ -189,7 +189,7 @@ class _Programs(NamedTuple):
 
 @lru_cache(maxsize=4)
 def _compile(density: Density, options: SMCOptions) -> _Programs:
-    import blackjax  # here: other samplers need not wait for it
+    import blackjax  # only some samplers need this import
     from blackjax.smc import base, resampling
 
     count = options.draws

@@ -54,14 +54,14 @@ def with_described_errors(
     Parameters
     ----------
     data : the data by the observation's name, NaN where missing.
-    descriptions : by a name of its own, each error as in an experiment file.
+    descriptions : the description of each error as in an experiment file, by the error's name.
 
     Raises
     ------
     InputError
         As :func:`errors_of_data`.
     """
-    # With its errors the model knows how far off data may be; without them it would refuse.
+    # The scale of data is checked against the model with its errors, not against this one.
     reduced, present = replace(model, check_scale=False).given(data)
     error = errors_of_data(reduced, descriptions)(present)
     return replace(reduced, check_scale=model.check_scale, error=error), present

@@ -27,17 +27,17 @@ from emulator.fem.energy import volume_ratio
 class Likelihoods(NamedTuple):
     """Log likelihoods of the data at one draw.
 
-    fem : with FEM's displacement, and the error of its mesh where the model allows for that;
-        ``-inf`` where FEM did not converge in a load state.
-    cheap : with the model's forward map and its error, where the model allows for one; ``-inf``
-        where the map has no answer.
+    fem : the log likelihood with FEM's displacement, and with the error of its mesh if the model
+        allows for one; ``-inf`` where FEM did not converge in a load state.
+    cheap : the log likelihood with the model's forward map, and with its error if the model allows
+        for one; ``-inf`` where the map has no answer.
     converged : whether FEM converged in every load state.
     smallest_J : smallest volume ratio det F in the body, by FEM; NaN where it did not converge.
     means : FEM's data without noise, by the observation's name; empty where it did not converge.
-    stable : whether FEM's equilibrium is a minimum of the energy; ``None`` where that was not asked
-        for, FEM did not converge or the scene has no energy.
+    stable : whether FEM's equilibrium is a minimum of the energy; ``None`` where this was not
+        examined, FEM did not converge or the scene has no energy.
     slopes : derivatives (m, S, p) of the flat means in theta of every load state, each in the
-        datum's unit over the parameter's; ``None`` where they were not asked for or do not exist.
+        datum's unit over the parameter's; ``None`` where they were not computed or do not exist.
     """
 
     fem: float

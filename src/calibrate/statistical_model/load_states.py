@@ -30,8 +30,8 @@ from emulator.scenes.scene import Scene
 class LoadStates:
     """The source of every entry of theta in every state. :func:`load_states` makes it.
 
-    states : names of the states; one empty name where there is but one.
-    entries : for each state and parameter, (S, p), the name of an unknown, or a known value.
+    states : the names of the states; one empty name where there is but one.
+    entries : the name of an unknown, or the known value, of each state and parameter, (S, p).
     """
 
     states: tuple[str, ...]

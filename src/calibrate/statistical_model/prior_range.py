@@ -27,8 +27,8 @@ from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap
 
 NEGLIGIBLE = 1e-3
-_ROUND_OFF = 1e-9  # mass that round-off in a cumulative distribution function may leave
-_DRAWS = 512  # from which the centre and the width of a prior are taken
+_ROUND_OFF = 1e-9  # mass that is round-off of a cumulative distribution function
+_DRAWS = 512  # draws from which the centre and the width of a prior are estimated
 
 
 def fit_to(forward: ForwardMap, prior: Prior) -> tuple[Prior, dict[str, float]]:
@@ -103,7 +103,7 @@ def _tails(parameter: Parameter, prior: dist.Distribution) -> Iterator[tuple[flo
 
 
 def _answers(forward: ForwardMap, k: int, value: float) -> bool:
-    """Return whether the map is valid with parameter ``k`` at ``value``, the others at centre."""
+    """Return whether the map is valid at the centre with parameter ``k`` at ``value``."""
     theta = forward.scene.centre.at[k].set(value)
     return bool(forward.evaluate(theta).valid)
 
