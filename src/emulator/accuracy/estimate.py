@@ -250,7 +250,7 @@ class ErrorBar:
         return cond(
             step.accepted,
             lambda: step,
-            lambda: self._guarded(state, theta)._replace(indefinite=step.indefinite),
+            lambda: self._error_by_fem(state, theta)._replace(indefinite=step.indefinite),
         )
 
     def _check_shape(self, name: str, array: jax.Array, expected: tuple[int, ...]) -> None:
@@ -273,7 +273,7 @@ class ErrorBar:
         return compiled(partial(newton_distance, self.simulator.system))
 
     @cached_property
-    def _guarded(self):  # noqa: ANN202
+    def _error_by_fem(self):  # noqa: ANN202
         return compiled(partial(guarded_distance, self.simulator))
 
     @cached_property

@@ -113,11 +113,11 @@ class MeshError:
         theta = jnp.asarray(theta, dtype=float)
         what = "the error of the mesh"
         coarse = self.simulator.solve(theta, start).require_converged(what).displacement
-        begin = self._prolonged(coarse)
+        begin = self._prolong(coarse)
         if neighbour is not None:
-            begin = begin + neighbour.fine - self._prolonged(neighbour.coarse)
+            begin = begin + neighbour.fine - self._prolong(neighbour.coarse)
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
-        stepped = None if self.fine.scene.loaded_by else self._stepped(theta, begin)
+        stepped = None if self.fine.scene.loaded_by else self._fine_by_steps(theta, begin)
         if stepped is not None:
             return MeshErrorEstimate(theta, coarse, stepped, solved=False)
         with self._alone:
@@ -131,14 +131,14 @@ class MeshError:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
         FACTORS.clear()
 
-    def _prolonged(self, u: jax.Array) -> jax.Array:
+    def _prolong(self, u: jax.Array) -> jax.Array:
         return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))
 
     @cached_property
     def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:
         return compiled(partial(newton_distance, self.fine.system))
 
-    def _stepped(self, theta: jax.Array, u: jax.Array) -> jax.Array | None:
+    def _fine_by_steps(self, theta: jax.Array, u: jax.Array) -> jax.Array | None:
         """Take a few steps from ``u`` (f, 3) on the finer mesh; None if they do not contract."""
         for _ in range(_STEPS):
             step = self._step(u, theta)

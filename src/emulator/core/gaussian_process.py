@@ -191,7 +191,7 @@ def fit_weights(features: Features, observations: jax.Array) -> jax.Array:
 
 
 def fold(features: Features, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Split weights into those of the values (c, r) and of the derivatives by feature (c, q, r).
+    """Split weights into weights of values (c, r) and of derivatives by feature (c, q, r).
 
     A derivative in position acts through the features' derivatives, so its p weights are q here.
     """

@@ -46,8 +46,8 @@ def inherited[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Return ``function`` for other threads, run on the calling thread's default device."""
     device = jax.config.jax_default_device
 
-    def there(*arguments: P.args, **named: P.kwargs) -> R:
+    def on_device(*arguments: P.args, **named: P.kwargs) -> R:
         with jax.default_device(device):
             return function(*arguments, **named)
 
-    return there
+    return on_device

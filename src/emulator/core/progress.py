@@ -20,14 +20,14 @@ class Lines(tqdm):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, mininterval=EVERY, miniters=1, delay=EVERY, **options)
-        self._told = 0.0
+        self._last_line = 0.0
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:  # noqa: ARG002
         """Print the progress, if the last line is older than ``EVERY`` seconds."""
         seconds = self._time() - self.start_t
-        if seconds - self._told < EVERY:
+        if seconds - self._last_line < EVERY:
             return
-        self._told = seconds
+        self._last_line = seconds
         of = f" of {self.total:g}" if self.total else ""
         postfix = f", {self.postfix}" if self.postfix else ""
         unit = "" if self.unit == "it" else f" {self.unit}s"
@@ -38,8 +38,8 @@ class Lines(tqdm):
         """Print the last line, if earlier ones were printed."""
         if self.disable:
             return
-        if self._told:
-            self._told = -EVERY
+        if self._last_line:
+            self._last_line = -EVERY
             self.display()
         self.disable = True
         self._decr_instances(self)

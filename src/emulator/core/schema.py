@@ -156,7 +156,7 @@ class OneOf:
 
 @dataclass(frozen=True)
 class Source:
-    """Data of a file, and what is needed to point at it.
+    """Data of a file, with the line numbers by which messages point at it.
 
     Parameters
     ----------
@@ -357,7 +357,7 @@ def _mistake(expected: str = "", *, problem: str = "", key: str = "") -> Pydanti
 
 def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
     """Return the line about one of pydantic's errors."""
-    path, value_found = _found(source.data, error["loc"])
+    path, value_found = _locate(source.data, error["loc"])
     context: dict[str, Any] = error.get("ctx", {})
     if error["type"] == "value_error":  # the dataclass refused its values
         return source.error(str(context["error"]), path, path)
@@ -374,14 +374,14 @@ def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
         expected += closest(value_found, choices)
     if source.toml and expected == "a list":
         expected = f"tables [[{path[-1]}]]"
-    value = _shortened(json.dumps(value_found, default=str, ensure_ascii=False))
+    value = _shorten(json.dumps(value_found, default=str, ensure_ascii=False))
     if expected == "a table" and path:
         return source.error(f"{source.written(path)} is {value}; expected a table", path)
     table, key = path[:-1], path[-1] if path else "content"
     return source.error(f"{key} = {value}; expected {expected}", path, table)
 
 
-def _found(data: Any, loc: Path) -> tuple[Path, Any]:
+def _locate(data: Any, loc: Path) -> tuple[Path, Any]:
     """Return the path and the value of an error; ``loc`` also names the members of a union."""
     path: Path = ()
     for step in loc:
@@ -395,5 +395,5 @@ def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."

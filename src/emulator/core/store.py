@@ -1,4 +1,4 @@
-"""Weights and checkpoints on disk: safetensors for arrays, JSON beside them; never pickle.
+"""Weights and checkpoints on disk: safetensors for arrays, JSON next to them; never pickle.
 
 A file is written whole or not at all: to a temporary name first, then renamed.
 """
@@ -26,7 +26,7 @@ from emulator.core.errors import InputError
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary file beside ``path``, which it replaces if nothing raises.
+    """Yield a temporary file next to ``path``, which it replaces if nothing raises.
 
     Folders are made as needed. The temporary name keeps the suffix, from which some writers take
     the format.

@@ -59,7 +59,7 @@ def compiled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _name(function: Any) -> str:
-    """Return the name under which XLA logs the program: that of the innermost function."""
+    """Return the innermost function's name, under which XLA logs the program."""
     function = getattr(function, "fun", function)  # the function inside a custom derivative rule
     function = getattr(function, "func", function)  # the function inside functools.partial
     return str(getattr(function, "__name__", "program"))

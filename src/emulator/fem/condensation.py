@@ -226,7 +226,7 @@ def _slopes(
 def _residuals(
     scene: Scene, H: jax.Array, volumes: Volumes, P: jax.Array, slope: jax.Array
 ) -> _Residuals:
-    """Return the derivatives of ``L``, from those of the density in ``H`` and in the volumes."""
+    """Return the derivatives of ``L`` from the density's, in ``H`` and in the volumes."""
     V, p = _volume(scene), volumes.pressure
     change, cofactor = _over_points(jax.value_and_grad(volume_change), H)
     return _Residuals(

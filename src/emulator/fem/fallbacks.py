@@ -87,7 +87,7 @@ _MOST_AT_LEVEL = 12  # steps at one load factor; schedules that need more do not
 # (docs/experiments.md, "Ramps: sooner lost, sooner up").
 _EASY = 0.3
 _TOO_STEEP = 2
-# Relative residual up to which a start is used; that of rest is about 1 (docs/experiments.md,
+# Relative residual up to which a start is used; at rest it is about 1 (docs/experiments.md,
 # "Rough starts").
 _FARTHEST = 0.9
 _SHORT = 15  # largest number of Newton iterations, except in the last strategy
@@ -110,7 +110,7 @@ def _iterates_stresses(system: System, options: NewtonOptions) -> bool:
 class SearchState(NamedTuple):
     """The state of the search for equilibrium.
 
-    newton : the state of Newton's method, whose status is that of the search.
+    newton : the state of Newton's method, whose status is also the status of the search.
     stress : the state of the stress iterates, or None where the scene has none.
     strategy : the index of the strategy.
     begins : whether the next step begins the strategy, or its Newton's method, at ``newton.u``.
@@ -335,7 +335,7 @@ def _begun(
     *,
     table: tuple[Strategy, ...],
 ) -> SearchState:
-    """Return the state on ``strategy``, Newton's method and stress iterates begun."""
+    """Return the state at the beginning of ``strategy``."""
     newton_load = _column(table, "newton_load")[strategy]
     largest_indefinite = _column(table, "largest_indefinite")[strategy]
     history = newton.history._replace(increment=newton_load, largest_indefinite=largest_indefinite)

@@ -94,7 +94,7 @@ PointState = Callable[..., tuple[jax.Array, jax.Array | None]]
 
 
 def carried_back(h: jax.Array, directions: jax.Array | None) -> jax.Array | None:
-    """Return the directions (3,) or (2, 3) at rest, from those of the loaded tissue."""
+    """Return the directions (3,) or (2, 3) at rest from the loaded tissue's directions."""
     if directions is None:
         return None
     f = h + jnp.eye(3, dtype=h.dtype)

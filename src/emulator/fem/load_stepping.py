@@ -132,7 +132,7 @@ class LoadStepping:
     def _auxiliary(
         self, state: NewtonState, step: Step, direction: Direction, after: NewtonState
     ) -> Any:
-        """Return the other unknowns after the step; at a new load level, those of its start."""
+        """Return the other unknowns after the step, or at the start of a new load level."""
         formulation = formulation_of(self.system)
         full = jnp.where(step.fraction > 0.0, direction.step, 0.0)
         return cond(

@@ -114,7 +114,7 @@ class LoadedEquilibrium:
         return self._total_derivatives(theta, w, v - w, w_slopes)
 
     def equations(self, v: jax.Array, theta: jax.Array) -> tuple[Equations, ...]:
-        """Return the equations of w and those of u, at ``v`` (n, 3) mm from the mesh."""
+        """Return the equations of w and of u, at ``v`` (n, 3) mm from the mesh."""
         image = partial(image_theta, self.scene)
         w = self.unloaded(theta).displacement
         (unloading,) = self.unloader.equations(w, image(theta))

@@ -172,9 +172,9 @@ class SupportForce:
         """Potentials and forces of loads where prescribed, potentials of springs where free."""
         prescribed, sprung = self._virtual
         scene = self._balanced
-        terms = _touching(local_terms(scene), self._moves(prescribed))
-        forces = _touching(local_forces(scene), self._moves(prescribed))
-        return terms, forces, _touching(spring_terms(scene), self._moves(sprung))
+        terms = _contributions_at(local_terms(scene), self._moves(prescribed))
+        forces = _contributions_at(local_forces(scene), self._moves(prescribed))
+        return terms, forces, _contributions_at(spring_terms(scene), self._moves(sprung))
 
     @staticmethod
     def _moves(virtual: np.ndarray) -> np.ndarray:
@@ -246,7 +246,9 @@ class SupportForce:
         return [replace(part, nodes=self._renumbered[part.nodes]) for part in parts]
 
 
-def _touching[T: (LocalTerm, LocalForce)](parts: Sequence[T], at_support: np.ndarray) -> list[T]:
+def _contributions_at[T: (LocalTerm, LocalForce)](
+    parts: Sequence[T], at_support: np.ndarray
+) -> list[T]:
     """Return the contributions of ``parts`` that have a node that ``moves`` (n,)."""
     contributions: list[T] = []
     for part in parts:

@@ -124,7 +124,7 @@ class Simulator(TableRepr):
             ``theta`` or ``start`` has the wrong shape, or float64 is off.
         """
         require_float64("FEM")
-        theta, u = self._checked(theta, self.rest if start is None else start)
+        theta, u = self._check_state(theta, self.rest if start is None else start)
         if self.scene.loaded_by:
             return self._loaded.solve(theta, None if start is None else u)
         return jax.block_until_ready(self._equilibrium(theta, jax.lax.stop_gradient(u)))
@@ -172,7 +172,7 @@ class Simulator(TableRepr):
         SolverError
             The tangent is singular.
         """
-        theta, u = self._checked(theta, u, "displacement")
+        theta, u = self._check_state(theta, u, "displacement")
         if self.scene.loaded_by:
             rows = self._loaded.sensitivities(u, theta)
         else:
@@ -217,7 +217,7 @@ class Simulator(TableRepr):
         InputError
             A load has no potential, so that there is no energy to be least.
         """
-        theta, u = self._checked(theta, u, "displacement")
+        theta, u = self._check_state(theta, u, "displacement")
         if not all(load.has_potential for load in self.scene.loads):
             raise InputError(
                 f"scene '{self.scene.name}': a follower pressure has no potential, so stability is "
@@ -236,7 +236,7 @@ class Simulator(TableRepr):
         Springs count as supports; where the body is free the force is zero. Their sum is minus the
         resultant of the loads (:mod:`emulator.fem.reactions`).
         """
-        theta, u = self._checked(theta, u, "displacement")
+        theta, u = self._check_state(theta, u, "displacement")
         return reactions(self._balanced, u, theta)
 
     def reaction(self, name: str, u: jax.Array, theta: jax.Array) -> jax.Array:
@@ -265,7 +265,7 @@ class Simulator(TableRepr):
         """Return the nonzeros (nnz,) of the tangent at ``u`` (n, 3) mm and ``theta`` (p,)."""
         return self.system.safe_tangent(u, theta, 1.0)[0]
 
-    def _checked(
+    def _check_state(
         self, theta: jax.Array, start: jax.Array, what: str = "start"
     ) -> tuple[jax.Array, jax.Array]:
         """Return both in float64; a short theta would be read past its end without an error."""

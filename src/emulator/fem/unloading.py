@@ -407,7 +407,7 @@ def system_at_rest(system: System, w: jax.Array, theta: jax.Array) -> System:
 def _traced_scene_at_rest(scene: Scene, w: jax.Array, theta: jax.Array) -> Scene:
     """Return :func:`scene_at_rest` for ``w`` (n, 3) and ``theta`` (p,) that may be traced.
 
-    Its fibres are those of ``theta``, and turn no more. It lives as long as the function that makes
+    Its fibres are already turned by ``theta``. It lives as long as the function that makes
     it, and nothing is checked.
     """
     grid, tissue = scene.discretisation, tissue_at_rest(scene, w, theta)

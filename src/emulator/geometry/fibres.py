@@ -101,8 +101,8 @@ def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
     step = centre[other] - centre[one]
     weight = 1.0 / np.sum(step**2, axis=1)
     change = side[:, None] * directions[other] - directions[one]
-    gram = _summed(one, weight[:, None, None] * step[:, :, None] * step[:, None, :], count)
-    moment = _summed(one, weight[:, None, None] * step[:, :, None] * change[:, None, :], count)
+    gram = _sum_rows(one, weight[:, None, None] * step[:, :, None] * step[:, None, :], count)
+    moment = _sum_rows(one, weight[:, None, None] * step[:, :, None] * change[:, None, :], count)
     damping = _DAMPING * np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-300)
     gram = gram + damping[:, None, None] * np.eye(3)
     slope = np.linalg.solve(gram, moment)  # by NumPy, because JAX's batched LAPACK is avoided
@@ -113,7 +113,7 @@ def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
     return np.where(alike[:, :, None], at_points, directions[:, None])
 
 
-def _summed(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+def _sum_rows(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Return the sums (count, 3, 3) of ``values`` (k, 3, 3) by row."""
     flat = values.reshape(len(values), 9)
     return np.stack([np.bincount(rows, each, count) for each in flat.T], axis=1).reshape(-1, 3, 3)

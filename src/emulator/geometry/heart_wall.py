@@ -45,7 +45,7 @@ class Ventricle:
 
     size : L in mm. axis : (3,) k. cavity, wall : volumes over L^3, which sum to one.
     offset : (n, 3) from the origin, over L. depth : (n,) 0 on the endocardium, 1 outside.
-    normal : (n, 3). inner, held : (n,) bool, on the endocardium, without freedom.
+    normal : (n, 3). inner, held : whether nodes are on the endocardium or fixed, (n,) bool.
     lean : (3,) g, shorter than one; zero in a body of revolution. volume : (n,) nodal, over L^3.
     """
 

@@ -254,18 +254,18 @@ def _directions(
         values = np.concatenate([data for block, data in blocks if block.type == kind])
         points = len(quadrature_points(order))
         if points > 1 and values.ndim == 2 and values.shape[1] == 3 * points:
-            at_points = _checked(values.reshape(-1, 3), name, "quadrature point")
+            at_points = _check_lengths(values.reshape(-1, 3), name, "quadrature point")
             return at_points.reshape(-1, points, 3)
-        of_elements = _checked(values, name, "element")
+        of_elements = _check_lengths(values, name, "element")
         return of_elements if order == 1 else from_elements(mesh, of_elements)
     if name in content.point_data:
-        at_nodes = _checked(np.asarray(content.point_data[name])[used], name, "node")
+        at_nodes = _check_lengths(np.asarray(content.point_data[name])[used], name, "node")
         at_points = from_nodes(mesh, at_nodes, order)
         return at_points[:, 0] if order == 1 else at_points
     return None
 
 
-def _checked(values: np.ndarray, name: str, where: str) -> np.ndarray:
+def _check_lengths(values: np.ndarray, name: str, where: str) -> np.ndarray:
     """Return vectors (k, 3) scaled to length one; refuse lengths off by more than round-off."""
     values = np.asarray(values, dtype=float)
     if values.ndim != 2 or values.shape[1] != 3:
@@ -329,7 +329,7 @@ def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh
         ends = np.cumsum([len(facets) for facets in sets])[:-1]
         for name, members in zip(mesh.facet_sets, np.split(place, ends), strict=True):
             marks[MARK + name] = np.isin(np.arange(len(rows)), members).astype(np.int32)
-    data = {name: _padded(values, blocks) for name, values in directions.items()}
+    data = {name: _pad_cells(values, blocks) for name, values in directions.items()}
     none = np.zeros(len(mesh.elements), np.int32)
     data |= {name: [none, values] for name, values in marks.items()}
     points = {
@@ -339,6 +339,6 @@ def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh
     return meshio.Mesh(mesh.nodes, blocks, cell_data=data, point_data=points)
 
 
-def _padded(values: np.ndarray, blocks: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
+def _pad_cells(values: np.ndarray, blocks: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
     """Return the cell data of every block: ``values`` (m, k) on the tetrahedra, zeros elsewhere."""
     return [values, *(np.zeros((len(rows), values.shape[1])) for _, rows in blocks[1:])]

@@ -80,13 +80,13 @@ def _rows(label: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def patches(mesh: Mesh, size: int = _SIZE) -> np.ndarray:
     """Return the patch of each linear tetrahedron, (m,) from 0 up.
 
-    A patch grows from the first tetrahedron that is in none, over faces, to ``size``; what is left
-    over and small joins the smallest patch beside it, so that none is alone to lock.
+    A patch grows from the first tetrahedron that is in none, over faces, to ``size``; small
+    remainders join their smallest neighbour, because isolated elements would lock.
     """
     corners = np.sort(mesh.corners, axis=1)
     order = np.lexsort(corners.T)
     neighbours = _neighbours(corners[order])
-    groups = _joined(_grown(corners[order].tolist(), neighbours, size), neighbours)
+    groups = _join_small(_grow(corners[order].tolist(), neighbours, size), neighbours)
     label = np.empty(len(order), dtype=int)
     for k, group in enumerate(groups):
         label[order[group]] = k
@@ -106,7 +106,7 @@ def _neighbours(corners: np.ndarray) -> list[list[int]]:
     return neighbours
 
 
-def _grown(
+def _grow(
     corners: Sequence[list[int]], neighbours: Sequence[list[int]], size: int
 ) -> list[list[int]]:
     """Return the elements of each patch, grown over faces to at most ``size``."""
@@ -131,7 +131,7 @@ def _grown(
     return groups
 
 
-def _joined(groups: list[list[int]], neighbours: Sequence[list[int]]) -> list[list[int]]:
+def _join_small(groups: list[list[int]], neighbours: Sequence[list[int]]) -> list[list[int]]:
     """Join each patch below ``_LEAST`` elements to its smallest neighbour; return the patches."""
     owner = {k: patch for patch, group in enumerate(groups) for k in group}
     for patch, group in enumerate(groups):

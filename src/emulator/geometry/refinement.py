@@ -113,7 +113,7 @@ _FOUR = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # of a facet: corners, the
 _NODES = np.concatenate([np.eye(4), [0.5 * (np.eye(4)[a] + np.eye(4)[b]) for a, b in EDGES]])
 
 
-def _upright(corners: tuple[int, ...]) -> tuple[int, ...]:
+def _orient_child(corners: tuple[int, ...]) -> tuple[int, ...]:
     """Return the local nodes of a child, the last two swapped if its volume would be negative."""
     sides = np.diff(_NODES[list(corners), 1:], axis=0)
     a, b, c, d = corners
@@ -122,7 +122,7 @@ def _upright(corners: tuple[int, ...]) -> tuple[int, ...]:
 
 def _children(diagonal: tuple[int, int], ring: tuple[int, ...]) -> list[tuple[int, ...]]:
     around = [(*diagonal, ring[k], ring[(k + 1) % 4]) for k in range(4)]
-    return [_upright(corners) for corners in (*_CORNERS, *around)]
+    return [_orient_child(corners) for corners in (*_CORNERS, *around)]
 
 
 # Local nodes (3, 8, 4) of the eight children, for each diagonal.

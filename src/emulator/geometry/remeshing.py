@@ -153,7 +153,7 @@ def _gmsh() -> Any:
 _HALVINGS = 30  # of an interval, until the middle of an edge is known to round-off
 
 
-class Flattened:
+class DiscMap:
     """The map from the unit disc to a surface with one rim.
 
     Parameters

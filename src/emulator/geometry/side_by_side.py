@@ -54,7 +54,7 @@ class Bodies:
         Raises
         ------
         InputError
-            A body without values, or with those of another number of elements or another shape.
+            A body without values, or with values of another shape or number of elements.
         """
         parts: list[np.ndarray] = []
         for k, name in enumerate(self.names):
@@ -98,7 +98,7 @@ def side_by_side(meshes: Mapping[str, Mesh], *, gap: float | None = None) -> Bod
             )
     for name in meshes:
         check_name(name)
-    placed = list(meshes.values()) if gap is None else _apart(list(meshes.values()), gap)
+    placed = list(meshes.values()) if gap is None else _separate(list(meshes.values()), gap)
     names = tuple(meshes)
     sizes = [len(mesh.nodes) for mesh in placed]
     starts = np.concatenate([[0], np.cumsum(sizes)])
@@ -130,7 +130,7 @@ def check_name(name: str) -> None:
         )
 
 
-def _apart(meshes: list[Mesh], gap: float) -> list[Mesh]:
+def _separate(meshes: list[Mesh], gap: float) -> list[Mesh]:
     """Return the meshes, each moved ``gap`` beyond the one before along x."""
     placed = meshes[:1]
     for mesh in meshes[1:]:

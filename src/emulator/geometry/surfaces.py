@@ -1,4 +1,4 @@
-r"""Surfaces of triangles from files: read, checked, cut by a plane, smoothed, asked what is inside.
+r"""Surfaces of triangles: reading, checks, cuts by a plane, smoothing, tests of enclosure.
 
 A surface is closed, or open with one rim. What a segmentation gives is rough: Taubin's filter moves
 each point to the mean of its neighbours by a fraction :math:`\lambda` and back by :math:`\mu`,
@@ -27,7 +27,7 @@ from emulator.geometry.io import read_cells
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 """Millimetres in a unit of length."""
-_MERGE = 1e-6  # of the surface's extent: points nearer than this are one
+_MERGE = 1e-6  # distance over the extent below which points are merged
 _SNAP = 1e-4  # of the extent: points this near a plane lie in it, so that no slivers are cut off
 # Taubin's filter: halves what repeats every five edges and keeps what repeats every twenty.
 _LAMBDA, _MU = 0.5, -0.53
@@ -103,10 +103,10 @@ def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
         raise InputError(f"{name}: a coordinate is not finite")
     if not len(triangles):
         raise InputError(f"{name}: it has no triangles")
-    points, triangles = _merged(points, np.asarray(triangles, dtype=np.int64))
+    points, triangles = _merge_points(points, np.asarray(triangles, dtype=np.int64))
     if len(triangles) < 4:
         raise InputError(f"{name}: {len(triangles)} triangles with an area; expected a surface")
-    triangles = _one_sided(name, points, triangles)
+    triangles = _orient_consistently(name, points, triangles)
     checked = Surface(name, points, triangles)
     volume = checked.volume
     if abs(volume) < 1e-6 * checked.extent**3:
@@ -114,7 +114,7 @@ def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
     return checked if volume > 0.0 else Surface(name, points, triangles[:, ::-1].copy())
 
 
-def _merged(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge_points(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return one point for each position, and the triangles whose corners differ."""
     tolerance = _MERGE * np.linalg.norm(np.ptp(points, axis=0))
     pairs = cKDTree(points, balanced_tree=False).query_pairs(tolerance, output_type="ndarray")
@@ -128,7 +128,7 @@ def _merged(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.n
     return points[first[used]], renumbered.reshape(-1, 3)
 
 
-def _one_sided(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _orient_consistently(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return the triangles turned so that neighbours list a common edge in opposite senses."""
     edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     owner = np.repeat(np.arange(len(triangles)), 3)

@@ -5,7 +5,7 @@ Both are cut by the base plane, laid out in the disc and meshed anew with even t
 enclose. The long axis is the base plane's normal, from apex to base. Where it is not given it is
 the area vector of the rims, :math:`\frac12 \sum_\text{edges} x_a \times x_b`, and the plane lies
 as low as the lowest point of a rim, so that rims which are not flat, or not at one height, are cut
-off; by how much is told.
+off; the result says by how much.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from emulator.geometry.facets import MM3_PER_ML, Cavity
 from emulator.geometry.mesh import Mesh, orient
 from emulator.geometry.quality import MeshQuality, mesh_quality
 from emulator.geometry.refinement import to_quadratic
-from emulator.geometry.remeshing import Flattened, tetrahedralise, triangulate
+from emulator.geometry.remeshing import DiscMap, tetrahedralise, triangulate
 from emulator.geometry.surfaces import (
     UNITS,
     Surface,
@@ -158,7 +158,7 @@ def mesh_wall(
             f"size {size} mm: expected edges above 0 and below a quarter of the epicardium's "
             f"extent, {intact[1].extent:.4g} mm"
         )
-    mesh = _mesh([Flattened(each) for each in within], size, order, normal, point)
+    mesh = _mesh([DiscMap(each) for each in within], size, order, normal, point)
     cavity, outer = (each.volume / MM3_PER_ML for each in below)
     try:
         own = float(discretise(mesh).weights.sum()) / MM3_PER_ML
@@ -271,7 +271,7 @@ def _thickness(endocardium: Surface, epicardium: Surface) -> Thickness:
 
 
 def _mesh(
-    maps: Sequence[Flattened], size: float, order: int, normal: np.ndarray, point: np.ndarray
+    maps: Sequence[DiscMap], size: float, order: int, normal: np.ndarray, point: np.ndarray
 ) -> Mesh:
     """Return the wall between two surfaces, the inner one first, with flat rims in one plane."""
     (inner, in_disc), (outer, out_disc) = (each.remeshed(size) for each in maps)

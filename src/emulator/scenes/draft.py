@@ -140,7 +140,7 @@ def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tu
     return replace(body, mesh=mesh), target.name
 
 
-def _named(sets: Mapping[str, np.ndarray], words: tuple[str, ...]) -> str | None:
+def _find_set(sets: Mapping[str, np.ndarray], words: tuple[str, ...]) -> str | None:
     """Return the first set whose name contains one of ``words``, the likeliest word first."""
     return next((name for word in words for name in sets if word in name.lower()), None)
 
@@ -157,13 +157,13 @@ def _law(body: Body, name: str | None, notes: list[str]) -> Law:
 
 def _helix(mesh: Mesh) -> tuple[str, str] | None:
     """Return the facet sets between which fibres can be computed, or None."""
-    inner, outer = (_named(mesh.facet_sets, words) for words in (_INSIDE, _OUTSIDE))
+    inner, outer = (_find_set(mesh.facet_sets, words) for words in (_INSIDE, _OUTSIDE))
     return (inner, outer) if inner and outer else None
 
 
 def _axis(mesh: Mesh) -> str:
     """Return the line of the long axis: the normal of the base, where there is a base."""
-    base = _named(mesh.facet_sets, _BASE)
+    base = _find_set(mesh.facet_sets, _BASE)
     if base is None:
         return "axis = [0.0, 0.0, 1.0]   # CHANGE: from apex to base"
     # Rounded, so that a base that is level to round-off gives a level axis, without -0.
@@ -174,7 +174,7 @@ def _axis(mesh: Mesh) -> str:
 def _loads(mesh: Mesh) -> list[tuple[Load, str, str]]:
     """Return the loads to try, each with its lines and a note."""
     loads: list[tuple[Load, str, str]] = []
-    wall = _named(mesh.facet_sets, _INSIDE)
+    wall = _find_set(mesh.facet_sets, _INSIDE)
     if wall is not None:
         for kind in (CavityPressure, FollowerPressure):
             lines = f'[[loads]]\nkind = "{kind.kind}"\nfacet_set = "{wall}"\n'
@@ -198,7 +198,7 @@ def _unused(mesh: Mesh, text: str) -> list[str]:
 
 def _support(mesh: Mesh, notes: list[str]) -> str:
     """Return the lines of the support."""
-    name = _named(mesh.node_sets, _SUPPORTS)
+    name = _find_set(mesh.node_sets, _SUPPORTS)
     if name is not None:
         notes.append(f"held at '{name}'")
         return f'[[supports]]\nnode_set = "{name}"   # all components; see components = "z"\n'

@@ -40,7 +40,7 @@ def effects_of(scene: Scene) -> dict[str, Effect]:
     """Return the effects that ``scene`` can do without, by name."""
     effects: dict[str, Effect] = {}
     for name, changes, remedy in _changes(scene):
-        without = _changed(scene, **changes)
+        without = _change(scene, **changes)
         if without is not None:
             effects.setdefault(name, Effect(name, without, remedy))
     return effects
@@ -56,20 +56,20 @@ def leave_out(scene: Scene, names: Iterable[str]) -> Scene:
     """
     names = tuple(names)
     for name in names:
-        if _without(scene, name) is None:
+        if _remove(scene, name) is None:
             raise InputError(
                 f"scene '{scene.name}' has no effect '{name}' that it can do without; it has "
                 f"{', '.join(effects_of(scene)) or 'none'}"
             )
     for name in names:
-        scene = _without(scene, name) or scene
+        scene = _remove(scene, name) or scene
     return scene
 
 
-def _without(scene: Scene, effect: str) -> Scene | None:
+def _remove(scene: Scene, effect: str) -> Scene | None:
     """Return ``scene`` without the effect; None where it has none of that name, or needs it."""
     changes = next((changes for name, changes, _ in _changes(scene) if name == effect), None)
-    return None if changes is None else _changed(scene, **changes)
+    return None if changes is None else _change(scene, **changes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class Onto:
     simpler: Scene
 
     def theta(self, theta: jax.Array) -> jax.Array:
-        """Return theta (..., q) of the simpler scene from that of the whole scene, (..., p)."""
+        """Return theta (..., q) of the simpler scene from theta (..., p) of the whole scene."""
         names = self.whole.parameter_names
         entries = [names.index(name) for name in self.simpler.parameter_names]
         return jnp.asarray(theta)[..., jnp.asarray(entries)]
@@ -128,7 +128,7 @@ def _changes(scene: Scene) -> Iterator[_Change]:
         yield "quadratic elements", linear, "order = 1, and no dilatation"
 
 
-def _changed(scene: Scene, **changes: Any) -> Scene | None:
+def _change(scene: Scene, **changes: Any) -> Scene | None:
     """Return ``scene`` with other fields; None where it would be at rest or invalid.
 
     Directions, rotations, parameters and constants that nothing reads any more are left out.

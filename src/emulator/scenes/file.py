@@ -126,11 +126,11 @@ def _several_bodies(
                 regions[entry.name] = read_regions(path, file.regions)
     with source.at("bodies"):
         bodies = side_by_side({name: body.mesh for name, body in members.items()})
-        fibres, sheets = (_stacked(bodies, members, kind) for kind in ("fibres", "sheets"))
+        fibres, sheets = (_stack_directions(bodies, members, kind) for kind in ("fibres", "sheets"))
     return Body(bodies.mesh, fibres, sheets), bodies.stacked(regions) if regions else None
 
 
-def _stacked(bodies: Bodies, members: Mapping[str, Body], kind: str) -> np.ndarray | None:
+def _stack_directions(bodies: Bodies, members: Mapping[str, Body], kind: str) -> np.ndarray | None:
     """Return the directions of all bodies; none where one of them has none."""
     values = {name: getattr(body, kind) for name, body in members.items()}
     return None if any(v is None for v in values.values()) else bodies.stacked(values)

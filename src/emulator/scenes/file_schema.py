@@ -94,7 +94,7 @@ def scene_schema() -> dict[str, Any]:
     keys = schema["properties"]
     keys["law"] |= {
         "enum": list(LAWS),
-        "x-taplo": {"docs": {"enumValues": [_takes(law) for law in LAWS.values()]}},
+        "x-taplo": {"docs": {"enumValues": [_law_inputs(law) for law in LAWS.values()]}},
     }
     varied = keys["parameters"]["additionalProperties"]
     texts = _texts()
@@ -109,7 +109,7 @@ def scene_schema() -> dict[str, Any]:
     return {"title": "Scene file", **schema, "allOf": [one_mesh, *units]}
 
 
-def _takes(law: Law) -> str:
+def _law_inputs(law: Law) -> str:
     """Return the parameters of a law with their units, and the directions it needs."""
     needed_directions = [name for name in ("fibres", "sheets") if getattr(law, name)]
     directions = f"; needs {' and '.join(needed_directions)}" if needed_directions else ""

@@ -23,7 +23,7 @@ class Finer:
 
     coarse : the scene on its own mesh.
     scene : the same scene on the finer mesh.
-    refinement : takes fields from the mesh of ``coarse`` to the finer one.
+    refinement : the map of fields from the mesh of ``coarse`` to the finer one.
     """
 
     coarse: Scene
@@ -36,7 +36,7 @@ def finer(scene: Scene) -> Finer:
 
     Fibres and sheets are evaluated by the rule that made them, where it is known, else continued
     linearly: most of the error of a coarse mesh may lie in its fibres (docs/experiments.md, "Fibres
-    of the finer mesh"). The body stays that of the coarse mesh: the gap between its elements and a
+    of the finer mesh"). The body stays the coarse mesh's: the gap between its elements and a
     curved surface remains.
 
     Raises
@@ -71,7 +71,7 @@ def finer(scene: Scene) -> Finer:
 def _directions(scene: Scene, refinement: Refinement) -> tuple[np.ndarray | None, ...]:
     """Return fibres and sheets on the finer mesh, None where the scene has none."""
     rule = scene.fibre_rule
-    if rule is not None and _made_by(rule, scene):
+    if rule is not None and _is_made_by(rule, scene):
         by_rule, sheets_by_rule = rule.directions(refinement.mesh)
         return by_rule, None if scene.sheets is None else sheets_by_rule
     fibres = None if scene.fibres is None else refinement.directions(scene.fibres)
@@ -84,7 +84,9 @@ def _directions(scene: Scene, refinement: Refinement) -> tuple[np.ndarray | None
 def _angles(scene: Scene, refinement: Refinement) -> tuple[FibreAngles, ...]:
     """Return the fibre angles on the finer mesh, by the rule that made them."""
     rule = scene.fibre_rule
-    angles = rule.angles_in(refinement.mesh) if rule is not None and _made_by(rule, scene) else ()
+    angles = (
+        rule.angles_in(refinement.mesh) if rule is not None and _is_made_by(rule, scene) else ()
+    )
     if len(angles) != len(scene.angles):
         raise InputError(
             f"scene '{scene.name}': fibre angles without the rule that made them have no finer mesh"
@@ -92,7 +94,7 @@ def _angles(scene: Scene, refinement: Refinement) -> tuple[FibreAngles, ...]:
     return angles
 
 
-def _made_by(rule: FibreRule, scene: Scene) -> bool:
+def _is_made_by(rule: FibreRule, scene: Scene) -> bool:
     """Return whether ``rule`` gives the fibres of ``scene``, which may have been replaced since."""
     if scene.fibres is None:
         return False

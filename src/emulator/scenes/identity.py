@@ -35,11 +35,11 @@ _HASH_LENGTH = 16  # hexadecimal digits
 class Identity:
     """Everything the solutions of a scene depend on, apart from theta.
 
-    lengths : arrays in mm by name: nodes, prescribed displacements.
-    directions : unit vectors by name: fibres, sheets and their rotations, if the scene has them.
-    indices : arrays of whole numbers by name: tetrahedra, prescribed components, regions, facet
+    lengths : the arrays in mm by name: nodes, prescribed displacements.
+    directions : the unit vectors by name: fibres, sheets and their rotations, if there are any.
+    indices : the arrays of whole numbers by name: tetrahedra, prescribed components, regions, facet
         sets under a load or a support.
-    description : law, constants, loads, springs and the names of the parameters, plain JSON.
+    description : the law, constants, loads, springs and the names of the parameters, plain JSON.
     """
 
     lengths: Mapping[str, np.ndarray]

@@ -74,7 +74,7 @@ class Parameter:
         return asdict(self)
 
 
-_SLACK = 1e-9  # fraction of a range by which round-off may leave it
+_SLACK = 1e-9  # round-off allowed, as a fraction of a range
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class ParameterSpace:
 
     Parameters
     ----------
-    parameters : entries of theta, in order.
+    parameters : the entries of theta, in order.
     """
 
     parameters: tuple[Parameter, ...]
@@ -120,8 +120,8 @@ class ParameterSpace:
 
         Parameters
         ----------
-        theta : parameters (c, p).
-        du_dtheta : sensitivities (c, p, n, 3) in mm per unit of each parameter.
+        theta : the parameters, (c, p).
+        du_dtheta : the sensitivities (c, p, n, 3) in mm per unit of each parameter.
 
         Returns
         -------

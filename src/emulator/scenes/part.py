@@ -27,7 +27,7 @@ class LocalTerm:
     """A sum of local energies.
 
     nodes : the nodes (k, a) that each local energy depends on.
-    data : arrays with leading axis k; NumPy arrays, because JAX arrays made inside jit are tracers.
+    data : the arrays with leading axis k, of NumPy, because JAX's made inside jit are tracers.
     energy : ``energy(u, data_row, values) -> ()``, the energy in mN mm of one group, ``u`` (a, 3).
     convex : whether every local energy is convex. Its stiffness then helps an iteration that starts
         far from equilibrium.
@@ -53,7 +53,7 @@ class LocalForce:
     """A sum of local forces that have no potential.
 
     nodes : the nodes (k, a) that each local force acts on and depends on.
-    data : NumPy arrays with leading axis k.
+    data : the NumPy arrays with leading axis k.
     force : ``force(u, data_row, values) -> (a, 3)``, the forces in mN of one group, ``u`` (a, 3).
     """
 

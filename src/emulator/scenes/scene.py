@@ -43,7 +43,7 @@ from emulator.scenes.tissue import (
 class Scene(SceneData, TableRepr):
     """Geometry, law, loads, supports and parameters of one problem, and what follows from them.
 
-    The fields are those of :class:`~emulator.scenes.scene_data.SceneData`. They are checked, and
+    The fields are listed in :class:`~emulator.scenes.scene_data.SceneData`. They are checked, and
     frozen, arrays included, so that compiled functions of the scene never go stale.
     """
 
@@ -198,10 +198,10 @@ class Scene(SceneData, TableRepr):
 
         Parameters
         ----------
-        u : displacement (..., n, 3) in mm, or (..., k, 3) at ``nodes``.
-        theta : parameters (..., p).
-        nodes : numbers (k,) of nodes; all by default.
-        level : fraction of the prescribed displacements that is applied.
+        u : the displacement (..., n, 3) in mm, or (..., k, 3) at ``nodes``.
+        theta : the parameters, (..., p).
+        nodes : the numbers (k,) of the nodes; all by default.
+        level : the fraction of the prescribed displacements that is applied.
         """
         prescribed = self.held if nodes is None else self.held[nodes]
         return jnp.where(prescribed, level * self.held_at(theta, nodes), u)

@@ -17,7 +17,7 @@ from emulator.scenes.supports.boundary_condition import BoundaryCondition
 from emulator.scenes.tissue import FibreAngles
 
 Dilatation = Literal["pointwise", "mean", "patch"]
-"""Volume changes are those of each point, of each element, or of patches of linear elements."""
+"""The part of a body that shares a volume change: a point, an element, or a patch of elements."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -45,8 +45,8 @@ _FULL_TURN = 360.0  # degrees
 class Tissue(NamedTuple):
     """Material data of one point, or stacked over elements and their points, axes (m, q).
 
-    directions : fibre (3,), or fibre and sheet (2, 3); None without fibres.
-    region : index () of the point's region among the factors; None without regions.
+    directions : the fibre (3,), or fibre and sheet (2, 3); None without fibres.
+    region : the index () of the point's region among the factors; None without regions.
     """
 
     directions: jax.Array | None = None
@@ -60,9 +60,9 @@ def tissue_of(
 
     Parameters
     ----------
-    fibres, sheets : unit directions (m, q, 3), or None.
-    regions : labels (m,), or None.
-    points : number q of quadrature points of an element.
+    fibres, sheets : the unit directions (m, q, 3), or None.
+    regions : the labels (m,), or None.
+    points : the number q of quadrature points of an element.
     """
     directions, region = fibres, None
     if fibres is not None and sheets is not None:
@@ -115,7 +115,7 @@ def checked_regions(regions: object, elements: int, law: Law) -> np.ndarray:
 class FibreAngles:
     """One rotation of the directions of a scene, by parameters, at every quadrature point.
 
-    axis : unit vectors (m, 3) or (m, q, 3) about which directions turn, counted right-handed.
+    axis : the unit vectors (m, 3) or (m, q, 3) about which directions turn, counted right-handed.
     shares : the share of each parameter in the angle, (m,) or (m, q), by the parameter's name.
     """
 
@@ -212,7 +212,7 @@ def turned(tissue: Tissue, angles: tuple[FibreAngles, ...], values: Values) -> T
 class Fibres:
     """The fibres of a scene in the form that loads along them take, element by element.
 
-    directions : unit vectors (m, q, 3) at the quadrature points at angles zero; traced where the
+    directions : the unit vectors (m, q, 3) at the quadrature points, angles zero; traced where the
         stress-free shape is an unknown.
     angles : the rotations of the fibres by parameters.
     """

@@ -38,7 +38,7 @@ Mean = Callable[[jax.Array], jax.Array]
 _SENSITIVITY_WEIGHT = 0.3
 _TRUNCATION = 1e-7  # relative to the largest singular value
 _MOST_MODES = 96
-# The lengths are fitted to at most so many modes and observations.
+# Largest numbers of modes and observations to which the lengths are fitted.
 _FITTED_MODES = 20
 _MOST_OBSERVATIONS = 500
 _FEATURES = 4

@@ -78,7 +78,7 @@ class Emulator(TableRepr):
     network : the graph network.
     family : the network that has learned a family of bodies, on this one.
     discrepancy : the model of what the other parts leave of FEM runs.
-    record : how the emulator was trained, plain JSON.
+    record : the account of the training, plain JSON.
     """
 
     scene: Scene
@@ -151,7 +151,7 @@ class CachedEmulator:
 
     @property
     def scene(self) -> Scene:
-        """What is emulated."""
+        """The scene that is emulated."""
         return self.emulator.scene
 
     @property

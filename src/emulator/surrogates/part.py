@@ -71,10 +71,10 @@ class ArrayPart:
     ) -> Self:
         """Return the part with these arrays."""
         del scene, description
-        return _filled(cls, arrays)
+        return _fill(cls, arrays)
 
 
-def _filled(kind: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+def _fill(kind: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """Return the dataclass or named tuple ``kind`` with its fields taken from ``arrays``."""
     values: dict[str, Any] = {}
     for name, hint in get_type_hints(kind).items():
@@ -83,7 +83,7 @@ def _filled(kind: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         elif hint is jax.Array:
             values[name] = jnp.asarray(widened(arrays[name]))
         else:
-            values[name] = _filled(hint, inside(arrays, name))
+            values[name] = _fill(hint, inside(arrays, name))
     return kind(**values)
 
 

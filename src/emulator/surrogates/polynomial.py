@@ -6,7 +6,7 @@ r"""Polynomials of theta: a part of an emulator, and their fit to fields of know
 
 with :math:`x` theta's position in the unit box and the Legendre polynomials :math:`P_k`. The terms
 have a mean square of 1 over the box and no mean product with each other, so that a singular value
-decomposition of the fields' coefficients leaves out what is least over the box.
+decomposition of the fields' coefficients leaves out the smallest modes over the box.
 
 The fit to fields :math:`v_i` with errors of about :math:`\epsilon_i` is
 
@@ -65,7 +65,7 @@ def compressed(degrees: np.ndarray, fields: np.ndarray, error: float) -> Polynom
     """Return a polynomial with as few modes as its error allows.
 
     degrees, fields : the degrees (m, p) and the fields (m, n, 3) mm of its terms.
-    error : the root mean square over box and nodes, mm, by which it may differ from them.
+    error : the allowed root mean square difference over box and nodes, mm.
     """
     flat = fields.reshape(len(fields), -1)
     left, sizes, right = np.linalg.svd(flat, full_matrices=False)
@@ -80,7 +80,7 @@ def compressed(degrees: np.ndarray, fields: np.ndarray, error: float) -> Polynom
 
 
 def terms(parameters: int, degree: int) -> int:
-    """Return the number of terms of a polynomial of ``degree`` in so many ``parameters``."""
+    """Return the number of terms of a polynomial of ``degree`` in ``parameters`` variables."""
     return comb(parameters + degree, degree)
 
 
@@ -159,7 +159,7 @@ def fit(samples: Samples, degree: int, own_error: float) -> PolynomialFit:
 
 
 def best_degree(known: Samples, new: Samples, degree: int, own_error: float) -> int:
-    """Return ``degree`` or a neighbour, by which fit to ``known`` is nearest to ``new`` samples.
+    """Return ``degree`` or a neighbour, whichever fit to ``known`` predicts ``new`` best.
 
     No fit has seen the new samples. The degree stays where there are too few for any fit.
     """

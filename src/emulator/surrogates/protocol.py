@@ -1,6 +1,6 @@
 """Forward maps: theta to displacement. Calibration sees nothing else of the mechanics.
 
-A kind of forward map is one :class:`ForwardKind` beside its map, and one line in
+A kind of forward map is one :class:`ForwardKind` next to its map, and one line in
 :mod:`emulator.surrogates.registry`.
 """
 
@@ -236,7 +236,7 @@ class Option:
         return f"--{self.name.replace('_', '-')}"
 
     def checked(self, value: Any) -> int:
-        """Return ``value``; refuse what is no whole number or too small."""
+        """Return ``value``; refuse one that is too small or no whole number."""
         if isinstance(value, bool) or not isinstance(value, int):
             raise InputError(f"{self.name} is {value!r}; it must be a whole number")
         if value < self.least:

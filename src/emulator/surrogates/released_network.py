@@ -71,7 +71,7 @@ def released_network(model: str, root: str | Path) -> Emulator:
         architecture=_ARCHITECTURE,
         parameters=count,
         graph=graph,
-        weights=filled(_ARCHITECTURE, graph, count, basis, _renamed(released, model)),
+        weights=filled(_ARCHITECTURE, graph, count, basis, _rename_weights(released, model)),
         scale=np.full(3, units(model).length),
         basis=basis,
         standardisation=Standardisation(scene.space, released.mean * unit, released.sd * unit),
@@ -81,7 +81,7 @@ def released_network(model: str, root: str | Path) -> Emulator:
     return emulator
 
 
-def _renamed(released: ReleasedNetwork, model: str) -> dict[str, np.ndarray]:
+def _rename_weights(released: ReleasedNetwork, model: str) -> dict[str, np.ndarray]:
     """Return the released weights by our names."""
     places = {f"FlaxMLP_{k}": place for k, place in enumerate(_PERCEPTRONS)}
     renamed = {}

@@ -16,7 +16,7 @@ ventricle with five parameters, over the whole box, orders 1, 2, 3 and 4 leave a
 is much larger.
 
 Where the displacement is a sum, as of a body whose mesh is loaded (:mod:`emulator.fem.loaded`), the
-terms of each summand follow from those of the ones before.
+terms of each summand follow from the terms of earlier summands.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Expansion(ArrayPart):
         return CachedPart(offset, modes, self.monomials)
 
     def less(self, part: CachedPart) -> Expansion:
-        """Return the series less that of ``part``, over all nodes, about its centre.
+        """Return the series less ``part``'s series about the same centre, over all nodes.
 
         Added to the part, it has the same derivatives there as FEM.
         """
@@ -238,7 +238,7 @@ def _forces(
             v = scene.on_supports(displacements[-1], theta)
             return last.residual(theta, *displacements[:-1], v), jnp.where(scene.held, v, 0.0)
 
-        return _mixed(along, degree)()
+        return _mixed_derivative(along, degree)()
 
     directions = jnp.stack([jnp.eye(len(position))[jnp.array(term)] for term in terms])
     return jax.jit(lambda d, p, k: jax.lax.map(lambda each: one(each, k), (d, p)))(
@@ -253,11 +253,11 @@ def _places(terms: list[tuple[int, ...]], parts: list[tuple[int, ...]], known: T
     return jnp.array(rows, dtype=int).reshape(len(terms), len(parts))
 
 
-def _mixed(function: Callable[..., Any], degree: int) -> Callable[[], Any]:
+def _mixed_derivative(function: Callable[..., Any], degree: int) -> Callable[[], Any]:
     """Return the derivative of ``function`` once in each of its ``degree`` scalars, at zero."""
     if degree == 0:
         return function
     derivative = lambda *rest: jax.jvp(  # noqa: E731
         lambda last: function(*rest, last), (jnp.zeros(()),), (jnp.ones(()),)
     )[1]
-    return _mixed(derivative, degree - 1)
+    return _mixed_derivative(derivative, degree - 1)

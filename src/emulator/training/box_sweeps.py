@@ -166,7 +166,7 @@ def sweep_box(
         Equilibria were not followed up to the loads, or not over the whole box.
     """
     check_sweeps(simulator.scene, sweeps, at_rest=start is None and beneath is None)
-    state = _restored(folder) or _first(simulator, start, beneath)
+    state = _restore(folder) or _initial_state(simulator, start, beneath)
     last_write = time.perf_counter()
     with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
         while state.number < sweeps and not state.done:
@@ -212,11 +212,11 @@ def _require_answer(scene: Scene, state: SweepState) -> None:
         )
 
 
-def _first(simulator: Simulator, start: Map | None, beneath: Map | None) -> SweepState:
+def _initial_state(simulator: Simulator, start: Map | None, beneath: Map | None) -> SweepState:
     """Return the state before the first sweep."""
     if beneath is not None:
         return replace(_at_rest(simulator), level=1.0)
-    return _at_rest(simulator) if start is None else _at(simulator, start)
+    return _at_rest(simulator) if start is None else _full_load_state(simulator, start)
 
 
 def _at_rest(simulator: Simulator) -> SweepState:
@@ -227,7 +227,7 @@ def _at_rest(simulator: Simulator) -> SweepState:
     return SweepState(PolynomialFit(degrees, zero), zero, none)
 
 
-def _at(simulator: Simulator, start: Map) -> SweepState:
+def _full_load_state(simulator: Simulator, start: Map) -> SweepState:
     """Return the state under the whole load whose polynomial is fitted to ``start``."""
     rest = _at_rest(simulator)
     parameters, degree = rest.values.position.shape[1], rest.polynomial.degree
@@ -306,7 +306,7 @@ def _at_level(state: SweepState, level: float, new: Samples, error: float) -> Sw
     return replace(
         state,
         polynomial=polynomial,
-        before=_padded(state.polynomial.coefficients, polynomial),
+        before=_pad(state.polynomial.coefficients, polynomial),
         values=new,
         here=1,
         level=level,
@@ -326,14 +326,14 @@ def _with_targets(state: SweepState, new: Samples, error: float) -> SweepState:
     return replace(
         state,
         polynomial=polynomial,
-        before=_padded(state.before, polynomial),
+        before=_pad(state.before, polynomial),
         values=known,
         here=state.here + 1,
         error=error,
     )
 
 
-def _padded(coefficients: np.ndarray, polynomial: PolynomialFit) -> np.ndarray:
+def _pad(coefficients: np.ndarray, polynomial: PolynomialFit) -> np.ndarray:
     """Return ``coefficients`` for the terms of ``polynomial``: terms of low degree come first."""
     padded = np.zeros_like(polynomial.coefficients)
     shared = min(len(padded), len(coefficients))
@@ -369,7 +369,7 @@ def _write(folder: Path, state: SweepState) -> None:
     save_arrays(folder / SWEEPS, named_leaves({**fits, **numbers, "before": state.before}))
 
 
-def _restored(folder: Path | None) -> SweepState | None:
+def _restore(folder: Path | None) -> SweepState | None:
     if folder is None or not (folder / SWEEPS).is_file():
         return None
     arrays, _ = read_arrays(folder / SWEEPS)

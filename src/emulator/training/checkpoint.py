@@ -120,7 +120,7 @@ def open_session(
     Parameters
     ----------
     folder : the folder of the checkpoint.
-    fingerprint, name : the fingerprint of what is emulated, and its name for messages.
+    fingerprint, name : the fingerprint of the emulated scene, and its name for messages.
     plan, architecture : the plan and the sizes of a new training; a checkpoint has its own.
     plan_kinds : the classes of plans by the name of their recipe, to read a checkpoint's.
     resume : whether to read the checkpoint.
@@ -157,6 +157,6 @@ def open_session(
 
 
 def remove_checkpoint(folder: str | Path) -> None:
-    """Remove the checkpoint in ``folder``, and that of its sweeps, if they are there."""
+    """Remove the checkpoints of the training and of its sweeps in ``folder``, if any."""
     for name in (CHECKPOINT, SWEEPS):
         (Path(folder) / name).unlink(missing_ok=True)

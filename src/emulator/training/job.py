@@ -21,7 +21,7 @@ from emulator.training.checkpoint import Session
 from emulator.training.plan import Plan, Record
 
 FEWEST = 10
-"""The FEM runs by which a discrepancy model can be judged; of fewer, none is held out."""
+"""The least number of FEM runs of which some are held out to judge a discrepancy model."""
 LEAST_S = 5.0
 """The seconds below which a budget is refused at once."""
 
@@ -67,7 +67,7 @@ class Job:
     Parameters
     ----------
     scene : the scene to emulate.
-    architecture : the sizes of the network; ``None`` for those of the recipe.
+    architecture : the sizes of the network; ``None`` for the recipe's sizes.
     start : the emulator to begin from, or ``None``.
     campaign : the stored FEM runs to use; only the one at the centre is then solved.
     folder : the folder of the sweeps' checkpoint, from which they resume; ``None`` for none.

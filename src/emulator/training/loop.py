@@ -32,7 +32,7 @@ _AIM_EVERY = 200  # steps between two estimates of the remaining time
 _TIMED = 8  # steps that are timed before a training
 
 
-def _unchanged(weights: Weights, _: bool) -> Weights:
+def _identity(weights: Weights, _: bool) -> Weights:
     return weights
 
 
@@ -54,7 +54,7 @@ class NetworkTraining:
     step: Step
     freeze: int | None = None
     frozen: Callable[[Weights], tuple[jax.Array, ...]] = lambda _: ()
-    finish: Callable[[Weights, bool], Weights] = _unchanged
+    finish: Callable[[Weights, bool], Weights] = _identity
 
     def initial(self) -> tuple[Weights, Any]:
         """Return copies of the untrained weights, and the optimiser's state."""

@@ -1,7 +1,7 @@
 """Recipe ``mechanics``: a Taylor series of the equilibrium, and a discrepancy model of FEM runs.
 
 There is no network; from a mesh to an emulator takes a minute. On a body of a family that a network
-has learned, the series is that of what the network leaves.
+has learned, the series expands the remainder of the network.
 """
 
 from __future__ import annotations

@@ -301,7 +301,7 @@ class BlockedMatrix(NamedTuple):
 
     columns : the columns of each block, (b, w), filled up with 0.
     values : the entries of the blocks, (b, rows, w).
-    order : the position of each row among those of the blocks, (n,).
+    order : the position of each row among the rows of the blocks, (n,).
     """
 
     columns: jax.Array

@@ -129,7 +129,7 @@ def with_network_of(emulator: Emulator, start: Emulator | None) -> Emulator:
 def architecture_of(
     plan: Plan, job: Job, decoder: Any, usual: Architecture = Architecture(), modes: int = 0
 ) -> Architecture:
-    """Return the sizes of the network to train, which are those of the start's if there is one.
+    """Return the sizes of the network to train: those of the start's network, if there is one.
 
     Parameters
     ----------

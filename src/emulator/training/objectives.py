@@ -47,7 +47,7 @@ def check_objective(name: str) -> None:
 class Batch(NamedTuple):
     """The theta of a step and their FEM solutions.
 
-    theta : (b, p). displacement : (b, n, 3) mm. energy : (b,) mN mm. Those of FEM are empty for the
+    theta : (b, p). displacement : (b, n, 3) mm. energy : (b,) mN mm. FEM arrays are empty for the
     objective ``energy``.
     """
 
@@ -115,7 +115,7 @@ def mean_square_gradient(scene: Scene, difference: jax.Array) -> jax.Array:
 def loss_scales(scene: Scene, runs: Runs, *, from_runs: bool) -> Scales:
     """Return the scales of the loss: root mean squares of the runs' deviations from the centre's.
 
-    from_runs : whether the deviations are those of the runs, or guessed from the centre's solution.
+    from_runs : whether the deviations come from the runs or are guessed from the centre's solution.
     """
     deviation = _deviations(runs, from_runs)
     return Scales(

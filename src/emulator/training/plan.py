@@ -74,7 +74,7 @@ class Plan:
 
 
 def check_order(order: int) -> None:
-    """Raise :class:`InputError` unless ``order`` is that of a Taylor series."""
+    """Raise :class:`InputError` unless ``order`` is an order of a Taylor series."""
     if not 0 <= order <= 4:
         raise InputError(f"training: a series of order {order}; give 0 to 4")
 

@@ -84,7 +84,7 @@ def in_branch(path: Any) -> bool:
 
 
 def branch_alone(updates: Weights, *frozen: jax.Array) -> Weights:
-    """Return ``updates``; once the modes are ``frozen``, those of the branch alone.
+    """Return ``updates``; once the modes are ``frozen``, only updates of the branch.
 
     Adam's momentum would otherwise move the weights that the frozen modes came from.
     """

@@ -2,7 +2,7 @@
 
 No FEM solution is needed (:mod:`~emulator.training.box_sweeps`). The sweeps begin at rest, or under
 the whole load where the network of a family says, or a series about the centre of the box, which is
-one FEM solution. On a finer mesh their polynomial is what an emulator on the coarser mesh leaves.
+one FEM solution. On a finer mesh their polynomial corrects an emulator of the coarser mesh.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def targets(
 
 
 def _displacement(system: System, v: jax.Array, theta: jax.Array, level: jax.Array) -> jax.Array:
-    """Return the displacement (n, 3): ``v`` (f,) where free, that of the supports elsewhere."""
+    """Return the displacement (n, 3): ``v`` (f,) where free, prescribed elsewhere."""
     return system.scene.on_supports(system.extend(v), theta, level=level)
 
 

@@ -73,7 +73,7 @@ def train(
     plan : the recipe and its options, e.g. ``recipe("mechanics")``.
     folder : the folder of the checkpoints. The finished emulator is returned, not written; remove
         the last checkpoint with :func:`remove_checkpoint` once it is safe.
-    architecture : the sizes of the network; by default those of the recipe.
+    architecture : the sizes of the network; by default the recipe's.
     start : the emulator whose network to begin from, which may be of another geometry; of recipe
         two_meshes, the emulator on the coarser mesh, made by recipe mechanics if none is given.
     campaign : FEM runs to take the first ``plan.simulations`` of, instead of making them; needed

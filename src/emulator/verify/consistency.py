@@ -135,7 +135,7 @@ def verify_derivatives() -> list[Benchmark]:
 
 
 def taylor_of_energy(form: str) -> list[Benchmark]:
-    """Measure the orders of the remainders of energy and residual beside an equilibrium."""
+    """Measure the orders of the remainders of energy and residual near an equilibrium."""
     simulator = Simulator(block(form))
     system, theta = simulator.system, simulator.scene.centre
     rng = np.random.default_rng(2)

@@ -5,7 +5,7 @@ import pytest
 
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import disc
-from emulator.geometry.remeshing import Flattened
+from emulator.geometry.remeshing import DiscMap
 from emulator.geometry.surfaces import (
     Surface,
     cut,
@@ -73,7 +73,7 @@ def test_a_flat_disc_is_laid_out_as_it_is():
     radius, angle, triangles = disc(4, 12)
     points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle])
     points[radius < 1.0, :2] += 0.05 * np.random.default_rng(0).normal(size=((radius < 1).sum(), 2))
-    flat = Flattened(Surface("disc", 20.0 * points, triangles))
+    flat = DiscMap(Surface("disc", 20.0 * points, triangles))
     # The rim may begin anywhere: lengths between places are those of the disc.
     between = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (flat.places, points)]
     np.testing.assert_allclose(*between, atol=1e-9)
@@ -81,7 +81,7 @@ def test_a_flat_disc_is_laid_out_as_it_is():
 
 def test_no_triangle_of_a_cap_turns_over(ball):
     cap = cut(ball, 5.0 * UP, UP)
-    flat = Flattened(cap)
+    flat = DiscMap(cap)
     corners = flat.places[cap.triangles]
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     sign = np.sign(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])

@@ -208,7 +208,7 @@ def run_campaign(
     results = solve_rows(
         solver,
         thetas,
-        numbers=_until(deadline, len(thetas), at_least),
+        numbers=_numbers_until(deadline, len(thetas), at_least),
         starts=Neighbours(simulator.scene, thetas, solutions, predictor),
         execute=execute,
     )
@@ -226,7 +226,7 @@ def run_campaign(
     )
 
 
-def _until(deadline: float, count: int, at_least: int) -> Iterator[int]:
+def _numbers_until(deadline: float, count: int, at_least: int) -> Iterator[int]:
     """Yield numbers up to ``count``; after the deadline, up to ``at_least``."""
     for number in range(count):
         if number >= at_least and time.perf_counter() > deadline:

@@ -67,7 +67,7 @@ class Cluster:
         try:
             yield from self._rows(self._name(solver), tasks)
         except (OSError, CancelledError) as error:  # errors of the solve itself have other types
-            raise self._gone(error) from error
+            raise self._connection_error(error) from error
 
     def _name(self, solver: Solver) -> str:
         """Return the name by which workers know ``solver``; send it to them once."""
@@ -87,7 +87,7 @@ class Cluster:
                 pending[future] = task.number
             if not pending:
                 break
-            for future in self._finished(pending):
+            for future in self._wait_for_any(pending):
                 try:
                     row = _result(future)
                 except TimeoutError:  # the worker was lost; Dask solves the task again
@@ -116,7 +116,7 @@ class Cluster:
                 )
             time.sleep(0.2)
 
-    def _finished(self, pending: dict[Future, int]) -> list[Future]:
+    def _wait_for_any(self, pending: dict[Future, int]) -> list[Future]:
         """Wait until a future is done, checking that there are workers; return all that are."""
         while True:
             try:
@@ -132,9 +132,9 @@ class Cluster:
         try:
             return len(self.client.nthreads())
         except (RuntimeError, ValueError) as error:  # the client has given up
-            raise self._gone(error) from error
+            raise self._connection_error(error) from error
 
-    def _gone(self, error: Exception) -> SolverError:
+    def _connection_error(self, error: Exception) -> SolverError:
         message = " ".join(str(error).split())
         return SolverError(f"campaign: the scheduler {self.address} does not answer ({message})")
 

@@ -1,6 +1,6 @@
 r"""Newton's method for saddle points: mean dilatation, and inverse motion.
 
-With mean dilatation, each block's volume ratio and pressure are unknowns beside the displacement;
+With mean dilatation, each block's volume ratio and pressure are unknowns besides the displacement;
 they are eliminated block by block (:mod:`emulator.fem.condensation`). In inverse motion
 (:mod:`emulator.fem.inverse_motion`) the tangent is not symmetric, with or without such blocks.
 

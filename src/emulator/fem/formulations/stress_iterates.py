@@ -96,7 +96,7 @@ class StressIterates:
     load: jax.Array
 
     def begin(self, u: jax.Array) -> StressState:
-        """Return the state whose stresses are those of ``u`` (n, 3) mm."""
+        """Return the state at ``u`` (n, 3) mm, with the stresses of this displacement."""
         unknown, measures = jnp.full((), jnp.inf, float), _measures_of(self.system, u, self.theta)
         return StressState(u, measures, unknown, jnp.ones(()), jnp.array(True), jnp.array(0))
 
@@ -155,7 +155,7 @@ class StressIterates:
         )
 
 
-def _seen(scene: Scene, u: jax.Array) -> jax.Array:
+def _law_gradients(scene: Scene, u: jax.Array) -> jax.Array:
     """Return the displacement gradients (b, q, 3, 3) that the law sees at ``u`` (n, 3) mm."""
     return seen_by_law(scene, displacement_gradient(scene, u))
 
@@ -167,7 +167,9 @@ def _measures_of(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     assert names is not None, "see applies"
     measures = Measures(names)
     return at_points(
-        lambda H, at: measures.of(H, at.directions), scene.block_tissue_at(theta), _seen(scene, u)
+        lambda H, at: measures.of(H, at.directions),
+        scene.block_tissue_at(theta),
+        _law_gradients(scene, u),
     )
 
 
@@ -189,7 +191,7 @@ def _equations(
         return point.linearise(H, own, at, geometric)
 
     tissue = scene.block_tissue_at(theta)
-    stress, moduli, known = at_points(linearise, tissue, _seen(scene, u), measures)
+    stress, moduli, known = at_points(linearise, tissue, _law_gradients(scene, u), measures)
     forces, bulk = block_derivatives(scene, u, stress, moduli, known)
     rest = system.springs_less_loads(u, theta, load)
     residual = system.restrict(system.scatter(forces) + rest)
@@ -230,7 +232,7 @@ def _advanced(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the displacement (n, 3) mm and measures (m, q, k) after ``fraction`` of the step."""
     scene, point = system.scene, MaterialPoint(system.scene, theta)
-    H, change = jax.jvp(lambda v: _seen(scene, v), (u,), (step,))
+    H, change = jax.jvp(lambda v: _law_gradients(scene, v), (u,), (step,))
     measures_after = at_points(point.at_stress, scene.block_tissue_at(theta), H, change, measures)
     advances = fraction > 0.0
     return jnp.where(advances, u + fraction * step, u), jnp.where(

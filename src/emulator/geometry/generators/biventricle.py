@@ -146,19 +146,19 @@ class Septum:
 
     def foot(self, xi: np.ndarray, eta: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return ``r, phi`` on the septum's epicardium, widened for depth ``s``."""
-        return self._widened(*_half_disc(xi, eta), s)
+        return self._widen(*_half_disc(xi, eta), s)
 
     def sheet(self, xi: np.ndarray, eta: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return the point of the free wall in mm, (..., 3)."""
         across, down = _half_disc(xi, eta)
         rho = np.hypot(across, down)
         along = np.sinc(0.5 * rho) * 0.5 * np.pi  # sin(pi rho / 2) / rho: even steps along the arc
-        r, phi = self._widened(along * across, along * down, s)
+        r, phi = self._widen(along * across, along * down, s)
         lift = (self.right.bulge + s * self.right.thickness) * np.cos(0.5 * np.pi * rho)
         outwards = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=-1)
         return self._epicardium(r, phi) + lift[..., None] * outwards
 
-    def _widened(
+    def _widen(
         self, across: np.ndarray, down: np.ndarray, s: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return ``r, phi`` of points in the half disc, its edge moved out by ``s`` thicknesses."""
@@ -216,7 +216,7 @@ def biventricle(
         raise InputError(f"biventricle: {layers} layers through the walls; expected at least 1")
     through, strips = layers
     septum = Septum(left, right)
-    flat = _laid_out(septum, rings, around, strips, grading)
+    flat = _open_disc(septum, rings, around, strips, grading)
     wall = stacked(len(flat.r), through)
     in_wall = _in_columns(wall, flat.r, flat.phi)
     sheet, in_sheet = _sheet(flat, wall, strips)
@@ -266,7 +266,7 @@ class _Flat:
         return np.setdiff1d(self.opened.inner, self.opened.line)
 
 
-def _laid_out(septum: Septum, rings: int, around: int, strips: int, grading: float) -> _Flat:
+def _open_disc(septum: Septum, rings: int, around: int, strips: int, grading: float) -> _Flat:
     """Return the disc opened around the septum, which takes half of ``around`` on full rings."""
     radius, angle, triangles = disc(rings, around)
     angle = np.angle(np.exp(1j * angle))  # from -pi to pi
@@ -284,11 +284,11 @@ def _laid_out(septum: Septum, rings: int, around: int, strips: int, grading: flo
     xi, eta, r, phi = (part[opened.origin] for part in (xi, eta, radius, angle))
     base = r == 1.0
     r, eta = toward_base(r, grading), np.where(eta > 0.0, toward_base(eta, grading), eta)
-    r, phi = _made_room(septum, opened, rim, half_angle, xi, eta, r, phi)
+    r, phi = _disc_coordinates(septum, opened, rim, half_angle, xi, eta, r, phi)
     return _Flat(opened, r, phi, xi, eta, base)
 
 
-def _made_room(
+def _disc_coordinates(
     septum: Septum,
     opened: Footprint,
     rim: np.ndarray,

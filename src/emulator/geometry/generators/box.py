@@ -116,7 +116,7 @@ def slab(
     if min(cells) < 1 or not thickness > 0.0:
         raise InputError(f"slab: cells {cells} and thickness {thickness} mm must be positive")
     square, triangles = _crossed_square(*cells)
-    plane = _bilinear(_checked(corners), square)
+    plane = _bilinear(_check_corners(corners), square)
     nodes = np.concatenate(
         [np.column_stack([plane, np.full(len(plane), z)]) for z in (0, thickness)]
     )
@@ -139,7 +139,7 @@ def cooks_membrane(cells: tuple[int, int] = (8, 8), thickness: float = 1.0, orde
     return slab(COOKS_MEMBRANE, cells, thickness, order)
 
 
-def _checked(corners: tuple[Corner, ...]) -> np.ndarray:
+def _check_corners(corners: tuple[Corner, ...]) -> np.ndarray:
     """Return the corners as (4, 2); refuse any that are not convex and anticlockwise."""
     points = np.asarray(corners, dtype=float)
     if points.shape != (4, 2) or not np.isfinite(points).all():

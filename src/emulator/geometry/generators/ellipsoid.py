@@ -5,7 +5,7 @@ r"""Truncated thick-walled ellipsoid of revolution: the idealised left ventricle
 
 with ``r`` from 0 at the apex to 1 at the base, ``t`` from 0 on the endocardium to 1 on the
 epicardium, and both semi-axes linear in ``t``. The long axis is z, the base a plane on top. The
-coordinates ``r`` and ``phi`` are those of a disc that is triangulated by rings around its centre.
+coordinates ``r`` and ``phi`` belong to a disc that is triangulated by rings around its centre.
 """
 
 from __future__ import annotations
@@ -160,11 +160,11 @@ def truncated_ellipsoid(
     around : the points on a full ring; rings nearer the apex have fewer.
     layers : the number of layers from endocardium to epicardium.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the true surfaces.
-    thicker : by which fraction the wall is thicker at the base towards an angle :math:`\phi_0`, in
+    thicker : the excess thickness at the base, as a fraction, towards an angle :math:`\phi_0`, in
         degrees; at ``t`` = 1 lies what would lie at
         :math:`t = 1 + \alpha\, r \cos(\phi - \phi_0)`.
     grading : ring k of n lies at :math:`r = 1 - (1 - k/n)^g`. Above 1, rings are closer at the
-        base, where a held wall bends: 1.5 is worth a third of the nodes.
+        base, where a fixed wall bends: 1.5 is worth a third of the nodes.
 
     Returns
     -------

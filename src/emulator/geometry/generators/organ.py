@@ -61,7 +61,7 @@ def organ(
     middle = ball_midpoints(nodes)
 
     def mapped(points: np.ndarray) -> np.ndarray:
-        return _shape(_clustered(points, clustering), half_axes)
+        return _shape(_moebius(points, clustering), half_axes)
 
     return body(
         mapped(nodes),
@@ -83,14 +83,14 @@ def _in_ligament(directions: np.ndarray, shells: int, clustering: float) -> np.n
     """Return whether each unit vector (k, 3) meets the ligament before the map, (k,) bool."""
     nodes, elements = ball(shells)
     triangles = boundary_facets(orient(nodes, elements))
-    inside = _clustered(nodes, clustering) @ _LIGAMENT_DIRECTION > np.cos(_LIGAMENT_HALF_ANGLE)
+    inside = _moebius(nodes, clustering) @ _LIGAMENT_DIRECTION > np.cos(_LIGAMENT_HALF_ANGLE)
     corners = nodes[triangles[inside[triangles].all(axis=1)]]  # (t, 3, 3)
     # A vector meets a triangle where it is a sum of its corners with no negative weight.
     weights = np.einsum("ki,tij->tkj", directions, np.linalg.inv(corners))
     return (weights > -1e-9).all(axis=2).any(axis=0)
 
 
-def _clustered(points: np.ndarray, clustering: float) -> np.ndarray:
+def _moebius(points: np.ndarray, clustering: float) -> np.ndarray:
     r"""Return the Moebius map of the unit ball that takes its centre to :math:`a = c\, d`, (k, 3).
 
     .. math:: T(x) = \frac{(1 + 2 a \cdot x + |x|^2)\, a + (1 - |a|^2)\, x}

@@ -86,7 +86,7 @@ def left_ventricle(
         name="left_ventricle",
         mesh=mesh,
         law=find_law("holzapfel_ogden"),
-        parameters=(*MYOCARDIUM, *_varied(angles), PRESSURE),
+        parameters=(*MYOCARDIUM, *_angle_parameters(angles), PRESSURE),
         loads=(CavityPressure("endocardium"),),
         supports=(Support("base"),),
         constants={"kappa": kappa},
@@ -227,7 +227,7 @@ def biventricle(
     )
 
 
-def _varied(angles: tuple[float | str, float | str]) -> tuple[Parameter, ...]:
+def _angle_parameters(angles: tuple[float | str, float | str]) -> tuple[Parameter, ...]:
     """Return the parameters of helix angles that are names, each once."""
     centres = {name: at for name, at in zip(angles, HELIX, strict=True) if isinstance(name, str)}
     return tuple(Parameter(name, "deg", at - 20.0, at + 20.0) for name, at in centres.items())

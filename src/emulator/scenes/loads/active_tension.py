@@ -11,8 +11,8 @@ so that the second Piola-Kirchhoff stress gains
 :math:`S = T_a\,[f_0 \otimes f_0 + \eta\,(I - f_0 \otimes f_0)]`, as in Land et al. (2015),
 problem 3, where :math:`\eta = 0`.
 
-The measures are those of F itself, also where the law reads isochoric measures or mean dilatation
-replaces J, because the published stress is that of F. Isochoric measures would subtract the
+The measures are taken of F itself, also where the law reads isochoric measures or mean dilatation
+replaces J, because the published stress depends on F. Isochoric measures would subtract the
 pressure :math:`\tfrac13 \operatorname{tr}(F S F^T) / J`, which incompressible tissue cannot feel.
 
 :math:`\Psi` is quadratic in the positions :math:`x = X + u` of the nodes,

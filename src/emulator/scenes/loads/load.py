@@ -51,9 +51,9 @@ class Load(Part):
 
         Parameters
         ----------
-        mesh : the body.
-        held : (n, 3) bool, where the displacement is prescribed.
-        displacement : (n, 3) mm, its prescribed value, for parameters their size per unit.
+        mesh : the mesh of the body.
+        held : whether the displacement is prescribed, (n, 3) bool.
+        displacement : the prescribed displacement, (n, 3) mm, of parameters per unit.
         """
 
     def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
@@ -70,7 +70,7 @@ class Load(Part):
         ----------
         grid : the discretised body. Its arrays are traced in unloading, where the stress-free shape
             is an unknown.
-        fibres : fibres of the tissue, likewise; None in a scene without.
+        fibres : the fibres of the tissue, traced too; None in a scene without.
         """
         return None
 
@@ -94,7 +94,7 @@ class Load(Part):
         Parameters
         ----------
         grid : the discretised loaded body.
-        fibres : fibres of the loaded tissue, None in a scene without.
+        fibres : the fibres of the loaded tissue; None in a scene without.
 
         Raises
         ------

@@ -19,11 +19,11 @@ from emulator.scenes.part import LocalForce, LocalTerm, Part
 class Held(NamedTuple):
     """Prescribed displacements of one support.
 
-    where : name of the node set, for error messages.
-    nodes : their nodes (k,).
-    displacement : (k, 3) in mm; with ``amount``, per unit of that parameter.
-    axes : numbers of the components that are prescribed.
-    amount : name of the parameter that multiplies the displacement, or None.
+    where : the name of the node set, for error messages.
+    nodes : the nodes (k,) of the set.
+    displacement : the displacement, (k, 3) mm; with ``amount``, per unit of that parameter.
+    axes : the numbers of the prescribed components.
+    amount : the name of the parameter that multiplies the displacement, or None.
     """
 
     where: str
@@ -87,14 +87,16 @@ def check_motions(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> None:
     for k in range(part.max() + 1):
         free = _free_motions(points[owner == k], directions[owner == k])
         if free:
-            description = _named(mesh.nodes, part, k) if part.any() else "its supports leave"
+            description = (
+                _part_in_words(mesh.nodes, part, k) if part.any() else "its supports leave"
+            )
             raise InputError(
                 f"{description} {free} of the 6 rigid motions free, the body could move "
                 "or turn; hold more nodes or components"
             )
 
 
-def _named(nodes: np.ndarray, part: np.ndarray, k: int) -> str:
+def _part_in_words(nodes: np.ndarray, part: np.ndarray, k: int) -> str:
     inside = nodes[part == k]
     x, y, z = inside.mean(axis=0)
     return (

@@ -32,7 +32,7 @@ from emulator.surrogates.network.ventricle_graph import BodyFeatures, describe
 from emulator.surrogates.part import CachedPart
 
 _SLACK = 1e-9  # round-off allowed, as a fraction of a parameter's range
-_BEYOND = 0.1  # part of the family's range by which a body may lie outside it
+_BEYOND = 0.1  # allowed excess of a body over the family's range, as a fraction of it
 
 VECTORS = 7
 """The number of vectors of a node of which the output is a combination."""
@@ -225,7 +225,7 @@ class FamilyNetwork:
 
 
 def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNetwork:
-    """Return the network for ``scene``, whose body must be like those of the family.
+    """Return the network for ``scene``, whose body must resemble the family.
 
     strict : whether to refuse a body outside the shapes of the family.
 

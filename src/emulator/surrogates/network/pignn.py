@@ -42,7 +42,7 @@ class Architecture:
     edge_sum : the sum over a node's edges in its final state: ``antisymmetric``, Algorithm 1's, or
         over the edges it ``receives``, as the released code has it.
     trunk, branch : the widths of the hidden layers below the learned modes and below the
-        coefficients of a separable decoder; empty for those of ``hidden``.
+        coefficients of a separable decoder; ``hidden`` where empty.
     """
 
     steps: int = 5
