@@ -101,13 +101,13 @@ class SystematicKind(Protocol):
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Points shifted and turned together: a camera or a clamp that moved, a hand that held.
+    """A shift and a turn of all points together, as of a camera or a clamp that moved.
 
-    of : observations of displacements, joined by ``+``.
-    shift : sd along x, y and z, mm; one for all, or three.
-    turn : sd about x, y and z, degrees; one for all, or three.
-    about : point that only shifts, mm; by default the mean of all points.
-    at : where the points are when their frame moves: ``loaded``, where they were seen, or ``rest``.
+    of : the observations of displacements, joined by ``+``.
+    shift : the sd along x, y and z, mm; one for all, or three.
+    turn : the sd about x, y and z, degrees; one for all, or three.
+    about : the point that only shifts, mm; by default the mean of all points.
+    at : the positions at which points move: ``loaded``, where they were seen, or ``rest``.
     """
 
     of: str
@@ -127,11 +127,11 @@ class RigidMotion:
 
 @dataclass(frozen=True)
 class Placement:
-    """Numbers with offsets of their own, each the same in all the observations.
+    """An offset of each number, which is the same in all the observations.
 
-    of : observations with as many numbers each, joined by ``+``.
-    sd : of each offset, in the unit of the data.
-    rows : points that have one, counted from 0; by default all.
+    of : the observations, all of the same shape, joined by ``+``.
+    sd : the sd of each offset, in the unit of the data.
+    rows : the indices of the points that have an offset, from 0; by default all.
     """
 
     of: str
@@ -143,17 +143,17 @@ class Placement:
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
         """Return one offset for each number."""
-        observed = measured.named(self.of)
-        shapes = {np.shape(measured.whole(each)[1]) for each in observed}
+        names = measured.named(self.of)
+        shapes = {np.shape(measured.whole(each)[1]) for each in names}
         if len(shapes) > 1:
-            raise InputError(f"of: {', '.join(observed)} have different numbers of points")
+            raise InputError(f"of: {', '.join(names)} have different numbers of points")
         sd = np.zeros(shapes.pop())
         rows = range(len(sd) if sd.ndim else 1) if self.rows is None else self.rows
         for row in rows:
             if not 0 <= row < len(np.atleast_1d(sd)):
                 raise InputError(f"rows: there is no point {row}; they are counted from 0")
             sd[row if sd.ndim else ()] = self.sd
-        every = placement(name, observed, sd)
+        every = placement(name, names, sd)
         used = np.flatnonzero(np.ravel(sd))
         modes = {each: modes[used] for each, modes in every.modes.items()}
         return Systematic(tuple(every.names[k] for k in used), modes)
@@ -161,13 +161,13 @@ class Placement:
 
 @dataclass(frozen=True)
 class Pins:
-    r"""Markers that stand elsewhere in the body's frame than the file says, all by one offset.
+    r"""One offset of all markers in the body's frame from the positions in the file.
 
     Where their surface has turned by R, as their data says, an offset d moves a marker by
     :math:`(R - I)\,d` more.
 
-    of : observations of three markers or more, joined by ``+``.
-    sd : of the offset along each axis, mm.
+    of : the observations of three markers or more, joined by ``+``.
+    sd : the sd of the offset along each axis, mm.
     """
 
     of: str
@@ -190,10 +190,10 @@ class Pins:
 
 @dataclass(frozen=True)
 class Gain:
-    """All the data larger or smaller by one factor: a load cell, a scale of an image.
+    """One factor of all the data, as of a load cell or of the scale of an image.
 
-    of : observations, joined by ``+``.
-    share : sd of the factor, 0.02 for two percent.
+    of : the observations, joined by ``+``.
+    share : the sd of the factor, 0.02 for two percent.
     """
 
     of: str
@@ -211,16 +211,16 @@ class Gain:
 
 @dataclass(frozen=True)
 class Curve:
-    """The model is off along a loading curve, and at points near each other alike.
+    """An error of the model that varies smoothly along a loading curve.
 
-    of : a single number in several load states, as ``reaction:top:x``.
-    along : parameter that is known in each state and says where on the curve it is.
-    length : over which the error changes, in the unit of ``along``.
-    share : sd of the error as a share of what is predicted, known.
-    share_scale : instead, the scale of the share's half-normal prior: it is inferred, as
+    of : the observation of one number in several load states, as ``reaction:top:x``.
+    along : the parameter that is known in each state and is the curve's abscissa.
+    length : the correlation length of the error, in the unit of ``along``.
+    share : the known sd of the error as a share of the prediction.
+    share_scale : the scale of the half-normal prior of a share that is inferred instead, as
         ``curve_share``, one for all curves.
-    sd : sd of the rest of it, in the unit of the data.
-    constant : part of the variance that is the same along the whole curve.
+    sd : the sd of a further error, in the unit of the data.
+    constant : the part of the variance that is the same along the whole curve.
     """
 
     of: str
@@ -242,24 +242,24 @@ class Curve:
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
         """Return as many unknowns as the curve can tell apart."""
-        observed = measured.named(self.of)
-        for each in observed:
+        observations = measured.named(self.of)
+        for each in observations:
             if np.shape(measured.whole(each)[1]) != ():
                 raise InputError(f"of: '{each}' is not a single number, as a force is")
-        amounts = np.array([measured.known(self.along, each) for each in observed])
+        amounts = np.array([measured.known(self.along, each) for each in observations])
         size = None if self.share_scale is None else (CURVE_SHARE, self.share_scale)
         unit = curve_modes(amounts, self.length, constant=self.constant)
         share = self.share if size is None else 1.0
-        # Shares of the prediction and the error beside them have unknowns of their own.
+        # The share of the prediction and the further error have unknowns of their own.
         zeros = np.zeros_like(unit)
         shares, modes = np.vstack([share * unit, zeros]), np.vstack([zeros, self.sd * unit])
         used = np.abs(shares + modes).max(axis=1) > 0.0
         names = tuple(f"{name} {k + 1}" for k in range(int(used.sum())))
         return Systematic(
             names,
-            {each: modes[used, k] for k, each in enumerate(observed)},
+            {each: modes[used, k] for k, each in enumerate(observations)},
             size,
-            {each: shares[used, k] for k, each in enumerate(observed)},
+            {each: shares[used, k] for k, each in enumerate(observations)},
         )
 
 
@@ -274,7 +274,7 @@ SYSTEMATIC_ERRORS: dict[str, type[Any]] = {
 
 
 def rotation_of(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) that carries ``points`` (d, 3) nearest to where they went."""
+    """Return the rotation (3, 3) that fits the displacement of ``points`` (d, 3) best."""
     deformed = points + displacement
     U, _, V = np.linalg.svd((deformed - deformed.mean(axis=0)).T @ (points - points.mean(axis=0)))
     return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V

@@ -52,8 +52,8 @@ SPATIAL_SD = "spatial_sd"
 class SpatialModes:
     """Eigenvectors and eigenvalues of K, component by component.
 
-    entries : of each component, its positions in the raveled data, (d_c,).
-    vectors : of each component, its eigenvectors as columns, (d_c, d_c).
+    entries : the positions of each component in the raveled data, (d_c,).
+    vectors : the eigenvectors of each component as columns, (d_c, d_c).
     eigenvalues : all eigenvalues in the order of the concatenated entries, (e,); none is negative.
     """
 
@@ -147,14 +147,15 @@ class SpatialNormal(dist.Distribution):
 
 
 class SpatialNoise(Noise):
-    r"""Noise of covariance :math:`\sigma^2 I + \omega^2 K`; its dataclass says what K is of.
+    r"""Noise of covariance :math:`\sigma^2 I + \omega^2 K`; subclasses say what correlates.
 
     Attributes
     ----------
-    length : correlation length of the reference positions, mm, known.
-    sd, sd_scale : of the independent part: standard deviation, or scale of its half-normal prior.
-    kernel : a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
-    sites : where the data was measured; a model sets it.
+    length : the known correlation length over reference positions, mm.
+    sd, sd_scale : the standard deviation of the independent part, or the scale of its half-normal
+        prior.
+    kernel : the kernel, a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
+    sites : the sites at which the data was measured; a model sets them.
     """
 
     length: float
@@ -212,11 +213,12 @@ class CorrelatedNoise(SpatialNoise):
 
     Parameters
     ----------
-    length : correlation length of the reference positions, mm, known.
-    sd, sd_scale : of the independent part: standard deviation, or scale of its half-normal prior.
+    length : the known correlation length over reference positions, mm.
+    sd, sd_scale : the standard deviation of the independent part, or the scale of its half-normal
+        prior.
     spatial_sd, spatial_sd_scale : the same for the part that correlates.
-    kernel : a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
-    sites : where the data was measured; a model sets it.
+    kernel : the kernel, a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
+    sites : the sites at which the data was measured; a model sets them.
     """
 
     length: float

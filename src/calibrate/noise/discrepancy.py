@@ -36,11 +36,11 @@ class DiscrepancyNoise(SpatialNoise):
 
     Parameters
     ----------
-    scale : of the half-normal prior of the discrepancy's standard deviation.
-    length : correlation length of the discrepancy over reference positions, mm, known.
-    sd, sd_scale : of the independent noise, as in :class:`~calibrate.noise.GaussianNoise`.
-    kernel : a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
-    sites : where the data was measured; a model sets it.
+    scale : the scale of the half-normal prior of the discrepancy's standard deviation.
+    length : the known correlation length of the discrepancy over reference positions, mm.
+    sd, sd_scale : the options of the independent noise (:class:`~calibrate.noise.GaussianNoise`).
+    kernel : the kernel, a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
+    sites : the sites at which the data was measured; a model sets them.
     """
 
     scale: float

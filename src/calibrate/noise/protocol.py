@@ -21,10 +21,10 @@ _PLAUSIBLE = 3.0  # scales of a half-normal prior that contain 99.7 % of its mas
 
 
 class Sites(NamedTuple):
-    """Where each number of an observation's data was measured, the data's axes raveled.
+    """The position and component of each number of an observation's raveled data.
 
-    positions : positions in the reference body, (e, 3) mm.
-    component : which component of a vector or tensor each number is, (e,); components do not
+    positions : the positions in the reference body, (e, 3) mm.
+    component : the index of each number's component of a vector or tensor, (e,); components do not
         correlate with one another.
     """
 
@@ -44,10 +44,10 @@ class Scale:
 
     Parameters
     ----------
-    name : name of the scale in the posterior, where it is inferred.
-    options : names of the two options that give it, for errors.
-    known : its value in the observation's unit; or
-    prior_scale : the scale of its half-normal prior.
+    name : the name of an inferred scale in the posterior.
+    options : the names of the two options that set the scale, for error messages.
+    known : the value in the observation's unit; or
+    prior_scale : the scale of the half-normal prior.
 
     Raises
     ------
@@ -74,12 +74,12 @@ class Scale:
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:
-        """Its half-normal prior by its name; empty where it is known."""
+        """The half-normal prior by the scale's name; empty for a known scale."""
         return {} if self.known is not None else {self.name: dist.HalfNormal(self._given)}
 
     @property
     def upper(self) -> float:
-        """Its value, or the 99.7 % quantile of its half-normal prior."""
+        """The value, or the 99.7 % quantile of the half-normal prior."""
         return self._given if self.known is not None else _PLAUSIBLE * self._given
 
     def value(self, values: Mapping[str, jax.Array]) -> float | jax.Array:
@@ -115,11 +115,11 @@ class Noise(ABC):
     @property
     @abstractmethod
     def scales(self) -> tuple[Scale, ...]:
-        """Its scales, known or inferred."""
+        """The scales of the noise, known or inferred."""
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:
-        """Priors of its unknown scales by name, e.g. ``noise_sd``; empty if all are known."""
+        """Priors of the unknown scales by name, e.g. ``noise_sd``; empty if all are known."""
         return {name: prior for scale in self.scales for name, prior in scale.priors.items()}
 
     @property

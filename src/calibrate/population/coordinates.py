@@ -101,10 +101,10 @@ def to_score(
     t = jnp.clip((value - jnp.asarray(mean)) / sd, -_FARTHEST, _FARTHEST)
     upper = t > 0.0
     lower_end, upper_end = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
-    whole = ndtr(upper_end) - ndtr(lower_end)
-    mass = (ndtr(jnp.where(upper, -t, t)) - ndtr(lower_end)) / whole
+    total_mass = ndtr(upper_end) - ndtr(lower_end)
+    mass = (ndtr(jnp.where(upper, -t, t)) - ndtr(lower_end)) / total_mass
     q = ndtri(jnp.maximum(mass, _LEAST))
-    slope = jnp.asarray(sd) * whole * jnp.exp(0.5 * (t**2 - q**2))
+    slope = jnp.asarray(sd) * total_mass * jnp.exp(0.5 * (t**2 - q**2))
     return jnp.where(upper, -q, q), slope
 
 
