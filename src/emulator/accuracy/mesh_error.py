@@ -117,9 +117,9 @@ class MeshError:
         if neighbour is not None:
             begin = begin + neighbour.fine - self._prolong(neighbour.coarse)
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
-        stepped = None if self.fine.scene.loaded_by else self._fine_by_steps(theta, begin)
-        if stepped is not None:
-            return MeshErrorEstimate(theta, coarse, stepped, solved=False)
+        fine_by_steps = None if self.fine.scene.loaded_by else self._fine_by_steps(theta, begin)
+        if fine_by_steps is not None:
+            return MeshErrorEstimate(theta, coarse, fine_by_steps, solved=False)
         with self._alone:
             solution = self.fine.solve(theta, begin)
             if not solution.converged:  # strains of locked elements may be too rough a start

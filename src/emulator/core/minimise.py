@@ -52,14 +52,14 @@ def minimise(
     tolerance : relative decrease of the value in one iteration below which the search ends.
     """
     start = np.asarray(start, dtype=float)
-    first, _ = evaluated = _arrays(function(start))
-    rejected = _REJECTED * max(1.0, abs(float(first)) if np.isfinite(first) else 1.0)
+    first, _ = arrays = _arrays(function(start))
+    rejection_value = _REJECTED * max(1.0, abs(float(first)) if np.isfinite(first) else 1.0)
 
     def guarded(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = evaluated if np.array_equal(x, start) else _arrays(function(x))
+        value, gradient = arrays if np.array_equal(x, start) else _arrays(function(x))
         if np.isfinite(value) and np.isfinite(gradient).all():
             return float(value), gradient
-        return rejected, np.zeros_like(start)
+        return rejection_value, np.zeros_like(start)
 
     if not len(start):
         value, converged, x = guarded(start)[0], True, start
@@ -70,10 +70,10 @@ def minimise(
             guarded, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
         )
         value, converged, x = float(result.fun), bool(result.success), result.x
-    finite = value < rejected
+    finite = value < rejection_value
     return Minimum(x, value if finite else np.inf, converged and finite)
 
 
-def _arrays(evaluated: tuple[Any, Any]) -> tuple[np.ndarray, np.ndarray]:
-    value, gradient = evaluated
+def _arrays(result: tuple[Any, Any]) -> tuple[np.ndarray, np.ndarray]:
+    value, gradient = result
     return np.asarray(value, dtype=float), np.asarray(gradient, dtype=float)

@@ -141,8 +141,10 @@ def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:
 def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) -> Condensed:
     """Return the force and tangent of every block at ``u`` (n, 3) mm and ``volumes``."""
     H, law = block_gradients(scene, u), stress_and_moduli(scene, theta)
-    seen = lambda H, change, at: law(with_volume_change(H, change), at)  # noqa: E731
-    stress, moduli = at_points(seen, scene.block_tissue_at(theta), H, per_point(H, volumes.change))
+    response = lambda H, change, at: law(with_volume_change(H, change), at)  # noqa: E731
+    stress, moduli = at_points(
+        response, scene.block_tissue_at(theta), H, per_point(H, volumes.change)
+    )
     return _condensed(scene, H, volumes, stress, moduli)
 
 

@@ -181,8 +181,8 @@ def energy_of_gradient(
 ) -> jax.Array:
     """Return ``int W dX`` in mN mm from the displacement gradient ``H`` (m, q, 3, 3)."""
     density = point_energy(scene, theta, barriers)
-    seen = seen_by_law(scene, H, barriers)
-    values = at_points(density, scene.block_tissue_at(theta), seen)
+    law_gradients = seen_by_law(scene, H, barriers)
+    values = at_points(density, scene.block_tissue_at(theta), law_gradients)
     return jnp.sum(scene.blocks.weights * values)
 
 

@@ -243,9 +243,9 @@ def _next_state(
 def _judge(state: NewtonState, step: Step, full: jax.Array, options: NewtonOptions) -> _Verdict:
     """Return whether the load level has converged or is given up after ``step``."""
     history, relative = state.history, step.relative_residual
-    iterations, before = history.iterations + 1, state.relative_residual
-    slow = state.renew & (relative > _SLOW * before) & (iterations > 1)
-    finite = jnp.isfinite(before) & jnp.isfinite(relative)
+    iterations, initial_residual = history.iterations + 1, state.relative_residual
+    slow = state.renew & (relative > _SLOW * initial_residual) & (iterations > 1)
+    finite = jnp.isfinite(initial_residual) & jnp.isfinite(relative)
     round_off = finite & _is_round_off(state, full)
     converged = (relative <= options.tolerance) | (slow & (relative <= options.round_off))
     converged |= round_off

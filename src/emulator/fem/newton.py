@@ -277,8 +277,8 @@ class Newton:
             if self.system.forces:
                 u = state.u + fraction * direction.step
                 residual = self.system.balance(u, self.theta, state.load).residual
-                before = jnp.sum(direction.equations.residual**2)
-                lower |= jnp.sum(residual**2) < (1.0 - ARMIJO * fraction) * before
+                squared_norm = jnp.sum(direction.equations.residual**2)
+                lower |= jnp.sum(residual**2) < (1.0 - ARMIJO * fraction) * squared_norm
             return lower, energy
 
         return progress
@@ -321,10 +321,14 @@ def _is_near(on_supports: jax.Array, relative_residual: jax.Array) -> jax.Array:
 
 @jax.jit
 def _is_good(
-    relative: jax.Array, before: jax.Array, J: jax.Array, shrink: float, J_before: jax.Array
+    relative: jax.Array,
+    initial_residual: jax.Array,
+    J: jax.Array,
+    shrink: float,
+    J_before: jax.Array,
 ) -> jax.Array:
     """Return whether a step halves the residual and inverts no element."""
-    return (relative <= 0.5 * before) & (shrink * J_before < J)
+    return (relative <= 0.5 * initial_residual) & (shrink * J_before < J)
 
 
 def _lowest(potential: Callable[[jax.Array], jax.Array], first: _Descent) -> jax.Array:

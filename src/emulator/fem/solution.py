@@ -70,10 +70,10 @@ class Solution(NamedTuple):
         status = np.atleast_1d(np.asarray(self.status)).ravel()
         failures = np.flatnonzero(status != Status.CONVERGED)
         if failures.size:
-            reached = float(np.atleast_1d(np.asarray(self.load_reached)).ravel()[failures[0]])
-            which = f" {failures[0]} of {status.size}" if status.size > 1 else ""
+            load_factor = float(np.atleast_1d(np.asarray(self.load_reached)).ravel()[failures[0]])
+            position = f" {failures[0]} of {status.size}" if status.size > 1 else ""
             raise SolverError(
-                f"{what}{which}: {Status(int(status[failures[0]])).text} "
-                f"(converged up to {100 * reached:.3g} % of it)"
+                f"{what}{position}: {Status(int(status[failures[0]])).text} "
+                f"(converged up to {100 * load_factor:.3g} % of it)"
             )
         return self

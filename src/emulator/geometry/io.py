@@ -185,12 +185,12 @@ def _convert(source: str | Path | Any, *, directions: bool, quadratic: bool = Fa
     is_file = isinstance(source, str | Path)
     content = read_cells(Path(source)) if is_file else as_meshio(source)
     try:
-        mesh, used = _mesh(content)
+        mesh, numbers = _mesh(content)
         if not directions:
             return Body(mesh)
         order = 2 if quadratic else mesh.order
         fibres, sheets = (
-            _directions(content, mesh, used, name, order) for name in ("fibres", "sheets")
+            _directions(content, mesh, numbers, name, order) for name in ("fibres", "sheets")
         )
         if fibres is not None and sheets is not None and fibres.ndim == 3:
             # Interpolation does not preserve orthogonality.
@@ -206,22 +206,22 @@ def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
     """Return the mesh, and the file's number (n,) of each of its nodes."""
     kind = _tetrahedra(content)
     elements = np.concatenate([block.data for block in content.cells if block.type == kind])
-    used, points = np.unique(elements), np.asarray(content.points, dtype=float)
-    if used[0] < 0 or used[-1] >= len(points):
-        return Mesh(points, elements), used  # raises InputError and names the range
+    numbers, points = np.unique(elements), np.asarray(content.points, dtype=float)
+    if numbers[0] < 0 or numbers[-1] >= len(points):
+        return Mesh(points, elements), numbers  # raises InputError and names the range
     number = np.full(len(points), -1)
-    number[used] = np.arange(len(used))
-    nodes = points[used]
+    number[numbers] = np.arange(len(numbers))
+    nodes = points[numbers]
     elements = orient(nodes, number[elements])
     mesh = Mesh(nodes, elements, *read_sets(content, number, elements))
     pairs = coincident(nodes)
     if len(pairs):
-        one, other = np.sort(used[pairs[0]])
+        one, other = np.sort(numbers[pairs[0]])
         raise InputError(
             f"its nodes {one} and {other} are at the same place, {len(pairs)} such pairs, so that "
             "what touches there is not joined; merge them"
         )
-    return mesh, used
+    return mesh, numbers
 
 
 def _tetrahedra(content: meshio.Mesh) -> str:
@@ -245,7 +245,7 @@ def _tetrahedra(content: meshio.Mesh) -> str:
 
 
 def _directions(
-    content: meshio.Mesh, mesh: Mesh, used: np.ndarray, name: str, order: int
+    content: meshio.Mesh, mesh: Mesh, numbers: np.ndarray, name: str, order: int
 ) -> np.ndarray | None:
     """Return unit vectors at the elements' points from cell or point data ``name``."""
     kind = _CELLS[mesh.order][0]
@@ -259,7 +259,7 @@ def _directions(
         of_elements = _check_lengths(values, name, "element")
         return of_elements if order == 1 else from_elements(mesh, of_elements)
     if name in content.point_data:
-        at_nodes = _check_lengths(np.asarray(content.point_data[name])[used], name, "node")
+        at_nodes = _check_lengths(np.asarray(content.point_data[name])[numbers], name, "node")
         at_points = from_nodes(mesh, at_nodes, order)
         return at_points[:, 0] if order == 1 else at_points
     return None
@@ -324,10 +324,10 @@ def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh
     marks: dict[str, np.ndarray] = {}
     if mesh.facet_sets:
         sets = list(mesh.facet_sets.values())
-        rows, place = np.unique(np.concatenate(sets), axis=0, return_inverse=True)
+        rows, positions = np.unique(np.concatenate(sets), axis=0, return_inverse=True)
         blocks.append((triangle, rows))
         ends = np.cumsum([len(facets) for facets in sets])[:-1]
-        for name, members in zip(mesh.facet_sets, np.split(place, ends), strict=True):
+        for name, members in zip(mesh.facet_sets, np.split(positions, ends), strict=True):
             marks[MARK + name] = np.isin(np.arange(len(rows)), members).astype(np.int32)
     data = {name: _pad_cells(values, blocks) for name, values in directions.items()}
     none = np.zeros(len(mesh.elements), np.int32)

@@ -169,13 +169,13 @@ class Mesh:
         if not np.isfinite(self.nodes).all():
             bad = int(np.flatnonzero(~np.isfinite(self.nodes).all(axis=1))[0])
             raise InputError(f"mesh: node {bad} has a coordinate that is not finite")
-        used = np.unique(self.elements)
-        if used[0] < 0 or used[-1] >= len(self.nodes):
+        rows = np.unique(self.elements)
+        if rows[0] < 0 or rows[-1] >= len(self.nodes):
             raise InputError(
-                f"mesh: elements name nodes {used[0]}..{used[-1]}, but there are {len(self.nodes)}"
+                f"mesh: elements name nodes {rows[0]}..{rows[-1]}, but there are {len(self.nodes)}"
             )
-        if len(used) < len(self.nodes):
-            loose = int(np.setdiff1d(np.arange(len(self.nodes)), used)[0])
+        if len(rows) < len(self.nodes):
+            loose = int(np.setdiff1d(np.arange(len(self.nodes)), rows)[0])
             raise InputError(f"mesh: node {loose} belongs to no element; remove it")
         for name, nodes in self.node_sets.items():
             if nodes.size == 0 or nodes.min() < 0 or nodes.max() >= len(self.nodes):

@@ -105,8 +105,8 @@ def _cells(gmsh: Any, kind: int, corners: int, dimension: int) -> tuple[np.ndarr
     _, rows = gmsh.model.mesh.getElementsByType(kind)
     if not len(rows):
         raise InputError("gmsh found no elements")
-    used = np.searchsorted(tags[order], rows).reshape(-1, corners)
-    return places.reshape(-1, 3)[order][:, :dimension], used
+    elements = np.searchsorted(tags[order], rows).reshape(-1, corners)
+    return places.reshape(-1, 3)[order][:, :dimension], elements
 
 
 @contextmanager

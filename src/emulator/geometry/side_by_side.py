@@ -89,8 +89,8 @@ def side_by_side(meshes: Mapping[str, Mesh], *, gap: float | None = None) -> Bod
         raise InputError("bodies: give one mesh or more, by name")
     if gap is not None and not 0.0 < gap < np.inf:
         raise InputError(f"bodies: gap is {gap} mm; it must be above 0, or None to move none")
-    (first, order), *others = ((name, mesh.order) for name, mesh in meshes.items())
-    for name, other in others:
+    (first, order), *orders = ((name, mesh.order) for name, mesh in meshes.items())
+    for name, other in orders:
         if other != order:
             raise InputError(
                 f"bodies: '{first}' has tetrahedra of order {order} and '{name}' of order {other}; "
@@ -132,11 +132,11 @@ def check_name(name: str) -> None:
 
 def _separate(meshes: list[Mesh], gap: float) -> list[Mesh]:
     """Return the meshes, each moved ``gap`` beyond the one before along x."""
-    placed = meshes[:1]
+    row = meshes[:1]
     for mesh in meshes[1:]:
-        beyond = placed[-1].nodes[:, 0].max() + gap - mesh.nodes[:, 0].min()
-        placed.append(shifted(mesh, (beyond, 0.0, 0.0)))
-    return placed
+        beyond = row[-1].nodes[:, 0].max() + gap - mesh.nodes[:, 0].min()
+        row.append(shifted(mesh, (beyond, 0.0, 0.0)))
+    return row
 
 
 def _check_apart(names: tuple[str, ...], nodes: np.ndarray, owner: np.ndarray) -> None:

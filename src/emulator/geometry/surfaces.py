@@ -124,8 +124,8 @@ def _merge_points(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray
     triangles = triangles[(a != b) & (b != c) & (c != a)]
     label = connected_components(graph, directed=False)[1]
     _, first = np.unique(label, return_index=True)
-    used, renumbered = np.unique(triangles, return_inverse=True)
-    return points[first[used]], renumbered.reshape(-1, 3)
+    vertices, renumbered = np.unique(triangles, return_inverse=True)
+    return points[first[vertices]], renumbered.reshape(-1, 3)
 
 
 def _orient_consistently(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -214,8 +214,8 @@ def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
         new += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
     pieces.append(np.array(new, dtype=np.int64).reshape(-1, 3))
     rows = np.concatenate(pieces)
-    used, numbered = np.unique(rows, return_inverse=True)
-    places = np.concatenate([points, np.array(new_points).reshape(-1, 3)])[used]
+    vertices, numbered = np.unique(rows, return_inverse=True)
+    places = np.concatenate([points, np.array(new_points).reshape(-1, 3)])[vertices]
     below_it = Surface(surface.name, places, numbered.reshape(-1, 3))
     one_rim(below_it)
     return below_it

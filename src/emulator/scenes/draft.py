@@ -101,10 +101,10 @@ def draft_scene(
     quality = mesh_quality(body.mesh)
     if quality.flat or quality.parts > 1:
         notes.append(quality.sentence())
-    chosen = _law(body, law, notes)
+    material = _law(body, law, notes)
     support = _support(body.mesh, notes)
     for load, lines, note in _loads(body.mesh):
-        entries = _entries(body, mesh_name, chosen, support, (load, lines))
+        entries = _entries(body, mesh_name, material, support, (load, lines))
         all_notes = [*notes, note, *_unused(body.mesh, entries)]
         out.write_text(_header(body.mesh, all_notes) + entries, encoding="utf-8")
         try:

@@ -104,9 +104,9 @@ def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
     return evaluator(forward)(thetas)
 
 
-def require_answers(forward: ForwardMap, predicted: Prediction, what: str) -> None:
+def require_answers(forward: ForwardMap, prediction: Prediction, what: str) -> None:
     """Raise :class:`InputError` where a prediction is not valid; ``what`` begins the message."""
-    invalid = ~np.asarray(predicted.valid)
+    invalid = ~np.asarray(prediction.valid)
     if invalid.any():
         raise InputError(
             f"{what}: {forward.label} has no answer at {invalid.sum()} of {len(invalid)} theta"

@@ -84,7 +84,7 @@ def released_network(model: str, root: str | Path) -> Emulator:
 def _rename_weights(released: ReleasedNetwork, model: str) -> dict[str, np.ndarray]:
     """Return the released weights by our names."""
     places = {f"FlaxMLP_{k}": place for k, place in enumerate(_PERCEPTRONS)}
-    renamed = {}
+    weights = {}
     for name, array in released.weights.items():
         owner, *rest = name.split("/")
         if owner == "LayerNorm_0":
@@ -95,8 +95,8 @@ def _rename_weights(released: ReleasedNetwork, model: str) -> dict[str, np.ndarr
             owner, rest = places[owner], ["norm", *rest[1:]]
         else:
             raise InputError(f"published data: network of {model}: array '{name}' is unknown")
-        renamed["/".join((owner, *rest))] = array
-    return renamed
+        weights["/".join((owner, *rest))] = array
+    return weights
 
 
 def _check_energy(emulator: Emulator, model: str, root: str | Path) -> None:
@@ -108,9 +108,9 @@ def _check_energy(emulator: Emulator, model: str, root: str | Path) -> None:
     def energy(theta: jax.Array) -> jax.Array:
         return potential_energy(scene)(emulator(theta), theta)
 
-    predicted, stored = float(energy(thetas[0])), float(tests.energy[0])
-    if not abs(predicted - stored) <= _OTHER_ENERGY * abs(stored):
+    prediction, reference = float(energy(thetas[0])), float(tests.energy[0])
+    if not abs(prediction - reference) <= _OTHER_ENERGY * abs(reference):
         raise InputError(
             f"published data: these weights are not of {model}: at the first stored theta their "
-            f"prediction has an energy of {predicted:.4g} mN mm, the solution {stored:.4g}"
+            f"prediction has an energy of {prediction:.4g} mN mm, the solution {reference:.4g}"
         )

@@ -212,8 +212,8 @@ def _forces(
     # The path holds one term for every proper subset of the multi-index, and those of the
     # displacements also one for the full multi-index.
     proper = [s for size in range(1, degree) for s in combinations(range(degree), size)]
-    whole = [*proper, tuple(range(degree))]
-    subsets = [whole if each is not last else proper for each in chain]
+    with_full_index = [*proper, tuple(range(degree))]
+    subsets = [with_full_index if each is not last else proper for each in chain]
     paths = [_places(terms, parts, here) for parts, here in zip(subsets, known, strict=False)]
     nothing = jnp.zeros((0, *last.u.shape))
     fields = [jnp.stack(list(h.values())) if h else nothing for h in known[: len(chain)]]

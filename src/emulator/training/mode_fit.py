@@ -248,10 +248,10 @@ class ModeFit:
         """
         weights = jax.jit(self._with_solved_layer)(weights)
         targets = self.branch_targets(weights)
-        branch, joined = _split(weights)
+        branch, join = _split(weights)
 
         def misfit(branch: Any) -> jax.Array:
-            return self._branch_misfit(joined(branch), targets)
+            return self._branch_misfit(join(branch), targets)
 
         solver = optax.lbfgs(memory_size=_MEMORY)
         both = optax.value_and_grad_from_state(misfit)
@@ -266,17 +266,17 @@ class ModeFit:
 
         many = jax.jit(lambda carry: jax.lax.scan(iterate, carry, None, length=_AT_ONCE))
         carry, measure = (branch, solver.init(branch)), jax.jit(misfit)
-        best, least = branch, float(measure(branch))
+        best_branch, least = branch, float(measure(branch))
         with counting(desc="L-BFGS", total=iterations, disable=not progress) as bar:
             for _ in range(iterations // _AT_ONCE):
                 carry, _ = many(carry)
                 value = float(measure(carry[0]))
                 if not value < least:
                     break
-                best, least = carry[0], value
+                best_branch, least = carry[0], value
                 bar.update(_AT_ONCE)
                 bar.set_postfix(loss=f"{least:.3e}")
-        return joined(best)
+        return join(best_branch)
 
 
 def _split(weights: Weights) -> tuple[list[jax.Array], Callable[[list[jax.Array]], Weights]]:

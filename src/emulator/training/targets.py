@@ -153,8 +153,8 @@ def _target(
     fraction = jnp.where(usable, trial.fraction, 0.0)
     target = jnp.where(usable, v + fraction * step, v)
     rest = residual(target)
-    before, after = jnp.vdot(r, precondition(r)), jnp.vdot(rest, precondition(rest))
-    contraction = jnp.sqrt(jnp.abs(after) / jnp.where(before > 0.0, before, 1.0))
+    initial_norm, final_norm = jnp.vdot(r, precondition(r)), jnp.vdot(rest, precondition(rest))
+    contraction = jnp.sqrt(jnp.abs(final_norm) / jnp.where(initial_norm > 0.0, initial_norm, 1.0))
     length = jnp.sqrt(jnp.sum(step**2) / system.scene.held.shape[0])
     size = potential(jnp.zeros(()))[1]
     return target, length, fraction, contraction, -0.5 * slope / size

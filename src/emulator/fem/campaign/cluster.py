@@ -124,9 +124,9 @@ class Cluster:
                     wait(list(pending), timeout=_POLL_S, return_when="FIRST_COMPLETED")
             except TimeoutError:
                 self._workers()
-            done = [future for future in pending if future.done()]
-            if done:
-                return done
+            completed = [future for future in pending if future.done()]
+            if completed:
+                return completed
 
     def _count(self) -> int:
         try:

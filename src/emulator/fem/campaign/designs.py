@@ -99,9 +99,9 @@ def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
         position = scene.to_unit(sobol(scene, count, TEST_SEED + 1))
         thetas = scene.from_unit(position * (1.0 + 2.0 * fraction) - fraction)
         outside = ~np.asarray(scene.space.contains(thetas))
-        admitted = outside & _admissible(scene, np.asarray(thetas))
-        if admitted.sum() >= cases:
-            return thetas[np.flatnonzero(admitted)[:cases]]
+        valid = outside & _admissible(scene, np.asarray(thetas))
+        if valid.sum() >= cases:
+            return thetas[np.flatnonzero(valid)[:cases]]
         count *= 2
     raise InputError(f"outside {fraction:g}: next to nothing there is a value the scene takes")
 

@@ -55,7 +55,7 @@ class Force(Load):
         return f"force on '{self.node_set}'", None
 
     @override
-    def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
+    def check(self, mesh: Mesh, prescribed: np.ndarray, displacement: np.ndarray) -> None:
         """Refuse a node set that the mesh does not have."""
         mesh.node_set(self.node_set)
 

@@ -46,13 +46,13 @@ class Load(Part):
         """
         return self
 
-    def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
+    def check(self, mesh: Mesh, prescribed: np.ndarray, displacement: np.ndarray) -> None:
         """Raise :class:`~emulator.core.errors.InputError` if the load cannot act on this body.
 
         Parameters
         ----------
         mesh : the mesh of the body.
-        held : whether the displacement is prescribed, (n, 3) bool.
+        prescribed : whether the displacement is prescribed, (n, 3) bool.
         displacement : the prescribed displacement, (n, 3) mm, of parameters per unit.
         """
 

@@ -175,10 +175,10 @@ class CavityPressure(SurfacePressure):
         return FollowerPressure(self.facet_set, self.pressure, self.parameter)
 
     @override
-    def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
+    def check(self, mesh: Mesh, prescribed: np.ndarray, displacement: np.ndarray) -> None:
         """Refuse a cavity whose rim is neither fixed nor slides in a plane through the origin."""
         edges = rim(mesh.facet_set(self.facet_set))
-        fixed = held[edges]  # (e, 2 or 3, 3)
+        fixed = prescribed[edges]  # (e, 2 or 3, 3)
         positions = np.where(fixed, mesh.nodes[edges] + displacement[edges], np.nan)
         in_symmetry_plane = (np.abs(positions) <= 1e-9 * mesh.size).all(axis=1).any(axis=1)
         loose = np.unique(edges[~(fixed.all(axis=(1, 2)) | in_symmetry_plane)])
@@ -209,7 +209,7 @@ class PublishedPressure(SurfacePressure):
     kind: ClassVar[str] = "published_pressure"
 
     @override
-    def check(self, mesh: Mesh, held: np.ndarray, displacement: np.ndarray) -> None:
+    def check(self, mesh: Mesh, prescribed: np.ndarray, displacement: np.ndarray) -> None:
         """Refuse quadratic tetrahedra, on which the released work is not defined."""
         if mesh.order != 1:
             raise InputError(
