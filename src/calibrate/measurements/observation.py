@@ -128,7 +128,7 @@ class Observation(ABC):
     def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
         """Return the name and the observation that ``word`` of the command line asks for.
 
-        None where the word is not one of this kind; ``seed`` is for places drawn at random.
+        The result is None if the word is of another kind. Random places are drawn from ``seed``.
         """
 
     @classmethod
@@ -138,7 +138,7 @@ class Observation(ABC):
 
     @abstractmethod
     def described(self) -> Mapping[str, Any]:
-        """Return what :meth:`from_json` needs, as plain JSON."""
+        """Return the plain JSON that :meth:`from_json` reads."""
 
     @classmethod
     @abstractmethod
@@ -162,7 +162,7 @@ class Observation(ABC):
     @property
     @abstractmethod
     def names(self) -> tuple[str, ...]:
-        """Names it may have in a data file; the first is its name where it is observed alone."""
+        """The observation's possible names in a data file; the first one where it is alone."""
 
     @property
     @abstractmethod
@@ -180,7 +180,7 @@ class Observation(ABC):
 
     @abstractmethod
     def check_values(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` where a value of the data without gaps cannot be."""
+        """Raise :class:`InputError` if a value of the data without gaps is impossible."""
 
     @classmethod
     def misuse(cls, word: str) -> InputError:
@@ -201,7 +201,7 @@ class Observation(ABC):
         return self.restricted(None)
 
     def restricted(self, entries: np.ndarray | None) -> Self:
-        """Return the observation of these entries alone, of all for None."""
+        """Return the observation of ``entries`` alone, or of all for None."""
         part = copy(self)  # unlike `replace`, `copy` keeps what the observation has computed
         part._derive(entries=entries)
         return part
@@ -239,7 +239,7 @@ class Observation(ABC):
         return filled.reshape(self.full_shape)
 
     def check(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` on data of a wrong shape or with values that cannot be.
+        """Raise :class:`InputError` on data of a wrong shape or with impossible values.
 
         NaN marks a missing value and passes.
         """

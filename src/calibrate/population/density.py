@@ -26,7 +26,7 @@ from calibrate.statistical_model import Data
 
 
 class Conditions(NamedTuple):
-    """What the posterior of a population depends on.
+    """The inputs of the posterior of a population.
 
     data : data by member and observation; members without data are missing.
     information : the information from which the coordinates are made; it does not change the

@@ -215,7 +215,7 @@ def pathfinder_start(
 
 
 class _State(NamedTuple):
-    """Everything that a killed run needs to go on."""
+    """The state from which a killed run continues."""
 
     run: Any  # _PILOT or _FINAL
     warmed: Any  # finished iterations of the warm-up
@@ -225,7 +225,7 @@ class _State(NamedTuple):
 
 
 class Chains:
-    """Chains under way: a pilot run, then the final one on the map fitted to it."""
+    """Running chains: a pilot run, then the final one on the map fitted to it."""
 
     def __init__(
         self,

@@ -97,12 +97,12 @@ class _Position(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Everything that a killed run needs to go on."""
+    """The state from which a killed run continues."""
 
     map_: transport.StandardMap
     position: _Position
-    count: Any  # draws so far, the discarded ones included
-    solves: Any  # FEM solves so far, those of starts and discarded draws included
+    count: Any  # number of draws so far, with discarded ones
+    solves: Any  # number of FEM solves so far, with those of starts and discarded draws
     draws: Draws
 
 
@@ -118,7 +118,7 @@ _STATISTICS = {
 
 
 class DelayedAcceptance(Sampler):
-    """The sampler."""
+    """The sampler whose proposals come from the cheap posterior and are decided by FEM."""
 
     solves_fem: ClassVar[bool] = True
 
@@ -153,7 +153,7 @@ class DelayedAcceptance(Sampler):
 
 
 class _Run:
-    """Chains under way."""
+    """Running chains."""
 
     def __init__(
         self,

@@ -41,7 +41,7 @@ class Draws(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What a run needs besides its density.
+    """The inputs of a run besides its density.
 
     progress : whether a progress bar is shown.
     checkpoint : the file that the run's state is written to, and restored from after a kill.

@@ -89,14 +89,14 @@ class _Particles(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Everything that a killed run needs to go on: finished sets, and the one under way."""
+    """The state from which a killed run continues: the finished sets, and the current one."""
 
     done: _Particles
     current: _Particles
 
 
 class TemperedSMC(Sampler):
-    """The sampler."""
+    """The sampler of tempered sequential Monte Carlo."""
 
     def sample(
         self,
