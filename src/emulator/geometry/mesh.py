@@ -124,7 +124,7 @@ class Mesh:
 
     Parameters
     ----------
-    nodes : (n, 3) reference coordinates, mm.
+    nodes : the reference coordinates (n, 3), mm.
     elements : (m, 4) corner indices, positively oriented; (m, 10) adds a node on each edge, in
         VTK's order (01, 12, 02, 03, 13, 23).
     node_sets : name -> (k,) node indices.

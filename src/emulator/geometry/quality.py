@@ -24,7 +24,7 @@ class MeshQuality(NamedTuple):
     """Shapes of a mesh's elements.
 
     parts : the number of disconnected parts.
-    angle : smallest dihedral angle, degrees. flat : elements with one below :data:`FLAT`.
+    angle : the least dihedral angle, degrees. flat : the number of elements below :data:`FLAT`.
     place : mm, middle of the element with the smallest angle.
     jacobian : least ratio of an element's smallest Jacobian to its mean, at quadrature points; 1
         where elements are straight.

@@ -35,7 +35,7 @@ def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
 
     Parameters
     ----------
-    mesh : linear tetrahedra.
+    mesh : the mesh of linear tetrahedra.
     midpoints : ``midpoints(edges) -> (e, 3)`` places in mm of the nodes on ``edges`` (e, 2), for
         curved surfaces; halfway along each edge by default.
 
@@ -135,7 +135,7 @@ class Refinement:
 
     mesh : quadratic; element k came from element ``k // children`` of the coarse mesh.
     prolongation : (fine nodes, coarse nodes), sparse; see the module docstring.
-    corners : (m, children, 4, 4) barycentric coordinates of each child's corners in its parent.
+    corners : the barycentric coordinates (m, children, 4, 4) of children's corners in parents.
     """
 
     coarse: Mesh

@@ -38,7 +38,7 @@ _TILT = 0.01
 class Surface:
     """Triangles with consistent normals.
 
-    name : for messages. points : (n, 3) mm. triangles : (t, 3), normals out of what they enclose.
+    name : the name in messages. points : (n, 3) mm. triangles : (t, 3), normals pointing out.
     """
 
     name: str

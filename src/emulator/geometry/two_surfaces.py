@@ -57,9 +57,9 @@ class Wall:
     mesh : facet and node sets endocardium, epicardium and base, and the node sets
         apex_endocardium and apex_epicardium of one node each; at the surfaces' own place.
     axis : (3,) from apex to base, of length 1. base : (3,) mm, the middle of the cavity's rim.
-    size : edge length aimed at, mm. thickness : of the wall.
-    cavity, wall : volumes in mL, of the mesh and of the surfaces below the base plane.
-    cut_off : height of what was cut off above the base plane, mm; 0 for closed surfaces.
+    size : the target edge length, mm. thickness : the thickness of the wall.
+    cavity, wall : the volumes in mL, of the mesh and of the surfaces below the base plane.
+    cut_off : the height of the part above the base plane, mm; 0 for closed surfaces.
     moved : the largest displacement of a point by smoothing, mm.
     """
 
@@ -118,7 +118,7 @@ def mesh_wall(
     Parameters
     ----------
     endocardium, epicardium : files of triangles (STL, PLY, OBJ), or surfaces in mm.
-    size : edge length in mm; 0.7 of the median thickness by default.
+    size : the edge length in mm; 0.7 of the median thickness by default.
     order : 2 for quadratic elements with curved edges on both surfaces, or 1.
     axis : the base plane's normal, from apex to base, of any length; found from the rims by
         default. Closed surfaces need it.

@@ -28,7 +28,7 @@ class Effect:
 
     name : the name of the effect.
     without : the scene without the effect.
-    remedy : the change that takes the effect out of a scene file.
+    remedy : the change that removes the effect from a scene file.
     """
 
     name: str

@@ -154,8 +154,8 @@ def _rotation(depth: np.ndarray, axis: np.ndarray, angles: Angles) -> tuple[Fibr
     Parameters
     ----------
     depth : relative depth in the wall (m,) or (m, q), 0 on the endocardium, 1 on the epicardium.
-    axis : unit axes with a last axis of 3.
-    angles : on endocardium and epicardium.
+    axis : the unit vectors of rotation, (..., 3).
+    angles : the angles on endocardium and epicardium.
     """
     shares: dict[str, np.ndarray] = {}
     for angle, share in zip(angles, (1.0 - depth, depth), strict=True):

@@ -30,7 +30,7 @@ def toward_ends(count: int, grading: float, ends: tuple[str, ...]) -> np.ndarray
     Parameters
     ----------
     grading : the exponent g; 1 is even, and more is finer at the ends.
-    ends : ``left``, ``right`` or both.
+    ends : the fine ends, ``left``, ``right`` or both.
 
     Raises
     ------
@@ -56,9 +56,9 @@ def box(
 
     Parameters
     ----------
-    lengths : edge lengths in mm.
+    lengths : the edge lengths, mm.
     cells : number of cells along x, y, z.
-    order : 1, or 2 for quadratic elements.
+    order : the order of the elements, 1 or 2.
     along : (cells[0] + 1,) ends of the cells along x as fractions of its length, see
         :func:`toward_ends`; even by default.
 
@@ -103,10 +103,10 @@ def slab(
 
     Parameters
     ----------
-    corners : bottom left, bottom right, top right, top left in the plane, mm.
-    cells : number from left to right and from bottom to top.
-    thickness : mm.
-    order : 1, or 2 for quadratic elements.
+    corners : the corners bottom left, bottom right, top right, top left in the plane, mm.
+    cells : the numbers of cells from left to right and from bottom to top.
+    thickness : the thickness, mm.
+    order : the order of the elements, 1 or 2.
 
     Returns
     -------

@@ -32,9 +32,9 @@ def disc(rings: int, around: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Returns
     -------
-    radius : (v,) from 0 at the centre to 1 on the outermost ring.
-    angle : (v,) polar angle in [0, 2 pi), zero at the centre.
-    triangles : (k, 3) vertices, anticlockwise.
+    radius : the radius (v,) from 0 at the centre to 1 on the outermost ring.
+    angle : the polar angle (v,) in [0, 2 pi), zero at the centre.
+    triangles : the vertices (k, 3) of triangles, anticlockwise.
     """
     counts = ring_counts(rings, around)
     first = np.concatenate([[1], 1 + np.cumsum(counts)])
@@ -75,9 +75,9 @@ _MOST_UNEVEN = 0.5  # beyond, the thin side of a thick-walled ventricle is too t
 class EllipsoidalWall:
     """Dimensions of the wall, all in mm.
 
-    short_endocardium, long_endocardium : semi-axes of the inner surface.
-    short_epicardium, long_epicardium : semi-axes of the outer surface.
-    base : height of the base plane over the ellipsoids' centre.
+    short_endocardium, long_endocardium : the semi-axes of the inner surface.
+    short_epicardium, long_epicardium : the semi-axes of the outer surface.
+    base : the height of the base plane over the ellipsoids' centre.
     """
 
     short_endocardium: float
@@ -155,7 +155,7 @@ def truncated_ellipsoid(
 
     Parameters
     ----------
-    wall : dimensions in mm.
+    wall : the dimensions in mm.
     rings : the number of rings from apex to base.
     around : the points on a full ring; rings nearer the apex have fewer.
     layers : the number of layers from endocardium to epicardium.

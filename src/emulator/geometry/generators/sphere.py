@@ -54,7 +54,7 @@ def ball(shells: int) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     nodes : (1 + sum of 10 k^2 + 2 over the shells, 3).
-    elements : (20 shells^3, 4), not oriented.
+    elements : the tetrahedra (20 shells^3, 4), not oriented.
     """
     corners, faces = _icosahedron()
     steps, cells = _kuhn_lattice(shells)
@@ -107,9 +107,9 @@ def sphere_octant(
 
     Parameters
     ----------
-    inner, outer : radii in mm.
+    inner, outer : the radii in mm.
     cells : number along each edge of the spherical triangle, and through the wall.
-    grading : ratio of the outermost layer's thickness to the innermost layer's; layers grow
+    grading : the ratio of the outermost layer's thickness to the innermost layer's; layers grow
         geometrically.
     order : 1, or 2 for quadratic elements with their mid-edge nodes on the spheres.
 

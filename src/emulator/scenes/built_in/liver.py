@@ -34,10 +34,10 @@ def liver(
 
     Parameters
     ----------
-    shells, clustering, ligament_shells : of the mesh, as in
+    shells, clustering, ligament_shells : the resolution of the mesh, as in
         :func:`~emulator.geometry.generators.organ.organ`; by default what the elements' order
         needs.
-    order : of the elements.
+    order : the order of the elements.
     ligament : its stiffness in kPa/mm, 2 by default. Linear elements have it clamped by default, as
         published: stresses are then infinite at its edge, and no mesh for daily use is right there
         (six shells of quadratic elements are 0.5 mm off).

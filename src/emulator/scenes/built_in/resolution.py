@@ -18,7 +18,7 @@ def resolved(sizes: Mapping[int, Mapping[str, Any]], order: int, **chosen: Any) 
     ----------
     sizes : default sizes by the order of the elements, 1 and 2.
     order : order of the elements.
-    chosen : sizes by name, None for the default.
+    chosen : the sizes by name, None for the default.
     """
     if order not in sizes:
         raise InputError(f"order {order} of the elements; expected 1 (linear) or 2 (quadratic)")

@@ -24,10 +24,10 @@ def twisting_cube(
 
     Parameters
     ----------
-    cells : along each edge; by default what the elements' order needs.
-    edge : length in mm.
-    degrees : angle of the rotation whose half chord is prescribed.
-    order : of the elements; 1 as published.
+    cells : the number of cells along each edge; the default depends on the order.
+    edge : the length of an edge, mm.
+    degrees : the angle of the rotation whose half chord is prescribed.
+    order : the order of the elements; 1 as published.
     """
     count = resolved(_SIZES, order, cells=cells)["cells"]
     mesh = box((edge,) * 3, (count,) * 3, order)
@@ -57,9 +57,9 @@ def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
 
     Parameters
     ----------
-    points : coordinates in mm.
+    points : the coordinates (k, 3) in mm.
     centre : a point (3,) on the axis of rotation, which is parallel to x.
-    degrees : angle of rotation.
+    degrees : the angle of rotation.
     """
     angle = np.deg2rad(degrees)
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

@@ -68,12 +68,12 @@ def left_ventricle(
 
     Parameters
     ----------
-    rings, around, layers, grading : of the mesh, as in
+    rings, around, layers, grading : the resolution of the mesh, as in
         :func:`~emulator.geometry.generators.ellipsoid.truncated_ellipsoid`; by default what the
         elements' order needs.
-    angles : helix angle on the endocardium and on the epicardium, in degrees, or the name of a
+    angles : the helix angle on the endocardium and on the epicardium, in degrees, or the name of a
         parameter, which then varies within 20 degrees of ``HELIX``.
-    kappa : resistance to volume change, kPa.
+    kappa : the resistance to volume change, kPa.
     wall : dimensions in mm of an :class:`~emulator.geometry.generators.ellipsoid.EllipsoidalWall`.
     thicker : by which fraction the wall is thicker at the base, and towards which angle in degrees.
     order : 2, quadratic elements with a fibre at each of their four points; 1, linear ones as
@@ -119,7 +119,7 @@ def left_ventricle_neo_hookean(
 
     Parameters
     ----------
-    rings, around, layers, order, grading : of the mesh, as in ``left_ventricle``.
+    rings, around, layers, order, grading : the resolution, as in ``left_ventricle``.
     """
     sizes = resolved(_SIZES, order, rings=rings, around=around, layers=layers, grading=grading)
     return Scene(
@@ -191,13 +191,13 @@ def biventricle(
 
     Parameters
     ----------
-    rings, around, layers, grading : of the mesh, as in
+    rings, around, layers, grading : the resolution of the mesh, as in
         :func:`~emulator.geometry.generators.biventricle.biventricle`; by default what the elements'
         order needs.
-    angles : helix angle in degrees on the endocardia and on the epicardium.
-    kappa : resistance to volume change, kPa.
-    right_pressure : in the right ventricle, kPa.
-    order : of the elements; 1, linear, as published.
+    angles : the helix angle in degrees on the endocardia and on the epicardium.
+    kappa : the resistance to volume change, kPa.
+    right_pressure : the pressure in the right ventricle, kPa.
+    order : the order of the elements; 1, linear, as published.
     """
     mesh_sizes = {"rings": rings, "around": around, "layers": layers, "grading": grading}
     sizes = resolved(_BIVENTRICLE_SIZES, order, **mesh_sizes)
