@@ -8,6 +8,7 @@ from studies.common.output import Results
 from studies.silicone_beam import beam, experiment
 
 import calibrate as cal
+from calibrate.model_error.kinds import rotation_of
 from emulator.core.errors import InputError
 from scene_support import rotation
 
@@ -41,7 +42,7 @@ def made_up() -> experiment.Measured:
 
 def test_the_turn_of_markers_is_found():
     R = rotation(2)
-    found = beam.turned(experiment.TIP, experiment.TIP @ R.T + 3.0 - experiment.TIP)
+    found = rotation_of(experiment.TIP, experiment.TIP @ R.T + 3.0 - experiment.TIP)
     np.testing.assert_allclose(found, R, atol=1e-12)
 
 
@@ -55,7 +56,7 @@ def test_what_is_unknown_fits_the_observations():
             assert np.shape(modes) == (len(error.names), *shapes[name])
     # A pin that stands elsewhere changes what is seen by what the tip's turn makes of it.
     pins = next(e for e in beam.unknowns(seen) if e.names[0] == "pins x")
-    turn = beam.turned(seen.rest, seen.weight) - np.eye(3)
+    turn = rotation_of(seen.rest, seen.weight) - np.eye(3)
     np.testing.assert_allclose(pins.modes[beam.WEIGHT][1, 2], beam.PIN * turn @ [0.0, 1.0, 0.0])
 
 

@@ -28,7 +28,7 @@ from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.pod_gp import fit_reduced
 from emulator.surrogates.protocol import ForwardMap
 from emulator.surrogates.taylor import expand
-from emulator.training import RECIPES, train
+from emulator.training import recipe, train
 
 POINTS, SEED = 24, 4
 FAST_CALLS = 60
@@ -230,7 +230,7 @@ STAGES: dict[str, Callable[[Place], Iterator[Rung]]] = {
 def mechanics(scene: Scene, runs: int) -> Emulator:
     """A series of order 3 and a discrepancy model of so many FEM runs."""
     with TemporaryDirectory() as folder:
-        return train(scene, replace(RECIPES["mechanics"], simulations=runs), folder)
+        return train(scene, replace(recipe("mechanics"), simulations=runs), folder)
 
 
 def _series(place: Place, order: int) -> tuple[float, ForwardMap]:

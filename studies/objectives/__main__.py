@@ -30,7 +30,8 @@ from emulator.core.store import write_json
 from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates import Architecture, load, save_emulator
-from emulator.training import Plan, recipe, remove_checkpoint, train
+from emulator.training import recipe, remove_checkpoint, train
+from emulator.training.graph_network import GraphNetwork
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
@@ -51,14 +52,14 @@ def beam(quick: bool) -> Scene:
     return em.scenes.once_clamped_beam(*([COARSE] if quick else []), order=1)
 
 
-def plan_of(objective: str, steps: int, simulations: int, quick: bool) -> Plan:
+def plan_of(objective: str, steps: int, simulations: int, quick: bool) -> GraphNetwork:
     """The recipe ``network`` with ``objective``; initial weights, theta and rates do not differ."""
     plan = replace(recipe("network"), steps=steps, simulations=simulations)
     plan = replace(plan, objective=objective)  # a name of OBJECTIVES
     return replace(plan, batch=8, learning_rate=3e-3) if quick else plan
 
 
-def train_one(scene: Scene, plan: Plan, folder: Path, quick: bool) -> None:
+def train_one(scene: Scene, plan: GraphNetwork, folder: Path, quick: bool) -> None:
     """Train and write the emulator to ``folder``, with this process's processor time."""
     trained = train(scene, plan, folder, architecture=SMALL if quick else None)
     record = {**trained.record, "processor_s": round(time.process_time(), 1)}
@@ -74,7 +75,7 @@ def in_its_own_process(objective: str, folder: Path, arguments: argparse.Namespa
     subprocess.run(command("objectives", *words), check=True, env=environment())
 
 
-def fem_seconds(scene: Scene, plan: Plan) -> float:
+def fem_seconds(scene: Scene, plan: GraphNetwork) -> float:
     """Processor time of the FEM runs that ``plan`` trains on, compilation included."""
     thetas = scene.centre[None]
     if plan.runs:

@@ -42,7 +42,7 @@ _ALL: tuple[Recipe, ...] = (
 RECIPES: dict[str, Recipe] = {plan.recipe: plan for plan in _ALL}
 
 
-def recipe(name: str) -> Recipe:
+def recipe(name: str) -> Any:  # a Recipe; each has options of its own, which ``replace`` takes
     """Return the plan of that recipe; ``dataclasses.replace`` changes its options."""
     return look_up(RECIPES, name, "recipe")
 

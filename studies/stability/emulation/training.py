@@ -19,7 +19,7 @@ from emulator.accuracy.estimate import error_bar
 from emulator.fem import Simulator, sobol
 from emulator.scenes import Scene
 from emulator.surrogates.emulator import Emulator
-from emulator.training import RECIPES, objectives, train
+from emulator.training import objectives, recipe, train
 
 FAMILY = "training"
 STEPS, TESTS = 60, 4
@@ -49,8 +49,8 @@ def _without_barriers() -> Iterator[None]:
         objectives.Barriers = kept
 
 
-def _trained(rate: float, batch: int, exponent: float, barriers: bool, recipe: str) -> Ended:
-    plan = replace(RECIPES[recipe], learning_rate=rate, batch=batch, steps=STEPS)
+def _trained(rate: float, batch: int, exponent: float, barriers: bool, name: str) -> Ended:
+    plan = replace(recipe(name), learning_rate=rate, batch=batch, steps=STEPS)
     with tempfile.TemporaryDirectory() as folder:
         if barriers:
             found = train(ventricle(exponent), plan, folder)
@@ -83,7 +83,7 @@ def judge(found: Emulator) -> Ended:
     return Ended("TRAINED", note=f"{note}, {flagged} of {TESTS} not trusted")
 
 
-_DEFAULT = {"rate": 1e-3, "batch": 1, "exponent": 1.0, "barriers": True, "recipe": "paper"}
+_DEFAULT = {"rate": 1e-3, "batch": 1, "exponent": 1.0, "barriers": True, "name": "paper"}
 for _name, _other in {
     "rate_1e_6": {"rate": 1e-6},
     "rate_1e_3": {},

@@ -129,7 +129,7 @@ def test_infer_takes_both_and_infers_a_noise(setting, folder, tmp_path, capsys):
     [
         (
             ["--noise", "volume=0"],
-            "volume (mL): noise: standard deviation is 0.0; it must be above",
+            "volume (mL): noise 'gaussian': standard deviation is 0.0; it must be above",
         ),
         (["--noise", "pressure=1"], "noise: 'pressure' is not observed; observed: displacement"),
         (["--observe", "landmarks:3+volume+volume"], "volume is given twice"),
