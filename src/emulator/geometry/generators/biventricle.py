@@ -45,7 +45,7 @@ class Footprint:
     inner : (k, 3) triangles on the near side of the line.
     outer : (k, 3) triangles on the far side, attached to the band's last line.
     band : (k, 3) triangles of the band, cut along the same diagonals as the sides of ``inner``
-        extruded through ``strips`` layers (:func:`emulator.geometry.generators.prisms.extrude`).
+        extruded through ``strips`` layers (:func:`emulator.geometry.generators.body.extrude`).
     """
 
     origin: np.ndarray
