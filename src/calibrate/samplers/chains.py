@@ -50,7 +50,8 @@ _MEMORY = 6  # pairs of steps and gradients that make a Gaussian's covariance
 class ChainSampler(Sampler):
     """A sampler made of a kernel.
 
-    kernel : (log_density(position, *arguments), options) -> :class:`Kernel`.
+    kernel : the function of a log density and the options that returns a :class:`Kernel`. The log
+        density takes a position and further arguments.
     adapts_in_steps : whether the first ``options.warmup`` steps adapt; otherwise ``init`` adapts.
     """
 

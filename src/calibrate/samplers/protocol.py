@@ -79,11 +79,13 @@ class Sampler(ABC):
 class Kernel(NamedTuple):
     """A Markov transition, written for one chain.
 
-    init : (rng_key, position (p,), *arguments) -> state. The state is a pytree of arrays with
-        everything the next step needs, its random key included.
-    step : (state, *arguments) -> (state, position (p,), statistics by name, each ()).
+    init : the function of a random key, a position (p,) and further arguments that returns the
+        first state: a pytree of arrays with everything the next step needs, its random key
+        included.
+    step : the function of a state and further arguments that returns the next state, its position
+        (p,), and statistics by name, each ().
 
-    ``arguments`` are passed on to the log density and not interpreted.
+    Further arguments are passed on to the log density and not interpreted.
     """
 
     init: Callable[..., Any]

@@ -155,7 +155,6 @@ class Cavity:
     Attributes
     ----------
     nodes : the nodes (k,) of the wall, in the order in which :meth:`__call__` takes them.
-    rest : the volume of the undeformed cavity, mL, above 0.
 
     Raises
     ------
