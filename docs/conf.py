@@ -47,7 +47,7 @@ def _public(package: object) -> list[str]:
             lines += [f"- ``{path}``: {thing.__doc__.strip().splitlines()[0]}", ""]
             continue
         if isinstance(thing, dict):
-            lines += [f".. data:: {path}", "", f"   A registry: {', '.join(thing)}.", ""]
+            lines += [f".. data:: {name}", "", f"   A registry: {', '.join(thing)}.", ""]
             continue
         kind = "class" if inspect.isclass(thing) else "function" if callable(thing) else "data"
         lines += [f".. auto{kind}:: {path}"]
