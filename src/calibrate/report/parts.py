@@ -127,8 +127,14 @@ def chart(figure: go.Figure) -> Chart:
     figure.update_layout(template="simple_white", margin={"t": 50, "b": 40}, font={"size": 13})
     if figure.layout.height is None:
         figure.update_layout(height=420)
-    config = {"displaylogo": False}
-    return Chart(to_html(figure, full_html=False, include_plotlyjs=False, config=config))
+    html = to_html(
+        figure,
+        full_html=False,
+        include_plotlyjs=False,
+        auto_play=False,  # a body is shown at its mean, not in motion through the draws
+        config={"displaylogo": False},
+    )
+    return Chart(html)
 
 
 def summary_cells(row: Mapping[str, float]) -> list[str]:
