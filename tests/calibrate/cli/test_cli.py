@@ -176,7 +176,11 @@ def test_kept_data_is_data_like_any_other(capsys, block, tmp_path):
         capsys, "infer", block, "--data", tmp_path / "r" / "data.csv", "--noise", "0.02",
         *run[6:], "--out", tmp_path / "s",
     )  # fmt: skip
-    assert (code, again["verdict"]) == (0, "accepted")
+    # The map is right, and the certificate refuses the block's few linear elements.
+    findings = again["certificate"]["findings"]
+    assert (code, again["verdict"]) == (1, "not certified")
+    assert findings[-1].startswith("no mean moves by more than")
+    assert all(finding.startswith("on a finer mesh") for finding in findings[:-1])
     assert again["parameters"]["mu"]["mean"] == pytest.approx(row["mean"], abs=row["sd"])
 
 
