@@ -11,7 +11,7 @@ of a Student's t about a Newton step from :math:`x_r`,
 with the Fisher information F of :mod:`~calibrate.analysis.fisher`, the prior's
 covariance P and the share :math:`\beta` of draws from the prior; :math:`\hat x` and Q are
 then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000).
-Where too few draws carry the weight the covariance is Q. Posteriors are
+If too few draws carry the weight, the covariance is Q. Posteriors are
 averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
 the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
 :math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
@@ -218,7 +218,7 @@ def _posterior_covariances(
         for k in round_keys:
             proposals = around.draw(k, _AROUND)
             inside = jax.vmap(log_prior)(proposals)
-            # Where the prior density is 0 the map may be undefined: it is evaluated at x instead.
+            # The map may be undefined at points of prior density 0, so it is evaluated at x there.
             evaluated = jnp.where(jnp.isfinite(inside)[:, None], proposals, x)
             likely = jax.lax.map(
                 lambda x: log_likelihood(x, predicted(x), data, error), evaluated, batch_size=_BATCH

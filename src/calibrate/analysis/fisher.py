@@ -50,8 +50,8 @@ from calibrate.statistical_model import Model
 from emulator.core.errors import InputError
 
 At = Callable[[jax.Array, ModelError | None, jax.Array], tuple[jax.Array, jax.Array]]
-"""From x (q,), the errors that numbers share, if any, and the unknowns (m,) of these: F (q, q), and
-whether the map is valid there."""
+"""The function of x (q,), the shared errors (or ``None``) and their unknowns (m,) that returns the
+information F (q, q), and whether the map is valid at x."""
 
 
 def information_at(
@@ -96,7 +96,7 @@ def information_at(
 _SIZES = 32
 
 Errors = Callable[[Mapping[str, Any]], ModelError | None]
-"""From data without noise by name to the errors besides noise that a model has about it."""
+"""The function of data without noise, by name, that returns the model's errors besides noise."""
 
 
 def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError | None:

@@ -7,7 +7,7 @@ The Monte Carlo error of any figure is the delete-a-group jackknife's,
 with every G-th point in a group (Owen 2013, Section 2.7; Wolter 2007). It ignores a tail that no
 point has reached; Pareto :math:`\hat k` watches that.
 
-Whether the data could have come from the model at all is a posterior predictive check. For draws of
+A posterior predictive check tests whether the model could have made the data. For draws of
 FEM's posterior and data :math:`\tilde y` simulated from each, two discrepancies between data and
 prediction (Gelman, Meng and Stern 1996),
 

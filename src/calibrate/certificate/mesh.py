@@ -54,7 +54,7 @@ None where FEM failed on one of the meshes.
 def points_for(unknowns: int, states: int, most: int | None) -> int:
     """Return the number of points at which both meshes are solved, in every load state.
 
-    By default four more than there are unknowns, and no more than 15 solves on a mesh.
+    The default is four more than there are unknowns, and at most 15 solves on a mesh.
 
     most : the largest number of solves on a mesh.
     """

@@ -219,7 +219,7 @@ class Tail:
 
     @property
     def heavy(self) -> bool:
-        """Whether the tail is too heavy for errors to be trusted; NaN counts as heavy."""
+        """Return whether the tail is too heavy to trust the errors; NaN counts as heavy."""
         return not (self.k_hat < self.k_threshold or self.largest < NO_TAIL)
 
 

@@ -1,4 +1,4 @@
-"""What commands print: results as JSON or as text, tables, posteriors, cavity volumes."""
+"""The output of commands: results as JSON or text, tables, posteriors, cavity volumes."""
 
 from __future__ import annotations
 
