@@ -15,7 +15,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 import jax
 import pytest
 
-import calibrate.project  # noqa: F401 - with all it imports, before warnings are errors
+import calibrate.project.calibration  # noqa: F401 - with all it imports, before warnings are errors
 import emulator as em
 from emulator.scenes import Scene
 

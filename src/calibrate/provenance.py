@@ -1,11 +1,10 @@
-"""Provenance of results: machine, versions of packages, commit."""
+"""Provenance of results: machine, versions of packages."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
-import subprocess
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -45,38 +44,14 @@ def versions() -> dict[str, str]:
 def hardware() -> dict[str, Any]:
     """Return processor, cores, and the accelerator if JAX uses one."""
     accelerator = None if jax.default_backend() == "cpu" else jax.devices()[0].device_kind
+    cpuinfo, processor = Path("/proc/cpuinfo"), ""
+    if cpuinfo.is_file():
+        lines = cpuinfo.read_text(encoding="utf-8").splitlines()
+        names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+        processor = next(names, "")
     return {
-        "processor": _processor(),
+        "processor": processor or platform.processor() or "unknown",
         "cores": os.cpu_count(),
         "machine": platform.machine(),
         "accelerator": accelerator,
-    }
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or "unknown"
-
-
-def commit(folder: str | Path) -> str | None:
-    """Return the commit at ``folder``, with ``+`` if files were changed; ``None`` without git."""
-    try:
-        words = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=12"]
-        process = subprocess.run(words, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return process.stdout.strip()
-
-
-def study_header(folder: str | Path, seed: int) -> dict[str, Any]:
-    """Return the first entries of every study's results.json."""
-    return {
-        "hardware": hardware(),
-        "versions": versions(),
-        "commit": commit(folder),
-        "seed": seed,
     }

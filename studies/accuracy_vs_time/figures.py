@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from studies.common.output import Case, save
 
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
 STYLES = {

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from studies.common.output import study_header
 
 import calibrate as cal
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.measurements import spread_nodes
-from calibrate.provenance import study_header
 from emulator import Simulator, load
 from emulator.core.store import write_json
 from emulator.released.scenes import published_tests

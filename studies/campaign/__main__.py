@@ -25,7 +25,7 @@ from studies.common.processes import environment
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from emulator.scenes import Scene
 
 HERE = Path(__file__).parent

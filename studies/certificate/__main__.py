@@ -19,12 +19,11 @@ import numpy as np
 from studies.certificate import problems
 from studies.certificate.cases import cases
 from studies.certificate.problems import ExactSimulator
-from studies.common.output import save
+from studies.common.output import save, study_header
 
 import calibrate as cal
 from calibrate.certificate import certify
-from calibrate.figures.drawing import BLUE, GREEN, ORANGE, VERMILION, pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import BLUE, GREEN, ORANGE, VERMILION, pyplot
 from emulator import Simulator
 from emulator.core.store import write_json
 

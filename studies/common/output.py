@@ -5,13 +5,14 @@
 
 import argparse
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from calibrate.figures.drawing import pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import pyplot
+from calibrate.provenance import hardware, versions
 from emulator.core.errors import InputError, SolverError
 from emulator.core.store import replacing, write_json
 
@@ -35,6 +36,21 @@ def run(main: Callable[[], None]) -> None:
         main()
     except (InputError, SolverError, OSError) as error:
         raise SystemExit(f"{Path(sys.argv[0]).parent.name}: {error}") from None
+
+
+def commit(folder: str | Path) -> str | None:
+    """Return the commit at ``folder``, with ``+`` if files were changed; ``None`` without git."""
+    try:
+        words = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=12"]
+        process = subprocess.run(words, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return process.stdout.strip()
+
+
+def study_header(folder: str | Path, seed: int) -> dict[str, Any]:
+    """Return the first entries of every study's results.json."""
+    return {"hardware": hardware(), "versions": versions(), "commit": commit(folder), "seed": seed}
 
 
 class Results:

@@ -10,11 +10,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from studies.common.output import save
+from studies.common.output import save, study_header
 from studies.decoder_speed import cubes, kinds, ventricle
 
-from calibrate.figures.drawing import pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import pyplot
 from emulator.core.store import write_json
 
 HERE = Path(__file__).parent

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from studies.common.output import study_header
 from studies.common.timing import milliseconds, per_call
 from studies.decoder_speed.kinds import SCENE, problem
 
 import calibrate as cal
 import emulator as em
-from calibrate.provenance import study_header
 from calibrate.samplers.density import density_of
 from calibrate.samplers.smc import SMCOptions
 from calibrate.statistical_model import Data, Model

@@ -20,7 +20,7 @@ from studies.effects.scenes import SCENES, observed, other_choices, points, publ
 import calibrate as cal
 import emulator as em
 from calibrate.analysis.effects import Comparison, Measured, recommend
-from calibrate.figures.drawing import BLUE, GREEN, VERMILION, pyplot
+from calibrate.figures import BLUE, GREEN, VERMILION, pyplot
 from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import run_campaign

@@ -24,7 +24,7 @@ from studies.common.output import Case, Results, parser, save
 from studies.elements.bodies import BEAM, BODIES, Body, Measured, measured
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.measurements.displacements import spread_landmarks
 from emulator.scenes.scene import Scene
 

@@ -14,14 +14,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from studies.common.output import save
+from studies.common.output import save, study_header
 from studies.common.timing import clocked
 from studies.error_bar.centre import centre_estimate
 from studies.error_bar.tables import ESTIMATES, effectivities, polishes
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import pyplot
 from emulator.accuracy.estimate import error_bar
 from emulator.core.store import write_json
 from emulator.fem import run_campaign, sobol

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from studies.common.output import commit, study_header
 from studies.common.processes import command, environment
 from studies.fem_posterior.comparison import largest, of_weights, with_agreement
 from studies.fem_posterior.figure import draw
@@ -35,7 +36,6 @@ from studies.fem_posterior.problems import PROBLEMS, Problem
 from studies.fem_posterior.shifts import PAIRED, SHIFT, certificates
 from studies.fem_posterior.tables import tables
 
-from calibrate.provenance import commit, study_header
 from emulator.core.store import write_json
 
 HERE = Path(__file__).parent

@@ -7,7 +7,7 @@ from studies.common.output import save
 from studies.fem_posterior.comparison import cost
 from studies.fem_posterior.methods import CHEAP, LATE, PLAIN, TUNED
 
-from calibrate.figures.drawing import BLUE, GREEN, ORANGE, VERMILION, pyplot
+from calibrate.figures import BLUE, GREEN, ORANGE, VERMILION, pyplot
 
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
 MARKS = {

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from studies.common.output import Case, save
 
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 
 
 def draw(cases: list[Case], path: Path) -> None:

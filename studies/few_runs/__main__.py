@@ -14,13 +14,13 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from studies.common.output import study_header
 from studies.common.processes import command, environment
 from studies.few_runs.accuracy import SEED, accuracy
 from studies.few_runs.figures import draw_meshes, draw_runs, draw_time
 from studies.few_runs.meshes import mesh_case
 from studies.few_runs.tables import check, summary, tables
 
-from calibrate.provenance import study_header
 from emulator.core.store import write_json
 
 HERE = Path(__file__).parent

@@ -6,7 +6,7 @@ from studies.common.output import save
 from studies.few_runs.accuracy import OVER, PLAIN, POSITIONS, RIVAL, SERIES, VALUES
 from studies.few_runs.tables import WANTED, median, mesh_totals, rows, scenes
 
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 
 STYLES = {
     SERIES: ("tab:blue", "*", 13),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from studies.common.output import Case, save
 
-from calibrate.figures.drawing import BLUE, ORANGE, VERMILION, pyplot
+from calibrate.figures import BLUE, ORANGE, VERMILION, pyplot
 
 COLOURS = {"unloaded": BLUE, "fibres known": ORANGE, "image at rest": VERMILION}
 LABELS = {

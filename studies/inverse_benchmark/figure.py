@@ -5,7 +5,7 @@ from pathlib import Path
 from studies.common.output import Case, save
 from studies.inverse_benchmark.problems import PROBLEMS
 
-from calibrate.figures.drawing import COLOURS, pyplot
+from calibrate.figures import COLOURS, pyplot
 
 MARKS = "osv^DXP*<>"
 

@@ -30,7 +30,7 @@ from studies.large_meshes import solvers
 from studies.mesh_to_certificate.__main__ import one as from_mesh_to_certificate
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from emulator.fem.assembly import System
 from emulator.fem.linear.reuse import KeptFactor
 from emulator.fem.linear.suitesparse import SUITESPARSE

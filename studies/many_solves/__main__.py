@@ -13,11 +13,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from studies.common.output import save
+from studies.common.output import save, study_header
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import pyplot
 from emulator.core.store import write_json
 from emulator.fem import uniform
 from emulator.released.scenes import published_scene

@@ -26,7 +26,7 @@ from studies.common.two_meshes import Pair, on_two_meshes
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures.drawing import COLOURS, pyplot
+from calibrate.figures import COLOURS, pyplot
 from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import Simulator

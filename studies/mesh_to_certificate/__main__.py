@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from studies.common.output import save
+from studies.common.output import save, study_header
 
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.measurements.data import write_data
 from calibrate.project import Run, make_data
-from calibrate.provenance import study_header
 from emulator.catalogue import find_scene
 from emulator.core.store import write_json
 from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid

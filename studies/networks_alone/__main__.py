@@ -21,11 +21,10 @@ from typing import Any
 import jax
 import numpy as np
 import optax
-from studies.common.output import save
+from studies.common.output import save, study_header
 
 import emulator as em
-from calibrate.figures.drawing import BLUE, pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import BLUE, pyplot
 from emulator.accuracy.comparison import case_errors, quantiles
 from emulator.core.store import write_json
 from emulator.fem import Runs, run_campaign, sobol

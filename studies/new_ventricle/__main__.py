@@ -13,12 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from studies.common.output import save
+from studies.common.output import save, study_header
 from studies.common.processes import printed
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import pyplot
 from emulator.accuracy.comparison import evaluate
 from emulator.core.store import write_json
 from emulator.fem import run_campaign, sobol

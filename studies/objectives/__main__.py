@@ -18,13 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-from studies.common.output import save
+from studies.common.output import save, study_header
 from studies.common.processes import command, environment
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.figures.evaluation import LABELS
-from calibrate.provenance import study_header
 from emulator.accuracy.comparison import Errors, case_errors, log_density, quantiles
 from emulator.core.store import write_json
 from emulator.fem import run_campaign, sobol

@@ -32,7 +32,7 @@ from studies.ventricle_family.shapes import ventricles
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures.drawing import BLUE, GREEN, ORANGE, PINK, VERMILION, pyplot
+from calibrate.figures import BLUE, GREEN, ORANGE, PINK, VERMILION, pyplot
 from calibrate.measurements import parse_observation
 from emulator.core.errors import SolverError
 from emulator.fem import Runs, run_campaign, sobol

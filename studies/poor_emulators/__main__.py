@@ -19,12 +19,11 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from studies.common.output import save
+from studies.common.output import save, study_header
 
 import calibrate as cal
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.measurements import parse_observation
-from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import FEMLikelihood, with_error
 from emulator.core.store import write_json

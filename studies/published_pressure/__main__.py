@@ -18,12 +18,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from studies.common.output import save
+from studies.common.output import save, study_header
 
 import calibrate as cal
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.measurements import parse_observation
-from calibrate.provenance import study_header
 from emulator.core.store import write_json
 from emulator.fem import Runs, Simulator, sobol
 from emulator.scenes.built_in.ventricles import left_ventricle

@@ -18,13 +18,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from studies.common.output import save
+from studies.common.output import save, study_header
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.measurements import parse_observation
-from calibrate.provenance import study_header
 from emulator.core.store import write_json
 from emulator.released.scenes import published_tests, units
 from emulator.surrogates import Emulator

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpyro.distributions as dist
+from studies.common.output import study_header
 
 import calibrate as cal
 from calibrate.analysis.sbc import Calibration, sbc
 from calibrate.figures.sensitivity import draw_calibration
 from calibrate.project import Run, by_fem, model_before_data
-from calibrate.provenance import study_header
 from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import Model
 from emulator.core.store import read_json, write_json

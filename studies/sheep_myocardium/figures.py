@@ -10,7 +10,7 @@ from studies.common.output import Case, save
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.experiment import MODES, Heart
 
-from calibrate.figures.drawing import BLACK, BLUE, COLOURS, VERMILION, pyplot
+from calibrate.figures import BLACK, BLUE, COLOURS, VERMILION, pyplot
 
 
 def modes(hearts: Sequence[Heart], cases: Sequence[Case], out: Path) -> None:

@@ -17,7 +17,7 @@ from studies.silicone_beam.experiment import BLIND, FORCE, Measured, measured, r
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.model_error import ModelError
 from emulator.core.errors import InputError
 from emulator.training import recipe

@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from studies.common.output import save
+from studies.common.output import save, study_header
 from studies.stability import emulation
 from studies.stability.cases import CASES
 from studies.stability.judge import TOLERANCE
 from studies.stability.solver.case import SEED
 from studies.stability.workers import study
 
-from calibrate.figures.drawing import pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import pyplot
 from emulator import Status
 from emulator.core.store import write_json
 

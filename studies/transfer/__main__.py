@@ -17,12 +17,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from studies.common.output import save
+from studies.common.output import save, study_header
 from studies.transfer.pretraining import pretrain
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
-from calibrate.provenance import study_header
+from calibrate.figures import pyplot
 from emulator.accuracy.comparison import evaluate, field_errors, quantiles
 from emulator.core.store import write_json
 from emulator.fem import Runs, run_campaign, sobol

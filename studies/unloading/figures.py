@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from studies.common.output import Case, save
 
-from calibrate.figures.drawing import COLOURS, pyplot
+from calibrate.figures import COLOURS, pyplot
 
 
 def draw(cases: list[Case], path: Path) -> None:

@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 from scipy.stats import qmc
-from studies.common.output import save
+from studies.common.output import save, study_header
 from studies.ventricle_family.shapes import ventricles
 from studies.ventricle_family.training import PLAN, BodyRuns, train_family
 from studies.ventricle_family.workers import (
@@ -38,8 +38,8 @@ from studies.ventricle_family.workers import (
 )
 
 import emulator as em
-from calibrate.figures.drawing import BLUE, GREEN, VERMILION, pyplot
-from calibrate.provenance import hardware, study_header, versions
+from calibrate.figures import BLUE, GREEN, VERMILION, pyplot
+from calibrate.provenance import hardware, versions
 from emulator.accuracy.comparison import quantiles
 from emulator.core.store import read_arrays, write_json
 from emulator.fem.campaign import run_campaign

@@ -2,28 +2,36 @@
 
 Exit codes: 0 done, 1 ran but its result may not be used, 2 bad input with one clear line.
 
-Commands only translate words into a call of the library and print its result. :data:`COMMANDS` is
-the list of them.
+Commands only translate words into a call of the library and its result into text.
+:data:`COMMANDS` is the list of them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import os
+import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from calibrate.cli.compiled import VARIABLE, keep_programs
-from calibrate.cli.output import BAD_INPUT, FAILED
+import jax
+
 from calibrate.cli.words import Parser
 from emulator import __version__
 from emulator.core.errors import InputError, SolverError
+from emulator.core.store import to_json
+
+DONE, FAILED, BAD_INPUT = 0, 1, 2
+"""Exit codes."""
 
 COMMANDS = {
     "campaign": "fem",
     "certify": "posteriors",
     "check": "check",
     "compare": "posteriors",
-    "completion": "completion",
+    "completion": "scene_files",
     "demo": "posteriors",
     "effects": "analyses",
     "evaluate": "emulators",
@@ -37,16 +45,19 @@ COMMANDS = {
     "report": "posteriors",
     "scenes": "scene_files",
     "schema": "scene_files",
-    "sensitivity": "sensitivity",
+    "sensitivity": "analyses",
     "serve": "serving",
     "simulate": "fem",
     "train": "train",
     "unload": "fem",
     "verify": "check",
 }
-"""The module of :mod:`calibrate.cli.commands` that has ``add_<command>``, by command."""
+"""The module of :mod:`calibrate.cli.commands` that has the command, by the command's name."""
 
 _NO_CACHE = "--no-cache"
+VARIABLE = "CALIBRATE_CACHE"
+LARGEST = 1 << 30  # bytes; the least recently used programs are deleted first
+_LEAST_SECONDS = 0.0  # every program is kept: compiling a hundred small ones takes 2 s
 
 
 def build_parser(only: str | None = None) -> Parser:
@@ -64,7 +75,7 @@ def build_parser(only: str | None = None) -> Parser:
     )
     for name in COMMANDS if only is None else [only]:
         module = importlib.import_module(f"calibrate.cli.commands.{COMMANDS[name]}")
-        getattr(module, f"add_{name}")(commands)
+        getattr(module, name)(commands, name)
     return parser
 
 
@@ -79,7 +90,11 @@ def main(words: Sequence[str] | None = None) -> int:
         arguments = build_parser(None if option else first).parse_args(words)
         if not arguments.no_cache:
             keep_programs()
-        return arguments.run(arguments)
+        answer = arguments.run(arguments)
+        print(to_json(answer.result) if arguments.json else answer.text, flush=True)
+        if answer.then is not None:
+            answer.then()
+        return DONE if answer.usable else FAILED
     except InputError as error:
         print(f"calibrate: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -93,3 +108,51 @@ def main(words: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("calibrate: interrupted", file=sys.stderr)
         return FAILED
+
+
+def keep_programs(environment: Mapping[str, str] = os.environ) -> Path | None:
+    """Have JAX write compiled programs to disk; return their folder, or ``None`` for nowhere.
+
+    Half of the time of a short command is compilation. As a library the package configures nothing,
+    and ``JAX_COMPILATION_CACHE_DIR`` takes precedence where it is set. A folder that cannot be
+    written to is reported, and the command runs without it.
+    """
+    if jax.config.jax_compilation_cache_dir is not None:
+        return None
+    folder = program_folder(environment)
+    if folder is None:
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f".writable-{os.getpid()}").touch()
+        (folder / f".writable-{os.getpid()}").unlink()
+    except OSError as error:
+        print(f"calibrate: compiled programs are not kept: {folder}: {error}", file=sys.stderr)
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", LARGEST)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_SECONDS)
+    return folder
+
+
+def program_folder(environment: Mapping[str, str]) -> Path | None:
+    """Return the folder for programs of this machine and this JAX; ``None`` for nowhere.
+
+    ``CALIBRATE_CACHE`` names it; empty, there is none, and by default it is in the user's cache.
+    Programs use the instructions of the processor they were compiled on, so that a home directory
+    on several machines holds a folder for each kind.
+    """
+    folder_name = environment.get(VARIABLE)
+    if folder_name == "":
+        return None
+    if folder_name is not None:
+        base = Path(folder_name).expanduser()
+    else:
+        home = environment.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        base = Path(home) / "calibrate"
+    cpuinfo, flags = Path("/proc/cpuinfo"), ""
+    if cpuinfo.is_file():
+        lines = cpuinfo.read_text(encoding="utf-8").splitlines()
+        flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    digest = hashlib.sha256(f"{platform.processor()} {flags}".encode()).hexdigest()[:8]
+    return base / f"jax-{jax.__version__}-{platform.machine()}-{digest}"

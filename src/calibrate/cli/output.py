@@ -1,66 +1,27 @@
-"""The output of commands: results as JSON or text, tables, posteriors, cavity volumes."""
+"""Results of commands as text: tables, posteriors, cavity volumes."""
 
 from __future__ import annotations
 
-import argparse
 import shutil
-import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from emulator.core.errors import InputError
-from emulator.core.store import to_json
 
 if TYPE_CHECKING:
     import jax
 
-    from calibrate.local_server import Server
     from emulator.accuracy.estimate import ErrorEstimate
     from emulator.scenes.scene import Scene
-
-DONE, FAILED, BAD_INPUT = 0, 1, 2
-"""Exit codes."""
 
 _UNLIMITED = 1_000_000  # columns when the output is a file or a pipe
 
 
-def emit(arguments: argparse.Namespace, result: Any, text: str) -> None:
-    """Print ``result`` as JSON where ``--json`` asks for it, or ``text``."""
-    print(to_json(result) if arguments.json else text)
-
-
-def show_progress(arguments: argparse.Namespace) -> bool:
-    """Return whether to show progress on standard error: yes without ``--json``."""
-    return not arguments.json
-
-
-@contextmanager
-def needing_plotly(what: str) -> Iterator[None]:
-    """Report a missing Plotly in one line that says that ``what`` it."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name != "plotly":
-            raise
-        raise InputError(f"{what} plotly: pip install 'soft-tissue-calibrate[plot]'") from error
-
-
-def serve_until_interrupted(
-    arguments: argparse.Namespace, server: Server, result: Any, text: str, open_page: str = ""
-) -> int:
-    """Print where a server listens, open its page in a browser, and serve until Ctrl-C."""
-    emit(arguments, result, text)
-    sys.stdout.flush()
-    if open_page:
-        import webbrowser
-
-        webbrowser.open(open_page)
-    try:
-        server.serve_forever()
-    except KeyboardInterrupt:
-        print("ended", file=sys.stderr)
-    return DONE
+def check_plotly(what: str) -> None:
+    """Refuse ``what`` needs Plotly in one line, where that is missing."""
+    if find_spec("plotly") is None:
+        raise InputError(f"{what} needs plotly: pip install 'soft-tissue-calibrate[plot]'")
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]], width: int | None = None) -> str:
@@ -69,31 +30,21 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], width: int | 
     Columns that do not fit ``width`` (by default the terminal's, if there is one) go below, with
     the first column again.
     """
-    lines = [list(header), *([_cell(value) for value in row] for row in rows)]
-    widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
+    columns = list(zip(header, *(map(_cell, row) for row in rows), strict=True))
+    widths = [max(map(len, column)) for column in columns]
     if width is None:
         width = shutil.get_terminal_size((_UNLIMITED, 24)).columns
-    blocks = [
-        "\n".join(_aligned(line, widths, columns) for line in lines)
-        for columns in _blocks(widths, width)
-    ]
-    return "\n\n".join(blocks)
-
-
-def _blocks(widths: Sequence[int], width: int) -> list[list[int]]:
-    """Return the columns after the first that stand side by side, at least one in each block."""
-    blocks: list[list[int]] = [[]]
-    for k in range(1, len(widths)):
-        together = [0, *blocks[-1], k]
-        if blocks[-1] and sum(widths[j] + 2 for j in together) - 2 > width:
-            blocks.append([])
-        blocks[-1].append(k)
-    return blocks
-
-
-def _aligned(line: Sequence[str], widths: Sequence[int], columns: Sequence[int]) -> str:
-    cells = [line[0].ljust(widths[0]), *(line[k].rjust(widths[k]) for k in columns)]
-    return "  ".join(cells).rstrip()
+    first, taken = [cell.ljust(widths[0]) for cell in columns[0]], widths[0]
+    blocks = [[first]]
+    for column, own in zip(columns[1:], widths[1:], strict=True):
+        if len(blocks[-1]) > 1 and taken + 2 + own > width:
+            blocks.append([first])
+            taken = widths[0]
+        blocks[-1].append([cell.rjust(own) for cell in column])
+        taken += 2 + own
+    return "\n\n".join(
+        "\n".join("  ".join(line).rstrip() for line in zip(*block, strict=True)) for block in blocks
+    )
 
 
 def _cell(value: object) -> str:

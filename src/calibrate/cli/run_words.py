@@ -7,26 +7,28 @@ without a word given leave the run's default, or the entry of an experiment file
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, Field, dataclass, fields
-from typing import Any, get_type_hints
+from dataclasses import MISSING, dataclass, fields
+from functools import partial
+from typing import TYPE_CHECKING, Any, get_type_hints
 
-from calibrate.cli.words import add_forward, add_scene, assignments, forward_options, scene_words
-from calibrate.noise import NOISES, parse_noise
-from calibrate.project.experiment import is_experiment_file, read_experiment
-from calibrate.project.members import Members
-from calibrate.project.problem import Problem, read_problem
-from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
-from calibrate.samplers import SAMPLERS
-from emulator.core.docstrings import documented
+from calibrate.cli.words import (
+    Option,
+    add_forward,
+    add_scene,
+    assignments,
+    forward_options,
+    scene_words,
+)
 from emulator.core.errors import InputError
 
-NoiseWord = float | dict[str, Any]
+if TYPE_CHECKING:
+    from calibrate.project import Problem, Run
+    from calibrate.project.members import Members
 
-SAMPLING = ("sampler", "sampler_options", "warmup", "draws", "chains", "seed")
-"""Fields of a run that say how it is sampled."""
+NoiseWord = float | dict[str, Any]
 
 MODEL = (
     "data", "truth", "known", "observe", "prior", "noise", "noise_scale", "discrepancy",
@@ -52,39 +54,47 @@ class Word:
     read: Callable[[Sequence[str]], Any] | None = None
 
 
-def add_run(parser: argparse.ArgumentParser, more: Sequence[str] = ()) -> None:
-    """Add the options of a run's scene and :data:`MODEL`, and of ``more`` of its fields."""
+def run_options(*more: str) -> Option:
+    """Return the options of a run's scene and :data:`MODEL`, and of ``more`` of its fields."""
+    return partial(_add_run, more=more)
+
+
+def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
+    from calibrate.project.run import Run
+    from calibrate.samplers import SAMPLERS
+    from emulator.core.docstrings import documented
+
     add_scene(parser, "; or an experiment file, whose entries the options replace")
+    parser.set_defaults(fields=(*MODEL, *more))
     exclusive = parser.add_mutually_exclusive_group()
+    hints, texts = get_type_hints(Run), documented(Run)
     for field in fields(Run):
-        if field.name == "forward":
+        name, default = field.name, field.default
+        if name == "forward":
             add_forward(parser, default=None)
-        elif field.name in (*MODEL, *more):
-            group = exclusive if field.name.endswith("error_runs") else parser
-            word = WORDS.get(field.name, Word())
-            flag = word.flag or f"--{field.name.replace('_', '-')}"
-            group.add_argument(flag, dest=field.name, **_argument(field, word))
+        elif name in (*MODEL, *more):
+            word = WORDS.get(name, Word())
+            usual = "" if default in (MISSING, None) else f" (default {default})"
+            text = word.help or f"{texts[name].removesuffix('.').replace('%', '%%')}{usual}"
+            about: dict[str, Any] = {"metavar": word.metavar}
+            if hints[name] is bool:
+                about = {"action": "store_const", "const": not default}
+            elif word.read is not None:
+                about |= {"nargs": "+", "default": []}
+            elif name == "sampler":
+                about, text = {"choices": tuple(SAMPLERS)}, f"default {default}"
+            elif hints[name] is int:
+                about = {"type": int, "metavar": "N"}
+            group = exclusive if name.endswith("error_runs") else parser
+            flag = word.flag or f"--{name.replace('_', '-')}"
+            group.add_argument(flag, dest=name, help=text, **about)
 
 
-def _argument(field: Field[Any], word: Word) -> dict[str, Any]:
-    """Return the arguments of ``add_argument`` for one field of a run."""
-    hint, has_default = get_type_hints(Run)[field.name], field.default not in (MISSING, None)
-    description = documented(Run)[field.name].removesuffix(".").replace("%", "%%")
-    usual = f" (default {field.default})" if has_default else ""
-    text = {"help": word.help or f"{description}{usual}"}
-    if hint is bool:
-        return {"action": "store_const", "const": not field.default, **text}
-    if word.read is not None:
-        return {"nargs": "+", "default": [], "metavar": word.metavar, **text}
-    if field.name == "sampler":
-        return {"choices": tuple(SAMPLERS), "help": f"default {field.default}"}
-    if hint is int:
-        return {"type": int, "metavar": "N", **text}
-    return {"metavar": word.metavar, **text}
+def plan_of(arguments: Namespace) -> Run | Problem | Members:
+    """Return what :func:`run_options` read: a run, or an experiment file's problem or members."""
+    from calibrate.project.experiment import is_experiment_file, read_experiment
+    from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
 
-
-def entries_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the fields of a run that :func:`add_run` read: those that an option was given for."""
     has_data_file = arguments.data not in (None, SYNTHETIC)
     for option in ("truth", "observe") if has_data_file else ():
         if getattr(arguments, option):
@@ -92,35 +102,32 @@ def entries_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> dict[
                 f"--{option} has no effect beside --data {arguments.data}: it is for synthetic data"
             )
     entries: dict[str, Any] = {}
-    for name in (*MODEL, *more):
-        read = WORDS[name].read if name in WORDS else None
-        word = getattr(arguments, name)
+    for name in arguments.fields:
+        read, word = WORDS.get(name, Word()).read, getattr(arguments, name)
         entries[name] = word if read is None else read(word)
     entries["forward_options"] = forward_options(arguments)
-    if is_experiment_file(arguments.scene):
+    in_file = is_experiment_file(arguments.scene)
+    if in_file:
         entries["root"] = arguments.root
     else:
         entries["scene"], entries["root"] = scene_words(arguments)
+    # An option that is not given leaves the run's default, or the file's entry, as it is.
     nonempty = {name: value for name, value in entries.items() if value is not None and value != {}}
-    return with_absolute_paths(nonempty)
+    given = with_absolute_paths(nonempty)
+    return read_experiment(arguments.scene, given) if in_file else Run(**given)
 
 
-def plan_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> Problem | Members:
-    """Read what :func:`add_run` read: the problem of one run, or an experiment file's members."""
-    entries = entries_of(arguments, more)
-    if is_experiment_file(arguments.scene):
-        return read_experiment(arguments.scene, entries)
-    return read_problem(Run(**entries))
+def problem_of(arguments: Namespace) -> Problem:
+    """Return the problem of :func:`plan_of`; :class:`InputError` if it is of members."""
+    from calibrate.project import read_problem
+    from calibrate.project.members import Members
 
-
-def problem_of(arguments: argparse.Namespace, more: Sequence[str] = ()) -> Problem:
-    """Return :func:`plan_of` of one run; :class:`InputError` if it is of members."""
-    plan = plan_of(arguments, more)
+    plan = plan_of(arguments)
     if isinstance(plan, Members):
         raise InputError(
             f"{arguments.scene} has members of a population; give an experiment file of one of them"
         )
-    return plan
+    return read_problem(plan)
 
 
 def noise_words(words: Sequence[str]) -> dict[str, NoiseWord] | float:
@@ -129,32 +136,38 @@ def noise_words(words: Sequence[str]) -> dict[str, NoiseWord] | float:
     A single bare number is returned as it is: which observation it belongs to depends on the data.
     Beside named values, a bare number is the displacements'.
     """
+    from calibrate.noise import NOISES, parse_noise
+
     for word in words:
         if word.partition(":")[0] in NOISES:
             raise InputError(f"--noise: '{word}' needs a name, as in displacement={word}")
-    if len(words) == 1 and "=" not in words[0]:
-        return _number(words[0], "--noise")
     return _by_name(words, "--noise", parse_noise)
 
 
 def noise_scale_words(words: Sequence[str]) -> dict[str, float] | float:
     """Read ``--noise-scale``: numbers as in :func:`noise_words`."""
-    if len(words) == 1 and "=" not in words[0]:
-        return _number(words[0], "--noise-scale")
     return _by_name(words, "--noise-scale", float)
 
 
-def discrepancy_words(words: Sequence[str]) -> dict[str, dict[str, float]]:
+def discrepancy_words(words: Sequence[str]) -> dict[str, dict[str, float]] | float:
     """Read ``--discrepancy``: scale and correlation length, ``SCALE:LENGTH``, by name."""
-    return _by_name(words, "--discrepancy", _discrepancy)
+
+    def read(text: str) -> dict[str, float]:
+        scale, length = map(float, text.split(":"))
+        return {"scale": scale, "length": length}
+
+    return _by_name(words, "--discrepancy", read, bare=False)
 
 
-def _discrepancy(text: str) -> dict[str, float]:
-    scale, length = map(float, text.split(":"))
-    return {"scale": scale, "length": length}
-
-
-def _by_name[T](words: Sequence[str], option: str, read: Callable[[str], T]) -> dict[str, T]:
+def _by_name[T](
+    words: Sequence[str], option: str, read: Callable[[str], T], *, bare: bool = True
+) -> dict[str, T] | float:
+    """Read values by name; where a ``bare`` number may stand alone, return it as it is."""
+    if bare and len(words) == 1 and "=" not in words[0]:
+        try:
+            return float(words[0])
+        except ValueError as error:
+            raise InputError(f"{option}: '{words[0]}' is not a number") from error
     values: dict[str, T] = {}
     for word in words:
         name, equals, text = word.partition("=")
@@ -169,16 +182,9 @@ def _by_name[T](words: Sequence[str], option: str, read: Callable[[str], T]) -> 
         except InputError as error:
             raise InputError(f"{option}: {error}") from error
         except ValueError as error:
-            right = {"--discrepancy": "displacement=0.5:20"}.get(option, "volume=1.0")
+            right = "volume=1.0" if bare else "displacement=0.5:20"
             raise InputError(f"{option}: '{word}' is wrong; write it as in {right}") from error
     return values
-
-
-def _number(word: str, option: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise InputError(f"{option}: '{word}' is not a number") from error
 
 
 def sampler_options(words: Sequence[str]) -> dict[str, Any]:
@@ -195,16 +201,6 @@ def sampler_options(words: Sequence[str]) -> dict[str, Any]:
             with suppress(ValueError):
                 options[name] = kind(text)
     return options
-
-
-def check_warmup(problem: Problem, arguments: argparse.Namespace) -> None:
-    """Raise :class:`InputError` if ``--warmup`` is given to a sampler that does not adapt."""
-    sampler, _ = problem.run.sampling()
-    adapts = "warmup" in {field.name for field in fields(sampler.options)}
-    if arguments.warmup is not None and not adapts:
-        raise InputError(
-            f"--warmup has no effect with sampler '{sampler.name}', which does not adapt"
-        )
 
 
 WORDS = {

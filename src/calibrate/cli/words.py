@@ -1,12 +1,13 @@
-"""Options that several commands share, each declared once, and how their words are read."""
+"""Commands, the options that several of them share, and how their words are read."""
 
 from __future__ import annotations
 
-import argparse
+import inspect
 import re
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder
@@ -15,12 +16,9 @@ if TYPE_CHECKING:
     import jax
 
     from emulator.scenes.scene import Scene
-    from emulator.surrogates.emulator import Emulator
-
-COMMAND_NAME = "calibrate"
 
 
-class Parser(argparse.ArgumentParser):
+class Parser(ArgumentParser):
     """An argument parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
@@ -28,13 +26,99 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
-def answer(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], int]) -> None:
-    """Have ``run`` answer a command, with ``--json``, which every command has."""
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
-    parser.set_defaults(run=run)
+class Answer(NamedTuple):
+    """The result of a command, as JSON and as text.
+
+    usable : whether the result may be used: the exit code is 0, or 1.
+    then : what is to be done once the result is printed.
+    """
+
+    result: Any
+    text: str
+    usable: bool = True
+    then: Callable[[], None] | None = None
 
 
-def add_scene(parser: argparse.ArgumentParser, more: str = "") -> None:
+Option = Callable[[ArgumentParser], object]
+"""Adds options to the parser of a command."""
+
+
+Command = Callable[[Any, str], None]
+"""Adds a command, called so, to the commands of a parser."""
+
+
+def command(*options: Option, **about: str) -> Callable[[Callable[[Namespace], Answer]], Command]:
+    """Make a command of the function that answers it.
+
+    Parameters
+    ----------
+    options : what the command takes; ``--json`` comes last, unless it is among them.
+    about : its help, description and epilog, as :mod:`argparse` takes them.
+    """
+
+    def made_of(run: Callable[[Namespace], Answer]) -> Command:
+        def add(commands: Any, name: str) -> None:
+            parser = commands.add_parser(name, **about)
+            for each in options if JSON in options else (*options, JSON):
+                each(parser)
+            parser.set_defaults(run=run)
+
+        return add
+
+    return made_of
+
+
+def command_of_kinds(about: str, **kinds: Command) -> Command:
+    """Make a command whose second word names one of several ``kinds``."""
+
+    def add(commands: Any, name: str) -> None:
+        parser = commands.add_parser(name, help=about)
+        names = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
+        for kind, add_kind in kinds.items():
+            add_kind(names, kind)
+
+    return add
+
+
+def option(flag: str, metavar: Any = None, help: str | None = None, **about: Any) -> Option:
+    """Return what adds one option, as :mod:`argparse` describes it."""
+    return lambda parser: parser.add_argument(flag, metavar=metavar, help=help, **about)
+
+
+def flag(name: str, text: str) -> Option:
+    """Return what adds an option without a value."""
+    return lambda parser: parser.add_argument(name, action="store_true", help=text)
+
+
+JSON = flag("--json", "print the result as JSON")
+THETA = option("--theta", "NAME=VALUE", "default: the box's centre", nargs="+", default=[])
+
+
+def seed_option(what: str) -> Option:
+    """Return ``--seed``; ``what`` is drawn from it."""
+    return option("--seed", type=int, default=0, help=f"seed of {what} (default 0)")
+
+
+def scheduler_option(which: str) -> Option:
+    """Return ``--scheduler``; ``which`` names the solves that go there."""
+    text = f"{which} on the workers of this Dask scheduler, e.g. tcp://127.0.0.1:8786"
+    return option("--scheduler", "ADDRESS", text)
+
+
+def load_steps_option(default: int | None = 1) -> Option:
+    """Return ``--load-steps``; without a ``default`` it is the run's."""
+    usual = "the run's own" if default is None else default
+    text = f"follow the loading path; a very soft body has several equilibria (default {usual})"
+    return option("--load-steps", "N", text, type=int, default=default)
+
+
+def parameters(function: Callable[..., Any], arguments: Namespace) -> dict[str, Any]:
+    """Return the words of the options that are called as parameters of ``function``."""
+    names = inspect.signature(function).parameters
+    return {name: word for name, word in vars(arguments).items() if name in names}
+
+
+def add_scene(parser: ArgumentParser, more: str = "") -> None:
     """Add the scene and the folder of published ones; ``more`` ends the scene's help."""
     parser.add_argument(
         "scene",
@@ -44,7 +128,7 @@ def add_scene(parser: argparse.ArgumentParser, more: str = "") -> None:
     parser.add_argument("--root", metavar="DIR", help="folder of the published data")
 
 
-def scene_words(arguments: argparse.Namespace) -> tuple[str, str | None]:
+def scene_words(arguments: Namespace) -> tuple[str, str | None]:
     """Return the name and the folder that :func:`add_scene` read.
 
     Raises
@@ -61,22 +145,15 @@ def scene_words(arguments: argparse.Namespace) -> tuple[str, str | None]:
     return arguments.scene, arguments.root
 
 
-def scene_of(arguments: argparse.Namespace) -> Scene:
+def scene_of(arguments: Namespace) -> Scene:
     """Return the scene that :func:`add_scene` read."""
     from emulator.catalogue import find_scene
 
     return find_scene(*scene_words(arguments))
 
 
-def add_theta(parser: argparse.ArgumentParser) -> None:
-    """Add one theta."""
-    parser.add_argument(
-        "--theta", nargs="+", default=[], metavar="NAME=VALUE", help="default: the box's centre"
-    )
-
-
-def theta_of(arguments: argparse.Namespace, scene: Scene) -> jax.Array:
-    """Return the theta (p,) that :func:`add_theta` read, inside the scene's box."""
+def theta_of(arguments: Namespace, scene: Scene) -> jax.Array:
+    """Return the theta (p,) of :data:`THETA`, inside the scene's box."""
     return scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
 
 
@@ -85,34 +162,8 @@ def theta_by_name(scene: Scene, theta: Any) -> dict[str, float]:
     return dict(zip(scene.parameter_names, map(float, theta), strict=True))
 
 
-def add_load_steps(parser: argparse.ArgumentParser, default: int | None = 1) -> None:
-    """Add ``--load-steps``; without a ``default`` it is the run's."""
-    usual = "the run's own" if default is None else default
-    parser.add_argument(
-        "--load-steps",
-        type=int,
-        default=default,
-        metavar="N",
-        help=f"follow the loading path; a very soft body has several equilibria (default {usual})",
-    )
-
-
-def add_seed(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add ``--seed``; ``what`` is drawn from it."""
-    parser.add_argument("--seed", type=int, default=0, help=f"seed of {what} (default 0)")
-
-
-def add_scheduler(parser: argparse.ArgumentParser, which: str) -> None:
-    """Add ``--scheduler``; ``which`` names the solves that go there."""
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help=f"{which} on the workers of this Dask scheduler, e.g. tcp://127.0.0.1:8786",
-    )
-
-
-def scheduler_word(arguments: argparse.Namespace) -> str | None:
-    """Return the address that :func:`add_scheduler` read; :class:`InputError` for another word."""
+def scheduler_word(arguments: Namespace) -> str | None:
+    """Return the address of :func:`scheduler_option`; :class:`InputError` for another word."""
     if arguments.scheduler is not None:
         from emulator.fem.campaign.cluster import check_address
 
@@ -120,57 +171,23 @@ def scheduler_word(arguments: argparse.Namespace) -> str | None:
     return arguments.scheduler
 
 
-def add_forward(parser: argparse.ArgumentParser, default: str | None = "emulator") -> None:
+def add_forward(parser: ArgumentParser, default: str | None = "emulator") -> None:
     """Add ``--forward`` and every option of every kind in the registry."""
     from emulator.surrogates.registry import FORWARD_MAPS, known_options
 
     kinds = "; ".join(f"{kind.name}: {kind.help}" for kind in FORWARD_MAPS.values())
     parser.add_argument("--forward", choices=tuple(FORWARD_MAPS), default=default, help=kinds)
-    for option, _ in known_options().values():
-        text = f"{option.help} (default {option.default})"
-        parser.add_argument(option.flag, type=int, metavar="N", help=text)
+    for each, _ in known_options().values():
+        text = f"{each.help} (default {each.default})"
+        parser.add_argument(each.flag, type=int, metavar="N", help=text)
 
 
-def forward_options(arguments: argparse.Namespace) -> dict[str, int]:
+def forward_options(arguments: Namespace) -> dict[str, int]:
     """Return the options of a forward map that :func:`add_forward` read."""
     from emulator.surrogates.registry import known_options
 
     words = {name: getattr(arguments, name) for name in known_options()}
     return {name: value for name, value in words.items() if value is not None}
-
-
-def checked_forward_options(arguments: argparse.Namespace) -> dict[str, int]:
-    """Return :func:`forward_options`; :class:`InputError` where the map has no such option."""
-    from emulator.surrogates.registry import full_options
-
-    options = forward_options(arguments)
-    full_options(arguments.forward, options)
-    return options
-
-
-def add_body(parser: argparse.ArgumentParser) -> None:
-    """Add an emulator or a scene, and the scene's emulator."""
-    parser.add_argument(
-        "body", metavar="EMULATOR|SCENE", help="an emulator's shipped name or folder, or a scene"
-    )
-    parser.add_argument(
-        "--emulator", metavar="E", help="the scene's emulator: shipped name or folder"
-    )
-
-
-def emulator_of(arguments: argparse.Namespace) -> Emulator:
-    """Return the emulator that :func:`add_body` read."""
-    from emulator.catalogue import find_scene
-    from emulator.surrogates import load
-
-    body, word = arguments.body, arguments.emulator
-    emulator = load(word or body)
-    if word and find_scene(body).fingerprint != emulator.scene.fingerprint:
-        raise InputError(
-            f"--emulator {word} is of scene '{emulator.scene.name}', or of another mesh, not of "
-            f"'{body}'"
-        )
-    return emulator
 
 
 def assignments(words: Sequence[str]) -> dict[str, float]:

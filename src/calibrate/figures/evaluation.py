@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibrate.figures.drawing import pyplot, save
+from calibrate.figures import draw_body, panels, pyplot, save
 from emulator.accuracy.comparison import UNITS, Errors, log_density, quantiles
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.mesh import Mesh
@@ -50,10 +50,7 @@ def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
 def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
     """Return a figure of each error's density, its median and 97.5 % quantile; log axis."""
     names = [name for name in LABELS if name in inside.fields]
-    columns = 3 if len(names) > 4 else 2
-    figure, grid = pyplot().subplots(
-        2, columns, figsize=(4.2 * columns, 6.4), layout="constrained", squeeze=False
-    )
+    figure, grid = panels(len(names), 3 if len(names) > 4 else 2, (4.2, 3.2))
     for axes, name in zip(grid.flat, names, strict=False):
         _draw_density(axes, inside.fields[name], _INSIDE, "inside" if outside else "")
         if outside is not None:
@@ -66,8 +63,6 @@ def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
         else:
             axes.text(0.5, 0.5, "no error", transform=axes.transAxes, ha="center")
         axes.spines[["top", "right", "left"]].set_visible(False)
-    for axes in grid.flat[len(names) :]:
-        axes.set_axis_off()
     figure.suptitle(title)
     return figure
 
@@ -131,17 +126,7 @@ def _draw_map(scene: Scene, cases: list[Any]) -> Any:
 
 def _draw_panels(scene: Scene, cases: list[Any]) -> Any:
     """Draw the error of the cases over each parameter in turn."""
-    count = len(scene.parameters)
-    columns = min(count, 3)
-    rows = -(-count // columns)
-    figure, grid = pyplot().subplots(
-        rows,
-        columns,
-        figsize=(3.8 * columns + 0.6, 3.2 * rows + 0.6),
-        sharey=True,
-        squeeze=False,
-        layout="constrained",
-    )
+    figure, grid = panels(len(scene.parameters), 3, (3.8, 3.2), margin=(0.6, 0.6), sharey=True)
     for k, (axes, parameter) in enumerate(zip(grid.flat, scene.parameters, strict=False)):
         for (thetas, errors, marker, label), colour in zip(
             cases, (_INSIDE, _OUTSIDE), strict=False
@@ -153,8 +138,6 @@ def _draw_panels(scene: Scene, cases: list[Any]) -> Any:
         axes.axvspan(parameter.low, parameter.high, color="0.93", zorder=0)
         axes.set(xlabel=_name(parameter), yscale="log")
         _scale(axes.set_xscale, axes.xaxis, parameter)
-    for axes in grid.flat[count:]:
-        axes.set_axis_off()
     _plain(grid[0, 0].yaxis, (1.0, 2.0, 5.0))  # shared
     for axes in grid[:, 0]:
         axes.set_ylabel("median err_u of a case (mm)")
@@ -196,31 +179,25 @@ def surface_figure(
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator, NullFormatter
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    plt = pyplot()
     nodes, triangles = mesh.nodes, flat_triangles(mesh.surface)
     shades = values[triangles].mean(axis=1)
     colour = ScalarMappable(Normalize(0.0, max(float(shades.max()), 1e-17)), "viridis")
     extent = np.ptp(nodes, axis=0)
-    figure = plt.figure(figsize=(11.0, 5.2), layout="constrained")
-    panels = []
+    figure = pyplot().figure(figsize=(11.0, 5.2), layout="constrained")
+    thin = extent < 0.25 * extent.max()
+    sides = []
     for column, (azimuth, elevation) in enumerate(((-60.0, 15.0), (120.0, 40.0)), 1):
         axes = figure.add_subplot(1, 2, column, projection="3d", azim=azimuth, elev=elevation)
-        axes.add_collection3d(
-            Poly3DCollection(nodes[triangles], facecolors=colour.to_rgba(shades), lw=0.0)
-        )
-        thin = extent < 0.25 * extent.max()
+        draw_body(axes, nodes, triangles, 0.88, facecolors=colour.to_rgba(shades), lw=0.0)
         for k, name in enumerate("xyz"):
             axis = (axes.xaxis, axes.yaxis, axes.zaxis)[k]
-            getattr(axes, f"set_{name}lim")(nodes[:, k].min(), nodes[:, k].max())
             axis.set_major_locator(MaxNLocator(4))
             if thin[k]:  # tick labels would overlap
                 axis.set_major_formatter(NullFormatter())
             else:
                 getattr(axes, f"set_{name}label")(f"{name} (mm)", labelpad=14 if thin.any() else 4)
-        axes.set_box_aspect(extent, zoom=0.88)
-        panels.append(axes)
-    figure.colorbar(colour, ax=panels, label=label, shrink=0.75)
+        sides.append(axes)
+    figure.colorbar(colour, ax=sides, label=label, shrink=0.75)
     figure.suptitle(title)
     return figure

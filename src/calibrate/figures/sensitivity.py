@@ -10,7 +10,7 @@ import xarray as xr
 
 from calibrate.analysis.sbc import LEVELS, Calibration
 from calibrate.analysis.sensitivity import FIELD
-from calibrate.figures.drawing import BLUE, VERMILION, pyplot, save
+from calibrate.figures import BLUE, VERMILION, draw_body, panels, pyplot, save
 from emulator.geometry.facets import flat_triangles
 from emulator.scenes.scene import Scene
 
@@ -23,14 +23,8 @@ def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> 
     A hump above zero: truths lie low among the draws. Steep ends, flat middle: the posterior is too
     narrow. Flat ends, steep middle: it is too wide.
     """
-    plt = pyplot()
     names, outside = list(calibration.ranks), calibration.outside()
-    columns = min(len(names), 3)
-    rows = -(-len(names) // columns)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=(3.6 * columns, 2.9 * rows), layout="constrained", squeeze=False,
-        sharex=True,
-    )  # fmt: skip
+    figure, grid = panels(len(names), 3, (3.6, 2.9), sharex=True)
     each = 1.0 - 0.05 / len(names)
     for axes, name in zip(grid.flat, names, strict=False):
         band = calibration.band(name, each)
@@ -42,8 +36,6 @@ def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> 
         text = ", ".join(f"{100 * covered[c][0]:.0f}" for c in LEVELS)
         wanted = "/".join(f"{100 * c:g}" for c in LEVELS)
         axes.set_title(f"{name}\ncoverage {text} % ({wanted} %)", fontsize=9)
-    for axes in grid.flat[len(names) :]:
-        axes.set_axis_off()
     for axes in grid[-1]:
         axes.set_xlabel("rank of the truth among the draws")
     for axes in grid[:, 0]:
@@ -57,19 +49,13 @@ def draw_prior_predictive(
     data: dict[str, np.ndarray], units: dict[str, str], title: str, path: str | Path
 ) -> None:
     """Draw a histogram over the prior of each observation, or of its largest size."""
-    plt = pyplot()
-    figure, grid = plt.subplots(
-        1, len(data), figsize=(4.2 * len(data), 3.2), layout="constrained", squeeze=False
-    )
+    figure, grid = panels(len(data), len(data), (4.2, 3.2))
     for axes, (name, values) in zip(grid.flat, data.items(), strict=True):
-        several = values.ndim > 1
-        sizes = (
-            np.linalg.norm(values, axis=-1).reshape(len(values), -1).max(axis=1)
-            if several
-            else values
-        )
+        sizes, label = values, name
+        if values.ndim > 1:
+            sizes = np.linalg.norm(values, axis=-1).reshape(len(values), -1).max(axis=1)
+            label = f"largest {name}"
         axes.hist(sizes, 30, color=_INSIDE, alpha=0.8)
-        label = f"largest {name}" if several else name
         axes.set(xlabel=f"{label} ({units[name]})", yticks=[])
         low, high = np.quantile(sizes, [0.05, 0.95])
         axes.set_title(f"90 %: {low:.3g} to {high:.3g} {units[name]}", fontsize=9)
@@ -83,10 +69,7 @@ if TYPE_CHECKING:
 _FIRST, _TOTAL = BLUE, VERMILION
 # By method: what a bar shows, and its label.
 _BARS = {
-    "sobol": (
-        ("first_together", "first order", _FIRST),
-        ("total_together", "total", _TOTAL),
-    ),
+    "sobol": (("first_together", "first order", _FIRST), ("total_together", "total", _TOTAL)),
     "morris": (("mu_star_together", "mean absolute effect", _FIRST),),
     "derivatives": (("bound_on_total_together", "bound on the total index", _TOTAL),),
 }
@@ -106,16 +89,13 @@ def draw(study: xr.DataTree, scene: Scene, folder: str | Path) -> list[Path]:
 
 def index_figure(study: xr.DataTree) -> Any:
     """Return a figure of every factor's bars with 95 % intervals, a panel for each observation."""
-    plt = pyplot()
     names, bars = list(study.children), _BARS[study.attrs["method"]]
-    figure, panels = plt.subplots(
-        1, len(names), figsize=(1.5 + 3.4 * len(names), 3.8), layout="constrained", squeeze=False
-    )
-    for axes, name in zip(panels[0], names, strict=True):
+    figure, grid = panels(len(names), len(names), (3.4, 3.8), margin=(1.5, 0.0))
+    for axes, name in zip(grid[0], names, strict=True):
         _draw_bars(axes, study[name].to_dataset(), bars)
         title = name if name != FIELD else "displacement of all nodes"
         axes.set_title(f"{title}, sd {_sd(study[name].to_dataset())}", fontsize="medium")
-    panels[0, 0].legend(frameon=False)
+    grid[0, 0].legend(frameon=False)
     figure.suptitle(f"{study.attrs['scene']} by {study.attrs['forward']}: what moves what")
     return figure
 
@@ -148,7 +128,6 @@ def body_figure(study: xr.DataTree, scene: Scene) -> Any:
     """Return a figure of the body at rest for each factor, coloured by its nodal index."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     plt = pyplot()
     name = _MAPPED[study.attrs["method"]]
@@ -166,18 +145,15 @@ def body_figure(study: xr.DataTree, scene: Scene) -> Any:
     columns = min(len(labels), 5)
     rows = -(-len(labels) // columns)
     figure = plt.figure(figsize=(2.6 * columns + 1.2, 3.4 * rows), layout="constrained")
-    panels = []
+    maps = []
     for k, label in enumerate(labels):
         axes = figure.add_subplot(rows, columns, k + 1, projection="3d", azim=-60.0, elev=15.0)
         faces = colour.to_rgba(np.ma.masked_invalid(shades[k]))
-        axes.add_collection3d(Poly3DCollection(nodes[triangles], facecolors=faces, lw=0.0))
-        low, high = nodes.min(axis=0), nodes.max(axis=0)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        axes.set_box_aspect(high - low, zoom=1.15)
+        draw_body(axes, nodes, triangles, 1.15, facecolors=faces, lw=0.0)
         axes.set_axis_off()
         axes.set_title(label)
-        panels.append(axes)
+        maps.append(axes)
     quantities = {"total": "total index", "mu_star": "mean absolute effect (mm)"}
     label = quantities.get(name, "bound on the total index")
-    figure.colorbar(colour, ax=panels, label=f"{label} of the displacement", shrink=0.8)
+    figure.colorbar(colour, ax=maps, label=f"{label} of the displacement", shrink=0.8)
     return figure

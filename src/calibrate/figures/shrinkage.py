@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from calibrate.figures.drawing import BLUE, VERMILION, pyplot, save
+from calibrate.figures import BLUE, VERMILION, panels, save
 from calibrate.population import Hierarchy
 from calibrate.population.posterior import ALONE
 
-_ALONE, _TOGETHER, _POPULATION = "0.55", BLUE, VERMILION
 APART = 0.16  # offset of a member's two intervals, in distances of rows
 
 
@@ -49,19 +48,20 @@ def draw(population: Hierarchy, path: str | Path, probability: float = 0.9) -> N
     Grey: the member's own data. Blue: with the population. The band is where a member not seen is
     expected, the line its median.
     """
-    plt = pyplot()
     names, members = population.shared, population.members
-    figure, grid = plt.subplots(
-        1, len(names), figsize=(1.2 + 3.6 * len(names), 1.6 + 0.34 * len(members)), sharey=True,
-        layout="constrained", squeeze=False,
-    )  # fmt: skip
+    size, margin = (3.6, 0.34 * len(members)), (1.2, 1.6)
+    figure, grid = panels(len(names), len(names), size, margin, sharey=True)
     rows = np.arange(len(members))
     for axes, name in zip(grid.flat, names, strict=True):
         alone, together, (low, middle, high) = intervals_of(population, name, probability)
-        axes.axvspan(low, high, color=_POPULATION, alpha=0.14, lw=0, label="a member not seen")
-        axes.axvline(middle, color=_POPULATION, lw=1.2)
-        _intervals(axes, alone, rows - APART, _ALONE, "alone")
-        _intervals(axes, together, rows + APART, _TOGETHER, "with the others")
+        axes.axvspan(low, high, color=VERMILION, alpha=0.14, lw=0, label="a member not seen")
+        axes.axvline(middle, color=VERMILION, lw=1.2)
+        for (start, median, end), at, colour, label in (
+            (alone, rows - APART, "0.55", "alone"),
+            (together, rows + APART, BLUE, "with the others"),
+        ):
+            axes.hlines(at, start, end, color=colour, lw=2.2, label=label)
+            axes.plot(median, at, "o", color=colour, ms=4)
         axes.set_xlabel(label_of(population, name))
         axes.spines[["top", "right"]].set_visible(False)
     grid[0, 0].set_yticks(rows, members)
@@ -72,10 +72,3 @@ def draw(population: Hierarchy, path: str | Path, probability: float = 0.9) -> N
         title=f"medians and central {100 * probability:g} % intervals", title_fontsize=9,
     )  # fmt: skip
     save(figure, path)
-
-
-def _intervals(axes: Any, ends: np.ndarray, rows: np.ndarray, color: str, label: str) -> None:
-    """Draw a line and a dot for each of the intervals ``ends`` (3, n)."""
-    low, middle, high = ends
-    axes.hlines(rows, low, high, color=color, lw=2.2, label=label)
-    axes.plot(middle, rows, "o", color=color, ms=4)

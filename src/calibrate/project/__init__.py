@@ -1,29 +1,8 @@
-"""From a run to its report: a :class:`Run` is read, modelled, sampled, saved and certified."""
+"""From a run to its report: a :class:`Run` is read, modelled, sampled, saved and certified.
 
-from calibrate.project.calibration import certify_and_keep, infer, report
-from calibrate.project.problem import (
-    Problem,
-    by_fem,
-    make_data,
-    model_before_data,
-    read_problem,
-    simulator_of,
-)
-from calibrate.project.results import holds_population, load, read_posterior
-from calibrate.project.run import Run
+What it exports is listed in ``__init__.pyi`` and imported when first used.
+"""
 
-__all__ = [
-    "Problem",
-    "Run",
-    "by_fem",
-    "certify_and_keep",
-    "holds_population",
-    "infer",
-    "load",
-    "make_data",
-    "model_before_data",
-    "read_posterior",
-    "read_problem",
-    "report",
-    "simulator_of",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

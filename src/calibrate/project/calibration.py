@@ -73,39 +73,28 @@ def certify_and_keep(
     posterior: Posterior,
     folder: str | Path,
     *,
-    draws: int | None = None,
-    at_most: int | None = None,
-    mesh: int | None = None,
     load_steps: int = 1,
     reweight_to: str | Path | None = None,
-    scheduler: str | None = None,
-    progress: bool = False,
+    **options: Any,
 ) -> Certificate:
     """Check a posterior against FEM and write ``certificate.json``.
 
     Parameters
     ----------
     folder : the folder of the posterior.
-    draws, at_most, mesh : the numbers of FEM runs, as of :func:`calibrate.certify`.
     load_steps : load steps of every solve.
     reweight_to : the folder that the reweighted posterior is written to, ready to be certified in
         its turn, where the verdict allows it (:func:`calibrate.certificate.check.can_reweight`).
-    scheduler : the address of a Dask scheduler whose workers solve.
+    options : the numbers of FEM runs, and where they are solved, as of
+        :func:`calibrate.certificate.examine`.
 
     Raises
     ------
     InputError
         FEM has decided on the draws already.
     """
-    check = examine(
-        posterior,
-        simulator_of(posterior.model.forward.scene, load_steps),
-        draws=draws,
-        at_most=at_most,
-        mesh=mesh,
-        scheduler=scheduler,
-        progress=progress,
-    )
+    simulator = simulator_of(posterior.model.forward.scene, load_steps)
+    check = examine(posterior, simulator, **options)
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     remove_pages(Path(folder).resolve())
     if reweight_to is not None and can_reweight(check.certificate):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from calibrate.provenance import versions
 from emulator.core.errors import InputError, look_up
 from emulator.core.progress import counting
 from emulator.fem import NewtonOptions, Simulator
-from emulator.fem.campaign import Executor, Neighbours, Solver, executor, solve_rows
+from emulator.fem.campaign import Neighbours, Solver, executor, solve_rows
 from emulator.fem.campaign.designs import DESIGNS
 from emulator.fem.campaign.store import Campaign, ZarrRows, make_store, writing
 from emulator.scenes.scene import Scene
@@ -66,12 +67,8 @@ def campaign(
     plan = question(
         scene, samples, thetas=thetas, design=design, seed=seed, slopes=slopes, options=options
     )
-    if out is not None:
-        fill(plan, out, scheduler=scheduler, progress=progress)
-        return xr.open_zarr(out, chunks=None)
-    store = zarr.storage.MemoryStore()
-    with executor(scheduler) as execute:
-        _solve_missing(ZarrRows(make_store(store, plan)), plan.solver, execute, progress)
+    store = zarr.storage.MemoryStore() if out is None else out
+    fill(plan, store, scheduler=scheduler, progress=progress)
     return xr.open_zarr(store, chunks=None)
 
 
@@ -107,31 +104,24 @@ def question(
 
 
 def fill(
-    plan: Campaign,
-    out: str | Path,
-    *,
-    scheduler: str | None = None,
-    progress: bool = False,
+    plan: Campaign, store: Any, *, scheduler: str | None = None, progress: bool = False
 ) -> int:
-    """Solve what the store at ``out`` lacks, and return the number of rows that were solved."""
-    with executor(scheduler) as execute, writing(out, plan) as rows:
-        return _solve_missing(rows, plan.solver, execute, progress)
-
-
-def _solve_missing(rows: ZarrRows, solver: Solver, execute: Executor, progress: bool) -> int:
-    missing = rows.missing()
-    solved = solve_rows(
-        solver,
-        jnp.asarray(rows.thetas),
-        numbers=missing,
-        starts=Neighbours(solver.simulator.scene, rows.thetas, rows),
-        execute=execute,
-    )
-    total = len(rows.thetas)
-    with counting(
-        total=total, initial=total - len(missing), desc="FEM", disable=not progress, unit="run"
-    ) as bar:
-        for row in solved:
-            rows.write(row)
-            bar.update()
+    """Solve what a store, at a path or in memory, lacks; return how many rows were solved."""
+    in_memory = isinstance(store, zarr.storage.MemoryStore)
+    opened = nullcontext(ZarrRows(make_store(store, plan))) if in_memory else writing(store, plan)
+    with executor(scheduler) as execute, opened as rows:
+        missing, total = rows.missing(), len(rows.thetas)
+        solved = solve_rows(
+            plan.solver,
+            jnp.asarray(rows.thetas),
+            numbers=missing,
+            starts=Neighbours(plan.scene, rows.thetas, rows),
+            execute=execute,
+        )
+        with counting(
+            total=total, initial=total - len(missing), desc="FEM", disable=not progress, unit="run"
+        ) as bar:
+            for row in solved:
+                rows.write(row)
+                bar.update()
     return len(missing)

@@ -41,40 +41,39 @@ Members of one population have a table each; keys outside of these tables hold f
 
     [population]
     shared = ["a", "b"]
+
+The JSON Schema, for editors that complete and check TOML, has the keys, types and descriptions of
+the run, of the dataclasses in the registries of noises, systematic errors and samplers, and of the
+options of forward maps.
 """
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Union
 
+from pydantic import Field, create_model
+
+from calibrate.model_error.kinds import SYSTEMATIC_ERRORS
+from calibrate.noise import NOISES, DiscrepancyNoise
+from calibrate.priors.population import BOX, POPULATIONS, Population
 from calibrate.project.members import POPULATION, Members, Shared
 from calibrate.project.problem import Problem, naming, read_problem
 from calibrate.project.results import MEMBERS
 from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
+from calibrate.samplers import SAMPLERS
 from emulator.core import schema
+from emulator.core.docstrings import documented
 from emulator.core.errors import InputError
-from emulator.core.line_index import Path as Entry
+from emulator.core.gaussian_process import CORRELATIONS
 from emulator.core.line_index import toml_lines
-from emulator.surrogates.registry import forward_kind
+from emulator.core.schema import OneOf, Table, json_schema, table_of
+from emulator.surrogates.registry import FORWARD_MAPS, forward_kind, known_options
 
 _OF_A_MEMBER = ("data", "truth", "known", "observe")
-
-
-@dataclass(frozen=True)
-class _File:
-    """A parsed file: its path, its entries, and the line of each."""
-
-    path: Path
-    entries: dict[str, Any]
-    lines: Mapping[Entry, int]
-
-    @property
-    def name(self) -> str:
-        return f"experiment file {self.path}"
 
 
 def is_experiment_file(word: str) -> bool:
@@ -102,62 +101,47 @@ def read_experiment(path: str | Path, entries: Mapping[str, Any] = {}) -> Proble
     InputError
         One line naming the file, its line and key, what was found and what would be right.
     """
-    file = _read(Path(path))
-    if MEMBERS not in file.entries:
-        if POPULATION in file.entries:
-            raise InputError(f"{file.name}: [population] is of members; give [members.NAME], too")
-        return _problem(file, file.entries, file.lines, file.name, entries)
-    return _members(file, entries)
-
-
-def _read(path: Path) -> _File:
+    path = Path(path)
+    file_name = f"experiment file {path}"
     if not path.is_file():
-        raise InputError(f"experiment file {path} does not exist")
+        raise InputError(f"{file_name} does not exist")
     try:
         text = path.read_text(encoding="utf-8")
-        return _File(path, tomllib.loads(text), toml_lines(text))
+        file, lines = tomllib.loads(text), toml_lines(text)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"experiment file {path} is not valid TOML: {error}") from error
+        raise InputError(f"{file_name} is not valid TOML: {error}") from error
 
+    def problem(table: Mapping[str, Any], table_lines: Mapping[Any, int], where: str) -> Problem:
+        if "data" in table and "observe" in table and table["data"] != SYNTHETIC:
+            raise InputError(
+                f"{where}: observe has no effect beside data: it is for synthetic data"
+            )
+        run = schema.read_as(Run, _without(table, entries), where, table_lines, toml=True)
+        with naming(where):
+            run = replace(run, **{**with_absolute_paths(vars(run), path.parent), **entries})
+        return read_problem(run, where)
 
-def _members(file: _File, entries: Mapping[str, Any]) -> Members:
+    if MEMBERS not in file:
+        if POPULATION in file:
+            raise InputError(f"{file_name}: [population] is of members; give [members.NAME], too")
+        return problem(file, lines, file_name)
     for name in _OF_A_MEMBER:
         if name in entries:
-            raise InputError(f"--{name} has no effect with {file.path}: it is of one member")
-    tables = file.entries[MEMBERS]
+            raise InputError(f"--{name} has no effect with {path}: it is of one member")
+    tables = file[MEMBERS]
     if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
-        raise InputError(f"{file.name}: members are tables [members.NAME]")
-    common = {k: v for k, v in file.entries.items() if k not in (MEMBERS, POPULATION)}
+        raise InputError(f"{file_name}: members are tables [members.NAME]")
+    common = {k: v for k, v in file.items() if k not in (MEMBERS, POPULATION)}
     problems = {}
     for name, table in tables.items():
-        member_lines = {
-            at[2:]: n for at, n in file.lines.items() if at[:2] == (MEMBERS, name) and at[2:]
-        }
-        where = f"{file.name}, member '{name}'"
-        lines = {**file.lines, **member_lines}
-        problems[name] = _problem(file, {**common, **table}, lines, where, entries)
-    lines = {at[1:]: n for at, n in file.lines.items() if at[0] == POPULATION}
-    shared = schema.read_as(
-        Shared, file.entries.get(POPULATION, {}), f"{file.name}, [population]", lines, toml=True
-    )
-    with naming(file.name):
+        own = {at[2:]: n for at, n in lines.items() if at[:2] == (MEMBERS, name) and at[2:]}
+        where = f"{file_name}, member '{name}'"
+        problems[name] = problem({**common, **table}, {**lines, **own}, where)
+    own = {at[1:]: n for at, n in lines.items() if at[0] == POPULATION}
+    where = f"{file_name}, [population]"
+    shared = schema.read_as(Shared, file.get(POPULATION, {}), where, own, toml=True)
+    with naming(file_name):
         return Members({name: each.run for name, each in problems.items()}, shared, problems)
-
-
-def _problem(
-    file: _File,
-    table: Mapping[str, Any],
-    lines: Mapping[Entry, int],
-    where: str,
-    entries: Mapping[str, Any],
-) -> Problem:
-    """Return the problem of one table, with ``entries`` in place of the table's own."""
-    if "data" in table and "observe" in table and table["data"] != SYNTHETIC:
-        raise InputError(f"{where}: observe has no effect beside data: it is for synthetic data")
-    run = schema.read_as(Run, _without(table, entries), where, lines, toml=True)
-    with naming(where):
-        run = replace(run, **{**with_absolute_paths(vars(run), file.path.parent), **entries})
-    return read_problem(run, where)
 
 
 def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, Any]:
@@ -169,3 +153,51 @@ def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, 
     if entries.get("data", SYNTHETIC) != SYNTHETIC:
         replaced |= {"truth", "observe"}
     return {name: value for name, value in table.items() if name not in replaced}
+
+
+def experiment_schema() -> dict[str, Any]:
+    """Return the schema (draft 2020-12). It admits what the reader admits of any scene and data."""
+    run: Any = _entries()
+    about = documented(Members)
+    tables: dict[str, Any] = {
+        MEMBERS: (dict[str, run], Field(None, description=about[MEMBERS])),
+        POPULATION: (table_of(Shared), Field(None, description=about[POPULATION])),
+    }
+    found = json_schema(create_model("ExperimentFile", __base__=run, **tables))
+    found["description"] = "What was measured on which body, and what is not known of it."
+    for table in found["$defs"].values():
+        if "kernel" in table["properties"]:
+            table["properties"]["kernel"]["enum"] = list(CORRELATIONS)
+    # An entry that the file lacks for all members is required of each member.
+    found["$defs"][Run.__name__].pop("required")
+    whole: list[Any] = [{"dependentRequired": {POPULATION: [MEMBERS]}}]
+    for key in found.pop("required")[::-1]:
+        each = {MEMBERS: {"additionalProperties": {"required": [key]}}}
+        in_all = {"required": [MEMBERS], "properties": each}
+        whole.insert(0, {"anyOf": [{"required": [key]}, in_all]})
+    return {"title": "Experiment file", **found, "allOf": whole}
+
+
+def _entries() -> type[Table]:
+    """Return the table of a run, with an exact type for entries that a run holds as plain data."""
+    noise = Annotated[Any, OneOf("kind", NOISES)]
+    of_maps: dict[str, Any] = {}  # of all maps: each member may choose its own
+    for name, (option, _) in known_options().items():
+        shown: dict[str, Any] = {"default": option.default}
+        entry = Field(None, ge=option.least, description=option.help, json_schema_extra=shown)
+        of_maps[name] = (int, entry)
+    named, in_file = Literal[BOX, *POPULATIONS], Annotated[str, Field(pattern=r"\.json$")]
+    discrepancy: Any = create_model("Discrepancy", __base__=table_of(DiscrepancyNoise))
+    exact: dict[str, Any] = {
+        "prior": Union[named, in_file, table_of(Population)],  # noqa: UP007
+        "noise": Mapping[str, float | noise] | float,
+        "discrepancy": dict[str, discrepancy],
+        "systematic": dict[str, Annotated[Any, OneOf("kind", SYSTEMATIC_ERRORS)]],
+        "forward": Literal[tuple(FORWARD_MAPS)],
+        "forward_options": create_model("ForwardOptions", __base__=Table, **of_maps),
+        "sampler": Literal[tuple(SAMPLERS)],
+        "sampler_options": Union[tuple(table_of(s.options) for s in SAMPLERS.values())],  # noqa: UP007
+    }
+    table = table_of(Run)
+    entries: dict[str, Any] = {k: (hint, table.model_fields[k]) for k, hint in exact.items()}
+    return create_model(Run.__name__, __base__=table, __doc__=table.__doc__, **entries)

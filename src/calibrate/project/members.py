@@ -8,12 +8,11 @@ hierarchy of them all (:func:`calibrate.read_hierarchy`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpyro.distributions as dist
 
 from calibrate.figures import shrinkage
 from calibrate.population import Hierarchy, population_model, read_hierarchy, sample_population
@@ -35,7 +34,7 @@ from calibrate.project.results import (
     reserved,
 )
 from calibrate.project.run import Run
-from calibrate.samplers import find_sampler, options_from
+from calibrate.samplers import find_sampler
 from calibrate.samplers.nuts import NUTS
 from calibrate.statistical_model import Model
 from emulator.core import schema
@@ -71,11 +70,6 @@ class Shared:
             if len(numbers) != 2:
                 raise InputError(f"median of '{name}' is {numbers}; give median and relative sd")
 
-    @property
-    def medians(self) -> dict[str, dist.Distribution]:
-        """The log-normal priors of the population's medians, by name."""
-        return {name: log_normal(median, sd) for name, (median, sd) in self.median.items()}
-
 
 @dataclass(frozen=True)
 class Members:
@@ -98,11 +92,6 @@ class Members:
         for name in self.members:
             if not name or set("/@[]") & set(name):
                 raise InputError(f"members: '{name}' is no name; leave out /, @ and brackets")
-
-    @property
-    def first(self) -> Run:
-        """The first member's run: sampler, length and seed are those of all members together."""
-        return next(iter(self.members.values()))
 
     def problem(self, name: str) -> Problem:
         """Return the problem of one member."""
@@ -143,12 +132,15 @@ def infer_members(
         posteriors: dict[str, Posterior] = {}
         verdicts: dict[str, str] = {}
         for name, run in plan.members.items():
-            member_folder = folder / MEMBERS / name
-            posteriors[name] = _posterior_of(
-                plan.problem(name), member_folder, force=force, progress=progress
-            )
+            own = folder / MEMBERS / name
+            posteriors[name] = _posterior_of(plan.problem(name), own, force, progress)
             if certify:
-                verdicts[name] = _verdict(posteriors[name], member_folder, run, progress=progress)
+                verdicts[name] = (
+                    _written_verdict(run, own)
+                    or certify_and_keep(
+                        posteriors[name], own, load_steps=run.load_steps, progress=progress
+                    ).verdict
+                )
         hierarchy = _sample_together(plan, posteriors, folder / SAMPLING, progress=progress)
         shrinkage.draw(hierarchy, folder / SHRINKAGE)
         hierarchy.save(folder / POSTERIOR)
@@ -166,14 +158,18 @@ def read_members(folder: str | Path) -> tuple[Members, Hierarchy]:
     folder = Path(folder)
     if not holds_population(folder):
         raise InputError(f"{folder} holds a single run; calibrate.load reads it")
-    plan, path = _read_plan(folder / RUN), folder / POSTERIOR
+    entries, where = read_json(folder / RUN), folder / RUN
+    runs = {
+        name: schema.read_as(Run, run, f"{where}, member '{name}'")
+        for name, run in entries[MEMBERS].items()
+    }
+    shared = schema.read_as(Shared, entries.get(POPULATION, {}), f"{where}, {POPULATION}")
+    plan, path = Members(runs, shared), folder / POSTERIOR
     if not path.exists():
-        sampled_members = [
-            name for name in plan.members if (folder / MEMBERS / name / POSTERIOR).exists()
-        ]
+        sampled = sum((folder / MEMBERS / name / POSTERIOR).exists() for name in runs)
         raise InputError(
-            f"{folder} holds a population without {POSTERIOR}: {len(sampled_members)} of its "
-            f"{len(plan.members)} members are sampled; repeat calibrate infer, which goes on"
+            f"{folder} holds a population without {POSTERIOR}: {sampled} of its "
+            f"{len(runs)} members are sampled; repeat calibrate infer, which goes on"
         )
     hierarchy = read_hierarchy(path)
     if hierarchy.members != tuple(plan.members):
@@ -184,26 +180,16 @@ def read_members(folder: str | Path) -> tuple[Members, Hierarchy]:
     return plan, hierarchy
 
 
-def _read_plan(path: Path) -> Members:
-    entries = read_json(path)
-    runs = {
-        name: schema.read_as(Run, run, f"{path}, member '{name}'")
-        for name, run in entries[MEMBERS].items()
-    }
-    shared = schema.read_as(Shared, entries.get(POPULATION, {}), f"{path}, {POPULATION}")
-    return Members(runs, shared)
-
-
 def verdicts_in(plan: Members, folder: str | Path) -> dict[str, str]:
     """Return FEM's verdicts on members in ``folder``, by name; some may have no certificate."""
-    verdicts = {
-        name: _written_verdict(run, Path(folder) / MEMBERS / name)
+    return {
+        name: verdict
         for name, run in plan.members.items()
+        if (verdict := _written_verdict(run, Path(folder) / MEMBERS / name)) is not None
     }
-    return {name: verdict for name, verdict in verdicts.items() if verdict is not None}
 
 
-def _posterior_of(problem: Problem, folder: Path, *, force: bool, progress: bool) -> Posterior:
+def _posterior_of(problem: Problem, folder: Path, force: bool, progress: bool) -> Posterior:
     """Return a member's own posterior: the one in ``folder`` if it is of this problem."""
     if (folder / POSTERIOR).exists() and not force:
         run, posterior = read_posterior(folder)
@@ -216,14 +202,6 @@ def _posterior_of(problem: Problem, folder: Path, *, force: bool, progress: bool
     return infer(problem, folder, force=force, progress=progress)
 
 
-def _verdict(posterior: Posterior, folder: Path, run: Run, *, progress: bool) -> str:
-    """Return FEM's verdict on a member, from its certificate if there is one."""
-    if (verdict := _written_verdict(run, folder)) is not None:
-        return verdict
-    certificate = certify_and_keep(posterior, folder, load_steps=run.load_steps, progress=progress)
-    return certificate.verdict
-
-
 def _written_verdict(run: Run, folder: Path) -> str | None:
     if find_sampler(run.sampler).solves_fem:
         return DECIDED_BY_FEM
@@ -234,42 +212,34 @@ def _written_verdict(run: Run, folder: Path) -> str | None:
 def _sample_together(
     plan: Members, posteriors: Mapping[str, Posterior], checkpoint: Path, *, progress: bool
 ) -> Hierarchy:
-    run, population = plan.first, plan.population
-    first_options = run.sampler_options if run.sampler == NUTS.name else {}
-    options = options_from(
-        NUTS,
-        {"target_accept": TARGET_ACCEPT, **first_options},
-        warmup=run.warmup,
-        draws=run.draws,
-        chains=run.chains,
+    """Sample all members by NUTS; the first one's run says for how long and with which seed."""
+    run, shared = next(iter(plan.members.values())), plan.population
+    own_options = run.sampler_options if run.sampler == NUTS.name else {}
+    by_nuts = replace(
+        run, sampler=NUTS.name, sampler_options={"target_accept": TARGET_ACCEPT, **own_options}
     )
+    models: dict[tuple[Any, ...], Model] = {}  # one for all members that differ in their data only
     model = population_model(
-        _models(posteriors),
-        shared=population.shared,
-        median=population.medians,
-        spread=population.spread,
-        eta=population.eta,
+        {
+            name: models.setdefault(
+                tuple(posterior.tree.attrs.get(key) for key in _SAME_MODEL), posterior.model
+            )
+            for name, posterior in posteriors.items()
+        },
+        shared=shared.shared,
+        median={name: log_normal(median, sd) for name, (median, sd) in shared.median.items()},
+        spread=shared.spread,
+        eta=shared.eta,
     )
     return sample_population(
         model,
         {name: posterior.data for name, posterior in posteriors.items()},
-        options=options,
+        options=by_nuts.sampling()[1],
         alone={name: posterior.draws() for name, posterior in posteriors.items()},
         seed=run.seed,
         progress=progress,
         checkpoint=checkpoint,
     )
-
-
-def _models(posteriors: Mapping[str, Posterior]) -> dict[str, Model]:
-    """Return each member's model; one object for all that differ in their data only."""
-    models: dict[tuple[Any, ...], Model] = {}
-    return {
-        name: models.setdefault(
-            tuple(posterior.tree.attrs.get(key) for key in _SAME_MODEL), posterior.model
-        )
-        for name, posterior in posteriors.items()
-    }
 
 
 def members_report(hierarchy: Hierarchy, verdicts: Mapping[str, str]) -> dict[str, Any]:
@@ -285,12 +255,9 @@ def members_report(hierarchy: Hierarchy, verdicts: Mapping[str, str]) -> dict[st
             for member in hierarchy.members
         },
         "new_member": {
-            name: dict(zip(("low", "median", "high"), _quantiles(draws), strict=True))
+            name: dict(zip(("low", "median", "high"), quantiles, strict=True))
             for name, draws in hierarchy.new_member().items()
+            for quantiles in [np.quantile(draws, (0.05, 0.5, 0.95)).tolist()]
         },
         "warnings": hierarchy.warnings(),
     }
-
-
-def _quantiles(draws: np.ndarray) -> list[float]:
-    return [float(value) for value in np.quantile(draws, (0.05, 0.5, 0.95))]

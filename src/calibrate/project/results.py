@@ -28,18 +28,17 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from calibrate.measurements import Observations, leave_out_missing, observations_from_json
+from calibrate.measurements import leave_out_missing, observations_from_json
 from calibrate.measurements.data import write_data
 from calibrate.model_error import ModelError
 from calibrate.posterior import Posterior, read_tree
-from calibrate.project.problem import Problem, model_of, restore_forward
+from calibrate.project.problem import Problem, ingredients, model_of
 from calibrate.project.run import Run
 from emulator.catalogue import find_scene
 from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.core.store import exclusive, read_arrays, read_json, save_arrays, write_json
 from emulator.surrogates import registry
-from emulator.surrogates.protocol import ForwardMap
 
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
 FORWARD, ERROR = "forward.safetensors", "error.safetensors"
@@ -48,11 +47,7 @@ SAMPLING = "sampling.safetensors"  # checkpoint of a run that has not ended
 MEMBERS = "members"  # entry of a population's members in run.json, and folder of their runs
 
 _RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # files of a run that has ended
-_PLACES = (
-    "scene",
-    "root",
-    "emulator",
-)  # paths may change, because fingerprints identify the content
+_PLACES = ("scene", "root", "emulator")  # may change: fingerprints identify the content
 _DESCRIPTION = "systematic"  # metadata of a file of systematic errors
 _SHOWN = 4  # largest number of a folder's files that an error names
 
@@ -86,8 +81,9 @@ def save_results(folder: Path, problem: Problem, posterior: Posterior) -> None:
         write_data(new / DATA, problem.observe, problem.data)
         write_json(new / RUN, run)
         registry.keep_forward(posterior.model.full, new / FORWARD)
-        if posterior.model.error is not None:
-            _save_error(new / ERROR, posterior.model.error)
+        if (error := posterior.model.error) is not None:
+            metadata = {_DESCRIPTION: json.dumps(error.words)} if error.words else {}
+            save_arrays(new / ERROR, error.arrays(), metadata)
         posterior.tree.attrs["run"] = json.dumps(run)
         posterior.save(new / POSTERIOR)
         # Earlier results go first and the posterior comes last: a run that is killed leaves no
@@ -152,13 +148,21 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{path} was made for another scene than '{run.scene}'")
     _check_run(path, tree, read_json(folder / RUN))
-    forward = restore_forward(run, scene, folder / FORWARD)
-    _check_forward(path, tree, forward)
+    forward = registry.restore_forward(
+        run.forward, ingredients(run, scene), run.forward_options, folder / FORWARD
+    )
+    if (sampled_with := tree.attrs.get("forward_fingerprint")) != forward.fingerprint:
+        raise InputError(
+            f"{path} was made with another {forward.kind} map (fingerprint {sampled_with}; it is "
+            f"{forward.fingerprint} now); infer again"
+        )
     observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
-    # The data was checked when it was sampled, or the check was overruled.
-    run_model = model_of(run, forward, observe, check_scale=False)
-    if run.error_runs or run.mesh_error_runs or run.systematic:
-        run_model = replace(run_model, error=_read_error(folder / ERROR, path, tree))
+    has_error = run.error_runs or run.mesh_error_runs or run.systematic
+    run_model = replace(
+        model_of(run, forward, observe),
+        error=_read_error(folder / ERROR, path, tree) if has_error else None,
+        check_scale=False,  # the data was checked when it was sampled, or the check was overruled
+    )
     observed = tree["observed_data"]
     data = run_model.check_data(
         {n: np.asarray(observed[n]).reshape(part.shape) for n, part in observe.parts.items()}
@@ -197,15 +201,11 @@ def is_of(posterior: Posterior, problem: Problem) -> bool:
     """Return whether a posterior was sampled with the observations and the data of ``problem``."""
     assert problem.data is not None
     reduced, present = leave_out_missing(problem.observe, problem.data)
-    return _same_observations(posterior, reduced) and all(
+    described = json.loads(json.dumps(reduced.to_json()))
+    return described == json.loads(posterior.tree.attrs["observe"]) and all(
         np.array_equal(np.ravel(present[name]), np.ravel(values))
         for name, values in posterior.data.items()
     )
-
-
-def _same_observations(posterior: Posterior, observe: Observations) -> bool:
-    described = json.loads(json.dumps(observe.to_json()))
-    return described == json.loads(posterior.tree.attrs["observe"])
 
 
 def _check_run(path: Path, tree: xr.DataTree, run: Mapping[str, Any]) -> None:
@@ -225,20 +225,6 @@ def _check_run(path: Path, tree: xr.DataTree, run: Mapping[str, Any]) -> None:
                 f"{path} was sampled with {name} = {json.dumps(sampled.get(name))}, but run.json "
                 f"says {json.dumps(run.get(name))}; infer again"
             )
-
-
-def _check_forward(path: Path, tree: xr.DataTree, forward: ForwardMap) -> None:
-    sampled_with = tree.attrs.get("forward_fingerprint")
-    if sampled_with != forward.fingerprint:
-        raise InputError(
-            f"{path} was made with another {forward.kind} map (fingerprint {sampled_with}; it is "
-            f"{forward.fingerprint} now); infer again"
-        )
-
-
-def _save_error(path: Path, error: ModelError) -> None:
-    metadata = {_DESCRIPTION: json.dumps(error.words)} if error.words else {}
-    save_arrays(path, error.arrays(), metadata)
 
 
 def _read_error(path: Path, posterior: Path, tree: xr.DataTree) -> ModelError:

@@ -2,13 +2,13 @@
 
 A :class:`Run` is an experiment file, ``run.json``, and what the command line's options say. Its
 fields are the keys of both files and the names of the options; its docstring describes the keys in
-the JSON Schema (:mod:`calibrate.project.experiment_schema`) and the options in the help
+the JSON Schema (:mod:`calibrate.project.experiment`) and the options in the help
 (:mod:`calibrate.cli.run_words`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,12 @@ from typing import Any
 from calibrate.measurements import DISPLACEMENT, Observations
 from calibrate.model_error.kinds import read_systematic
 from calibrate.noise import Noise, noise_of, with_discrepancy
+from calibrate.priors.population import read_population
 from calibrate.samplers import Sampler, find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
 from emulator.core.errors import InputError
-from emulator.surrogates import registry
+from emulator.surrogates import registry, shipped
 
 SYNTHETIC = "synthetic"
 """The word for data that FEM makes."""
@@ -103,12 +104,12 @@ class Run:
     def __post_init__(self) -> None:
         registry.full_options(self.forward, self.forward_options)
         registry.check_emulator(self.forward, self.emulator)
-        for name in ("warmup", "draws", "chains", "load_steps"):
-            self._check_at_least(name, 1)
+        least = dict.fromkeys(("warmup", "draws", "chains", "load_steps"), 1)
+        for name in (*least, "error_runs", "mesh_error_runs", "seed"):
+            if (value := getattr(self, name)) < least.get(name, 0):
+                raise InputError(f"{name} is {value}; it must be {least.get(name, 0)} or more")
         if self.truth and self.data != SYNTHETIC:
             raise InputError(f"truth has no effect beside data file {self.data}; leave one out")
-        for name in ("error_runs", "mesh_error_runs"):
-            self._check_at_least(name, 0)
         if self.error_runs and self.mesh_error_runs:
             raise InputError(
                 "error_runs and mesh_error_runs are both given; the latter see the map's error, too"
@@ -119,11 +120,6 @@ class Run:
             raise InputError(
                 "systematic and error_runs are both given; a likelihood allows for one of them"
             )
-        self._check_at_least("seed", 0)
-
-    def _check_at_least(self, name: str, least: int) -> None:
-        if getattr(self, name) < least:
-            raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
 
     @property
     def is_synthetic(self) -> bool:
@@ -167,7 +163,12 @@ class Run:
             discrepancy_source, discrepancy = discrepancies.get(name, (source, None))
             # An entry that names one load state gives that state a noise of its own.
             has_own_noise = name in (source, scale_source, discrepancy_source)
-            noise = _noise(name, observe, description, scale, discrepancy)
+            try:
+                noise = noise_of(description)
+                noise = noise if scale is None else noise.inferred(scale)
+                noise = noise if discrepancy is None else with_discrepancy(noise, discrepancy)
+            except InputError as error:
+                raise InputError(f"{name} ({observe.parts[name].unit}): {error}") from error
             noises[name if has_own_noise else source] = noise
         return noises
 
@@ -194,21 +195,6 @@ def _by_name[T](
     return dict(values)
 
 
-def _noise(
-    name: str,
-    observe: Observations,
-    description: float | Mapping[str, Any],
-    scale: float | None,
-    discrepancy: Mapping[str, Any] | None,
-) -> Noise:
-    try:
-        noise = noise_of(description)
-        noise = noise if scale is None else noise.inferred(scale)
-        return noise if discrepancy is None else with_discrepancy(noise, discrepancy)
-    except InputError as error:
-        raise InputError(f"{name} ({observe.parts[name].unit}): {error}") from error
-
-
 def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> dict[str, Any]:
     """Return entries of a run that mean the same in every folder.
 
@@ -220,40 +206,32 @@ def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> di
     entries : some fields of a run by name.
     folder : the folder that relative paths start from.
     """
-    absolute = {"scene": _scene, "root": _path, "data": _data, "emulator": _emulator}
-    resolve = {**absolute, "prior": _prior}
+
+    def path(word: str) -> str:
+        return str((folder / word).resolve())
+
+    def scene(word: str) -> str:
+        if word.startswith("finer:"):
+            return "finer:" + scene(word.removeprefix("finer:"))
+        return path(word) if word.endswith(".toml") else word
+
+    def data(word: str | dict[str, str]) -> str | dict[str, str]:
+        if isinstance(word, dict):
+            return {state: path(file) for state, file in word.items()}
+        return word if word == SYNTHETIC else path(word)
+
+    def emulator(word: str) -> str:
+        return word if word in shipped() else path(word)
+
+    def prior(word: str | dict[str, Any]) -> str | dict[str, Any]:
+        if isinstance(word, str) and word.endswith(".json"):
+            return asdict(read_population(folder / word))
+        return word
+
+    resolve: dict[str, Callable[[Any], Any]] = {
+        "scene": scene, "root": path, "data": data, "emulator": emulator, "prior": prior,
+    }  # fmt: skip
     return {
-        name: resolve[name](value, folder) if name in resolve and value is not None else value
+        name: resolve[name](value) if name in resolve and value is not None else value
         for name, value in entries.items()
     }
-
-
-def _path(word: str, folder: Path) -> str:
-    return str((folder / word).resolve())
-
-
-def _scene(word: str, folder: Path) -> str:
-    """Keep a name, make a file absolute; ``finer:`` stays before either."""
-    if word.startswith("finer:"):
-        return "finer:" + _scene(word.removeprefix("finer:"), folder)
-    return _path(word, folder) if word.endswith(".toml") else word
-
-
-def _data(word: str | dict[str, str], folder: Path) -> str | dict[str, str]:
-    if isinstance(word, dict):
-        return {state: _path(file, folder) for state, file in word.items()}
-    return word if word == SYNTHETIC else _path(word, folder)
-
-
-def _emulator(word: str, folder: Path) -> str:
-    from emulator.surrogates import shipped
-
-    return word if word in shipped() else _path(word, folder)
-
-
-def _prior(word: str | dict[str, Any], folder: Path) -> str | dict[str, Any]:
-    from calibrate.priors.population import read_population
-
-    if isinstance(word, str) and word.endswith(".json"):
-        return asdict(read_population(folder / word))
-    return word

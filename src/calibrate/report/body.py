@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import jax
@@ -19,6 +20,8 @@ _DRAWS = 20
 _MOMENTS = 100  # draws from which mean and sd are computed
 _FIBRES = 400  # largest number of fibres that are drawn
 _DIGITS = 4
+_SIGHT = np.array([1.45, 1.45, 0.9])  # from the body towards the eye
+_WIDTH = 1.3  # of the picture, in its heights
 
 
 def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
@@ -35,8 +38,9 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     mean = fields.mean(axis=0)
     centre = thetas.mean(axis=0)
     colours = _colours(scene, fields, mean, centre)
-    if simulator is not None:
-        colours |= _error(posterior, centre, simulator)
+    if simulator is not None and (solution := simulator.solve(centre)).converged:
+        wrong = np.linalg.norm(model.full(centre) - solution.displacement, axis=1)
+        colours["error against FEM at the mean theta (mm)"] = wrong
     shown = fields[np.linspace(0, len(fields) - 1, min(_DRAWS, len(fields))).astype(int)]
     nodes, triangles = surface_mesh(scene.mesh.surface)
     i, j, k = triangles.T.tolist()
@@ -60,14 +64,28 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
         for name, u in frames.items()
     ]
     _add_controls(figure, list(frames), {n: v[nodes] for n, v in colours.items()})
-    return figure
+    shapes = np.concatenate([at_rest, *(at_rest + u[nodes] for u in frames.values())])
+    return figure.update_layout(scene_camera=_camera(np.ptp(shapes, axis=0)))
+
+
+def _camera(extent: np.ndarray) -> dict[str, Any]:
+    """Return Plotly's camera, as near as a box of this extent (3,) allows that is seen whole.
+
+    Plotly scales the box to the volume 1; its eye sees 45 degrees from top to bottom.
+    """
+    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * extent / np.cbrt(extent.prod())
+    sight = _SIGHT / np.linalg.norm(_SIGHT)
+    right = np.cross([0.0, 0.0, 1.0], sight) / np.hypot(*sight[:2])
+    height = np.maximum(np.abs(corners @ np.cross(sight, right)), np.abs(corners @ right) / _WIDTH)
+    eye = sight * (corners @ sight + height / np.tan(np.pi / 8.0)).max()
+    return {
+        "eye": dict(zip("xyz", eye.tolist(), strict=True)),
+        "center": {"x": 0, "y": 0, "z": -0.1},
+    }
 
 
 def _colours(
-    scene: Scene,
-    fields: np.ndarray,
-    mean: np.ndarray,
-    theta: jax.Array,
+    scene: Scene, fields: np.ndarray, mean: np.ndarray, theta: jax.Array
 ) -> dict[str, np.ndarray]:
     """Return the values (n,) at the nodes by which the surface can be coloured, by their labels."""
     colours = {
@@ -80,15 +98,6 @@ def _colours(
     if "fibre_stretch" in element_values:
         colours["fibre stretch"] = _nodal(scene, element_values["fibre_stretch"])
     return colours
-
-
-def _error(posterior: Posterior, theta: jax.Array, simulator: Simulator) -> dict[str, np.ndarray]:
-    """Return the map's error (n,) at ``theta`` (p,); nothing where FEM does not converge."""
-    solution = simulator.solve(theta)
-    if not solution.converged:
-        return {}
-    wrong = np.asarray(posterior.model.full(theta) - solution.displacement)
-    return {"error against FEM at the mean theta (mm)": np.linalg.norm(wrong, axis=1)}
 
 
 def _nodal(scene: Scene, values: np.ndarray) -> np.ndarray:
@@ -140,10 +149,6 @@ def _add_controls(figure: go.Figure, names: list[str], colours: dict[str, np.nda
     figure.update_layout(
         sliders=[{"steps": steps, "currentvalue": {"prefix": "shape: "}, "pad": {"t": 10}}],
         updatemenus=[{"buttons": buttons, "x": 0.0, "xanchor": "left", "y": 1.12}],
-        scene_camera={
-            "eye": {"x": 1.45, "y": 1.45, "z": 0.9},
-            "center": {"x": 0, "y": 0, "z": -0.1},
-        },
         scene={"aspectmode": "data", **{f"{a}axis": {"title": f"{a} (mm)"} for a in "xyz"}},
         height=680,
         legend={"x": 0.0, "y": 0.0},

@@ -13,7 +13,7 @@ from plotly.subplots import make_subplots
 from scipy.stats import rankdata
 
 from calibrate.analysis.identifiability import stress_band
-from calibrate.figures.drawing import BLUE, COLOURS, VERMILION
+from calibrate.figures import BLUE, COLOURS, VERMILION
 from calibrate.measurements import Observation
 from calibrate.measurements.klotz import klotz_of
 from calibrate.measurements.volume import PressureVolume, in_mmhg, pressure_volume
@@ -26,9 +26,7 @@ _MOST_TRACED = 500  # largest number of a chain's draws in a trace
 _MOST_PAIRED = 800  # largest number of draws in a pair plot
 _CURVES = 60  # largest number of draws in a pressure-volume band
 _VOLUMES = 400  # largest number of draws of a volume
-_CLOSER_AT_REST = (
-    3  # power by which pressures of Klotz's curve, which rises from 0, lie closer there
-)
+_CLOSER_AT_REST = 3  # power of Klotz's pressures, as his curve rises from 0
 
 
 def translucent(colour: str, opacity: float) -> str:
@@ -64,24 +62,21 @@ def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
         values = np.asarray(tree["posterior_predictive"][name])
         values = values.reshape(values.shape[0] * values.shape[1], -1)
         data = np.ravel(np.asarray(posterior.data[name]))
-        if values.shape[1] == 1:
-            yield name, _one_number(name, part, values[:, 0], float(data[0]))
-        else:
+        if values.shape[1] > 1:
             yield name, _many_numbers(name, part, values, data)
-
-
-def _one_number(name: str, part: Observation, values: np.ndarray, datum: float) -> go.Figure:
-    figure = go.Figure(
-        go.Histogram(
-            x=values, histnorm="probability density", marker_color=BLUE, opacity=0.75,
-            name="predicted, with noise",
+            continue
+        figure = go.Figure(
+            go.Histogram(
+                x=values[:, 0], histnorm="probability density", marker_color=BLUE, opacity=0.75,
+                name="predicted, with noise",
+            )
+        )  # fmt: skip
+        line = {"color": VERMILION, "width": 3}
+        figure.add_vline(x=float(data[0]), line=line, annotation_text="measured")
+        figure.update_layout(
+            xaxis_title=f"predicted {name} ({part.unit})", yaxis={"showticklabels": False}
         )
-    )  # fmt: skip
-    figure.add_vline(x=datum, line={"color": VERMILION, "width": 3}, annotation_text="measured")
-    figure.update_layout(
-        xaxis_title=f"predicted {name} ({part.unit})", yaxis={"showticklabels": False}
-    )
-    return figure
+        yield name, figure
 
 
 def _many_numbers(name: str, part: Observation, values: np.ndarray, data: np.ndarray) -> go.Figure:
@@ -95,38 +90,23 @@ def _many_numbers(name: str, part: Observation, values: np.ndarray, data: np.nda
         hoverinfo="skip",
     )  # fmt: skip
     figure.add_scatter(
-        x=data[present],
-        y=middle[present],
-        mode="markers",
-        marker={"color": BLUE, "size": 6},
-        error_y={
-            "type": "data",
-            "symmetric": False,
-            "array": (high - middle)[present],
-            "arrayminus": (middle - low)[present],
-            "thickness": 1,
-        },
+        x=data[present], y=middle[present], mode="markers", marker={"color": BLUE, "size": 6},
+        error_y={"type": "data", "symmetric": False, "array": (high - middle)[present],
+                 "arrayminus": (middle - low)[present], "thickness": 1},
         name=f"median and 90 %; {share:.0f} % of the data lie within",
-    )
+    )  # fmt: skip
     figure.update_layout(
         xaxis_title=f"{name} measured ({part.unit})", yaxis_title=f"predicted ({part.unit})"
     )
     return figure
 
 
-def traces(posterior: Posterior) -> go.Figure:
-    """Return each unknown's draws by chain: their densities, their order, and their ranks."""
-    labels = names_with_units(posterior)
-    draws = {name: np.asarray(posterior.tree["posterior"][name]) for name in labels}
-    return traces_of(labels, draws, posterior.model.sampled_priors)
-
-
-def traces_of(
+def traces(
     labels: Mapping[str, str],
     every: Mapping[str, np.ndarray],
     priors: Mapping[str, dist.Distribution],
 ) -> go.Figure:
-    """Return :func:`traces` of the draws (chains, draws) of those names that have labels."""
+    """Return the draws (chains, draws) of names with labels: densities, order, ranks by chain."""
     figure = make_subplots(
         len(labels), 3, column_titles=["posterior", "trace", "ranks by chain"],
         horizontal_spacing=0.06, vertical_spacing=0.25 / max(len(labels), 2),
@@ -139,22 +119,25 @@ def traces_of(
         for chain, values in enumerate(draws):
             colour = _CHAINS[chain % len(_CHAINS)]
             style: dict[str, Any] = {
-                "marker": {"color": colour},
-                "name": f"chain {chain + 1}",
-                "legendgroup": str(chain),
-                "showlegend": False,
-            }
+                "marker": {"color": colour}, "name": f"chain {chain + 1}",
+                "legendgroup": str(chain), "showlegend": False,
+            }  # fmt: skip
             counts = np.histogram(ranks[chain], edges)[0]
             line = {"mode": "lines", **style}
-            density = go.Histogram(
+            histogram = go.Histogram(
                 x=values, histnorm="probability density", opacity=0.5, nbinsx=40,
                 **{**style, "showlegend": row == 1},
             )  # fmt: skip
             trace = go.Scatter(y=values[::step], line_width=1, **line)
             rank = go.Scatter(x=edges, y=[*counts, counts[-1]], line_shape="hv", **line)
-            for column, panel in enumerate((density, trace, rank), start=1):
+            for column, panel in enumerate((histogram, trace, rank), start=1):
                 figure.add_trace(panel, row, column)
-        _add_prior(figure, priors.get(name), draws, row)
+        if (prior := priors.get(name)) is not None and not prior.shape():
+            x = np.linspace(draws.min(), draws.max(), 100)
+            line = {"color": "grey", "width": 2, "dash": "dash"}
+            style = {"name": "prior", "legendgroup": "prior", "showlegend": row == 1}
+            density = np.exp(np.asarray(prior.log_prob(x)))
+            figure.add_trace(go.Scatter(x=x, y=density, mode="lines", line=line, **style), row, 1)
         even = draws.shape[1] / 20.0
         figure.add_hline(y=even, line={"color": "grey", "dash": "dot"}, row=row, col=3)
         figure.update_yaxes(title_text=label, showticklabels=False, row=row, col=1)
@@ -163,25 +146,7 @@ def traces_of(
     return figure
 
 
-def _add_prior(
-    figure: go.Figure, prior: dist.Distribution | None, draws: np.ndarray, row: int
-) -> None:
-    """Add the prior's density over the range of the draws, behind them."""
-    if prior is None or prior.shape():
-        return
-    x = np.linspace(draws.min(), draws.max(), 100)
-    density = np.exp(np.asarray(prior.log_prob(x)))
-    line = {"color": "grey", "width": 2, "dash": "dash"}
-    style = {"name": "prior", "legendgroup": "prior", "showlegend": row == 1}
-    figure.add_trace(go.Scatter(x=x, y=density, mode="lines", line=line, **style), row, 1)
-
-
-def pairs(posterior: Posterior) -> go.Figure:
-    """Return the scatter of the draws of every two unknowns."""
-    return pairs_of(names_with_units(posterior), posterior.draws())
-
-
-def pairs_of(labels: Mapping[str, str], draws: Mapping[str, np.ndarray]) -> go.Figure:
+def pairs(labels: Mapping[str, str], draws: Mapping[str, np.ndarray]) -> go.Figure:
     """Return the scatter of the draws (s,) of every two names that have labels."""
     count = len(next(iter(draws.values())))
     rows = np.linspace(0, count - 1, min(count, _MOST_PAIRED)).astype(int)
@@ -195,13 +160,10 @@ def pairs_of(labels: Mapping[str, str], draws: Mapping[str, np.ndarray]) -> go.F
     figure = go.Figure(
         go.Splom(
             dimensions=[{"label": labels[n], "values": draws[n][rows]} for n in labels],
-            marker=marker,
-            showupperhalf=False,
-            diagonal_visible=False,
+            marker=marker, showupperhalf=False, diagonal_visible=False,
         )
-    )
-    figure.update_layout(height=160 + 140 * len(labels))
-    return figure
+    )  # fmt: skip
+    return figure.update_layout(height=160 + 140 * len(labels))
 
 
 def stress(posterior: Posterior) -> go.Figure:
@@ -251,8 +213,13 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
         marker={"color": BLUE, "size": 8, "symbol": "circle-open"}, mode="lines+markers",
         name="without load, as the mesh is",
     )  # fmt: skip
-    for label, (volume, pressures) in data_volumes.items():
-        _add_measured(figure, label, volume, pressures)
+    for label, (volume, pressures) in data_volumes.items():  # at the pressure of its load state
+        figure.add_scatter(
+            x=[volume], y=[float(pressures.mean())], mode="markers",
+            marker={"color": VERMILION, "size": 11, "symbol": "x"},
+            error_y={"type": "data", "array": [float(pressures.std())]},
+            name=f"{label} measured; pressure {'known' if pressures.std() == 0.0 else 'inferred'}",
+        )  # fmt: skip
     figure.update_layout(
         xaxis_title="cavity volume (mL)",
         yaxis_title=f"{name} (kPa; 1 kPa is {1.0 / KPA_PER_MMHG:.1f} mmHg)",
@@ -286,16 +253,6 @@ def _measured_volumes(
             pressures = np.asarray(posterior.thetas(split(observation)[1])[:, column])
             volumes[observation] = float(posterior.data[observation]), pressures
     return volumes
-
-
-def _add_measured(figure: go.Figure, name: str, volume: float, pressures: np.ndarray) -> None:
-    """Add the measured volume at the pressure of its load state, inferred or known."""
-    figure.add_scatter(
-        x=[volume], y=[float(pressures.mean())], mode="markers",
-        marker={"color": VERMILION, "size": 11, "symbol": "x"},
-        error_y={"type": "data", "array": [float(pressures.std())]},
-        name=f"{name} measured; pressure {'known' if pressures.std() == 0.0 else 'inferred'}",
-    )  # fmt: skip
 
 
 def _add_klotz(

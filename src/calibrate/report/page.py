@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpyro.distributions as dist
+from markupsafe import Markup
 
 from calibrate.analysis.identifiability import identify, in_words
 from calibrate.certificate.verdict import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT, shifts
@@ -20,7 +21,7 @@ from calibrate.project.members import read_members
 from calibrate.project.results import CERTIFICATE, REPORT
 from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
-from calibrate.report.parts import Block, Paragraph, Table, Verdict
+from calibrate.report.parts import Verdict
 from emulator.core.store import read_json, replacing
 
 _SHIFTS = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
@@ -48,17 +49,16 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, fem: bool
     if holds_population(folder):
         page = population.html_of(*read_members(folder), folder, target.parent)
     else:
-        page = _page_of_posterior(folder, fem=fem)
+        run, posterior = read_posterior(folder)
+        path = folder / CERTIFICATE
+        certificate, day = None, ""
+        if path.is_file():
+            certificate = read_json(path)
+            day = f"{datetime.fromtimestamp(path.stat().st_mtime).date()}."
+        page = html_of(run, posterior, certificate, fem=fem, certificate_day=day)
     with replacing(target) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return target
-
-
-def _page_of_posterior(folder: Path, *, fem: bool) -> str:
-    run, posterior = read_posterior(folder)
-    path = folder / CERTIFICATE
-    certificate = read_json(path) if path.is_file() else None
-    return html_of(run, posterior, certificate, fem=fem, certificate_day=_day(path))
 
 
 def html_of(
@@ -72,12 +72,21 @@ def html_of(
     """Return the page of a posterior as HTML; ``certificate_day`` is the day of the certificate."""
     scene = posterior.model.forward.scene
     simulator = simulator_of(scene, run.load_steps) if fem else None
+    data: list[Markup] = [parts.chart(figure) for _, figure in charts.against_data(posterior)]
+    labels = charts.names_with_units(posterior)
+    in_chains = {name: np.asarray(posterior.tree["posterior"][name]) for name in labels}
+    draws = [charts.traces(labels, in_chains, posterior.model.sampled_priors)]
+    draws += [charts.pairs(labels, posterior.draws())] if len(labels) > 1 else []
+    of_body = parts.note(
+        "Drag to turn. The slider goes through draws of the posterior; the menu changes the "
+        "colour; fibres and the body at rest are in the legend."
+    )
     sections = [
-        ("Data against prediction", _data(posterior)),
-        ("Parameters", _parameters(run, posterior, certificate)),
-        ("The body", _body(posterior, simulator)),
+        ("Data against prediction", data or [parts.note("The run kept no predictions.")]),
+        ("Parameters", _parameters(run, posterior, certificate, labels)),
+        ("The body", [of_body, parts.chart(body_figure(posterior, simulator))]),
         ("What the data determine", _known(posterior)),
-        ("Draws", _draws(posterior)),
+        ("Draws", [parts.chart(figure) for figure in draws]),
         ("Where this comes from, and how to repeat it", _provenance(run, posterior)),
     ]
     title = f"{scene.name}: posterior of {', '.join(posterior.model.names)}"
@@ -117,20 +126,9 @@ def _basis(certificate: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def _day(path: Path) -> str:
-    """Return the day on which a file was written; an empty text where there is no file."""
-    if not path.is_file():
-        return ""
-    return f"{datetime.fromtimestamp(path.stat().st_mtime).date()}."
-
-
-def _data(posterior: Posterior) -> list[Block]:
-    blocks: list[Block] = [parts.chart(figure) for _, figure in charts.against_data(posterior)]
-    return blocks or [parts.note("The run kept no predictions.")]
-
-
-def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | None) -> list[Block]:
-    labels, cut = charts.names_with_units(posterior), posterior.model.prior_cut
+def _parameters(
+    run: Run, posterior: Posterior, certificate: dict[str, Any] | None, labels: Mapping[str, str]
+) -> list[Markup]:
     truth = run.truth if run.data == "synthetic" else {}
     priors = posterior.model.sampled_priors
     shifts_by_judge = shifts(certificate or {})
@@ -148,52 +146,29 @@ def _parameters(run: Run, posterior: Posterior, certificate: dict[str, Any] | No
             f"{name}: {100 * share:.2g} % of the prior lies where the map has no answer and was "
             "left out."
         )
-        for name, share in cut.items()
+        for name, share in posterior.model.prior_cut.items()
         if share
     ]
-    return [Table(head, rows), *notes]
+    return [parts.table(head, rows), *notes]
 
 
-def _body(posterior: Posterior, simulator: Any) -> list[Block]:
-    note = parts.note(
-        "Drag to turn. The slider goes through draws of the posterior; the menu changes the "
-        "colour; fibres and the body at rest are in the legend."
-    )
-    return [note, parts.chart(body_figure(posterior, simulator))]
-
-
-def _known(posterior: Posterior) -> list[Block]:
-    words = Paragraph(in_words(identify(posterior)), "lines")
-    blocks: list[Block] = [words, parts.chart(charts.stress(posterior))]
+def _known(posterior: Posterior) -> list[Markup]:
+    words = parts.paragraph(in_words(identify(posterior)), "lines")
+    blocks: list[Markup] = [words, parts.chart(charts.stress(posterior))]
     if (curve := charts.volume_band(posterior)) is not None:
         blocks.append(parts.chart(curve))
-    return blocks + _ejection(charts.state_volumes(posterior))
-
-
-def _ejection(volumes: Mapping[str, np.ndarray]) -> list[Block]:
-    """Return the volumes by load state, and the share of the largest that is ejected."""
-    if not volumes:
-        return []
-    rows = [(state, parts.median_and_range(values)) for state, values in volumes.items()]
-    medians = {state: float(np.median(values)) for state, values in volumes.items()}
-    full, empty = (pick(medians, key=medians.__getitem__) for pick in (max, min))
-    ejected = 100.0 * (1.0 - volumes[empty] / volumes[full])
-    return [
-        Table(("load state", "cavity volume (mL), median and 90 %"), rows),
-        Paragraph(
-            f"Ejection fraction from {full} to {empty}: {parts.median_and_range(ejected)} %."
-        ),
-    ]
-
-
-def _draws(posterior: Posterior) -> list[Block]:
-    blocks: list[Block] = [parts.chart(charts.traces(posterior))]
-    if len(posterior.model.names) > 1:
-        blocks.append(parts.chart(charts.pairs(posterior)))
+    if volumes := charts.state_volumes(posterior):
+        rows = [(state, parts.median_and_range(values)) for state, values in volumes.items()]
+        medians = {state: float(np.median(values)) for state, values in volumes.items()}
+        full, empty = (pick(medians, key=medians.__getitem__) for pick in (max, min))
+        ejected = parts.median_and_range(100.0 * (1.0 - volumes[empty] / volumes[full]))
+        text = f"Ejection fraction from {full} to {empty}: {ejected} %."
+        head = ("load state", "cavity volume (mL), median and 90 %")
+        blocks += [parts.table(head, rows), parts.paragraph(text)]
     return blocks
 
 
-def _provenance(run: Run, posterior: Posterior) -> list[Block]:
+def _provenance(run: Run, posterior: Posterior) -> list[Markup]:
     program = (
         "from calibrate.project import infer, read_posterior\n\n"
         'run, _ = read_posterior("THIS FOLDER")\n'

@@ -8,11 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
 
@@ -27,43 +28,6 @@ SUMMARY = ("mean", "sd", "5 %", "95 %", "R-hat", "ESS bulk", "ESS tail")
 _COLOURS = {
     "accepted": GOOD, "decided by FEM": GOOD, "reweight": UNSURE, "undecided": UNSURE,
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Paragraph:
-    """A paragraph of plain text; ``style`` is ``note``, ``warning``, ``lines`` or empty."""
-
-    text: str
-    style: str = ""
-    kind: ClassVar = "paragraph"
-
-
-@dataclass(frozen=True)
-class Code:
-    """A program or a file's content."""
-
-    text: str
-    kind: ClassVar = "code"
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table; a cell is plain text, or markup (``markupsafe.Markup``)."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    kind: ClassVar = "table"
-
-
-@dataclass(frozen=True)
-class Chart:
-    """A Plotly chart as HTML that draws with the page's own library."""
-
-    html: str
-    kind: ClassVar = "chart"
-
-
-Block = Paragraph | Code | Table | Chart
 
 
 @dataclass(frozen=True)
@@ -87,7 +51,7 @@ class Verdict:
 
 
 def render(
-    title: str, heading: str, verdict: Verdict, sections: Sequence[tuple[str, Sequence[Block]]]
+    title: str, heading: str, verdict: Verdict, sections: Sequence[tuple[str, Sequence[Markup]]]
 ) -> str:
     """Return the whole page as HTML; ``sections`` are titles with their blocks."""
     templates = Environment(
@@ -112,29 +76,36 @@ def colour_of(verdict: str) -> str:
     return _COLOURS.get(verdict, BAD)
 
 
-def note(text: str) -> Paragraph:
+def paragraph(text: str, style: str = "") -> Markup:
+    """Return a paragraph; ``style`` is ``note``, ``warning``, ``lines`` or empty."""
+    attribute = Markup(' class="{}"').format(style) if style else ""
+    return Markup("<p{}>{}</p>").format(attribute, text)
+
+
+def note(text: str) -> Markup:
     """Return a paragraph that explains."""
-    return Paragraph(text, "note")
+    return paragraph(text, "note")
 
 
-def warnings(sentences: Iterable[str]) -> list[Block]:
-    """Return a paragraph for each sentence, in the colour of warnings."""
-    return [Paragraph(sentence, "warning") for sentence in sentences]
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
+    """Return a table; a cell is plain text or markup."""
+
+    def row(tag: str, cells: Sequence[str]) -> Markup:
+        cell = Markup(f"<{tag}>{{}}</{tag}>")
+        return Markup("<tr>{}</tr>\n").format(Markup("").join(map(cell.format, cells)))
+
+    body = Markup("").join(row("td", cells) for cells in rows)
+    return Markup("<table>{}{}</table>").format(row("th", head), body)
 
 
-def chart(figure: go.Figure) -> Chart:
-    """Return a figure as a block, in the page's style."""
+def chart(figure: go.Figure) -> Markup:
+    """Return a figure in the page's style, drawn by the page's own library."""
     figure.update_layout(template="simple_white", margin={"t": 50, "b": 40}, font={"size": 13})
     if figure.layout.height is None:
         figure.update_layout(height=420)
-    html = to_html(
-        figure,
-        full_html=False,
-        include_plotlyjs=False,
-        auto_play=False,  # a body is shown at its mean, not in motion through the draws
-        config={"displaylogo": False},
-    )
-    return Chart(html)
+    # Not played: a body is shown at its mean, not in motion through the draws.
+    options = {"full_html": False, "include_plotlyjs": False, "auto_play": False}
+    return Markup(to_html(figure, config={"displaylogo": False}, **options))
 
 
 def summary_cells(row: Mapping[str, float]) -> list[str]:
@@ -149,10 +120,10 @@ def median_and_range(values: np.ndarray, form: str = ".1f") -> str:
     return f"{middle} ({low} to {high})"
 
 
-def attributes(values: Mapping[Any, Any], omitted: Iterable[str]) -> Table:
+def attributes(values: Mapping[Any, Any], omitted: Iterable[str]) -> Markup:
     """Return a table of a posterior's attributes that are not empty and not ``omitted``."""
     texts = {str(key): in_text(value) for key, value in values.items() if key not in omitted}
-    return Table(("", ""), [(key, text) for key, text in texts.items() if text])
+    return table(("", ""), [(key, text) for key, text in texts.items() if text])
 
 
 def in_text(value: Any) -> str:
@@ -176,11 +147,12 @@ def changed_settings(run: Run) -> dict[str, Any]:
     return {k: v for k, v in asdict(run).items() if k == "scene" or v != defaults[k]}
 
 
-def how_to_repeat(settings: Mapping[str, Any], subject: str, program: str) -> list[Block]:
+def how_to_repeat(settings: Mapping[str, Any], subject: str, program: str) -> list[Markup]:
     """Return the settings of ``subject`` as JSON, and the program that repeats it."""
+    code = Markup("<pre>{}</pre>")
     return [
-        Paragraph(f"{subject}, where it is not as usual (all of it is in run.json):"),
-        Code(json.dumps(settings, indent=2)),
-        Paragraph("To repeat it:"),
-        Code(program),
+        paragraph(f"{subject}, where it is not as usual (all of it is in run.json):"),
+        code.format(json.dumps(settings, indent=2)),
+        paragraph("To repeat it:"),
+        code.format(program),
     ]

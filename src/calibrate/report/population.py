@@ -18,7 +18,7 @@ import xarray as xr
 from markupsafe import Markup
 from plotly.subplots import make_subplots
 
-from calibrate.figures.drawing import BLUE, VERMILION
+from calibrate.figures import BLUE, VERMILION
 from calibrate.figures.shrinkage import APART, Intervals, intervals_of, label_of
 from calibrate.population import Hierarchy
 from calibrate.population.model import MEDIAN, SD
@@ -30,7 +30,7 @@ from calibrate.project.members import POPULATION, Members, Shared, verdicts_in
 from calibrate.project.results import MEMBERS, POSTERIOR, REPORT
 from calibrate.report import charts, parts
 from calibrate.report.charts import translucent
-from calibrate.report.parts import Block, Paragraph, Table, Verdict
+from calibrate.report.parts import Verdict
 
 _GREY = "#8c8c8c"
 _COLUMNS = 3  # parameters beside each other, at most
@@ -113,11 +113,29 @@ def html_of(plan: Members, population: Hierarchy, folder: Path, page_folder: Pat
     page_folder : the folder that the page is written to, from which links start.
     """
     verdicts = dict.fromkeys(population.members, NOT_CERTIFIED) | verdicts_in(plan, folder)
-    table, warnings = population.summary(), population.warnings()
+    table, warnings, member = population.summary(), population.warnings(), population.new_member()
+    labels = {name: label_of(population, name) for name in member}
+    rows = [
+        (label, *parts.summary_cells(table[name])) for name, label in _labels(population).items()
+    ]
+    before_the_cut = parts.note(
+        "Of the population before it is cut to the parameters' ranges. A spread is an sd; of a "
+        "logarithm it is about a relative sd. Few members tell little of it: it is then what its "
+        "prior says."
+    )
+    of_member = [(labels[name], parts.median_and_range(v, _FORM)) for name, v in member.items()]
+    new_member = [
+        parts.table(("", "median and 90 %"), of_member),
+        parts.note(
+            "What is not known of the population widens it. In Python, the hierarchy's "
+            "predict(model) gives the data of such a member, and as_prior() the prior of the next."
+        ),
+        *([parts.chart(charts.pairs(labels, member))] if len(member) > 1 else []),
+    ]
     sections = [
-        ("The population", _population(population, table)),
+        ("The population", [parts.table(("", *parts.SUMMARY), rows), before_the_cut]),
         ("Members beside the population", _members(population, folder, page_folder, verdicts)),
-        ("A member not seen", _new_member(population)),
+        ("A member not seen", new_member),
         ("How sampling went", _sampling(population, table, warnings)),
         ("Where this comes from, and how to repeat it", _provenance(plan, population)),
     ]
@@ -158,20 +176,9 @@ def _labels(population: Hierarchy) -> dict[str, str]:
     return medians | spreads | correlations
 
 
-def _population(population: Hierarchy, table: Mapping[str, Mapping[str, float]]) -> list[Block]:
-    labels = _labels(population)
-    rows = [(label, *parts.summary_cells(table[name])) for name, label in labels.items()]
-    note = parts.note(
-        "Of the population before it is cut to the parameters' ranges. A spread is an sd; of a "
-        "logarithm it is about a relative sd. Few members tell little of it: it is then what its "
-        "prior says."
-    )
-    return [Table(("", *parts.SUMMARY), rows), note]
-
-
 def _members(
     population: Hierarchy, folder: Path, page_folder: Path, verdicts: Mapping[str, str]
-) -> list[Block]:
+) -> list[Markup]:
     """Return the chart of the members, its numbers, each member's checks and its misfits."""
     draws = population.draws()
     numbers, checks, misfit_sentences = [], [], []
@@ -192,14 +199,14 @@ def _members(
     return [
         parts.chart(shrinkage(population)),
         parts.note("Medians and 90 % of each member with the others, the chart's blue:"),
-        Table(("", *labels), numbers),
+        parts.table(("", *labels), numbers),
         parts.note(
             "Each member by itself, the chart's grey: FEM's verdict, and how much of its data "
             "lies within 90 % of what its posterior predicts, noise included. For a page: "
             f"calibrate report on {MEMBERS}/NAME in this folder, then on the folder again."
         ),
-        Table(("", "FEM says", "data within 90 %", "page"), checks),
-        *parts.warnings(misfit_sentences),
+        parts.table(("", "FEM says", "data within 90 %", "page"), checks),
+        *(parts.paragraph(each, "warning") for each in misfit_sentences),
     ]
 
 
@@ -228,21 +235,9 @@ def _page(path: Path, page_folder: Path) -> str:
     return Markup('<a href="{}">open</a>').format(quote(relative))
 
 
-def _new_member(population: Hierarchy) -> list[Block]:
-    member = population.new_member()
-    labels = {name: label_of(population, name) for name in member}
-    rows = [(labels[name], parts.median_and_range(v, _FORM)) for name, v in member.items()]
-    note = parts.note(
-        "What is not known of the population widens it. In Python, the hierarchy's predict(model) "
-        "gives the data of such a member, and as_prior() the prior of the next."
-    )
-    pairs = [parts.chart(charts.pairs_of(labels, member))] if len(member) > 1 else []
-    return [Table(("", "median and 90 %"), rows), note, *pairs]
-
-
 def _sampling(
     population: Hierarchy, table: Mapping[str, Mapping[str, float]], warnings: Sequence[str]
-) -> list[Block]:
+) -> list[Markup]:
     """Return draws, the worst R-hat and the fewest effective draws in words, and traces."""
     labels = _labels(population)
     sizes, statistics = population.tree["posterior"].sizes, population.tree["sample_stats"]
@@ -256,10 +251,10 @@ def _sampling(
         f"bulk, {fewest['ess_tail']:.0f} or more in the tails, of population and members alike. "
     )
     text += "Warnings are at the top." if warnings else "Nothing is wrong with the run."
-    return [Paragraph(text), parts.chart(charts.traces_of(labels, population.draws(), {}))]
+    return [parts.paragraph(text), parts.chart(charts.traces(labels, population.draws(), {}))]
 
 
-def _provenance(plan: Members, population: Hierarchy) -> list[Block]:
+def _provenance(plan: Members, population: Hierarchy) -> list[Markup]:
     """Return attributes, each member's scene and data, and settings as in an experiment file."""
     runs = {name: parts.changed_settings(run) for name, run in plan.members.items()}
     first = next(iter(runs.values()))

@@ -7,7 +7,7 @@ import sys
 import jax
 import pytest
 
-from calibrate.cli.compiled import keep_programs, program_folder
+from calibrate.cli import keep_programs, program_folder
 
 CALL = "import sys; from calibrate.cli import main; sys.exit(main(sys.argv[1:]))"
 WORDS = ("simulate", "once_clamped_beam", "--theta", "mu=70", "lam=80", "--json")

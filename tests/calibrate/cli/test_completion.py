@@ -5,8 +5,7 @@ import subprocess
 
 import pytest
 
-from calibrate.cli import COMMANDS
-from calibrate.cli.commands.completion import completion
+from calibrate.cli import COMMANDS, build_parser
 
 ASK = """
 source "$1"; shift
@@ -15,6 +14,11 @@ _shtab_calibrate
 printf '%s\\n' "${COMPREPLY[@]}"
 """
 pytestmark = pytest.mark.slow
+
+
+def completion(shell):
+    arguments = build_parser("completion").parse_args(["completion", shell])
+    return arguments.run(arguments).text
 
 
 @pytest.fixture(scope="module")

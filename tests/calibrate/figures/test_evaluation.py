@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate.figures.drawing import pyplot
+from calibrate.figures import pyplot
 from calibrate.figures.evaluation import (
     density_figure,
     parameter_figure,

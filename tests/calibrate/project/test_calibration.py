@@ -10,7 +10,7 @@ import journeys
 from calibrate.cli import main
 from calibrate.measurements import data as reader
 from calibrate.project import Problem, Run, by_fem, infer, read_problem, simulator_of
-from calibrate.project.problem import Simulators, with_data
+from calibrate.project.problem import with_data
 from calibrate.report import page
 from emulator.fem import NewtonOptions
 from emulator.scenes.built_in import BUILT_IN
@@ -88,17 +88,15 @@ def test_simulators_are_found_by_the_fingerprint_of_their_scene():
     first, again = (em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1) for _ in range(2))
     other = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=2)
     assert first is not again
-    simulators = Simulators(size=2)
-    simulator = simulators.of(first, 1)
-    assert simulators.of(again, 1) is simulator
-    assert simulators.of(first, 2) is not simulator
-    assert simulators.of(first, 1) is simulator
-    simulators.of(other, 1)
-    assert simulators.of(first, 1) is simulator  # the one used longest ago went
-    simulators.of(other, 2)
-    simulators.of(other, 1)
-    assert simulators.of(first, 1) is not simulator
-    assert simulator_of(first) is simulator_of(again)
+    simulator = simulator_of(first, 1)
+    assert simulator_of(again, 1) is simulator
+    assert simulator_of(first, 2) is not simulator
+    assert simulator_of(first, 1) is simulator
+    simulator_of(other, 1)
+    assert simulator_of(first, 1) is simulator  # the one used longest ago went
+    simulator_of(other, 2)
+    simulator_of(other, 1)
+    assert simulator_of(first, 1) is not simulator
 
 
 def test_fem_data_of_a_check_is_solved_in_the_load_steps_of_the_run(count, monkeypatch, tmp_path):

@@ -16,8 +16,7 @@ from calibrate.model_error.kinds import SYSTEMATIC_ERRORS
 from calibrate.noise import NOISES
 from calibrate.priors import Population
 from calibrate.project import Run
-from calibrate.project.experiment import read_experiment
-from calibrate.project.experiment_schema import experiment_schema
+from calibrate.project.experiment import experiment_schema, read_experiment
 from calibrate.project.members import Shared
 from calibrate.samplers import SAMPLERS
 from emulator.core.errors import InputError

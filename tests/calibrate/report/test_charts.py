@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibrate.report.charts import inside, pairs_of
+from calibrate.report.charts import inside, pairs
 
 LABELS = {"mu": "mu (kPa)", "lam": "lam (kPa)", "nu": "nu"}
 
@@ -13,7 +13,7 @@ def test_pairs_are_drawn_of_two_and_of_more(count):
     """A matrix of one panel is left blank by Plotly, so two names are a chart of their own."""
     labels = dict(list(LABELS.items())[:count])
     draws = {name: np.arange(5.0) + k for k, name in enumerate(labels)}
-    figure = pairs_of(labels, draws)
+    figure = pairs(labels, draws)
     if count == 3:
         assert [each.label for each in figure.data[0].dimensions] == list(labels.values())
         return

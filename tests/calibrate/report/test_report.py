@@ -143,11 +143,12 @@ def test_charts_say_what_was_drawn(ventricle_posterior):
     # Klotz's curve lies behind, through what was measured.
     assert np.interp(seen.y[0], klotz.y, klotz.x) == pytest.approx(seen.x[0], rel=1e-3)
     assert klotz.x[0] == pytest.approx(seen.x[0] * (0.6 - 0.006 * seen.y[0] / 0.133322), rel=1e-6)
-    ranks = [
-        t for t in charts.traces(ventricle_posterior).data if t.type == "scatter" and t.line.shape
-    ]
+    labels = charts.names_with_units(ventricle_posterior)
+    draws = {name: np.asarray(ventricle_posterior.tree["posterior"][name]) for name in labels}
+    traces = charts.traces(labels, draws, ventricle_posterior.model.sampled_priors).data
+    ranks = [t for t in traces if t.type == "scatter" and t.line.shape]
     assert len(ranks) == 2 * 5
-    priors = [t for t in charts.traces(ventricle_posterior).data if t.name == "prior"]
+    priors = [t for t in traces if t.name == "prior"]
     assert len(priors) == 5
     a = priors[0]
     np.testing.assert_allclose(a.y, 1.0 / (np.array(a.x) * np.log(0.52 / 0.2)), rtol=1e-6)

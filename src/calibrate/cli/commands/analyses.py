@@ -1,69 +1,59 @@
-"""``calibrate identify`` and ``effects``: what data determine, and what a scene does not need."""
+"""``calibrate identify``, ``effects`` and ``sensitivity``: what data determine, what matters."""
 
 from __future__ import annotations
 
-import argparse
 import sys
+from argparse import Namespace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.output import DONE, emit, table
-from calibrate.cli.words import add_scene, answer, scene_of
-from emulator.core.errors import check_seed
+from calibrate.cli import words
+from calibrate.cli.output import table
+from calibrate.cli.run_words import run_options
+from calibrate.cli.words import Answer, command, flag, option
+from emulator.core.errors import InputError, check_seed
+from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
-    from calibrate.analysis.effects import Measured, Recommendation
+    import xarray as xr
+
+    from calibrate.analysis.effects import Recommendation
+    from emulator.scenes.scene import Scene
 
 
-def add_identify(commands: Any) -> None:
-    """Add the command, before data and after."""
-    from calibrate.cli.run_words import add_run
-
-    parser = commands.add_parser("identify", help="which parameters the data can determine")
-    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
-    before = kinds.add_parser("before", help="of data not yet measured, from a scene")
-    add_run(before, ("seed",))
-    after = kinds.add_parser("after", help="of a posterior that calibrate infer wrote")
-    after.add_argument("folder", metavar="DIR")
-    after.add_argument(
-        "--next",
-        nargs="+",
-        default=[],
-        metavar="WHAT",
-        help="measurements to compare, written as for infer --observe, with their usual noise",
-    )
-    after.add_argument(
-        "--profile", nargs="+", default=[], metavar="NAME", help="profile likelihoods"
-    )
-    for kind, run in ((before, run_before), (after, run_after)):
-        answer(kind, run)
-
-
-def run_before(arguments: argparse.Namespace) -> int:
-    """Print what the observations would determine."""
+@command(run_options("seed"), help="of data not yet measured, from a scene")
+def _before(arguments: Namespace) -> Answer:
+    """Find what the observations would determine."""
     from calibrate.analysis.expected import expected_precision
     from calibrate.analysis.identifiability import products_in_words
     from calibrate.cli.run_words import problem_of
     from calibrate.project import model_before_data
 
-    problem = problem_of(arguments, ("seed",))
+    problem = problem_of(arguments)
     # Errors that many numbers share are made for each data set, not at one draw of the prior.
     model = model_before_data(problem.change(systematic={}))
     expected = expected_precision(model, systematic=problem.run.systematic)
     rows = [(name, f"{100 * ratio:.3g} %") for name, ratio in expected["sd"].items()]
     lines = [table(("parameter", "expected sd / prior sd"), rows)]
     lines += products_in_words(expected["combinations"], len(rows))
-    emit(arguments, expected, "\n".join(lines))
-    return DONE
+    return Answer(expected, "\n".join(lines))
 
 
-def run_after(arguments: argparse.Namespace) -> int:
-    """Print what a posterior's data determined, and which measurement would add most."""
-    from calibrate.analysis.identifiability import (
-        identify,
-        in_words,
-        next_measurement,
-        stress_band,
-    )
+@command(
+    option("folder", "DIR"),
+    option(
+        "--next",
+        "WHAT",
+        "measurements to compare, written as for infer --observe, with their usual noise",
+        nargs="+",
+        default=[],
+    ),
+    option("--profile", "NAME", "profile likelihoods", nargs="+", default=[]),
+    help="of a posterior that calibrate infer wrote",
+)
+def _after(arguments: Namespace) -> Answer:
+    """Find what a posterior's data determined, and which measurement would add most."""
+    from calibrate.analysis.identifiability import identify, in_words, next_measurement, stress_band
     from calibrate.analysis.profile import profile_likelihood
     from calibrate.measurements import parse_observation
     from calibrate.project import read_posterior
@@ -87,7 +77,7 @@ def run_after(arguments: argparse.Namespace) -> int:
         result[f"profile {name}"] = [profile.low, profile.high]
     scene = posterior.model.forward.scene
     candidates = {}
-    for word in [each for words in arguments.next for each in words.split("+")]:
+    for word in "+".join(arguments.next).split("+") if arguments.next else ():
         (part,) = parse_observation(scene, word, run.seed).parts.values()
         candidates[word] = (part, part.default_noise)
     if candidates:
@@ -100,46 +90,40 @@ def run_after(arguments: argparse.Namespace) -> int:
         lines.append("expected information gain, and by how much each sd would fall:")
         lines.append(table(("measure next", "bits", *names), rows))
         result["next"] = {name: c._asdict() for name, c in gains.items()}
-    emit(arguments, result, "\n".join(lines))
-    return DONE
+    return Answer(result, "\n".join(lines))
 
 
-def add_effects(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "effects",
-        help="which effects a scene can do without",
-        description="Solves the scene with and without each effect it could do without (gravity, "
-        "fibres, a pressure that follows the wall, quadratic elements, springs ...) and recommends "
-        "which to leave out, so that what is observed changes by no more than a tolerance.",
-        epilog="example: calibrate effects left_ventricle --observe landmarks:24+volume "
-        "--tolerance 0.5mm 1mL",
-    )
-    add_scene(parser)
-    parser.add_argument(
-        "--observe", required=True, metavar="WHAT", help="as for infer, e.g. landmarks:24+volume"
-    )
-    parser.add_argument(
+identify = words.command_of_kinds(
+    "which parameters the data can determine", before=_before, after=_after
+)
+
+
+@command(
+    words.add_scene,
+    option("--observe", "WHAT", "as for infer, e.g. landmarks:24+volume", required=True),
+    option(
         "--tolerance",
+        "VALUE",
+        "change that is allowed, with its unit, one for each unit observed, e.g. 0.5mm 1mL",
         required=True,
         nargs="+",
-        metavar="VALUE",
-        help="change that is allowed, with its unit, one for each unit observed, e.g. 0.5mm 1mL",
-    )
-    parser.add_argument(
-        "--samples", type=int, default=6, metavar="N", help="theta to solve at (default 6)"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    answer(parser, run_effects)
-
-
-def run_effects(arguments: argparse.Namespace) -> int:
+    ),
+    option("--samples", "N", "theta to solve at (default 6)", type=int, default=6),
+    option("--seed", type=int, default=0),
+    help="which effects a scene can do without",
+    description="Solves the scene with and without each effect it could do without (gravity, "
+    "fibres, a pressure that follows the wall, quadratic elements, springs ...) and recommends "
+    "which to leave out, so that what is observed changes by no more than a tolerance.",
+    epilog="example: calibrate effects left_ventricle --observe landmarks:24+volume "
+    "--tolerance 0.5mm 1mL",
+)
+def effects(arguments: Namespace) -> Answer:
     """Measure each effect, and recommend which to leave out."""
     from calibrate.analysis.effects import recommend, tolerances
     from calibrate.measurements import observations, parse_observation
 
     check_seed(arguments.seed, "effects")
-    scene = scene_of(arguments)
+    scene = words.scene_of(arguments)
     observe = observations(parse_observation(scene, arguments.observe, arguments.seed))
     recommendation = recommend(
         scene,
@@ -149,38 +133,23 @@ def run_effects(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         say=lambda what: None if arguments.json else print(what, "...", file=sys.stderr),
     )
-    emit(arguments, effects_report(recommendation), effects_summary(recommendation))
-    return DONE
-
-
-def effects_report(recommendation: Recommendation) -> dict[str, Any]:
-    """Return all that was measured as plain JSON."""
-    return {
+    result = {
         "leave_out": [
             {"effect": name, "remedy": recommendation.effects[name].remedy}
             for name in recommendation.left_out
         ],
-        "tolerance": dict(recommendation.tolerance),
-        "units": dict(recommendation.units),
-        "whole": _plain(recommendation.whole),
-        "alone": [_plain(each) for each in recommendation.alone],
-        "chosen": _plain(recommendation.chosen),
+        "tolerance": recommendation.tolerance,
+        "units": recommendation.units,
+        "whole": vars(recommendation.whole),
+        "alone": [vars(each) for each in recommendation.alone],
+        "chosen": vars(recommendation.chosen),
     }
+    return Answer(result, _effects_in_words(recommendation))
 
 
-def _plain(measured: Measured) -> dict[str, Any]:
-    plain = vars(measured) | {"left_out": list(measured.left_out)}
-    return plain | {"changes": dict(measured.changes)}
-
-
-def effects_summary(recommendation: Recommendation) -> str:
+def _effects_in_words(recommendation: Recommendation) -> str:
     """Return a table of the effects, and the recommendation in words."""
-    header = [
-        "without",
-        *(f"{name}, {unit}" for name, unit in recommendation.units.items()),
-        "time",
-        "unknowns",
-    ]
+    observed = [f"{name}, {unit}" for name, unit in recommendation.units.items()]
     rows = [
         (
             ", ".join(each.left_out),
@@ -194,7 +163,7 @@ def effects_summary(recommendation: Recommendation) -> str:
     lines = [
         f"the scene as it is: {whole.seconds:.3g} s a solve, {whole.unknowns} unknowns",
         "largest change where one effect is left out:",
-        table(header, rows),
+        table(("without", *observed, "time", "unknowns"), rows),
     ]
     if not recommendation.left_out:
         return "\n".join([*lines, "keep everything: no effect can go and save time"])
@@ -210,3 +179,179 @@ def effects_summary(recommendation: Recommendation) -> str:
         f"{selection.ratio:.2f} of the time"
     )
     return "\n".join(lines)
+
+
+_SAMPLES = {"sobol": 512, "morris": 64, "derivatives": 256}
+# By method: the heads of a table's columns, and what is in them; blanks keep heads apart.
+_COLUMNS = {
+    "sobol": {
+        "first": "first_together",
+        "+-": "first_together_half_width",
+        "total": "total_together",
+        "+- ": "total_together_half_width",
+    },
+    "morris": {"mean absolute effect": "mu_star_together"},
+    "derivatives": {"total index at most": "bound_on_total_together"},
+}
+
+
+@command(
+    words.add_scene,
+    option("--observe", "WHAT", "as for infer, e.g. volume or landmarks:24+volume"),
+    flag("--field", "the displacement of every node, and a map of it"),
+    option(
+        "--method",
+        choices=tuple(_SAMPLES),
+        default="sobol",
+        help="sobol (default): shares of the variance; morris: mean effects, for many parameters; "
+        "derivatives: bounds on the shares, and combinations of parameters that matter",
+    ),
+    option(
+        "--samples",
+        "N",
+        "sobol evaluates N (p + 2) theta, a power of two (default 512); morris N (p + 1) "
+        "(64); derivatives N (256)",
+        type=int,
+    ),
+    option(
+        "--prior",
+        "NAME|FILE",
+        "box (uniform over the range, on its scale), or a population's .json file without "
+        "correlations",
+        default="box",
+    ),
+    option(
+        "--group",
+        "NAME=A,B",
+        "vary parameters together, e.g. matrix=a,b fibres=a_f,b_f",
+        nargs="+",
+        default=[],
+    ),
+    words.add_forward,
+    option("--emulator", "NAME|DIR", "default: the one shipped"),
+    words.scheduler_option("with --forward fem, the FEM runs"),
+    words.seed_option("the design, of random landmarks and of FEM runs"),
+    option("--out", "DIR", "write sensitivity.nc, figures, and the map as VTU"),
+    help="which parameter moves which observation",
+    description="Shares of each observation's variance over the prior (Sobol' indices), "
+    "screening of many parameters (Morris), or bounds from exact derivatives.",
+    epilog="example: calibrate sensitivity left_ventricle --observe volume --field --out DIR",
+)
+def sensitivity(arguments: Namespace) -> Answer:
+    """Analyse a scene's forward map, and write the indices."""
+    from calibrate.analysis.sensitivity import sensitivity
+    from calibrate.measurements import parse_observation
+    from calibrate.priors import prior_of
+    from calibrate.project.run import with_absolute_paths
+    from emulator import Simulator
+    from emulator.surrogates.protocol import Ingredients
+    from emulator.surrogates.registry import build_forward, check_scheduler, full_options
+
+    check_seed(arguments.seed, "sensitivity")
+    check_scheduler(arguments.forward, arguments.scheduler)
+    scheduler = words.scheduler_word(arguments)
+    scene = words.scene_of(arguments)
+    if arguments.out:
+        check_folder(arguments.out)
+    observe = arguments.observe and parse_observation(scene, arguments.observe, arguments.seed)
+    options = full_options(arguments.forward, words.forward_options(arguments))
+    groups = _groups(arguments.group)
+    entries = {"emulator": arguments.emulator, "prior": arguments.prior}
+    emulator, prior = with_absolute_paths(entries).values()
+    ingredients = Ingredients(scene, Simulator(scene), emulator, arguments.seed, progress=False)
+    indices = sensitivity(
+        build_forward(arguments.forward, ingredients, options),
+        observe or None,
+        prior=prior_of(prior, scene),
+        method=arguments.method,
+        samples=_SAMPLES[arguments.method] if arguments.samples is None else arguments.samples,
+        groups=groups,
+        field=arguments.field,
+        seed=arguments.seed,
+        scheduler=scheduler,
+    )
+    if arguments.out:
+        _write_indices(indices, scene, Path(arguments.out))
+    result: dict[str, Any] = {str(name): value for name, value in indices.attrs.items()}
+    result |= {name: _plain(node.to_dataset()) for name, node in indices.children.items()}
+    return Answer(result, _indices_in_words(indices))
+
+
+def _write_indices(indices: xr.DataTree, scene: Scene, folder: Path) -> None:
+    """Write the indices as netCDF, their figures, and indices of the nodes as VTU."""
+    import numpy as np
+
+    from calibrate.analysis.sensitivity import FIELD
+    from calibrate.figures.sensitivity import draw
+    from emulator.core.store import write_netcdf
+    from emulator.geometry.io import write_nodal
+
+    write_netcdf(folder / "sensitivity.nc", indices)
+    draw(indices, scene, folder)
+    if FIELD in indices.children:
+        data = indices[FIELD].to_dataset()
+        nodal = {
+            f"{name} {label}": np.nan_to_num(values)
+            for name in {"first", "total", "mu_star", "bound_on_total"} & set(map(str, data))
+            for label, values in zip(
+                data[data[name].dims[0]].values, data[name].values, strict=True
+            )
+        }
+        write_nodal(folder / "sensitivity.vtu", scene.mesh, nodal)
+
+
+def _indices_in_words(indices: xr.DataTree) -> str:
+    """Return a table for each observation."""
+    lines = []
+    for name, node in indices.children.items():
+        data = node.to_dataset()
+        count = data.sizes["output"]
+        numbers = f"{count} numbers, " if count > 1 else ""
+        lines.append(f"{name} ({numbers}{data.attrs['unit']})")
+        columns = _COLUMNS[indices.attrs["method"]]
+        names = list(columns.values())
+        header = [str(data[names[0]].dims[0]), *(head.rstrip() for head in columns)]
+        rows = [
+            (str(label), *(round(float(data[n][k]), 4) for n in names))
+            for k, label in enumerate(data[data[names[0]].dims[0]].values)
+        ]
+        lines.append(table(header, rows))
+        if indices.attrs["method"] == "derivatives":
+            lines.append(_active(data))
+    return "\n".join(lines)
+
+
+def _active(data: xr.Dataset) -> str:
+    """Return the direction of theta along which the observation changes most, in words."""
+    values, vectors = data["active_value"].values, data["active_direction"].values
+    if not values.sum() > 0.0:
+        return "nothing changes along any direction"
+    terms = " ".join(
+        f"{weight:+.2f} {name}"
+        for name, weight in zip(data["parameter"].values, vectors[:, 0], strict=True)
+    )
+    share = 100.0 * values[0] / values.sum()
+    return f"{share:.0f} % of the squared slopes along {terms} (in the unit box)"
+
+
+def _plain(data: xr.Dataset) -> dict[str, Any]:
+    """Return indices of all numbers together, and of each where they are few, as plain JSON."""
+    few = data.sizes["output"] <= 100
+    result: dict[str, Any] = {"unit": data.attrs["unit"], "evaluations": data.attrs["evaluations"]}
+    for name, values in data.variables.items():
+        if few or "output" not in values.dims:
+            result[str(name)] = values.values.tolist()
+    return result
+
+
+def _groups(texts: list[str]) -> dict[str, list[str]]:
+    """Read words ``NAME=A,B``: the parameters of each group by its name."""
+    groups = {}
+    for word in texts:
+        name, mark, members = word.partition("=")
+        if not mark or not name or not all(members.split(",")):
+            raise InputError(f"--group {word}: write NAME=A,B, e.g. matrix=a,b")
+        if name in groups:
+            raise InputError(f"--group {name} is given twice")
+        groups[name] = members.split(",")
+    return groups

@@ -2,53 +2,39 @@
 
 from __future__ import annotations
 
-import argparse
 import math
+from argparse import Namespace
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.output import DONE, FAILED, emit, show_progress, table, volume_lines, volumes
-from calibrate.cli.words import (
-    add_forward,
-    add_theta,
-    answer,
-    assignments,
-    check_vtu,
-    checked_forward_options,
-    theta_by_name,
-)
+from calibrate.cli import words
+from calibrate.cli.output import table, volume_lines, volumes
+from calibrate.cli.words import Answer, command, flag, option
 from emulator.core.errors import InputError
-from emulator.core.store import write_json
+from emulator.core.store import check_folder, write_json
 
 if TYPE_CHECKING:
     import jax
 
-    from calibrate.analysis.evaluation import Evaluated
     from emulator.accuracy.estimate import ErrorEstimate
     from emulator.scenes import Scene
 
-
-def add_predict(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "predict",
-        help="an emulator's displacement, and whether to trust it",
-        description="Evaluate an emulator at one theta. Exit code 1 says not to trust the result: "
-        "theta outside the box, an inverted element, no equilibrium near the prediction.",
-    )
-    parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
-    add_theta(parser)
-    parser.add_argument(
-        "--error-bar", action="store_true", help="estimate the error from the residual forces"
-    )
-    parser.add_argument("--out", metavar="FILE.vtu", help="write displacement, stress and strain")
-    answer(parser, run_predict)
+_EMULATOR = option("emulator", "EMULATOR", "shipped name or folder")
 
 
-def run_predict(arguments: argparse.Namespace) -> int:
-    """Predict at one theta and report the guard's verdict."""
+@command(
+    _EMULATOR,
+    words.THETA,
+    flag("--error-bar", "estimate the error from the residual forces"),
+    option("--out", "FILE.vtu", "write displacement, stress and strain"),
+    help="an emulator's displacement, and whether to trust it",
+    description="Evaluate an emulator at one theta. Exit code 1 says not to trust the result: "
+    "theta outside the box, an inverted element, no equilibrium near the prediction.",
+)
+def predict(arguments: Namespace) -> Answer:
+    """Predict at one theta, with the guard's verdict."""
     import jax
     import numpy as np
 
@@ -58,11 +44,11 @@ def run_predict(arguments: argparse.Namespace) -> int:
     from emulator.surrogates import load
 
     if arguments.out:
-        check_vtu(arguments.out)
+        words.check_vtu(arguments.out)
     emulator = load(arguments.emulator)
     scene, forward = emulator.scene, emulator.cache()
-    values = assignments(arguments.theta)
-    theta = anywhere(scene, values) if values else scene.centre
+    values = words.assignments(arguments.theta)
+    theta = _anywhere(scene, values) if values else scene.centre
     u = forward(theta)
     estimate, against = None, jax.jit(partial(guard, scene))(theta, u)
     if arguments.error_bar:
@@ -75,22 +61,21 @@ def run_predict(arguments: argparse.Namespace) -> int:
     result: dict[str, Any] = {
         "emulator": arguments.emulator,
         "scene": scene.name,
-        "theta": theta_by_name(scene, theta),
+        "theta": words.theta_by_name(scene, theta),
         "trusted": bool(against.trusted),
         "guard": against.sentence(scene),
         "max_displacement": float(np.linalg.norm(u, axis=1).max()) if finite else None,
         "least_J": float(against.least_J) if finite else None,
         "volumes": volumes(scene, u, estimate) if finite else {},
-        "error": None if estimate is None else error_of(estimate),
+        "error": None if estimate is None else _error_of(estimate),
     }
     if arguments.out and finite and against.least_J > 0.0:
         write_solution(arguments.out, scene.mesh, np.asarray(u), element_fields(scene, u, theta))
         result["out"] = arguments.out
-    emit(arguments, result, prediction_summary(result))
-    return DONE if result["trusted"] else FAILED
+    return Answer(result, prediction_summary(result), result["trusted"])
 
 
-def anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
+def _anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
     """Return theta (p,) from named finite values, which may lie outside the box."""
     import jax.numpy as jnp
 
@@ -106,7 +91,7 @@ def anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
     return jnp.array([values[name] for name in scene.parameter_names])
 
 
-def error_of(estimate: ErrorEstimate) -> dict[str, Any]:
+def _error_of(estimate: ErrorEstimate) -> dict[str, Any]:
     """Return the error bar as plain JSON; without numbers where it is not valid."""
     if not estimate.valid:
         return {"valid": False}
@@ -147,57 +132,42 @@ def prediction_summary(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def add_evaluate(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser("evaluate", help="errors of an emulator against FEM")
-    parser.add_argument("emulator", metavar="EMULATOR", help="shipped name or folder")
-    parser.add_argument(
-        "--against", required=True, metavar="DIR|fem", help="a published model's folder, or our FEM"
-    )
-    parser.add_argument("--cases", type=int, help="FEM runs when against fem (default 50)")
-    parser.add_argument(
+@command(
+    _EMULATOR,
+    option("--against", "DIR|fem", "a published model's folder, or our FEM", required=True),
+    option("--cases", type=int, help="FEM runs when against fem (default 50)"),
+    option(
         "--outside",
+        "FRACTION",
+        "evaluate at as many theta again outside the box, each side widened by this fraction",
         type=float,
-        metavar="FRACTION",
-        help="evaluate at as many theta again outside the box, each side widened by this fraction",
-    )
-    add_forward(parser)
-    parser.add_argument("--out", metavar="DIR", help="write evaluation.json and figures")
-    answer(parser, run_evaluate)
-
-
-def run_evaluate(arguments: argparse.Namespace) -> int:
+    ),
+    words.add_forward,
+    option("--out", "DIR", "write evaluation.json and figures"),
+    help="errors of an emulator against FEM",
+)
+def evaluate(arguments: Namespace) -> Answer:
     """Compare a forward map with stored or fresh FEM solutions."""
     from calibrate.analysis.evaluation import Evaluation, run_evaluation
 
-    names = ("emulator", "against", "cases", "outside", "forward")
-    plan = Evaluation(
-        **{name: getattr(arguments, name) for name in names},
-        forward_options=checked_forward_options(arguments),
-    )
+    options = words.forward_options(arguments)
+    plan = Evaluation(**words.parameters(Evaluation, arguments), forward_options=options)
     if arguments.out:
-        from calibrate.figures.drawing import pyplot
-        from emulator.core.store import check_folder
+        from calibrate.figures import pyplot
 
         check_folder(arguments.out)
         pyplot()  # a missing plotting package is reported before minutes of FEM
-    evaluated = run_evaluation(plan, progress=show_progress(arguments))
-    files = (
-        [str(path) for path in save_evaluation(evaluated, arguments.out)] if arguments.out else []
-    )
-    report = {**evaluated.report, **({"files": files} if files else {})}
-    text = evaluation_summary(report) + (f"\nwritten: {', '.join(files)}" if files else "")
-    emit(arguments, report, text)
-    return DONE
+    evaluated = run_evaluation(plan, progress=not arguments.json)
+    report = dict(evaluated.report)
+    text = evaluation_summary(report)
+    if arguments.out:
+        from calibrate.figures.evaluation import draw
 
-
-def save_evaluation(evaluated: Evaluated, folder: str | Path) -> list[Path]:
-    """Write evaluation.json and the figures to ``folder``; the files written."""
-    from calibrate.figures.evaluation import draw
-
-    path = Path(folder) / "evaluation.json"
-    write_json(path, evaluated.report)
-    return [path, *draw(evaluated, folder)]
+        path = Path(arguments.out) / "evaluation.json"
+        write_json(path, evaluated.report)
+        report["files"] = [str(each) for each in (path, *draw(evaluated, arguments.out))]
+        text += f"\nwritten: {', '.join(report['files'])}"
+    return Answer(report, text)
 
 
 def evaluation_summary(report: Mapping[str, Any]) -> str:

@@ -1,166 +1,138 @@
-"""``calibrate init``, ``mesh``, ``scenes`` and ``schema``: scenes and their files."""
+"""``calibrate init``, ``mesh``, ``scenes``, ``schema`` and ``completion``: scenes, and their files.
+
+A schema and a completion are what editors and shells complete words from.
+"""
 
 from __future__ import annotations
 
 import argparse
 import textwrap
+from argparse import Namespace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from calibrate.cli.output import DONE, emit, table
-from calibrate.cli.words import answer, check_vtu
-from emulator.core.store import check_folder
+from calibrate.cli import words
+from calibrate.cli.output import table
+from calibrate.cli.words import Answer, command, option
+from emulator.core.store import check_folder, to_json
 
 
-def add_init(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "init",
-        help="a first scene file for your mesh",
-        description="Reads a mesh (gmsh, VTU and whatever meshio reads), says which sets it has, "
-        "guesses from their names and from its size, says so, and writes a commented scene file.",
-        epilog="example: calibrate init ventricle.msh, then calibrate simulate ventricle.toml",
-    )
-    parser.add_argument("mesh", metavar="MESH", help="mesh file of tetrahedra")
-    parser.add_argument(
-        "--out", metavar="FILE.toml", help="scene file to write (default: beside the mesh)"
-    )
-    parser.add_argument(
-        "--unit", metavar="mm|cm|m", help="of the mesh's coordinates (default: guessed, and said)"
-    )
-    parser.add_argument("--law", metavar="NAME", help="default: by whether there are fibres")
-    answer(parser, run_init)
-
-
-def run_init(arguments: argparse.Namespace) -> int:
-    """Write the scene file, and print what the mesh has."""
+@command(
+    option("mesh", "MESH", "mesh file of tetrahedra"),
+    option("--out", "FILE.toml", "scene file to write (default: beside the mesh)"),
+    option("--unit", "mm|cm|m", "of the mesh's coordinates (default: guessed, and said)"),
+    option("--law", "NAME", "default: by whether there are fibres"),
+    help="a first scene file for your mesh",
+    description="Reads a mesh (gmsh, VTU and whatever meshio reads), says which sets it has, "
+    "guesses from their names and from its size, says so, and writes a commented scene file.",
+    epilog="example: calibrate init ventricle.msh, then calibrate simulate ventricle.toml",
+)
+def init(arguments: Namespace) -> Answer:
+    """Write the scene file, and say what the mesh has."""
     from emulator.scenes.draft import draft_scene
 
     mesh_path = Path(arguments.mesh)
     out = arguments.out or mesh_path.parent / f"{mesh_path.stem or 'scene'}.toml"
-    scene_file = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
-    path = scene_file.path
-    mesh = scene_file.scene.mesh
-    sets = {name: len(nodes) for name, nodes in mesh.node_sets.items()}
+    draft = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
+    scene, mesh = draft.scene, draft.scene.mesh
     facets = {name: len(rows) for name, rows in mesh.facet_sets.items()}
     result = {
-        "out": str(path),
+        "out": str(draft.path),
         "nodes": len(mesh.nodes),
         "elements": len(mesh.elements),
-        "node_sets": sets,
+        "node_sets": {name: len(nodes) for name, nodes in mesh.node_sets.items()},
         "facet_sets": facets,
-        "law": scene_file.scene.law.name,
-        "parameters": list(scene_file.scene.parameter_names),
-        "notes": list(scene_file.notes),
+        "law": scene.law.name,
+        "parameters": list(scene.parameter_names),
+        "notes": list(draft.notes),
     }
     lines = [
         f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra",
         f"sets: {', '.join(f'{n} ({k} facets)' for n, k in facets.items()) or 'none'}",
-        *scene_file.notes,
-        f"written to {path}; look for CHANGE in it, then: calibrate simulate {path}",
+        *draft.notes,
+        f"written to {draft.path}; look for CHANGE in it, then: calibrate simulate {draft.path}",
     ]
-    emit(arguments, result, "\n".join(lines))
-    return DONE
+    return Answer(result, "\n".join(lines))
 
 
-def add_mesh(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "mesh",
-        help="tetrahedra between the two surfaces of a left ventricle",
-        description="Cuts both surfaces at the base, meshes the wall between them by Gmsh and "
-        "names endocardium, epicardium and base, for calibrate init. Surfaces are STL, PLY or OBJ: "
-        "open at the base, or closed, with --axis and a base plane.",
-        epilog="example: calibrate mesh --endocardium endo.stl --epicardium epi.stl --out lv.vtu, "
-        "then calibrate init lv.vtu",
-    )
-    for name in ("endocardium", "epicardium"):
-        parser.add_argument(f"--{name}", required=True, metavar="FILE", help="triangles")
-    parser.add_argument("--out", required=True, metavar="FILE.vtu", help="mesh to write, in mm")
-    parser.add_argument(
-        "--size", type=float, metavar="MM", help="edges (default: 0.7 of the median thickness)"
-    )
-    parser.add_argument(
+_PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
+
+
+@command(
+    option("--endocardium", "FILE", "triangles", required=True),
+    option("--epicardium", "FILE", "triangles", required=True),
+    option("--out", "FILE.vtu", "mesh to write, in mm", required=True),
+    option("--size", "MM", "edges (default: 0.7 of the median thickness)", type=float),
+    option(
         "--order", type=int, default=2, choices=(1, 2), help="of the elements (default: 2, curved)"
-    )
-    three = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    parser.add_argument(
-        "--axis", **three, help="from apex to base, across the base plane (default: by the rims)"
-    )
-    parser.add_argument(
-        "--base-height", type=float, metavar="MM", help="of the base plane along the axis"
-    )
-    parser.add_argument("--base-point", **three, help="a point of the base plane instead, mm")
-    parser.add_argument(
+    ),
+    option(
+        "--axis", **_PLACE, help="from apex to base, across the base plane (default: by the rims)"
+    ),
+    option("--base-height", "MM", "of the base plane along the axis", type=float),
+    option("--base-point", **_PLACE, help="a point of the base plane instead, mm"),
+    option(
         "--smooth",
+        "N",
+        "times of Taubin's filter; 20 for surfaces of voxels (default: 0)",
         type=int,
         default=0,
-        metavar="N",
-        help="times of Taubin's filter; 20 for surfaces of voxels (default: 0)",
-    )
-    parser.add_argument(
-        "--unit", default="mm", metavar="mm|cm|m", help="of the surfaces' coordinates (default: mm)"
-    )
-    parser.add_argument("--picture", metavar="FILE.png", help="the mesh, by the wall's thickness")
-    answer(parser, run_mesh)
-
-
-def run_mesh(arguments: argparse.Namespace) -> int:
+    ),
+    option("--unit", "mm|cm|m", "of the surfaces' coordinates (default: mm)", default="mm"),
+    option("--picture", "FILE.png", "the mesh, by the wall's thickness"),
+    help="tetrahedra between the two surfaces of a left ventricle",
+    description="Cuts both surfaces at the base, meshes the wall between them by Gmsh and "
+    "names endocardium, epicardium and base, for calibrate init. Surfaces are STL, PLY or OBJ: "
+    "open at the base, or closed, with --axis and a base plane.",
+    epilog="example: calibrate mesh --endocardium endo.stl --epicardium epi.stl --out lv.vtu, "
+    "then calibrate init lv.vtu",
+)
+def mesh(arguments: Namespace) -> Answer:
     """Mesh the wall, and write the mesh and its picture."""
     from emulator.geometry.io import write_mesh
     from emulator.geometry.two_surfaces import mesh_wall
 
-    check_vtu(arguments.out)
-    if arguments.picture is not None:
-        check_folder(Path(arguments.picture).parent)
-    wall = mesh_wall(
-        arguments.endocardium,
-        arguments.epicardium,
-        size=arguments.size,
-        order=arguments.order,
-        axis=arguments.axis,
-        base_height=arguments.base_height,
-        base_point=arguments.base_point,
-        smooth=arguments.smooth,
-        unit=arguments.unit,
-    )
-    write_mesh(arguments.out, wall.mesh)
+    out, picture = arguments.out, arguments.picture
+    words.check_vtu(out)
+    if picture is not None:
+        check_folder(Path(picture).parent)
+    wall = mesh_wall(**words.parameters(mesh_wall, arguments))
+    write_mesh(out, wall.mesh)
+    pairs = {
+        name: dict(zip(("mesh", "surface"), getattr(wall, name), strict=True))
+        for name in ("cavity", "wall")
+    }
     result = {
-        "out": arguments.out,
+        "out": out,
         "nodes": len(wall.mesh.nodes),
         "elements": len(wall.mesh.elements),
         "size": wall.size,
         "axis": wall.axis,
         "base": wall.base,
         "thickness": wall.thickness._asdict(),
-        "cavity": dict(zip(("mesh", "surface"), wall.cavity, strict=True)),
-        "wall": dict(zip(("mesh", "surface"), wall.wall, strict=True)),
+        **pairs,
         "cut_off": wall.cut_off,
         "moved": wall.moved,
         "quality": wall.quality._asdict(),
     }
-    lines = [*wall.sentences(), f"written to {arguments.out}, then: calibrate init {arguments.out}"]
-    if arguments.picture is not None:
-        from calibrate.figures.drawing import save
+    lines = [*wall.sentences(), f"written to {out}, then: calibrate init {out}"]
+    if picture is not None:
+        from calibrate.figures import save
         from calibrate.figures.evaluation import surface_figure
 
-        title = f"{Path(arguments.out).stem}: {result['nodes']} nodes"
+        title = f"{Path(out).stem}: {result['nodes']} nodes"
         figure = surface_figure(wall.mesh, wall.local_thickness(), title, "wall thickness (mm)")
-        save(figure, arguments.picture)
-        lines.append(f"picture: {arguments.picture}")
-    emit(arguments, result, "\n".join(lines))
-    return DONE
+        save(figure, picture)
+        lines.append(f"picture: {picture}")
+    return Answer(result, "\n".join(lines))
 
 
 _WIDTH = 79
 
 
-def add_scenes(commands: Any) -> None:
-    """Add the command."""
-    answer(commands.add_parser("scenes", help="what is built in"), run_scenes)
-
-
-def run_scenes(arguments: argparse.Namespace) -> int:
+@command(help="what is built in")
+def scenes(arguments: Namespace) -> Answer:  # noqa: ARG001
     """List the built-in scenes and the emulators shipped for them."""
     from emulator.scenes import BUILT_IN
     from emulator.surrogates.emulator import shipped_for
@@ -182,11 +154,10 @@ def run_scenes(arguments: argparse.Namespace) -> int:
                 "emulators": shipped_for(name),
             }
         )
-    emit(arguments, rows, _text(rows))
-    return DONE
+    return Answer(rows, _scenes_in_words(rows))
 
 
-def _text(rows: list[dict[str, Any]]) -> str:
+def _scenes_in_words(rows: list[dict[str, Any]]) -> str:
     """Return a line for each scene, and under it its parameters and shipped emulators."""
     head, *lines = table(
         ("scene", "nodes", "tetrahedra", "law"),
@@ -222,41 +193,85 @@ def _parameters(parameters: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-_FILES = ("scene", "experiment")
+@command(
+    option(
+        "file",
+        nargs="?",
+        choices=("scene", "experiment"),
+        default="scene",
+        help="kind of file (default: scene)",
+    ),
+    help="JSON Schema of scene or experiment files, for editors",
+    description="Prints the JSON Schema of scene files: their keys, kinds of laws, loads and "
+    "supports, with units and descriptions; or of experiment files: kinds of noise, systematic "
+    "errors, forward maps and samplers. Editors complete and check a file that begins "
+    "with the line '#:schema ./scene.schema.json'.",
+    epilog="examples: calibrate schema > scene.schema.json; "
+    "calibrate schema experiment > experiment.schema.json",
+)
+def schema(arguments: Namespace) -> Answer:
+    """Return the schema, which is JSON with and without ``--json``."""
+    if arguments.file == "scene":
+        from emulator.scenes.file_schema import scene_schema as schema_of_file
+    else:
+        from calibrate.project.experiment import experiment_schema as schema_of_file
+    schema = schema_of_file()
+    return Answer(schema, to_json(schema))
 
 
-def add_schema(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "schema",
-        help="JSON Schema of scene or experiment files, for editors",
-        description="Prints the JSON Schema of scene files: their keys, kinds of laws, loads and "
-        "supports, with units and descriptions; or of experiment files: kinds of noise, systematic "
-        "errors, forward maps and samplers. Editors complete and check a file that begins "
-        "with the line '#:schema ./scene.schema.json'.",
-        epilog="examples: calibrate schema > scene.schema.json; "
-        "calibrate schema experiment > experiment.schema.json",
-    )
-    parser.add_argument(
-        "file", nargs="?", choices=_FILES, default="scene", help="kind of file (default: scene)"
-    )
-    answer(parser, run_schema)
+@command(
+    option("shell", choices=("bash", "zsh", "fish")),
+    help="script that completes calibrate's words in your shell",
+    description="Prints a script for bash, zsh or fish that completes commands, options, "
+    "scenes, emulators, samplers, recipes and files, without starting calibrate.",
+    epilog='bash: eval "$(calibrate completion bash)" in ~/.bashrc; zsh: calibrate completion '
+    "zsh > a folder of $fpath/_calibrate; fish: calibrate completion fish > "
+    "~/.config/fish/completions/calibrate.fish",
+)
+def completion(arguments: Namespace) -> Answer:
+    """Return the script, made from the parsers of all commands."""
+    import shtab
+
+    from calibrate.cli import build_parser
+    from emulator.mechanics.laws import LAWS
+    from emulator.scenes import BUILT_IN
+    from emulator.surrogates.emulator import shipped
+
+    of_words = {
+        "SCENE": _words([*BUILT_IN], "toml"),
+        "EMULATOR": _words(shipped()),
+        "NAME|DIR": _words(shipped()),
+        "DIR|fem": _words(["fem"]),
+        "synthetic": _words(["synthetic"], "csv"),
+    }
+    complete = {metavar: shtab.cmd(texts) for metavar, texts in of_words.items()}
+    complete |= dict.fromkeys(("MESH", "NAME|FILE", "FILE|synthetic"), shtab.FILE)
+    parser = build_parser()
+    for action in _actions(parser):
+        metavar = str(action.metavar)
+        if metavar in complete:
+            action.complete = complete[metavar]  # type: ignore[attr-defined]
+        elif metavar.startswith("DIR"):
+            action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
+        elif metavar.startswith("FILE"):
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+        elif action.dest == "law":
+            action.complete = shtab.cmd(_words([*LAWS]))  # type: ignore[attr-defined]
+    script = shtab.complete(parser, arguments.shell)
+    return Answer({"script": script}, script)
 
 
-def run_schema(arguments: argparse.Namespace) -> int:
-    """Print the schema, which is JSON with and without ``--json``."""
-    from emulator.core.store import to_json
-
-    schema = _schema(arguments.file)
-    emit(arguments, schema, to_json(schema))
-    return DONE
+def _words(names: list[str], suffix: str = "") -> str:
+    """Return a command of any shell that prints names, and files here that end in ``suffix``."""
+    print_names = f"printf '%s\\n' {' '.join(sorted(names))}"
+    files = f"ls | grep '\\.{suffix}$'" if suffix else "ls -d */ 2>/dev/null"
+    return f"{print_names}; {files}"
 
 
-def _schema(file: str) -> dict[str, Any]:
-    if file == "scene":
-        from emulator.scenes.file_schema import scene_schema
-
-        return scene_schema()
-    from calibrate.project.experiment_schema import experiment_schema
-
-    return experiment_schema()
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Yield every argument of a parser and of its commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _actions(command)

@@ -2,41 +2,75 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import Any
+import sys
+import webbrowser
+from argparse import ArgumentParser, Namespace
+from functools import partial
+from typing import TYPE_CHECKING
 
-from calibrate.cli.output import needing_plotly, serve_until_interrupted
-from calibrate.cli.words import add_body, answer, emulator_of
-from calibrate.local_server import LOOPBACK
+from calibrate.cli.output import check_plotly
+from calibrate.cli.words import Answer, command, flag, option
+from calibrate.local_server import LOOPBACK, Server
 from emulator.core.errors import InputError
 
+if TYPE_CHECKING:
+    from emulator.surrogates.emulator import Emulator
 
-def add_serve(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "serve",
-        help="an emulator, or FEM, for other programs, by the UM-Bridge protocol",
-        description="The model 'forward': theta to what is observed, with derivatives, for QUEENS, "
-        "tinyDA, PyMC and whatever else speaks UM-Bridge. End with Ctrl-C.",
-        epilog="example: calibrate serve left_ventricle --observe landmarks:24+volume",
-    )
-    add_body(parser)
-    parser.add_argument("--fem", action="store_true", help="FEM of the scene instead")
+
+def _add_body(parser: ArgumentParser) -> None:
     parser.add_argument(
+        "body", metavar="EMULATOR|SCENE", help="an emulator's shipped name or folder, or a scene"
+    )
+    parser.add_argument(
+        "--emulator", metavar="E", help="the scene's emulator: shipped name or folder"
+    )
+
+
+def _emulator_of(arguments: Namespace) -> Emulator:
+    from emulator.catalogue import find_scene
+    from emulator.surrogates import load
+
+    body, word = arguments.body, arguments.emulator
+    emulator = load(word or body)
+    if word and find_scene(body).fingerprint != emulator.scene.fingerprint:
+        raise InputError(
+            f"--emulator {word} is of scene '{emulator.scene.name}', or of another mesh, not of "
+            f"'{body}'"
+        )
+    return emulator
+
+
+def _serve_until_interrupted(server: Server, page: str = "") -> None:
+    """Open the page in a browser, if there is one, and serve until Ctrl-C."""
+    if page:
+        webbrowser.open(page)
+    with server:
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            print("ended", file=sys.stderr)
+
+
+@command(
+    _add_body,
+    flag("--fem", "FEM of the scene instead"),
+    option(
         "--observe",
-        metavar="WHAT",
-        help="as for infer (default: the volumes of the scene's cavities, or landmarks:24)",
-    )
-    parser.add_argument("--port", type=int, default=4242, help="default 4242; 0 for a free one")
-    parser.add_argument(
+        "WHAT",
+        "as for infer (default: the volumes of the scene's cavities, or landmarks:24)",
+    ),
+    option("--port", type=int, default=4242, help="default 4242; 0 for a free one"),
+    option(
         "--host",
         default=LOOPBACK,
         help="default: this machine alone; 0.0.0.0 for all that reach it, without a password",
-    )
-    answer(parser, run_serve)
-
-
-def run_serve(arguments: argparse.Namespace) -> int:
+    ),
+    help="an emulator, or FEM, for other programs, by the UM-Bridge protocol",
+    description="The model 'forward': theta to what is observed, with derivatives, for QUEENS, "
+    "tinyDA, PyMC and whatever else speaks UM-Bridge. End with Ctrl-C.",
+    epilog="example: calibrate serve left_ventricle --observe landmarks:24+volume",
+)
+def serve(arguments: Namespace) -> Answer:
     """Serve until interrupted."""
     from calibrate.measurements import parse_observation
     from calibrate.um_bridge import NAME, serve
@@ -52,52 +86,46 @@ def run_serve(arguments: argparse.Namespace) -> int:
     if arguments.fem:
         forward = fem_forward(Simulator(find_scene(arguments.body)))
     else:
-        forward = emulator_of(arguments).cache()
+        forward = _emulator_of(arguments).cache()
     scene = forward.scene
     default = "volume" if cavity_sets(scene) else "landmarks:24"
     observe = parse_observation(scene, arguments.observe or default)
-    with serve(forward, observe, arguments.port, arguments.host) as server:
-        model = server.subject
-        address = f"http://{arguments.host}:{server.server_address[1]}"
-        outputs = [
-            {"name": name, "numbers": size, "unit": model.units[name]}
-            for name, size in zip(model.units, model.output_sizes, strict=True)
-        ]
-        names = list(scene.parameter_names)
-        result = {"address": address, "name": NAME, "input": names, "output": outputs}
-        numbers = ", ".join("{name} ({numbers}, {unit})".format_map(each) for each in outputs)
-        text = (
-            f"{address}, model '{NAME}': {model.label} of {scene.name}\n"
-            f"input: {', '.join(names)}\noutput: {numbers}\nCtrl-C ends it"
-        )
-        return serve_until_interrupted(arguments, server, result, text)
-
-
-def add_explore(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "explore",
-        help="a local page with a slider for every parameter",
-        description="The body deforms live, by the cached emulator; cavity volume, pressure-volume "
-        "curve and error bar beside it, and FEM on request. The page is served to this machine "
-        "only; end with Ctrl-C.",
-        epilog="example: calibrate explore left_ventricle",
+    server = serve(forward, observe, arguments.port, arguments.host)
+    model = server.subject
+    address = f"http://{arguments.host}:{server.server_address[1]}"
+    outputs = [
+        {"name": name, "numbers": size, "unit": model.units[name]}
+        for name, size in zip(model.units, model.output_sizes, strict=True)
+    ]
+    names = list(scene.parameter_names)
+    result = {"address": address, "name": NAME, "input": names, "output": outputs}
+    numbers = ", ".join("{name} ({numbers}, {unit})".format_map(each) for each in outputs)
+    text = (
+        f"{address}, model '{NAME}': {model.label} of {scene.name}\n"
+        f"input: {', '.join(names)}\noutput: {numbers}\nCtrl-C ends it"
     )
-    add_body(parser)
-    parser.add_argument("--port", type=int, default=0, help="default: a free one")
-    parser.add_argument("--no-browser", action="store_true", help="print the address alone")
-    answer(parser, run_explore)
+    return Answer(result, text, then=partial(_serve_until_interrupted, server))
 
 
-def run_explore(arguments: argparse.Namespace) -> int:
+@command(
+    _add_body,
+    option("--port", type=int, default=0, help="default: a free one"),
+    flag("--no-browser", "print the address alone"),
+    help="a local page with a slider for every parameter",
+    description="The body deforms live, by the cached emulator; cavity volume, pressure-volume "
+    "curve and error bar beside it, and FEM on request. The page is served to this machine "
+    "only; end with Ctrl-C.",
+    epilog="example: calibrate explore left_ventricle",
+)
+def explore(arguments: Namespace) -> Answer:
     """Serve until interrupted."""
-    with needing_plotly("exploring needs"):
-        from calibrate.explorer import Explorer, serve
+    check_plotly("exploring")
+    from calibrate.explorer import Explorer, serve
 
-    explorer = Explorer(emulator_of(arguments))
-    with serve(explorer, arguments.port) as server:
-        address = f"http://{LOOPBACK}:{server.server_address[1]}/"
-        result = {"scene": explorer.scene.name, "address": address}
-        text = f"{explorer.scene.name}: {address} (Ctrl-C ends it)"
-        page = "" if arguments.no_browser else address
-        return serve_until_interrupted(arguments, server, result, text, page)
+    explorer = Explorer(_emulator_of(arguments))
+    server = serve(explorer, arguments.port)
+    address = f"http://{LOOPBACK}:{server.server_address[1]}/"
+    result = {"scene": explorer.scene.name, "address": address}
+    text = f"{explorer.scene.name}: {address} (Ctrl-C ends it)"
+    page = "" if arguments.no_browser else address
+    return Answer(result, text, then=partial(_serve_until_interrupted, server, page))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.output import DONE, emit, show_progress
-from calibrate.cli.words import add_scene, answer, scene_of, seconds
+from calibrate.cli.words import Answer, add_scene, command, flag, option, scene_of, seconds
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder
 
@@ -16,13 +15,13 @@ if TYPE_CHECKING:
     from emulator.training.plan import Plan
 
 
-def add_train(commands: Any) -> None:
-    """Add the command."""
+_ENTRIES = ("objective", "steps", "simulations", "sweeps", "batch", "seed")  # of a plan
+
+
+def _add_plan(parser: ArgumentParser) -> None:
     from emulator.training import RECIPES
     from emulator.training.objectives import OBJECTIVES
 
-    parser = commands.add_parser("train", help="train an emulator")
-    add_scene(parser)
     parser.add_argument(
         "--recipe",
         choices=tuple(RECIPES),
@@ -53,24 +52,26 @@ def add_train(commands: Any) -> None:
         help="time for everything, e.g. 10m (default 10m; without a network, all FEM runs)",
     )
     length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
-    parser.add_argument("--simulations", type=int, help="FEM runs to train on")
-    parser.add_argument("--sweeps", type=int, help="of recipes physics and sweeps, in place of FEM")
-    parser.add_argument(
+
+
+@command(
+    add_scene,
+    _add_plan,
+    option("--simulations", type=int, help="FEM runs to train on"),
+    option("--sweeps", type=int, help="of recipes physics and sweeps, in place of FEM"),
+    option(
         "--campaign",
-        metavar="STORE.zarr",
-        help="take the FEM runs from this store of calibrate campaign, all that converged or the "
+        "STORE.zarr",
+        "take the FEM runs from this store of calibrate campaign, all that converged or the "
         "first --simulations of them; give it again with --resume",
-    )
-    parser.add_argument("--batch", type=int, help="theta a step")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument(
-        "--resume", action="store_true", help="continue from the checkpoint in --out"
-    )
-    parser.add_argument("--out", required=True, metavar="DIR")
-    answer(parser, run_train)
-
-
-def run_train(arguments: argparse.Namespace) -> int:
+    ),
+    option("--batch", type=int, help="theta a step"),
+    option("--seed", type=int),
+    flag("--resume", "continue from the checkpoint in --out"),
+    option("--out", "DIR", required=True),
+    help="train an emulator",
+)
+def train(arguments: Namespace) -> Answer:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
     from emulator.surrogates import load, save_emulator
@@ -81,7 +82,8 @@ def run_train(arguments: argparse.Namespace) -> int:
     check_folder(arguments.out)
     entries = _plan_entries(arguments)
     start = load(arguments.start) if arguments.start else None
-    plan = _plan(arguments.recipe or _default_recipe(start), entries, arguments.budget)
+    usual = "hybrid" if start is None else "network" if start.family is None else "family"
+    plan = _plan(arguments.recipe or usual, entries, arguments.budget)
     campaign = None
     if arguments.campaign:
         from emulator.fem.campaign.store import read_runs
@@ -101,11 +103,11 @@ def run_train(arguments: argparse.Namespace) -> int:
         campaign=campaign,
         budget=None if ignores_budget else seconds(time),
         resume=arguments.resume,
-        progress=show_progress(arguments),
+        progress=not arguments.json,
     )
     record = {
         **result.record,
-        "command": command_line(arguments.scene, result.record),
+        "command": _command_line(arguments.scene, result.record),
         "budget": arguments.budget,
         "hardware": hardware(),
         "versions": versions(),
@@ -119,8 +121,7 @@ def run_train(arguments: argparse.Namespace) -> int:
         text += f"\n{runs} of {plan.runs} FEM runs fit into the budget: more time, smaller errors"
     text += f"\nwritten to {arguments.out}; next: calibrate infer {arguments.scene} "
     text += f"--emulator {arguments.out} --data measured.csv --out RUN"
-    emit(arguments, {"out": arguments.out, **record}, text)
-    return DONE
+    return Answer({"out": arguments.out, **record}, text)
 
 
 def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str:
@@ -141,23 +142,13 @@ def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str
     return f"{text}; {error:.2g} mm from FEM at held-out runs"
 
 
-def _default_recipe(start: Any) -> str:
-    """Return the default recipe, which depends on what training starts from."""
-    if start is None:
-        return "hybrid"
-    return "network" if start.family is None else "family"
-
-
-def _plan_entries(arguments: argparse.Namespace) -> dict[str, Any]:
+def _plan_entries(arguments: Namespace) -> dict[str, Any]:
     """Return the plan's fields from the command line; ``--resume`` allows none."""
-    names = ("objective", "steps", "simulations", "sweeps", "batch", "seed")
-    entries = {name: getattr(arguments, name) for name in names}
-    entries = {name: value for name, value in entries.items() if value is not None}
-    further_options = [n for n in ("recipe", "budget") if getattr(arguments, n) is not None]
-    if arguments.resume and (entries or further_options):
-        option = next(iter([*entries, *further_options]))
-        raise InputError(f"--{option} has no effect with --resume: the checkpoint has its plan")
-    return entries
+    names = (*_ENTRIES, "recipe", "budget")
+    given = [name for name in names if getattr(arguments, name) is not None]
+    if arguments.resume and given:
+        raise InputError(f"--{given[0]} has no effect with --resume: the checkpoint has its plan")
+    return {name: getattr(arguments, name) for name in given if name in _ENTRIES}
 
 
 def _plan(name: str, entries: Mapping[str, Any], budget: str | None) -> Plan:
@@ -201,14 +192,15 @@ def _unused(plan: Plan) -> dict[str, str]:
     return unused
 
 
-def command_line(scene: str, record: Mapping[str, Any]) -> str:
+def _command_line(scene: str, record: Mapping[str, Any]) -> str:
     """Return the command that repeats a training exactly, with its actual steps and runs."""
     from emulator.training.trainer import plan_of
 
-    names = ("recipe", "objective", "steps", "simulations", "sweeps", "batch", "seed")
     options, unused = record["plan"], _unused(plan_of(record["plan"]))
     words = [
-        f"--{name} {options[name]}" for name in names if name in options and name not in unused
+        f"--{name} {options[name]}"
+        for name in ("recipe", *_ENTRIES)
+        if name in options and name not in unused
     ]
     # The record names the emulator training started from by its fingerprint, not by its folder.
     start = " --start EMULATOR" if "start" in record else ""
@@ -216,23 +208,15 @@ def command_line(scene: str, record: Mapping[str, Any]) -> str:
     return f"calibrate train {scene} {' '.join(words)}{start}{campaign} --out DIR"
 
 
-def add_released(commands: Any) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "released",
-        help="make an emulator of a network released with Dalton et al. (2023)",
-        description="Read a released network and write it as an emulator, which evaluate, predict, "
-        "infer and certify take like any other.",
-    )
-    parser.add_argument("model", metavar="MODEL", help="TwistingBeam, Liver or LeftVentricle")
-    parser.add_argument(
-        "--root", required=True, metavar="DIR", help="a clone of the release, or its folder data"
-    )
-    parser.add_argument("--out", required=True, metavar="DIR")
-    answer(parser, run_released)
-
-
-def run_released(arguments: argparse.Namespace) -> int:
+@command(
+    option("model", "MODEL", "TwistingBeam, Liver or LeftVentricle"),
+    option("--root", "DIR", "a clone of the release, or its folder data", required=True),
+    option("--out", "DIR", required=True),
+    help="make an emulator of a network released with Dalton et al. (2023)",
+    description="Read a released network and write it as an emulator, which evaluate, predict, "
+    "infer and certify take like any other.",
+)
+def released(arguments: Namespace) -> Answer:
     """Read, check and write the network."""
     from emulator.surrogates import save_emulator
     from emulator.surrogates.released_network import released_network
@@ -240,15 +224,13 @@ def run_released(arguments: argparse.Namespace) -> int:
     check_folder(arguments.out)
     emulator = released_network(arguments.model, arguments.root)
     save_emulator(emulator, arguments.out)
+    scene = emulator.scene
     result = {
-        "scene": emulator.scene.name,
-        "parameters": list(emulator.scene.parameter_names),
+        "scene": scene.name,
+        "parameters": list(scene.parameter_names),
         "fingerprint": emulator.fingerprint,
         "out": arguments.out,
     }
-    text = (
-        f"{emulator.scene.name}: the released network, theta is "
-        f"{', '.join(emulator.scene.parameter_names)}\nwritten: {arguments.out}"
-    )
-    emit(arguments, result, text)
-    return DONE
+    names = ", ".join(scene.parameter_names)
+    text = f"{scene.name}: the released network, theta is {names}\nwritten: {arguments.out}"
+    return Answer(result, text)
