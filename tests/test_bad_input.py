@@ -24,7 +24,7 @@ from emulator.core.errors import InputError
 from emulator.surrogates.emulator import SHIPPED
 from emulator.training import recipe
 from emulator.training.graph_network import GraphNetwork
-from emulator.training.job import Budget
+from emulator.training.plan import Job
 from linear_support import linear_forward
 
 BEAM = em.scenes.once_clamped_beam(cells=(4, 2, 2), order=1)
@@ -104,7 +104,10 @@ PYTHON = [
     (lambda: Run("liver", forward_options={"fem_runs": 9}), "no effect without --forward reduced"),
     (lambda: recipe("luck"), "recipe 'luck' is unknown; known: hybrid"),
     (lambda: GraphNetwork(steps=0), "steps is 0; it must be 1 or more"),
-    (lambda: Budget(1.0, 0.0), "a budget of 1 s: one FEM solution and its compilation alone take"),
+    (
+        lambda: Job(BEAM, budget=1.0),
+        "a budget of 1 s: one FEM solution and its compilation alone take",
+    ),
 ]
 
 

@@ -10,8 +10,8 @@ import emulator as em
 from emulator.core.errors import InputError
 from emulator.training.checkpoint import Session
 from emulator.training.graph_network import GraphNetwork
-from emulator.training.job import Job
 from emulator.training.network_plan import with_network_of
+from emulator.training.plan import Job
 from network_support import SMALL
 
 FAMILY = GraphNetwork(objective="energy", steps=9, batch=2, checkpoint_every=4)

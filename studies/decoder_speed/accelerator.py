@@ -23,10 +23,9 @@ from calibrate.samplers.density import density_of
 from calibrate.samplers.smc import SMCOptions
 from calibrate.statistical_model import Data, Model
 from emulator.core.store import write_json
-from emulator.training.checkpoint import State
 from emulator.training.graph_network import PAPER
-from emulator.training.job import Job
-from emulator.training.loop import Steps
+from emulator.training.optimiser import Steps
+from emulator.training.plan import Job
 
 HERE = Path(__file__).parent
 SEED = 12
@@ -58,9 +57,9 @@ def step_s(device: jax.Device, batch: int, steps: int) -> float:
     plan = replace(PAPER, steps=steps, batch=batch)
     with jax.default_device(jax.devices("cpu")[0]):
         training = plan.prepare(Job(em.load(SCENE).scene)).training
-        state = State(*training.initial())
+        state = training.initial()
     state = jax.device_put(state, device)
-    advance = Steps([training])
+    advance = Steps(training)
     for _ in range(3):
         state = advance(state, steps)
     began = time.perf_counter()

@@ -31,14 +31,13 @@ from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates import Architecture, Emulator, load, shipped
 from emulator.training import recipe
-from emulator.training.checkpoint import State
 from emulator.training.graph_network import GraphNetwork
-from emulator.training.job import Job
-from emulator.training.loop import NetworkTraining, Steps, optimise
 from emulator.training.modal import ARCHITECTURE, Modal, mode_training
 from emulator.training.mode_fit import ModeFit
 from emulator.training.network_plan import Problem, with_weights
 from emulator.training.objectives import loss_scales
+from emulator.training.optimiser import NetworkTraining, Steps
+from emulator.training.plan import Job
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
@@ -133,7 +132,9 @@ def trained(idea: Idea, scene: Any, seed: int, arguments: argparse.Namespace) ->
         sizes = Architecture(2, 8, (16, 16)) if arguments.quick else Architecture()
     problem = plan.prepare(Job(scene, sizes))
     training = _with(idea, problem)
-    state = optimise(State(*training.initial()), plan.steps, Steps([training]), [])
+    state, advance = training.initial(), Steps(training)
+    for _ in range(plan.steps):
+        state = advance(state, plan.steps)
     return with_weights(problem.emulator, training.finish(state.weights, False))
 
 

@@ -31,8 +31,8 @@ from emulator.scenes.cavities import cavity_sets
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import recipe, train
 from emulator.training.graph_network import GraphNetwork, predictor
-from emulator.training.job import Job
 from emulator.training.network_plan import Problem, with_network_of
+from emulator.training.plan import Job
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210

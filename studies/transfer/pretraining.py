@@ -16,11 +16,11 @@ from emulator.core.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.checkpoint import State, open_session
+from emulator.training.checkpoint import CHECKPOINT, Session, State
 from emulator.training.graph_network import GraphNetwork
-from emulator.training.job import Job
-from emulator.training.loop import Steps, require_finite, run
 from emulator.training.network_plan import with_weights
+from emulator.training.optimiser import run
+from emulator.training.plan import Job
 
 
 def pretrain(
@@ -46,15 +46,11 @@ def pretrain(
     """
     if not scenes:
         raise InputError("pretraining: no scene is given")
-    session = open_session(
-        folder,
-        "+".join(scene.fingerprint for scene in scenes),
-        ", ".join(scene.name for scene in scenes),
-        plan,
-        architecture,
-        {"network": GraphNetwork, "paper": GraphNetwork},
-        resume=resume,
-    )
+    fingerprint = "+".join(scene.fingerprint for scene in scenes)
+    session = Session(Path(folder) / CHECKPOINT, fingerprint, plan, architecture)
+    if resume:
+        kinds = {"network": GraphNetwork, "paper": GraphNetwork}
+        session = session.resumed(", ".join(scene.name for scene in scenes), kinds)
     assert isinstance(session.plan, GraphNetwork), "no other plan is written here"
     plan = session.plan
     first = plan.prepare(Job(scenes[0], session.architecture))
@@ -63,11 +59,15 @@ def pretrain(
     rest = [plan.prepare(Job(s, session.architecture, first.emulator)) for s in others]
     problems = [first, *rest]
     session = replace(session, architecture=first.training.network.architecture)
-    steps = Steps([problem.training for problem in problems])
-    state = State(*first.training.initial())
-    state = run(session, state, plan.steps, steps, progress=progress, name="pretrain")
+
+    def advance(state: State, total: int) -> State:
+        """The next step, of the next scene in turn."""
+        return problems[state.done % len(problems)].training.advance(state, total)
+
+    initial = first.training.initial()
+    state = run(session, initial, plan.steps, advance, progress=progress, name="pretrain")
     record = {
-        **plan.record(require_finite(state)),
+        **plan.record(state.loss),
         "family": [scene.fingerprint for scene in scenes],
         "seconds": round(session.seconds, 1),
     }

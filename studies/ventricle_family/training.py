@@ -39,10 +39,9 @@ from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.part import standardised
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.network.ventricle_graph import BodyFeatures, describe
-from emulator.training.checkpoint import State, open_session
-from emulator.training.loop import require_finite, run
+from emulator.training.checkpoint import CHECKPOINT, Session, State
+from emulator.training.optimiser import clipped_adam, cosine, make_step, run
 from emulator.training.plan import Plan
-from emulator.training.step import clipped_adam, cosine, make_step
 
 ARCHITECTURE = Architecture(
     steps=4,
@@ -135,15 +134,9 @@ def train_family(
     plan : the number of steps, learning rate, seed and checkpoints.
     folder : where checkpoints go.
     """
-    session = open_session(
-        folder,
-        _check(runs),
-        f"{len(runs)} bodies",
-        plan,
-        architecture,
-        {plan.recipe: FamilyPlan},
-        resume=resume,
-    )
+    session = Session(Path(folder) / CHECKPOINT, _check(runs), plan, architecture)
+    if resume:
+        session = session.resumed(f"{len(runs)} bodies", {plan.recipe: FamilyPlan})
     plan, architecture = cast(FamilyPlan, session.plan), session.architecture or architecture
     described = [describe(r.scene) for r in counting(runs, "describe", disable=not progress)]
     standard = _standard(described)
@@ -177,7 +170,7 @@ def train_family(
     state = State(weights, optimiser.init(weights))
     state = run(session, state, plan.steps, advance, progress=progress)
     record: dict[str, Any] = {
-        **plan.record(require_finite(state)),
+        **plan.record(state.loss),
         "bodies": len(runs),
         "seconds": round(session.seconds, 1),
     }

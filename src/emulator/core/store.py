@@ -137,17 +137,11 @@ def read_json(path: str | Path) -> Any:
 
 def named_leaves(tree: Any) -> dict[str, Any]:
     """Return the leaves of a pytree by their path, e.g. ``rounds/0/edge/kernel``."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {"/".join(filter(None, map(_word, path))): leaf for path, leaf in leaves}
-
-
-def _word(key: Any) -> str:
-    """Return one step of a leaf's path: a dictionary's key, a list index, or an attribute."""
-    for attribute in ("key", "idx", "name"):
-        if hasattr(key, attribute):
-            word = str(getattr(key, attribute))
-            return "" if word == "value" else word  # flax wraps each weight in a variable
-    raise TypeError(f"a leaf of kind {type(key).__name__} has no name")
+    named = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        words = jax.tree_util.keystr(path, simple=True, separator="/").split("/")
+        named["/".join(word for word in words if word != "value")] = leaf  # flax wraps each weight
+    return named
 
 
 def save_arrays(

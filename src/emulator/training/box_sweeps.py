@@ -25,9 +25,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,16 +67,12 @@ _TARGETS_PER_TERM = 3  # targets kept for each term of the next degree
 _CONVERGED = 1e-10  # relative error of the displacement at which the sweeps end
 _ROUNDED = 1e-2  # largest error of truncated modes, over the error bar
 _WRITE_EVERY = 30.0  # seconds
-_NUMBERS = (
-    "number", "here", "level", "rise", "gap", "error", "largest_error", "taken", "lost"
-)  # fmt: skip
 
 Map = Callable[[jax.Array], jax.Array]
 """A map from the position (p,) in the unit box to the displacement (n, 3) mm."""
 
 
-@dataclass(frozen=True, eq=False)
-class SweepState:
+class SweepState(NamedTuple):
     """The state between two sweeps.
 
     polynomial : the polynomial of the free displacements.
@@ -112,11 +107,8 @@ class SweepState:
     @property
     def record(self) -> dict[str, Any]:
         """The entries of an emulator's record."""
-        entries = {
-            "number": self.number,
-            "error_mm": self.error,
-            "largest_error_mm": float(self.largest_error),
-        }
+        largest = float(self.largest_error)
+        entries = {"number": self.number, "error_mm": self.error, "largest_error_mm": largest}
         return entries | ({"start": "left for rest"} if self.lost else {})
 
     @property
@@ -160,12 +152,9 @@ def sweep_box(
 
     Raises
     ------
-    InputError
-        A load of the scene has no potential, or too few sweeps for the loads to rise from rest.
     SolverError
         Equilibria were not followed up to the loads, or not over the whole box.
     """
-    check_sweeps(simulator.scene, sweeps, at_rest=start is None and beneath is None)
     state = _restore(folder) or _initial_state(simulator, start, beneath)
     last_write = time.perf_counter()
     with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
@@ -174,7 +163,7 @@ def sweep_box(
                 break
             state, display = _sweep(simulator, state, seed, beneath)
             if start is not None and state.level == 1.0 and not np.isfinite(state.error):
-                state = replace(_at_rest(simulator), number=state.number, lost=True)
+                state = _at_rest(simulator)._replace(number=state.number, lost=True)
             bar.set_postfix(display)
             bar.update()
             if folder is not None and time.perf_counter() - last_write > _WRITE_EVERY:
@@ -182,41 +171,30 @@ def sweep_box(
                 last_write = time.perf_counter()
     if folder is not None:
         _write(folder, state)
-    _require_answer(simulator.scene, state)
-    return state
+    if state.level < 1.0:
+        cause = "no step could be taken from where the start says, and from rest " * state.lost
+        failure = f"followed the equilibria to {100 * state.level:.0f} % of the loads"
+    elif state.taken < _LEAST_SHARE:
+        cause = ""
+        failure = f"know no equilibrium at {100 * (1.0 - state.taken):.0f} % of the box"
+    else:
+        return state
+    raise SolverError(
+        f"scene '{simulator.scene.name}': {cause}{state.number} sweeps {failure}; give more of "
+        "them, or use a recipe with FEM runs"
+    )
 
 
 def check_sweeps(scene: Scene, sweeps: int, *, at_rest: bool) -> None:
-    """Refuse what cannot be swept, with the :class:`InputError` of :func:`sweep_box`."""
+    """Raise :class:`InputError` for what cannot be swept.
+
+    A load of the scene has no potential, or sweeps from rest are too few for the loads to rise.
+    """
     potential_energy(scene)  # raises InputError for a scene without one
     if at_rest and sweeps <= _LEVELS:
         raise InputError(
             f"training: {sweeps} sweeps; the loads rise over {_LEVELS}, give {_LEVELS + 1} or more"
         )
-
-
-def _require_answer(scene: Scene, state: SweepState) -> None:
-    """Raise :class:`SolverError` where equilibria were lost on the way or in a part of the box."""
-    if state.level < 1.0:
-        cause = "no step could be taken from where the start says, and from rest " * state.lost
-        raise SolverError(
-            f"scene '{scene.name}': {cause}{state.number} sweeps followed the equilibria "
-            f"to {100 * state.level:.0f} % of the loads; give more of them, or use a recipe with "
-            "FEM runs"
-        )
-    if state.taken < _LEAST_SHARE:
-        raise SolverError(
-            f"scene '{scene.name}': {state.number} sweeps know no equilibrium at "
-            f"{100 * (1.0 - state.taken):.0f} % of the box; give more of them, or use a recipe "
-            "with FEM runs"
-        )
-
-
-def _initial_state(simulator: Simulator, start: Map | None, beneath: Map | None) -> SweepState:
-    """Return the state before the first sweep."""
-    if beneath is not None:
-        return replace(_at_rest(simulator), level=1.0)
-    return _at_rest(simulator) if start is None else _full_load_state(simulator, start)
 
 
 def _at_rest(simulator: Simulator) -> SweepState:
@@ -227,29 +205,33 @@ def _at_rest(simulator: Simulator) -> SweepState:
     return SweepState(PolynomialFit(degrees, zero), zero, none)
 
 
-def _full_load_state(simulator: Simulator, start: Map) -> SweepState:
-    """Return the state under the whole load whose polynomial is fitted to ``start``."""
+def _first_degree(parameters: int) -> int:
+    return _FIRST_DEGREE if terms(parameters, _FIRST_DEGREE) <= MOST_TERMS else 1
+
+
+def _initial_state(simulator: Simulator, start: Map | None, beneath: Map | None) -> SweepState:
+    """Return the state before the first sweep; its polynomial is fitted to ``start``, if any."""
     rest = _at_rest(simulator)
+    if beneath is not None:
+        return rest._replace(level=1.0)
+    if start is None:
+        return rest
     parameters, degree = rest.values.position.shape[1], rest.polynomial.degree
     if terms(parameters, degree + 1) <= MOST_TERMS:
         degree += 1
     position = np.random.default_rng(0).random((2 * terms(parameters, degree), parameters))
     fields = _free_fields(simulator, start, position)
     if not np.isfinite(fields).all():
-        return replace(rest, lost=True)
+        return rest._replace(lost=True)
     polynomial = fit(Samples(position, fields, np.zeros(len(position))), degree, 1.0)
     zeros = 0.0 * polynomial.coefficients
-    return replace(rest, polynomial=polynomial, before=zeros, level=1.0)
+    return rest._replace(polynomial=polynomial, before=zeros, level=1.0)
 
 
 def _free_fields(simulator: Simulator, displacement: Map, position: np.ndarray) -> np.ndarray:
     """Return the free displacements (c, f) mm of a map at ``position`` (c, p)."""
     free = lambda x: simulator.system.restrict(displacement(x))  # noqa: E731
     return np.asarray(jax.lax.map(free, jnp.asarray(position)))
-
-
-def _first_degree(parameters: int) -> int:
-    return _FIRST_DEGREE if terms(parameters, _FIRST_DEGREE) <= MOST_TERMS else 1
 
 
 def _sweep(
@@ -269,19 +251,19 @@ def _sweep(
     usable = np.isfinite(steps.error)
     usable_share = float(np.mean(usable & (steps.fraction >= _LEAST_FRACTION)))
     display = {"load": f"{level:.2f}", "taken": f"{usable_share:.2f}"}
-    new = Samples(position, steps.fields - below, steps.error).take(usable)
-    lengths = steps.step[usable]
     if not usable.any() or (state.rises and usable_share < _LEAST_SHARE):
-        next_state = _with_smaller_rise(state)
-    elif state.rises:
-        next_state = _at_level(state, level, new, float(np.median(lengths)))
-        next_state = replace(next_state, largest_error=lengths.max())
+        after = _with_smaller_rise(state)
     else:
-        next_state = _with_targets(state, new, float(np.median(lengths)))
-        next_state = replace(next_state, largest_error=lengths.max())
-        display["energy gap"] = f"{np.median(steps.gap[usable]):.0e}"
-    display |= {"degree": f"{next_state.polynomial.degree}", "error_mm": f"{next_state.error:.1e}"}
-    return replace(next_state, number=state.number + 1, taken=usable_share), display
+        new = Samples(position, steps.fields - below, steps.error).take(usable)
+        error = float(np.median(steps.step[usable]))
+        if state.rises:
+            after = _at_level(state, level, new, error)
+        else:
+            after = _with_targets(state, new, error)
+            display["energy gap"] = f"{np.median(steps.gap[usable]):.0e}"
+        after = after._replace(largest_error=steps.step[usable].max())
+    display |= {"degree": f"{after.polynomial.degree}", "error_mm": f"{after.error:.1e}"}
+    return after._replace(number=state.number + 1, taken=usable_share), display
 
 
 def _next_level(state: SweepState) -> tuple[float, PolynomialFit]:
@@ -296,15 +278,14 @@ def _next_level(state: SweepState) -> tuple[float, PolynomialFit]:
 def _with_smaller_rise(state: SweepState) -> SweepState:
     """Return the state after a level that was not reached: a lower one next, or more sweeps."""
     if state.rise > _LEAST_RISE:
-        return replace(state, rise=state.rise / 2.0)
-    return replace(state, rise=1.0 / _LEVELS, here=0, error=np.inf)
+        return state._replace(rise=state.rise / 2.0)
+    return state._replace(rise=1.0 / _LEVELS, here=0, error=np.inf)
 
 
 def _at_level(state: SweepState, level: float, new: Samples, error: float) -> SweepState:
     """Return the state at another ``level``, where the targets ``new`` are all that is known."""
     polynomial = fit(new, state.polynomial.degree, error)
-    return replace(
-        state,
+    return state._replace(
         polynomial=polynomial,
         before=_pad(state.polynomial.coefficients, polynomial),
         values=new,
@@ -323,13 +304,9 @@ def _with_targets(state: SweepState, new: Samples, error: float) -> SweepState:
     most = _TARGETS_PER_TERM * min(terms(parameters, degree + 1), MOST_TERMS)
     known = state.values.followed_by(new).take(slice(-max(most, 4 * len(new.position)), None))
     polynomial = fit(known, degree, error)
-    return replace(
-        state,
-        polynomial=polynomial,
-        before=_pad(state.before, polynomial),
-        values=known,
-        here=state.here + 1,
-        error=error,
+    before, here = _pad(state.before, polynomial), state.here + 1
+    return state._replace(
+        polynomial=polynomial, before=before, values=known, here=here, error=error
     )
 
 
@@ -364,18 +341,13 @@ def runs_of(simulator: Simulator, state: SweepState, thetas: jax.Array) -> Runs:
 
 
 def _write(folder: Path, state: SweepState) -> None:
-    fits = {name: getattr(state, name)._asdict() for name in ("polynomial", "values")}
-    numbers = {name: np.asarray(getattr(state, name)) for name in _NUMBERS}
-    save_arrays(folder / SWEEPS, named_leaves({**fits, **numbers, "before": state.before}))
+    save_arrays(folder / SWEEPS, named_leaves(state))
 
 
 def _restore(folder: Path | None) -> SweepState | None:
     if folder is None or not (folder / SWEEPS).is_file():
         return None
     arrays, _ = read_arrays(folder / SWEEPS)
-    return SweepState(
-        PolynomialFit(**inside(arrays, "polynomial")),
-        arrays["before"],
-        Samples(**inside(arrays, "values")),
-        **{name: arrays[name].item() for name in _NUMBERS},
-    )
+    polynomial, values = inside(arrays, "polynomial"), inside(arrays, "values")
+    numbers = {name: arrays[name].item() for name in SweepState._field_defaults}
+    return SweepState(PolynomialFit(**polynomial), arrays["before"], Samples(**values), **numbers)

@@ -18,9 +18,11 @@ from emulator.core.schema import read_as
 from emulator.core.store import fill_tree, named_leaves, read_arrays, save_arrays
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.plan import Plan, Record
 
 CHECKPOINT, SWEEPS = "checkpoint.safetensors", "sweeps.safetensors"
+
+Record = dict[str, Any]
+"""How an emulator was trained, as plain JSON: its ``plan``, ``final_loss`` and more."""
 
 
 class State(NamedTuple):
@@ -43,7 +45,7 @@ class Session:
 
     path : the file of the checkpoint.
     fingerprint : the fingerprint of the scene, or of all scenes of a family.
-    plan : the plan that is followed.
+    plan : the :class:`~emulator.training.plan.Plan` that is followed.
     architecture : the sizes of the network; ``None`` without one.
     began : the time it began, on the performance counter, less the time spent before it was
         resumed.
@@ -53,12 +55,49 @@ class Session:
 
     path: Path
     fingerprint: str
-    plan: Plan
-    architecture: Architecture | None
-    began: float
+    plan: Any
+    architecture: Architecture | None = None
+    began: float = field(default_factory=time.perf_counter)
     start: Mapping[str, Any] = field(default_factory=dict)
     arrays: Mapping[str, np.ndarray] | None = None
     loss: float = float("nan")
+
+    def resumed(self, name: str, plan_kinds: Mapping[str, type]) -> Session:
+        """Return the training whose checkpoint is at ``path``, with its own plan and sizes.
+
+        Parameters
+        ----------
+        name : the name of the emulated scene, for messages.
+        plan_kinds : the classes of plans by the name of their recipe, to read a checkpoint's.
+
+        Raises
+        ------
+        InputError
+            No checkpoint to resume, a damaged one, or one of another scene.
+        """
+        path = self.path
+        if not path.is_file():
+            raise InputError(f"nothing to resume: checkpoint {path} does not exist")
+        arrays, metadata = read_arrays(path)
+        if metadata.get("fingerprint") != self.fingerprint:
+            raise InputError(f"{path} belongs to another scene than '{name}'; train afresh")
+        try:
+            sizes = json.loads(metadata["architecture"])
+            options = json.loads(metadata["plan"])
+            kind = look_up(plan_kinds, options["recipe"], "recipe")
+            return replace(
+                self,
+                plan=read_as(kind, options, str(path)),
+                architecture=(
+                    read_as(Architecture, sizes, str(path)) if sizes else self.architecture
+                ),
+                began=self.began - float(metadata["seconds"]),
+                start=json.loads(metadata["start"]),
+                arrays=arrays if len(arrays) > 1 else None,  # weights, besides the number of steps
+                loss=float(metadata["loss"]),
+            )
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{path} lacks or garbles {error}; train afresh") from error
 
     @property
     def seconds(self) -> float:
@@ -79,14 +118,9 @@ class Session:
         tree = {"weights": state.weights, "optimiser": state.optimiser, "step": state.done}
         save_arrays(self.path, named_leaves(tree), metadata)
 
-    def finished(self, emulator: Emulator, record: Record) -> Emulator:
-        """Return ``emulator`` with its record: where it started, and the seconds it took."""
-        start = {"start": dict(self.start)} if self.start else {}
-        return replace(emulator, record={**record, **start, "seconds": round(self.seconds, 1)})
-
-    def write_plan(self) -> None:
+    def write_plan(self, plan: Any) -> None:
         """Write a checkpoint without weights, for a training that has no optimiser step so far."""
-        self.write(State({}, ()), getattr(self.plan, "steps", 0))
+        replace(self, plan=plan).write(State({}, ()), getattr(plan, "steps", 0))
 
     def first(self, state: State, total: int) -> State:
         """Return the checkpoint's state; without one ``state``, which is written."""
@@ -97,63 +131,10 @@ class Session:
         filled = jax.tree.map(jnp.asarray, fill_tree(tree, self.arrays, "the checkpoint"))
         return State(filled["weights"], filled["optimiser"], int(self.arrays["step"]), self.loss)
 
-    def __call__(self, state: State, total: int) -> int:
-        """Write the state as often as the plan says and after the last step; a hook."""
-        every: int = self.plan.checkpoint_every  # type: ignore[attr-defined]
-        if state.done % every == 0 or state.done == total:
-            self.write(state, total)
-        return total
-
-
-def open_session(
-    folder: str | Path,
-    fingerprint: str,
-    name: str,
-    plan: Plan,
-    architecture: Architecture | None,
-    plan_kinds: Mapping[str, type[Plan]],
-    *,
-    resume: bool,
-) -> Session:
-    """Return a training in ``folder``: one that begins, or the one whose checkpoint is there.
-
-    Parameters
-    ----------
-    folder : the folder of the checkpoint.
-    fingerprint, name : the fingerprint of the emulated scene, and its name for messages.
-    plan, architecture : the plan and the sizes of a new training; a checkpoint has its own.
-    plan_kinds : the classes of plans by the name of their recipe, to read a checkpoint's.
-    resume : whether to read the checkpoint.
-
-    Raises
-    ------
-    InputError
-        No checkpoint to resume, a damaged one, or one of another scene.
-    """
-    path, now = Path(folder) / CHECKPOINT, time.perf_counter()
-    if not resume:
-        return Session(path, fingerprint, plan, architecture, now)
-    if not path.is_file():
-        raise InputError(f"nothing to resume: checkpoint {path} does not exist")
-    arrays, metadata = read_arrays(path)
-    if metadata.get("fingerprint") != fingerprint:
-        raise InputError(f"{path} belongs to another scene than '{name}'; train afresh")
-    try:
-        sizes = json.loads(metadata["architecture"])
-        options = json.loads(metadata["plan"])
-        kind = look_up(plan_kinds, options["recipe"], "recipe")
-        return Session(
-            path,
-            fingerprint,
-            read_as(kind, options, str(path)),
-            read_as(Architecture, sizes, str(path)) if sizes else architecture,
-            now - float(metadata["seconds"]),
-            json.loads(metadata["start"]),
-            arrays if len(arrays) > 1 else None,  # weights, besides the number of steps
-            float(metadata["loss"]),
-        )
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path} lacks or garbles {error}; train afresh") from error
+    def finished(self, emulator: Emulator, record: Record) -> Emulator:
+        """Return ``emulator`` with its record: where it started, and the seconds it took."""
+        start = {"start": dict(self.start)} if self.start else {}
+        return replace(emulator, record={**record, **start, "seconds": round(self.seconds, 1)})
 
 
 def remove_checkpoint(folder: str | Path) -> None:

@@ -8,18 +8,17 @@ from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.family import FamilyNetwork, on_body
-from emulator.training.checkpoint import Session
-from emulator.training.job import Job, Recipe
-from emulator.training.plan import Record
+from emulator.training.checkpoint import Record, Session
+from emulator.training.plan import Job, Plan
 
 
 @dataclass(frozen=True)
-class Family(Recipe):
+class Family(Plan):
     """A network that has learned a family of bodies, as it is; nothing is trained or fitted."""
 
     recipe: str = "family"
 
-    def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
+    def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:  # noqa: ARG002
         """Return the emulator and its record; there is no checkpoint.
 
         Raises
@@ -27,7 +26,6 @@ class Family(Recipe):
         InputError
             No such network is given, or the scene's body is unlike those it has learned.
         """
-        del session
         if job.start is None or job.start.family is None:
             raise InputError(
                 "recipe 'family' takes a network that has learned a family of bodies to a new one; "

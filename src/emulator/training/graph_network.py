@@ -24,24 +24,25 @@ from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.graph import augment
 from emulator.surrogates.network.part import fresh
 from emulator.surrogates.taylor import constant
-from emulator.training.job import Job
-from emulator.training.loop import NetworkTraining
-from emulator.training.network_plan import (
-    NetworkPlan,
-    Problem,
-    architecture_of,
-    with_network_of,
-)
+from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, with_network_of
 from emulator.training.objectives import (
     Batch,
     Objective,
-    Scales,
     check_objective,
     component_scales,
     loss_scales,
     make_loss,
 )
-from emulator.training.step import Descent, Rate, Weights, clipped_adam, cosine, halves, make_step
+from emulator.training.optimiser import (
+    NetworkTraining,
+    Rate,
+    Weights,
+    clipped_adam,
+    cosine,
+    halves,
+    make_step,
+)
+from emulator.training.plan import Job
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,11 @@ class BatchPlan(NetworkPlan):
     batch: int = 16
     energy_weight: float = 0.3
 
-    def check(self) -> None:
-        """Raise :class:`InputError` for options that cannot work."""
-        super().check()
+    def __post_init__(self) -> None:
+        super().__post_init__()
         check_objective(self.objective)
         self.require_at_least(1, "batch")
-        if self.objective != "energy" and self.simulations < self.batch:
+        if self.learns_from_runs and self.simulations < self.batch:
             raise InputError(
                 f"training: {self.simulations} simulations are fewer than a batch of {self.batch}"
             )
@@ -134,37 +134,24 @@ PAPER = GraphNetwork(
 
 
 def batch_training(
-    emulator: Emulator,
-    plan: BatchPlan,
-    rate: Rate,
-    runs: Runs,
-    freeze: int | None = None,
+    emulator: Emulator, plan: BatchPlan, rate: Rate, runs: Runs, freeze: int | None = None
 ) -> NetworkTraining:
     """Return the training of the emulator's network on batches of theta, by Adam.
 
     freeze : the step at which the modes of a separable decoder are frozen; ``None`` for never.
     """
-    network, optimiser = emulator.network, clipped_adam()
+    scene, network, optimiser = emulator.scene, emulator.network, clipped_adam()
     assert network is not None, "an emulator in training has a network"
-    scales = loss_scales(emulator.scene, runs, from_runs=plan.learns_from_runs)
-    step = make_step(rate, batch_descent(emulator, plan, runs, scales), optimiser)
-
-    def frozen(weights: Weights) -> tuple[jax.Array, ...]:
-        return (jax.jit(lambda w: network.prepare(w)[1])(weights),)
-
-    return NetworkTraining(network, optimiser, step, freeze, frozen)
-
-
-def batch_descent(emulator: Emulator, plan: BatchPlan, runs: Runs, scales: Scales) -> Descent:
-    """Return the descent of the objective on batches, each of which follows from the step."""
     predict = predictor(emulator)
-    loss = make_loss(emulator.scene, plan.objective, scales, plan.energy_weight)
+    scales = loss_scales(scene, runs, from_runs=plan.learns_from_runs)
+    loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
 
     def draw(number: jax.Array) -> Batch:
+        """Return the batch of a step, which follows from its number."""
         key = jax.random.fold_in(jax.random.key(plan.seed), number)
         if not plan.learns_from_runs:
             nothing = jnp.zeros(0)
-            return Batch(uniform(emulator.scene, plan.batch, key), nothing, nothing)
+            return Batch(uniform(scene, plan.batch, key), nothing, nothing)
         rows = jax.random.choice(key, len(runs.theta), (plan.batch,), replace=False)
         return Batch(runs.theta[rows], runs.displacement[rows], runs.energy[rows])
 
@@ -175,7 +162,10 @@ def batch_descent(emulator: Emulator, plan: BatchPlan, runs: Runs, scales: Scale
         misfit = lambda w: loss(predict(w, batch.theta, *frozen), batch)  # noqa: E731
         return *jax.value_and_grad(misfit)(weights), weights
 
-    return descend
+    def frozen(weights: Weights) -> tuple[jax.Array, ...]:
+        return (jax.jit(lambda w: network.prepare(w)[1])(weights),)
+
+    return NetworkTraining(network, optimiser, make_step(rate, descend, optimiser), freeze, frozen)
 
 
 def predictor(emulator: Emulator) -> Callable[..., jax.Array]:

@@ -22,13 +22,13 @@ from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.graph import augment
 from emulator.surrogates.network.part import fresh
 from emulator.surrogates.taylor import Expansion
+from emulator.training.checkpoint import Record
 from emulator.training.graph_network import BatchPlan, batch_training
-from emulator.training.job import Job
 from emulator.training.mechanics import add_discrepancy, series_and_runs
 from emulator.training.network_plan import Problem, architecture_of, with_network_of
 from emulator.training.objectives import Objective, component_scales
-from emulator.training.plan import Record, check_model_runs, check_order
-from emulator.training.step import cosine
+from emulator.training.optimiser import cosine
+from emulator.training.plan import Job, check_order
 
 _SAMPLES = 400  # positions over which a mode's energy is averaged
 _TRUNCATION = 1e-12  # least energy of a mode, relative to the largest
@@ -55,10 +55,9 @@ class Hybrid(BatchPlan):
     freeze: int = 200
     needs_slopes: ClassVar[bool] = True
 
-    def check(self) -> None:
-        """Raise :class:`InputError` for options that cannot work."""
-        super().check()
-        check_model_runs(self.simulations)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_runs()
         check_order(self.order)
 
     @property
@@ -74,9 +73,8 @@ class Hybrid(BatchPlan):
     def prepare(self, job: Job) -> Problem:
         """Return the FEM runs, and an emulator whose network is untrained."""
         scene, simulator = job.scene, Simulator(job.scene)
-        architecture = architecture_of(
-            self, job, "separable", modes=self.modes if self.order else 0
-        )
+        modes = self.modes if self.order else 0
+        architecture = architecture_of(self, job, "separable", modes=modes)
         series, runs = series_and_runs(job, simulator, self, self.order)
         plan = self.with_counts(simulations=len(runs.theta) - 1)
         scale = component_scales(scene, runs, from_runs=self.learns_from_runs)

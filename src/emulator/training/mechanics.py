@@ -21,10 +21,9 @@ from emulator.scenes.scene import all_nodes
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import Expansion, constant, expand
-from emulator.training.checkpoint import Session
+from emulator.training.checkpoint import Record, Session
 from emulator.training.family import family_on
-from emulator.training.job import FEWEST, Job, Recipe
-from emulator.training.plan import Plan, Record, check_model_runs, check_order
+from emulator.training.plan import FEWEST, Job, Plan, check_order
 
 _HELD_OUT = 5  # every fifth run is held out
 _OBSERVATIONS = 4000  # values and derivatives; their covariance matrix takes 128 MB
@@ -33,7 +32,7 @@ FEM_SHARE = 0.3
 
 
 @dataclass(frozen=True)
-class Mechanics(Recipe):
+class Mechanics(Plan):
     """A Taylor series and a discrepancy model.
 
     Parameters
@@ -47,9 +46,9 @@ class Mechanics(Recipe):
     order: int = 3
     needs_slopes: ClassVar[bool] = True
 
-    def check(self) -> None:
-        """Raise :class:`InputError` for options that cannot work."""
-        check_model_runs(self.simulations)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_runs()
         check_order(self.order)
 
     def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion]:
@@ -69,7 +68,7 @@ class Mechanics(Recipe):
         """Return the emulator and its record."""
         emulator, runs, series = self.prepare(job)
         plan = self.with_counts(simulations=len(runs.theta) - 1)
-        replace(session, plan=plan, architecture=None).write_plan()
+        session.write_plan(plan)
         emulator, choice = add_discrepancy(emulator, runs, series)
         return emulator, {**plan.record(), "discrepancy": choice}
 

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from emulator.core.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
 from emulator.fem.campaign.designs import design
@@ -24,20 +23,19 @@ from emulator.surrogates.network.part import fresh
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.taylor import constant
 from emulator.training.box_sweeps import check_sweeps, runs_of, sweep_box
-from emulator.training.checkpoint import Session
-from emulator.training.job import Job
-from emulator.training.loop import NetworkTraining
+from emulator.training.checkpoint import Record, Session
 from emulator.training.mechanics import FEM_SHARE
 from emulator.training.mode_fit import ModeFit
-from emulator.training.network_plan import (
-    NetworkPlan,
-    Problem,
-    architecture_of,
-    with_network_of,
-)
+from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, with_network_of
 from emulator.training.objectives import loss_scales
-from emulator.training.plan import Record
-from emulator.training.step import Weights, make_step, orthogonal_steps, two_cosines
+from emulator.training.optimiser import (
+    NetworkTraining,
+    Weights,
+    make_step,
+    orthogonal_steps,
+    two_cosines,
+)
+from emulator.training.plan import Job
 
 ARCHITECTURE = Architecture(
     steps=3,
@@ -71,11 +69,9 @@ class Modal(NetworkPlan):
     polish: int = 4000
     needs_slopes: ClassVar[bool] = True
 
-    def check(self) -> None:
-        """Raise :class:`InputError` for options that cannot work."""
-        super().check()
-        if self.simulations < 1:
-            raise InputError(f"training: {self.simulations} simulations; modes need 1 or more")
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_runs("modes need")
 
     @property
     def budget_share(self) -> float:
@@ -116,9 +112,8 @@ class Physics(Modal):
     recipe: str = "physics"
     sweeps: int = 60
 
-    def check(self) -> None:
-        """Raise :class:`InputError` for options that cannot work."""
-        super().check()
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.require_at_least(1, "sweeps")
 
     @property
@@ -130,7 +125,7 @@ class Physics(Modal):
         """Return the trained emulator and its record."""
         check_sweeps(job.scene, self.sweeps, at_rest=True)
         if session.arrays is None:
-            session.write_plan()
+            session.write_plan(self)
         return super().train(job, session)
 
     def prepare(self, job: Job) -> Problem:
@@ -157,7 +152,7 @@ def mode_training(
 ) -> NetworkTraining:
     """Return the training of modes up to step ``plan.freeze``, then of their coefficients.
 
-    optimiser : by default :func:`~emulator.training.step.orthogonal_steps`.
+    optimiser : by default :func:`~emulator.training.optimiser.orthogonal_steps`.
     """
     optimiser = optimiser or orthogonal_steps()
 

@@ -21,7 +21,7 @@ trunk below descend: since w minimises, the derivative of
 
 at fixed w, with K the matrix of the inner product. No theta enters: a step costs one processor
 pass. Steps are as long in every direction of a layer's weights
-(:func:`~emulator.training.step.orthogonal_steps`).
+(:func:`~emulator.training.optimiser.orthogonal_steps`).
 
 **Coefficients.** The modes are frozen, the snapshots projected on them, and the branch is fitted to
 values and slopes of all runs at once,
@@ -35,7 +35,6 @@ by Adam and then by L-BFGS.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -54,7 +53,7 @@ from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network.part import Network
 from emulator.training.objectives import Scales
-from emulator.training.step import Weights, in_branch
+from emulator.training.optimiser import Weights
 
 _SLOPES = 0.1  # gamma: positions have a variance of 1/12 in the unit box
 _RIDGE = 1e-9  # over the hidden layer's mean square; larger weights are noise in float32
@@ -177,7 +176,6 @@ class ModeFit:
         return W, misfit / size, derivative / size
 
     def _with_solved_layer(self, weights: Weights) -> Weights:
-        """Return ``weights`` with the last layer of the trunk solved for."""
         return self._with_last_layer(weights, self._project(self._hidden(weights))[0])
 
     def _with_last_layer(self, weights: Weights, W: jax.Array) -> Weights:
@@ -248,10 +246,10 @@ class ModeFit:
         """
         weights = jax.jit(self._with_solved_layer)(weights)
         targets = self.branch_targets(weights)
-        branch, join = _split(weights)
+        branch, rest = nnx.split_state(weights, lambda path, _: "branch" in path, ...)
 
         def misfit(branch: Any) -> jax.Array:
-            return self._branch_misfit(join(branch), targets)
+            return self._branch_misfit(nnx.merge_state(rest, branch), targets)
 
         solver = optax.lbfgs(memory_size=_MEMORY)
         both = optax.value_and_grad_from_state(misfit)
@@ -276,20 +274,7 @@ class ModeFit:
                 best_branch, least = carry[0], value
                 bar.update(_AT_ONCE)
                 bar.set_postfix(loss=f"{least:.3e}")
-        return join(best_branch)
-
-
-def _split(weights: Weights) -> tuple[list[jax.Array], Callable[[list[jax.Array]], Weights]]:
-    """Return the weights of the branch, and the function that puts them back among all weights."""
-    leaves, structure = jax.tree_util.tree_flatten_with_path(weights)
-    mine = [in_branch(path) for path, _ in leaves]
-
-    def joined(branch: list[jax.Array]) -> Weights:
-        new = iter(branch)
-        values = [next(new) if own else leaf for own, (_, leaf) in zip(mine, leaves, strict=True)]
-        return jax.tree.unflatten(structure, values)
-
-    return [leaf for own, (_, leaf) in zip(mine, leaves, strict=True) if own], joined
+        return nnx.merge_state(rest, best_branch)
 
 
 class BlockedMatrix(NamedTuple):
@@ -325,10 +310,5 @@ class BlockedMatrix(NamedTuple):
 
     def __matmul__(self, fields: jax.Array) -> jax.Array:
         """Return the matrix times ``fields`` (n, k)."""
-
-        def block(one: tuple[jax.Array, jax.Array]) -> jax.Array:
-            columns, values = one
-            return values @ fields[columns]
-
-        rows = jax.lax.map(block, (self.columns, self.values))
+        rows = jax.lax.map(lambda block: block[1] @ fields[block[0]], (self.columns, self.values))
         return rows.reshape(-1, fields.shape[1])[self.order]

@@ -9,24 +9,22 @@ differ, because the network takes positions in the unit box.
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.fem.energy import require_rest
-from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.graph import node_inputs
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.checkpoint import Session
-from emulator.training.job import Job, Recipe
-from emulator.training.loop import NetworkTraining, require_finite, run_within
-from emulator.training.plan import Plan, Record
+from emulator.training.checkpoint import Record, Session
+from emulator.training.optimiser import NetworkTraining, StepLimit, Steps, run
+from emulator.training.plan import Job, Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +46,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class NetworkPlan(Recipe):
+class NetworkPlan(Plan):
     """The options of all recipes that train a network.
 
     Parameters
@@ -62,8 +60,8 @@ class NetworkPlan(Recipe):
     learning_rate: float = 1e-3
     checkpoint_every: int = 500
 
-    def check(self) -> None:
-        """Raise :class:`InputError` for options that cannot work."""
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.require_at_least(1, "steps", "checkpoint_every")
         if not 0.0 < self.learning_rate < math.inf:
             raise InputError(
@@ -80,30 +78,28 @@ class NetworkPlan(Recipe):
         """The largest number of steps that a budget may lead to; ``None`` for no limit."""
         return None
 
-    @abstractmethod
     def prepare(self, job: Job) -> Problem:
         """Return the FEM runs, and an emulator whose network is untrained."""
+        raise NotImplementedError
 
-    def complete(self, emulator: Emulator, problem: Problem) -> tuple[Emulator, Record]:
+    def complete(self, emulator: Emulator, problem: Problem) -> tuple[Emulator, Record]:  # noqa: ARG002
         """Return the emulator with all that follows the network, and entries of the record."""
-        del problem
         return emulator, {}
 
     def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
         """Return the trained emulator and its record."""
         require_rest(job.scene)  # networks learn from the energy there, or have its modes
         problem = self.prepare(job)
-        training = problem.training
-        session = replace(session, plan=problem.plan, architecture=training.network.architecture)
-        state = run_within(
-            session,
-            training,
-            self.steps,
-            job.deadline(self.budget_share),
-            self.most_steps,
-            progress=job.progress,
-        )
-        record = problem.plan.with_counts(steps=state.done).record(require_finite(state))
+        training, total, limit = problem.training, self.steps, None
+        deadline = job.deadline(self.budget_share)
+        if np.isfinite(deadline):
+            limit = StepLimit(deadline, self.most_steps, training.freeze)
+            total = limit.first_total(training, total)
+        architecture = training.network.architecture
+        session = replace(session, plan=problem.plan, architecture=architecture)
+        steps, initial = Steps(training), training.initial()
+        state = run(session, initial, total, steps, limit, progress=job.progress)
+        record = problem.plan.with_counts(steps=state.done).record(state.loss)
         weights = training.finish(state.weights, job.progress)
         emulator, more = self.complete(with_weights(problem.emulator, weights), problem)
         return emulator, {**record, **problem.record, **more}
@@ -121,7 +117,7 @@ def with_network_of(emulator: Emulator, start: Emulator | None) -> Emulator:
         return emulator
     assert emulator.network is not None, "only a network has weights"
     assert start.network is not None, "only a network has weights"
-    copies = [jnp.copy(leaf) for leaf in jax.tree.leaves(start.network.weights)]
+    copies = jax.tree.map(jnp.copy, jax.tree.leaves(start.network.weights))
     structure = jax.tree.structure(emulator.network.weights)
     return with_weights(emulator, jax.tree.unflatten(structure, copies))
 
@@ -172,15 +168,10 @@ def architecture_of(
             f"{theirs} has parameters {', '.join(start.scene.parameter_names)}; "
             f"'{scene.name}' has {', '.join(scene.parameter_names)}"
         )
-    _check_features(network.graph.node_features.shape[1], scene, theirs)
-    return sizes
-
-
-def _check_features(width: int, scene: Scene, theirs: str) -> None:
-    """Refuse a scene whose nodes have another number of features than ``width``."""
-    ours = node_inputs(scene).shape[1]
+    width, ours = network.graph.node_features.shape[1], node_inputs(scene).shape[1]
     if width != ours:
         raise InputError(
             f"{theirs} has {width} features a node, '{scene.name}' has {ours}: one has "
             "supports that move, the other has not"
         )
+    return sizes

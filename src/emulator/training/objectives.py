@@ -91,13 +91,8 @@ def make_loss(
         gap = (Pi(u, batch.theta) - batch.energy) / jnp.abs(batch.energy)
         return simulations(u, batch) + weight * jnp.mean(gap)
 
-    losses = {
-        "energy": energy,
-        "simulations": simulations,
-        "gradients": gradients,
-        "both": both,
-    }
-    return losses[objective]
+    losses = (energy, simulations, gradients, both)
+    return dict(zip(OBJECTIVES, losses, strict=True))[objective]
 
 
 def mean_square_gradient(scene: Scene, difference: jax.Array) -> jax.Array:

@@ -14,15 +14,14 @@ from emulator.fem import Simulator
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import expand
 from emulator.training.box_sweeps import Map, check_sweeps, polynomial_part, sweep_box
-from emulator.training.checkpoint import Session
+from emulator.training.checkpoint import Record, Session
 from emulator.training.family import family_on
-from emulator.training.job import Job, Recipe
-from emulator.training.plan import Record, check_order
+from emulator.training.plan import Job, Plan, check_order
 from emulator.training.two_meshes import of_position, on_finer
 
 
 @dataclass(frozen=True)
-class Sweeps(Recipe):
+class Sweeps(Plan):
     """A polynomial fitted by sweeps over the box.
 
     Parameters
@@ -35,8 +34,8 @@ class Sweeps(Recipe):
     sweeps: int = 60
     order: int = 0
 
-    def check(self) -> None:
-        """Raise :class:`InputError` for options that cannot work."""
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.require_at_least(1, "sweeps")
         check_order(self.order)
 
@@ -44,7 +43,7 @@ class Sweeps(Recipe):
         """Return the emulator and its record."""
         scene, start = job.scene, job.start
         check_sweeps(scene, self.sweeps, at_rest=not self.order and start is None)
-        session.write_plan()
+        session.write_plan(self)
         simulator = Simulator(scene)
         emulator = Emulator(scene)
         beginning: Map | None = None
@@ -72,6 +71,6 @@ class Sweeps(Recipe):
             progress=job.progress,
         )
         plan = self.with_counts(sweeps=state.number)
-        replace(session, plan=plan, architecture=None).write_plan()
+        session.write_plan(plan)
         emulator = replace(emulator, polynomial=polynomial_part(simulator, state))
         return emulator, {**plan.record(), "sweeps": state.record}

@@ -11,8 +11,7 @@ potential and inverts no element. There is no iteration at a theta, and no solut
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,11 +43,11 @@ class Targets(NamedTuple):
     gap : the relative decrease of the potential by the step, (c,).
     """
 
-    fields: np.ndarray
-    step: np.ndarray
-    fraction: np.ndarray
-    contraction: np.ndarray
-    gap: np.ndarray
+    fields: Any
+    step: Any
+    fraction: Any
+    contraction: Any
+    gap: Any
 
     @property
     def error(self) -> np.ndarray:
@@ -72,22 +71,17 @@ def targets(
     groups = _groups(position)
 
     def of_group(rows: np.ndarray) -> Targets:
-        factor = None
         for middle in rows[:_MIDDLES]:
             tangent, definite = _tangent(system, fields[middle], thetas[middle], load)
             if bool(definite):
-                factor = tangent
-                break
-        if factor is None:
-            nothing = np.zeros(len(rows))
-            return Targets(fields[rows], nothing + np.inf, nothing, nothing, nothing + np.inf)
-        each = [_target(system, factor, fields[k], thetas[k], load) for k in rows]
-        return Targets(*(np.stack([np.asarray(x) for x in row]) for row in zip(*each, strict=True)))
+                each = [_target(system, tangent, fields[k], thetas[k], load) for k in rows]
+                return jax.tree.map(lambda *numbers: np.stack(numbers), *each)
+        nothing = np.zeros(len(rows))
+        return Targets(fields[rows], nothing + np.inf, nothing, nothing, nothing + np.inf)
 
-    results: Iterator[Targets] = in_order(of_group, iter(groups), at_once(simulator))
-    columns = [np.concatenate(column) for column in zip(*results, strict=True)]
+    results = in_order(of_group, iter(groups), at_once(simulator))
     back = np.argsort(np.concatenate(groups))
-    return Targets(*(column[back] for column in columns))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[back], *results)
 
 
 def _displacement(system: System, v: jax.Array, theta: jax.Array, level: jax.Array) -> jax.Array:
@@ -126,7 +120,7 @@ def _tangent(
 @compiled
 def _target(
     system: System, factor: jax.Array, v: jax.Array, theta: jax.Array, level: jax.Array
-) -> tuple[jax.Array, ...]:
+) -> Targets:
     """Return the target from ``v`` (f,) at ``theta`` (p,), preconditioned by ``factor``."""
 
     def residual(v: jax.Array) -> jax.Array:
@@ -157,4 +151,4 @@ def _target(
     contraction = jnp.sqrt(jnp.abs(final_norm) / jnp.where(initial_norm > 0.0, initial_norm, 1.0))
     length = jnp.sqrt(jnp.sum(step**2) / system.scene.held.shape[0])
     size = potential(jnp.zeros(()))[1]
-    return target, length, fraction, contraction, -0.5 * slope / size
+    return Targets(target, length, fraction, contraction, -0.5 * slope / size)

@@ -1,7 +1,7 @@
 """The list of all recipes, and training by one of them, which can be killed and resumed.
 
-To add a recipe, write a subclass of :class:`~emulator.training.job.Recipe` in a file of its own,
-and add it to ``RECIPES``; the command line then knows it.
+To add a recipe, write a subclass of :class:`~emulator.training.plan.Plan` in a file of its own, and
+add it to ``RECIPES``; the command line then knows it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
+
+import numpy as np
 
 from emulator.core.errors import InputError, look_up
 from emulator.core.schema import read_as
@@ -17,18 +19,17 @@ from emulator.fem.campaign import StoredRuns
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.checkpoint import SWEEPS, Session, open_session
+from emulator.training.checkpoint import CHECKPOINT, SWEEPS, Session
 from emulator.training.family import Family
 from emulator.training.graph_network import PAPER, GraphNetwork
 from emulator.training.hybrid import Hybrid
-from emulator.training.job import Budget, Job, Recipe
 from emulator.training.mechanics import Mechanics
 from emulator.training.modal import Modal, Physics
-from emulator.training.plan import Plan
+from emulator.training.plan import Job, Plan
 from emulator.training.sweeps import Sweeps
 from emulator.training.two_meshes import TwoMeshes
 
-_ALL: tuple[Recipe, ...] = (
+_ALL: tuple[Plan, ...] = (
     Hybrid(),
     Mechanics(),
     TwoMeshes(),
@@ -39,15 +40,15 @@ _ALL: tuple[Recipe, ...] = (
     Sweeps(),
     PAPER,
 )
-RECIPES: dict[str, Recipe] = {plan.recipe: plan for plan in _ALL}
+RECIPES: dict[str, Plan] = {plan.recipe: plan for plan in _ALL}
 
 
-def recipe(name: str) -> Any:  # a Recipe; each has options of its own, which ``replace`` takes
+def recipe(name: str) -> Any:  # a Plan; each has options of its own, which ``replace`` takes
     """Return the plan of that recipe; ``dataclasses.replace`` changes its options."""
     return look_up(RECIPES, name, "recipe")
 
 
-def plan_of(options: Mapping[str, Any]) -> Recipe:
+def plan_of(options: Mapping[str, Any]) -> Plan:
     """Return the plan with these options, as an emulator's record has them."""
     kind = type(recipe(options["recipe"]))
     return read_as(kind, dict(options), f"recipe '{options['recipe']}'")
@@ -92,25 +93,23 @@ def train(
     folder = Path(folder)
     if campaign is not None and not (plan.runs or resume):
         raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
-    kinds = {name: type(each) for name, each in RECIPES.items()}
-    session = open_session(
-        folder, scene.fingerprint, scene.name, plan, architecture, kinds, resume=resume
-    )
-    trained = cast(Recipe, session.plan)
+    session = Session(folder / CHECKPOINT, scene.fingerprint, plan, architecture)
+    if resume:
+        kinds = {name: type(each) for name, each in RECIPES.items()}
+        session, budget = session.resumed(scene.name, kinds), None  # the checkpoint has the budget
+    seconds = np.inf if budget is None else budget
+    sizes = session.architecture
+    job = Job(scene, sizes, start, campaign, folder, seconds, session.began, progress)
     if start is None:
-        start = trained.default_start(scene, folder, resume=resume, progress=progress)
-    source = {} if start is None else _description(start)
+        job = replace(job, start=session.plan.default_start(job, resume=resume))
+    source = {} if job.start is None else _description(job.start)
     digest = "" if campaign is None else campaign.digest
     if resume:
         _check_same(session, digest, source)
-        budget = None  # the checkpoint has the budget
     else:
-        trained = replace(trained, campaign=digest)
-        session = replace(session, plan=trained, start=source)
+        session = replace(session, plan=replace(plan, campaign=digest), start=source)
         (folder / SWEEPS).unlink(missing_ok=True)
-    limit = None if budget is None else Budget(budget, session.began)
-    job = Job(scene, session.architecture, start, campaign, folder, limit, progress)
-    return session.finished(*trained.train(job, session))
+    return session.finished(*session.plan.train(job, session))
 
 
 def _description(start: Emulator) -> dict[str, Any]:

@@ -8,8 +8,7 @@ adds what the coarser mesh gets wrong.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import ClassVar
 
 import jax
@@ -20,14 +19,13 @@ from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
 from emulator.surrogates.coarse import carried
 from emulator.surrogates.emulator import Emulator, load, save_emulator
-from emulator.training.checkpoint import Session, open_session, remove_checkpoint
-from emulator.training.job import Job, Recipe
+from emulator.training.checkpoint import CHECKPOINT, Record, Session, remove_checkpoint
 from emulator.training.mechanics import FEM_SHARE, Mechanics, add_discrepancy
-from emulator.training.plan import Plan, Record, check_model_runs
+from emulator.training.plan import Job, Plan
 
 
 @dataclass(frozen=True)
-class TwoMeshes(Recipe):
+class TwoMeshes(Plan):
     """An emulator on a coarser mesh, and a discrepancy model.
 
     Parameters
@@ -39,21 +37,19 @@ class TwoMeshes(Recipe):
     simulations: int = 10
     needs_slopes: ClassVar[bool] = True
 
-    def check(self) -> None:
-        """Raise :class:`InputError` for options that cannot work."""
-        check_model_runs(self.simulations)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_runs()
 
-    def default_start(
-        self, scene: Scene, folder: Path, *, resume: bool, progress: bool
-    ) -> Emulator:
-        """Return an emulator on the mesh that the scene's is finer than, kept in ``folder``."""
-        coarse, folder, plan = finer_of(scene).coarse, folder / "coarse", Mechanics()
+    def default_start(self, job: Job, *, resume: bool) -> Emulator:
+        """Return an emulator on the mesh that the scene's is finer than, kept beside the rest."""
+        assert job.folder is not None, "a training has one"
+        coarse, folder, plan = finer_of(job.scene).coarse, job.folder / "coarse", Mechanics()
         if resume:
             return load(folder, coarse)
-        session = open_session(
-            folder, coarse.fingerprint, coarse.name, plan, None, {}, resume=False
-        )
-        emulator = session.finished(*plan.train(Job(coarse, progress=progress), session))
+        session = Session(folder / CHECKPOINT, coarse.fingerprint, plan)
+        below = Job(coarse, progress=job.progress)
+        emulator = session.finished(*plan.train(below, session))
         save_emulator(emulator, folder)
         remove_checkpoint(folder)
         return emulator
@@ -61,11 +57,10 @@ class TwoMeshes(Recipe):
     def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
         """Return the emulator and its record."""
         emulator = on_finer(job.start, job.scene, self)
-        runs = job.fem_runs(
-            Simulator(job.scene), self, of_position(emulator), job.deadline(FEM_SHARE)
-        )
+        predictor, deadline = of_position(emulator), job.deadline(FEM_SHARE)
+        runs = job.fem_runs(Simulator(job.scene), self, predictor, deadline)
         plan = self.with_counts(simulations=len(runs.theta) - 1)
-        replace(session, plan=plan, architecture=None).write_plan()
+        session.write_plan(plan)
         assert job.start is not None, "checked by on_finer"
         emulator, choice = add_discrepancy(emulator, runs, job.start.taylor)
         return emulator, {**plan.record(), "discrepancy": choice}

@@ -26,8 +26,8 @@ from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.pignn import Architecture, Processor
 from emulator.surrogates.network.ventricle_graph import describe
 from emulator.training import recipe, train
-from emulator.training.job import Job
 from emulator.training.mechanics import Mechanics
+from emulator.training.plan import Job
 
 SMALL = Architecture(
     steps=2, latent=8, hidden=(16,), decoder="separable", modes=4, trunk=(16,), branch=(16,)

@@ -13,11 +13,11 @@ from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import design, sobol
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training import train
-from emulator.training.job import Job
 from emulator.training.modal import Modal
 from emulator.training.mode_fit import ModeFit
 from emulator.training.objectives import loss_scales, mean_square_gradient
-from emulator.training.step import orthogonal_steps
+from emulator.training.optimiser import orthogonal_steps
+from emulator.training.plan import Job
 
 SMALL = Architecture(
     steps=2, latent=8, hidden=(16, 16), decoder="separable", modes=6, trunk=(16, 40)
@@ -176,9 +176,9 @@ def test_a_killed_training_goes_on_to_the_same_weights(beam, tmp_path, monkeypat
 
 
 def _killed_after(scene, folder, stop, monkeypatch):
-    from emulator.training import loop
+    from emulator.training import optimiser as module
 
-    advance = loop.Steps.__call__
+    advance = module.Steps.__call__
 
     def killed(self, state, total):
         if state.done == stop:
@@ -186,7 +186,7 @@ def _killed_after(scene, folder, stop, monkeypatch):
         return advance(self, state, total)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop.Steps, "__call__", killed)
+        patch.setattr(module.Steps, "__call__", killed)
         with pytest.raises(KeyboardInterrupt):
             train(scene, replace(PLAN, checkpoint_every=5), folder, architecture=SMALL)
 

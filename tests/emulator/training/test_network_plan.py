@@ -12,7 +12,7 @@ from emulator.surrogates import load, save_emulator
 from emulator.training import recipe, train
 from emulator.training.checkpoint import CHECKPOINT, Session
 from emulator.training.graph_network import GraphNetwork
-from emulator.training.job import Job
+from emulator.training.plan import Job
 from network_support import SMALL, untrained
 
 PLAN = GraphNetwork(objective="energy", steps=12, batch=2, checkpoint_every=5)

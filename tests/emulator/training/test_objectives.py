@@ -11,8 +11,8 @@ import emulator as em
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates import Architecture
 from emulator.training.graph_network import GraphNetwork
-from emulator.training.job import Job
 from emulator.training.objectives import OBJECTIVES, Batch, Scales, loss_scales, make_loss
+from emulator.training.plan import Job
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 SCALES = Scales(displacement=2.0, gradient=0.3, energy=7.0)

@@ -264,9 +264,9 @@ def test_a_network_that_never_saw_fem_killed_and_resumed(beam, no_fem, tmp_path,
         np.testing.assert_array_equal(a, b)
 
 
-def test_what_cannot_be_swept_is_refused(simulator):
+def test_what_cannot_be_swept_is_refused(beam, tmp_path):
     with pytest.raises(InputError, match="15 sweeps; the loads rise over 15, give 16 or more"):
-        sweep_box(simulator, 15, 0)
+        train(beam, replace(recipe("sweeps"), sweeps=15), tmp_path)
     assert recipe("physics").runs == recipe("sweeps").runs == 0
 
 

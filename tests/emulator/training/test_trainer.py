@@ -17,9 +17,9 @@ from emulator.training import recipe, train
 from emulator.training.checkpoint import CHECKPOINT, Session, State
 from emulator.training.graph_network import GraphNetwork
 from emulator.training.hybrid import Hybrid
-from emulator.training.job import Job
 from emulator.training.mechanics import Mechanics
-from emulator.training.step import WARMUP
+from emulator.training.optimiser import WARMUP
+from emulator.training.plan import Job
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 
@@ -223,7 +223,7 @@ def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatc
 @pytest.mark.slow
 def test_frozen_modes_do_not_move(beam):
     problem = HYBRID.prepare(Job(beam, SMALL))
-    weights, state = problem.training.initial()
+    weights, state, *_ = problem.training.initial()
     number, total = jnp.asarray(0), jnp.asarray(30)
     for _ in range(2):  # momentum that would move them
         weights, state, _ = problem.training.step(weights, state, number, total)
@@ -306,7 +306,7 @@ def test_a_network_on_a_quadratic_mesh(tmp_path):
 
 def test_an_aim_follows_the_clock(monkeypatch):
     """Steps of 1 s against a deadline in 1000 s, then of 2 s; no more than the plan's."""
-    from emulator.training import loop as module
+    from emulator.training import optimiser as module
 
     now = [0.0]
     monkeypatch.setattr(module.time, "perf_counter", lambda: now[0])
