@@ -28,7 +28,7 @@ from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.petsc import Factor, petsc_module
-from emulator.fem.linear.suitesparse import FACTORS, SUITESPARSE
+from emulator.fem.linear.suitesparse import SUITESPARSE, free_factors
 from emulator.scenes.scene import Scene
 
 # PETSC_OPTIONS of MUMPS: as it is, factors on disk, and block low-rank factors to six digits with
@@ -81,7 +81,7 @@ def factorised(solver: str, matrix: Any, pattern: Pattern) -> Case:
         solution, x = both_times(factor.solve, b)
         row = {"iterations": factor._ksp.getIterationNumber()}
     else:
-        FACTORS.clear()
+        free_factors()
         solve = jax.jit(lambda values, b: SUITESPARSE.solve(pattern, values, b, definite=True)[0])
         with_solution = lambda *given: np.asarray(solve(*given))  # noqa: E731
         first, _ = both_times(with_solution, matrix["first"], b)

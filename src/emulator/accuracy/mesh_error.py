@@ -31,7 +31,7 @@ import numpy as np
 from emulator.accuracy.distance import Distance, newton_distance
 from emulator.core.errors import InputError
 from emulator.fem.compiled import compiled
-from emulator.fem.linear.suitesparse import FACTORS
+from emulator.fem.linear.suitesparse import free_factors
 from emulator.fem.simulator import Simulator
 from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene
@@ -129,7 +129,7 @@ class MeshError:
 
     def forget(self) -> None:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
-        FACTORS.clear()
+        free_factors()
 
     def _prolong(self, u: jax.Array) -> jax.Array:
         return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))

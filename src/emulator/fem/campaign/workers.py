@@ -22,7 +22,7 @@ import numpy as np
 from emulator.core.errors import SolverError
 from emulator.core.machine import cores, inherited, memory
 from emulator.fem.energy import potential_energy, volume_ratio
-from emulator.fem.linear.suitesparse import FACTORS
+from emulator.fem.linear.suitesparse import keeping_factors
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
 
@@ -190,7 +190,7 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
     pending: deque[Future[R]] = deque()
     on_thread = inherited(function)
     pool = ThreadPoolExecutor(workers)
-    with FACTORS.keep(workers):
+    with keeping_factors(workers):
         try:
             for task in tasks:
                 pending.append(pool.submit(on_thread, task))

@@ -14,7 +14,6 @@ from __future__ import annotations
 import importlib
 import threading
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any
 
@@ -24,7 +23,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.solve import Outcome
+from emulator.fem.linear.solve import Direct, Outcome
 
 INSTALL = "pip install dolfinx-solver-real mpich mpi4py, or petsc4py for a PETSc with MUMPS"
 # Residual relative to |A| |x| + |b| that a direct solver leaves at most. Block low-rank factors
@@ -69,18 +68,19 @@ class Factor:
         self._values = np.full(len(pattern.rows), np.nan)
         csr = (*self._csr, np.zeros(len(pattern.rows)))
         shape, alone = (pattern.size, pattern.size), PETSc.COMM_SELF
-        self._matrix = (
-            PETSc.Mat().createSBAIJ(shape, 1, csr=csr, comm=alone)
-            if pattern.upper
-            else PETSc.Mat().createAIJ(shape, csr=csr, comm=alone)
-        )
+        matrix = PETSc.Mat()
+        if pattern.upper:
+            self._matrix = matrix.createSBAIJ(shape, 1, csr=csr, comm=alone)
+        else:
+            self._matrix = matrix.createAIJ(shape, csr=csr, comm=alone)
         self._ksp = PETSc.KSP().create(alone)
         self._ksp.setType("preonly")
         kind = "cholesky" if pattern.upper else "lu"
-        self._ksp.getPC().setType(kind)
-        self._ksp.getPC().setFactorSolverType("mumps")
+        pc = self._ksp.getPC()
+        pc.setType(kind)
+        pc.setFactorSolverType("mumps")
         self._ksp.setFromOptions()
-        options = self._ksp.getPC().getType(), self._ksp.getPC().getFactorSolverType()
+        options = pc.getType(), pc.getFactorSolverType()
         if options != (kind, "mumps"):
             raise InputError(
                 f"factorisation 'petsc': PETSC_OPTIONS ask for {' of '.join(map(str, options))}; "
@@ -124,9 +124,15 @@ class Factor:
         (self._ksp.solveTranspose if transposed else self._ksp.solve)(rhs, x)
         (self._matrix.multTranspose if transposed else self._matrix.mult)(x, residual)
         residual.aypx(-1.0, rhs)
-        solution = x.getArray().copy()
+        solution, left = x.getArray().copy(), np.abs(residual.getArray()).max()
         size = self._norm * np.abs(solution).max() + np.abs(b).max()
-        self._check_solution(np.abs(residual.getArray()).max(), size)
+        reason = self._ksp.getConvergedReason()
+        if reason < 0 or not left <= _BACKWARD_ERROR * size:
+            raise InputError(
+                f"petsc: the solution leaves a residual of {left / size:.0e} of |A||x| + |b| "
+                f"(KSP: {reason}); with an approximate factor, iterate: add "
+                "-ksp_type fgmres -ksp_rtol 1e-10 to PETSC_OPTIONS"
+            )
         return solution
 
     def _check_factor(self) -> None:
@@ -146,50 +152,18 @@ class Factor:
             )
         raise ValueError(f"petsc: no factor (MUMPS: {codes})")
 
-    def _check_solution(self, residual: float, size: float) -> None:
-        reason = self._ksp.getConvergedReason()
-        if reason < 0 or not residual <= _BACKWARD_ERROR * size:
-            raise InputError(
-                f"petsc: the solution leaves a residual of {residual / size:.0e} of |A||x| + |b| "
-                f"(KSP: {reason}); with an approximate factor, iterate: add "
-                "-ksp_type fgmres -ksp_rtol 1e-10 to PETSC_OPTIONS"
-            )
 
-
-@dataclass
-class LastFactor:
-    """The one factor that a process keeps, because a factor may take all of its memory.
-
-    lock : the lock that lets one thread solve at a time.
-    """
-
-    factor: Factor | None = None
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def of(self, pattern: Pattern, values: np.ndarray) -> Factor:
-        """Return the factor of a matrix; the one before is overwritten or freed."""
-        if self.factor is None or not self.factor.serves(pattern):
-            self.factor = None  # freed before the next one is allocated
-            self.factor = Factor(pattern)
-        try:
-            self.factor.factorise(values)
-        except Exception:
-            self.factor = None  # MUMPS cannot go on from a failure
-            raise
-        return self.factor
-
-
-@dataclass(frozen=True)
-class Petsc:
+class Petsc(Direct):
     """LDL^T where the matrix is symmetric, LU where not; inertia tells whether it is definite.
 
-    last : the factor that the solver keeps from one solve to the next.
+    factor : the one factor that the process keeps, because a factor may take all of its memory.
     """
 
-    name = "petsc"
-    on_host = True
+    name, on_host = "petsc", True
 
-    last: LastFactor = field(default_factory=LastFactor, compare=False)
+    def __init__(self) -> None:
+        self.factor: Factor | None = None
+        self._lock = threading.Lock()  # one thread solves at a time
 
     def check(self) -> None:
         """Raise :class:`InputError` where PETSc or MUMPS is missing."""
@@ -218,9 +192,9 @@ class Petsc:
         self, pattern: Pattern, values: jax.Array, b: jax.Array, *, definite: bool, transposed: bool
     ) -> tuple[np.ndarray, np.int32]:
         columns = np.asarray(b)
-        with self.last.lock:
+        with self._lock:
             try:
-                factor = self.last.of(pattern, np.asarray(values))
+                factor = self._factorised(pattern, np.asarray(values))
             except SingularMatrix:
                 return np.full(columns.shape, np.nan), np.int32(Outcome.SINGULAR)
             if definite and factor.negative_eigenvalues():
@@ -229,6 +203,18 @@ class Petsc:
             if columns.ndim == 1:
                 return solve(columns), np.int32(Outcome.OK)
             return np.stack([solve(each) for each in columns.T], axis=1), np.int32(Outcome.OK)
+
+    def _factorised(self, pattern: Pattern, values: np.ndarray) -> Factor:
+        """Return the factor of a matrix; the one before is overwritten or freed."""
+        if self.factor is None or not self.factor.serves(pattern):
+            self.factor = None  # freed before the next one is allocated
+            self.factor = Factor(pattern)
+        try:
+            self.factor.factorise(values)
+        except Exception:
+            self.factor = None  # MUMPS cannot go on from a failure
+            raise
+        return self.factor
 
 
 PETSC = Petsc()

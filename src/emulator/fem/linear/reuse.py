@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from emulator.fem.compiled import compiled, while_loop
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.solve import Direct, Outcome
-from emulator.fem.linear.suitesparse import FACTORS
+from emulator.fem.linear.suitesparse import keeping_factors
 
 TOLERANCE = 1e-10  # relative residual, in the norm of the inverse factorised tangent
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
@@ -138,7 +138,7 @@ class KeptFactor:
             if bool(solution.convex & (solution.reduction <= TOLERANCE)):
                 return solution.x, jnp.asarray(Outcome.OK, jnp.int32)
         self._factorised = None
-        with FACTORS.keep(1):  # two factors of a large mesh may not fit into memory
+        with keeping_factors(1):  # two factors of a large mesh may not fit into memory
             x, outcome = jax.block_until_ready(self._solve(tangent, b))
         self.factorisations += 1
         if int(outcome) == Outcome.OK:

@@ -6,9 +6,10 @@ refused does a general one follow, so that an unstable equilibrium has derivativ
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from enum import IntEnum
 from functools import partial
-from typing import Protocol
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ class Outcome(IntEnum):
     SINGULAR = 2
 
 
-class Direct(Protocol):
+class Direct(ABC):
     """A direct solver.
 
     name : the name in the registry.
@@ -36,16 +37,14 @@ class Direct(Protocol):
         reach it by a callback. Other solvers are part of the compiled program.
     """
 
-    @property
-    def name(self) -> str: ...  # noqa: D102
+    name: ClassVar[str]
+    on_host: ClassVar[bool] = False
 
-    @property
-    def on_host(self) -> bool: ...  # noqa: D102
-
+    @abstractmethod
     def check(self) -> None:
         """Load the solver's library; :class:`InputError` where it is not installed."""
-        ...
 
+    @abstractmethod
     def solve(
         self,
         pattern: Pattern,
@@ -61,7 +60,6 @@ class Direct(Protocol):
             definite.
         transposed : whether to solve with the transpose of ``A``.
         """
-        ...
 
 
 def attempt(

@@ -19,8 +19,7 @@ import sys
 from _thread import interrupt_main
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from math import prod
 from pathlib import Path
 from threading import Timer
@@ -36,18 +35,16 @@ from threadpoolctl import ThreadpoolController
 
 from emulator.core.errors import InputError
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.solve import Outcome
+from emulator.fem.linear.solve import Direct, Outcome
 
 _CHOLMOD, _UMFPACK = "calibrate_cholmod", "calibrate_umfpack"
 _FACTORS = 2  # factors of each pattern that are kept by default
 
 
-@dataclass(frozen=True)
-class SuiteSparse:
-    """CHOLMOD where the matrix must be definite, UMFPACK where not."""
+class SuiteSparse(Direct):
+    """CHOLMOD where the matrix must be definite, UMFPACK, which takes both triangles, where not."""
 
     name = "suitesparse"
-    on_host = False
 
     def check(self) -> None:
         """Prepare the library, which is always installed."""
@@ -62,24 +59,21 @@ class SuiteSparse:
         definite: bool,
         transposed: bool = False,
     ) -> tuple[jax.Array, jax.Array]:
-        """Solve by CHOLMOD, or by UMFPACK, which takes both triangles."""
+        """Return the solution and the outcome."""
+        _prepare()
+        shapes = jax.ShapeDtypeStruct(rhs.shape, jnp.float64), jax.ShapeDtypeStruct((), jnp.int32)
+        call = partial(jax.ffi.ffi_call, result_shape_dtypes=shapes, vmap_method="sequential")
         if definite:
-            matrix = pattern.rows, pattern.columns, values
-            return _call(_CHOLMOD, matrix, rhs, mode=np.int64(0))
-        return _call(_UMFPACK, pattern.both(values), rhs, trans=np.int64(transposed))
+            x, outcome = call(_CHOLMOD)(
+                pattern.rows, pattern.columns, values, rhs, mode=np.int64(0)
+            )
+        else:
+            trans = np.int64(transposed)
+            x, outcome = call(_UMFPACK)(*pattern.both(values), rhs, trans=trans)
+        return x, outcome
 
 
 SUITESPARSE = SuiteSparse()
-
-
-def _call(
-    target: str, matrix: tuple[np.ndarray, np.ndarray, jax.Array], rhs: jax.Array, **flags: Any
-) -> tuple[jax.Array, jax.Array]:
-    _prepare()
-    shapes = jax.ShapeDtypeStruct(rhs.shape, jnp.float64), jax.ShapeDtypeStruct((), jnp.int32)
-    call = jax.ffi.ffi_call(target, shapes, vmap_method="sequential")
-    x, outcome = call(*matrix, rhs, **flags)
-    return x, outcome
 
 
 @cache
@@ -111,38 +105,29 @@ def _outcome(message: str) -> int | None:
 
 
 # ---- the cache of factors ------------------------------------------------------------------------
-class FactorCache:
-    """The cache of factors, which is sparsax's and therefore one for the whole process.
+_kept = [_FACTORS]  # what the contexts ask for that are open; the cache is sparsax's, one a process
 
-    Its size is the number of Cholesky factors kept of each pattern: what the latest :meth:`keep`
-    that is still open asks for.
+
+@contextmanager
+def keeping_factors(count: int) -> Iterator[None]:
+    """Keep ``count`` Cholesky factors of each pattern inside the context.
+
+    As many as threads that solve; or one, where two would not fit into memory: a factorisation
+    then overwrites the one before. Contexts may be closed in any order; the latest one counts.
     """
-
-    def __init__(self) -> None:
-        self._sizes = [_FACTORS]
-
-    @contextmanager
-    def keep(self, count: int) -> Iterator[None]:
-        """Keep ``count`` Cholesky factors of each pattern inside the context.
-
-        As many as threads that solve; or one, where two would not fit into memory: a factorisation
-        then overwrites the one before. Contexts may be closed in any order.
-        """
-        _prepare()
-        self._sizes.append(count)
-        sparsax.set_num_cache_size(count)
-        try:
-            yield
-        finally:
-            self._sizes.remove(count)
-            sparsax.set_num_cache_size(self._sizes[-1])
-
-    def clear(self) -> None:
-        """Free all factors, and all orderings of patterns, which cost as much as a factor."""
-        sparsax.clear_cache()
+    _prepare()
+    _kept.append(count)
+    sparsax.set_num_cache_size(count)
+    try:
+        yield
+    finally:
+        _kept.remove(count)
+        sparsax.set_num_cache_size(_kept[-1])
 
 
-FACTORS = FactorCache()
+def free_factors() -> None:
+    """Free all factors, and all orderings of patterns, which cost as much as a factor."""
+    sparsax.clear_cache()
 
 
 # ---- a foreign function of XLA whose failure is an output ---------------------------------------
@@ -156,42 +141,31 @@ _API_MAJOR, _API_MINOR = 0, 3
 _REPEAT_S = 0.05  # seconds after which an interrupt is repeated
 
 
+def _words(names: str) -> list[tuple[str, type]]:
+    """Return fields of a struct, each in a word of its own, as XLA's are."""
+    return [(name, ctypes.c_size_t) for name in names.split()]
+
+
 class _Buffer(ctypes.Structure):
     """``XLA_FFI_Buffer``."""
 
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("dtype", ctypes.c_int),
-        ("data", ctypes.c_void_p),
-        ("rank", ctypes.c_int64),
+        *_words("struct_size extension dtype data rank"),
         ("shape", ctypes.POINTER(ctypes.c_int64)),
     )
 
     def fill(self) -> None:
         """Write NaN everywhere: all bits are one."""
-        count = prod(self.shape[k] for k in range(self.rank))
-        ctypes.memset(self.data, 0xFF, 8 * count)
+        ctypes.memset(self.data, 0xFF, 8 * prod(self.shape[: self.rank]))
 
 
 class CallFrame(ctypes.Structure):
     """``XLA_FFI_CallFrame`` up to its results."""
 
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("api", ctypes.c_void_p),
-        ("context", ctypes.c_void_p),
-        ("stage", ctypes.c_int),
-        ("arguments_size", ctypes.c_size_t),
-        ("arguments_extension", ctypes.c_void_p),
-        ("arguments_count", ctypes.c_int64),
-        ("arguments_types", ctypes.c_void_p),
-        ("arguments", ctypes.c_void_p),
-        ("results_size", ctypes.c_size_t),
-        ("results_extension", ctypes.c_void_p),
-        ("results_count", ctypes.c_int64),
-        ("results_types", ctypes.c_void_p),
+        *_words("struct_size extension api context stage"),
+        *_words("arguments_size arguments_extension arguments_count arguments_types arguments"),
+        *_words("results_size results_extension results_count results_types"),
         ("results", ctypes.POINTER(ctypes.c_void_p)),
     )
 
@@ -204,16 +178,10 @@ class Api(ctypes.Structure):
     """``XLA_FFI_Api`` up to the functions of errors; its version is a struct inside it."""
 
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("version_size", ctypes.c_size_t),
-        ("version_extension", ctypes.c_void_p),
+        *_words("struct_size extension version_size version_extension"),
         ("major", ctypes.c_int),
         ("minor", ctypes.c_int),
-        ("internal", ctypes.c_void_p),
-        ("error_create", ctypes.c_void_p),
-        ("error_message", ctypes.c_void_p),
-        ("error_destroy", ctypes.c_void_p),
+        *_words("internal error_create error_message error_destroy"),
     )
 
 
@@ -221,11 +189,9 @@ class _ErrorArguments(ctypes.Structure):
     """Arguments of both functions of errors; the second reads the first three."""
 
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("error", ctypes.c_void_p),
+        *_words("struct_size extension error"),
         ("message", ctypes.c_char_p),
-        ("code", ctypes.c_int),
+        *_words("code"),
     )
 
 
@@ -233,12 +199,10 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 _ErrorFunction = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 # Prototypes of their own: whoever sets the types of ctypes.pythonapi's functions sets them for all.
-_capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(
-    ("PyCapsule_GetName", ctypes.pythonapi)
-)
-_capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
-    ("PyCapsule_GetPointer", ctypes.pythonapi)
-)
+_NameOf = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)
+_PointerOf = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)
+_capsule_name = _NameOf(("PyCapsule_GetName", ctypes.pythonapi))
+_capsule_pointer = _PointerOf(("PyCapsule_GetPointer", ctypes.pythonapi))
 
 _alive: list[Any] = []  # XLA keeps bare pointers to registered functions, for the whole process
 
@@ -253,7 +217,7 @@ def api_version() -> tuple[int, int]:
 
 
 def check_api() -> None:
-    """Raise :class:`InputError` unless the structs below have XLA's layout.
+    """Raise :class:`InputError` unless the structs above have XLA's layout.
 
     A new minor version of the interface only adds fields at the ends of structs; a new major
     version may move any.
@@ -285,39 +249,32 @@ def register(target: str, capsule: Any, classify: Classify) -> None:
         frame = CallFrame.from_address(address)
         if frame.extension or frame.results_count != 2:  # XLA asks about the function itself
             return inner(address)
-        status = ctypes.cast(frame.result(1).data, ctypes.POINTER(ctypes.c_int32))
+        frame.results_count, number = 1, INTERRUPTED
         try:
-            return _call_inner(inner, frame, status, classify)
-        except BaseException as error:  # in ctypes it would become an invalid pointer
-            frame.results_count = 2
+            error = inner(address)
+            number = _number_of(error, Api.from_address(frame.api), classify) if error else 0
+        except KeyboardInterrupt:
+            Timer(_REPEAT_S, interrupt_main).start()  # raises once the program has ended
+        except BaseException as failure:  # in ctypes it would become an invalid pointer
+            sys.excepthook(type(failure), failure, failure.__traceback__)
+        frame.results_count = 2
+        if number is None:
+            return error
+        if number:
             frame.result(0).fill()
-            status[0] = INTERRUPTED
-            if isinstance(error, KeyboardInterrupt):
-                Timer(_REPEAT_S, interrupt_main).start()  # raises once the program has ended
-            else:
-                sys.excepthook(type(error), error, error.__traceback__)
-            return None
+        ctypes.c_int32.from_address(frame.result(1).data).value = number
+        return None
 
     outer = _Handler(handler)
     _alive.extend((inner, outer))
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(outer), platform="cpu")
 
 
-def _call_inner(inner: Any, frame: CallFrame, status: Any, classify: Classify) -> int | None:
-    """Call the original with its one result; write the number of an error into ``status``."""
-    frame.results_count = 1
-    error = inner(ctypes.addressof(frame))
-    frame.results_count = 2
-    if not error:
-        status[0] = 0
-        return None
-    api = Api.from_address(frame.api)
-    arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, error, None, 0)
+def _number_of(error: int, api: Api, classify: Classify) -> int | None:
+    """Return the number of an error, and free it; None for one that ends the program."""
+    arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), 0, error)
     _ErrorFunction(api.error_message)(ctypes.addressof(arguments))
     number = classify((arguments.message or b"").decode(errors="replace"))
-    if number is None:
-        return error
-    _ErrorFunction(api.error_destroy)(ctypes.addressof(arguments))
-    frame.result(0).fill()
-    status[0] = number
-    return None
+    if number is not None:
+        _ErrorFunction(api.error_destroy)(ctypes.addressof(arguments))
+    return number
