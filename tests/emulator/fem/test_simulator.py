@@ -162,8 +162,6 @@ def test_arguments_of_the_wrong_shape_are_refused(beam, simulator):
         jax.jit(simulator.solve)(jnp.array([60.0, 60.0, 60.0]))
     with pytest.raises(InputError, match=r"start has shape \(3,\)"):
         simulator.solve(beam.centre, jnp.zeros(3))
-    with pytest.raises(InputError, match="2 theta, but 1 starts"):
-        em.fem.solve_together(simulator, jnp.ones((2, 2)), jnp.zeros((1, *beam.held.shape)))
 
 
 @pytest.mark.parametrize("kind", [np.float32, int])

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError
 from emulator.core.progress import counting
 from emulator.fem.campaign.workers import Executor, Row, Solver, Task, in_process
 from emulator.fem.simulator import Simulator
@@ -49,37 +49,22 @@ def solve_rows(
     return execute(solver, tasks)
 
 
-def solve_together(
-    simulator: Simulator, thetas: jax.Array, starts: jax.Array | None = None
-) -> Solution:
-    """Return solutions at every theta (c, p), converged or not; fields gain a leading axis.
-
-    starts : the start of each solve, (c, n, 3) mm; the state at rest by default.
-    """
-    if starts is not None and len(thetas) != len(starts):
-        raise InputError(f"campaign: {len(thetas)} theta, but {len(starts)} starts")
-    solver = Solver(simulator, from_rest_again=False)
-    one = (lambda _: ()) if starts is None else (lambda number: (starts[number],))
-    solutions = [row.solution for row in solve_rows(solver, np.asarray(thetas), starts=one)]
-    return jax.tree.map(lambda *fields: jnp.stack(fields), *solutions)
+def solve_together(simulator: Simulator, thetas: jax.Array) -> Solution:
+    """Return solutions at every theta (c, p), converged or not; fields gain a leading axis."""
+    rows = solve_rows(Solver(simulator), np.asarray(thetas))
+    return jax.tree.map(lambda *fields: jnp.stack(fields), *(row.solution for row in rows))
 
 
-@contextmanager
-def executor(scheduler: str | None) -> Iterator[Executor]:
-    """Yield the executor of this process, or of the Dask scheduler at the address ``scheduler``.
+def executor(scheduler: str | None) -> AbstractContextManager[Executor]:
+    """Return the executor of this process, or of the Dask scheduler at the address ``scheduler``.
 
-    Raises
-    ------
-    InputError
-        The address is malformed, or nobody answers there.
+    Entering it raises :class:`InputError` where the address is malformed or nobody answers there.
     """
     if scheduler is None:
-        yield in_process
-        return
+        return nullcontext(in_process)
     from emulator.fem.campaign.cluster import connected
 
-    with connected(scheduler) as cluster:
-        yield cluster
+    return connected(scheduler)
 
 
 class Field(NamedTuple):
@@ -114,17 +99,14 @@ class Neighbours:
         if numbers:
             steps = position - self._positions[numbers]
             nearest = int(np.argmin(np.sum(steps**2, axis=1)))
-            starts += self._from(numbers[nearest], steps[nearest])
+            u, slopes = self.solutions[numbers[nearest]]
+            starts.append(u)
+            if slopes is not None:
+                rates = self._rates[numbers[nearest]]
+                starts.append(u + jnp.tensordot(steps[nearest] * rates, slopes, axes=1))
         if self.predictor is not None:
             starts.append(self.predictor(jnp.asarray(position)))
         return starts
-
-    def _from(self, number: int, step: np.ndarray) -> list[jax.Array]:
-        """Return a solution, and the same extrapolated by ``step`` (p,) in the unit box."""
-        u, slopes = self.solutions[number]
-        if slopes is None:
-            return [u]
-        return [u, u + jnp.tensordot(step * self._rates[number], slopes, axes=1)]
 
     @cached_property
     def _positions(self) -> np.ndarray:
@@ -150,20 +132,7 @@ class Runs(NamedTuple):
 
     def take(self, rows: slice | np.ndarray) -> Runs:
         """Return some of the runs."""
-        sensitivities = None if self.sensitivities is None else self.sensitivities[rows]
-        return Runs(self.theta[rows], self.displacement[rows], self.energy[rows], sensitivities)
-
-    def followed_by(self, later: Runs) -> Runs:
-        """Return these runs and ``later`` ones; with sensitivities where both have them."""
-        slopes = None
-        if self.sensitivities is not None and later.sensitivities is not None:
-            slopes = jnp.concatenate([self.sensitivities, later.sensitivities])
-        return Runs(
-            jnp.concatenate([self.theta, later.theta]),
-            jnp.concatenate([self.displacement, later.displacement]),
-            jnp.concatenate([self.energy, later.energy]),
-            slopes,
-        )
+        return jax.tree.map(lambda array: array[rows], self)
 
 
 class StoredRuns(NamedTuple):
@@ -205,10 +174,14 @@ def run_campaign(
     # every theta.
     solver = Solver(simulator, sensitivities=sensitivities, energy=not simulator.scene.loaded_by)
     solutions: dict[int, Field] = {}
+
+    def begins(number: int) -> bool:
+        return number < at_least or time.perf_counter() <= deadline
+
     results = solve_rows(
         solver,
         thetas,
-        numbers=_numbers_until(deadline, len(thetas), at_least),
+        numbers=takewhile(begins, range(len(thetas))),
         starts=Neighbours(simulator.scene, thetas, solutions, predictor),
         execute=execute,
     )
@@ -224,11 +197,3 @@ def run_campaign(
         jnp.stack([row.energy for row in rows]),
         jnp.stack([row.sensitivities for row in rows]) if sensitivities else None,
     )
-
-
-def _numbers_until(deadline: float, count: int, at_least: int) -> Iterator[int]:
-    """Yield numbers up to ``count``; after the deadline, up to ``at_least``."""
-    for number in range(count):
-        if number >= at_least and time.perf_counter() > deadline:
-            return
-        yield number

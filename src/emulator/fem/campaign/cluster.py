@@ -89,14 +89,14 @@ class Cluster:
                 break
             for future in self._wait_for_any(pending):
                 try:
-                    row = _result(future)
+                    row = future.result(timeout=_POLL_S)
                 except TimeoutError:  # the worker was lost; Dask solves the task again
                     continue
-                number = pending.pop(future)
-                if row is None:
-                    deadly.append(number)
-                else:
-                    yield row
+                except KilledWorker:
+                    deadly.append(pending.pop(future))
+                    continue
+                del pending[future]
+                yield row
         if deadly:
             raise SolverError(
                 f"campaign: theta {', '.join(map(str, deadly))} killed every worker it was given "
@@ -106,15 +106,17 @@ class Cluster:
     def _workers(self) -> int:
         """Return the number of workers; wait for the first."""
         began = time.monotonic()
-        while True:
-            count = self._count()
+        while time.monotonic() - began <= WORKERS_S:
+            try:
+                count = len(self.client.nthreads())
+            except (RuntimeError, ValueError) as error:  # the client has given up
+                raise self._connection_error(error) from error
             if count:
                 return count
-            if time.monotonic() - began > WORKERS_S:
-                raise SolverError(
-                    f"campaign: the scheduler {self.address} has had no worker for {WORKERS_S:g} s"
-                )
             time.sleep(0.2)
+        raise SolverError(
+            f"campaign: the scheduler {self.address} has had no worker for {WORKERS_S:g} s"
+        )
 
     def _wait_for_any(self, pending: dict[Future, int]) -> list[Future]:
         """Wait until a future is done, checking that there are workers; return all that are."""
@@ -127,12 +129,6 @@ class Cluster:
             completed = [future for future in pending if future.done()]
             if completed:
                 return completed
-
-    def _count(self) -> int:
-        try:
-            return len(self.client.nthreads())
-        except (RuntimeError, ValueError) as error:  # the client has given up
-            raise self._connection_error(error) from error
 
     def _connection_error(self, error: Exception) -> SolverError:
         message = " ".join(str(error).split())
@@ -181,13 +177,11 @@ class SolverPlugin(WorkerPlugin):
     """A solver as it is sent to a worker, once: its scene and options, without cached arrays."""
 
     def __init__(self, solver: Solver) -> None:
-        scene = solver.simulator.scene
-        self._scene = {field.name: getattr(scene, field.name) for field in fields(Scene)}
+        simulator, scene = solver.simulator, solver.simulator.scene
+        self._scene = {each.name: getattr(scene, each.name) for each in fields(Scene)}
         self._fingerprint = scene.fingerprint
-        self._newton = solver.simulator.options
-        self._factorisation = solver.simulator.factorisation
-        options = {field.name: getattr(solver, field.name) for field in fields(Solver)}
-        self._options = {name: v for name, v in options.items() if name != "simulator"}
+        self._simulator_options = simulator.options, simulator.factorisation
+        self._options = solver.sensitivities, solver.energy, solver.from_rest_again
 
     def setup(self, worker: Any) -> None:  # noqa: ARG002 - Dask's interface
         """Prepare each worker; Dask calls this."""
@@ -205,20 +199,12 @@ class SolverPlugin(WorkerPlugin):
             raise SolverError(
                 f"campaign: a worker makes another scene of '{scene.name}'; give it this version"
             )
-        return Solver(Simulator(scene, self._newton, self._factorisation), **self._options)
+        return Solver(Simulator(scene, *self._simulator_options), *self._options)
 
 
 def _solve(name: str, task: Task) -> Row:
     """Solve a task; a worker runs this."""
     return cast(SolverPlugin, get_worker().plugins[name]).solve(task)
-
-
-def _result(future: Future) -> Row | None:
-    """Return the row, or None where its theta killed workers."""
-    try:
-        return future.result(timeout=_POLL_S)
-    except KilledWorker:
-        return None
 
 
 def _as_numpy(task: Task) -> Task:

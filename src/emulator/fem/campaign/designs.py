@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +24,7 @@ _MOST_CORNERED = 6  # parameters up to which the box's corners are used; more ha
 
 def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
     """Return ``count`` theta (count, p) of a scrambled Sobol sequence over the box's scales."""
-    _check(count, seed)
-    from scipy.stats import qmc  # importing takes half a second, which a single solve does not need
-
+    qmc = _samplers(count, seed)
     bits = max(count - 1, 1).bit_length()
     points = qmc.Sobol(len(scene.parameters), rng=seed).random_base2(bits)[:count]
     return scene.from_unit(jnp.asarray(points))
@@ -37,11 +35,19 @@ def latin_hypercube(scene: Scene, count: int, seed: int) -> jax.Array:
 
     Each parameter is spread evenly by itself; a shorter design is not part of a longer one.
     """
-    _check(count, seed)
-    from scipy.stats import qmc
-
-    points = qmc.LatinHypercube(len(scene.parameters), rng=seed).random(count)
+    points = _samplers(count, seed).LatinHypercube(len(scene.parameters), rng=seed).random(count)
     return scene.from_unit(jnp.asarray(points))
+
+
+def _samplers(count: int, seed: int) -> Any:
+    """Return SciPy's module of designs; refuse a design of nothing."""
+    if count < 1 or seed < 0:
+        raise InputError(
+            f"{count} samples with seed {seed} asked for; give 1 or more, seed 0 or more"
+        )
+    from scipy.stats import qmc  # importing takes half a second, which a single solve does not need
+
+    return qmc
 
 
 def uniform(scene: Scene, count: int, key: jax.Array) -> jax.Array:
@@ -78,13 +84,6 @@ DESIGNS: dict[str, Callable[[Scene, int, int], jax.Array]] = {
 """Designs of a campaign by name; emulators are trained on the last."""
 
 
-def _check(count: int, seed: int) -> None:
-    if count < 1 or seed < 0:
-        raise InputError(
-            f"{count} samples with seed {seed} asked for; give 1 or more, seed 0 or more"
-        )
-
-
 def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
     """Return theta (cases, p) outside the box, but inside the box widened on both sides.
 
@@ -94,27 +93,22 @@ def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
     """
     if not 0.0 < fraction < np.inf:
         raise InputError(f"outside is {fraction}; give a fraction above 0, e.g. 0.25")
+    quantities = [scene.quantities[name] for name in scene.parameter_names]
+
+    def admissible(theta: np.ndarray) -> bool:
+        values = zip(quantities, theta.tolist(), strict=True)
+        return all(quantity.value_fault(value) is None for quantity, value in values)
+
     count = 2 * cases
     for _ in range(12):
         position = scene.to_unit(sobol(scene, count, TEST_SEED + 1))
         thetas = scene.from_unit(position * (1.0 + 2.0 * fraction) - fraction)
         outside = ~np.asarray(scene.space.contains(thetas))
-        valid = outside & _admissible(scene, np.asarray(thetas))
+        valid = outside & [admissible(theta) for theta in np.asarray(thetas)]
         if valid.sum() >= cases:
             return thetas[np.flatnonzero(valid)[:cases]]
         count *= 2
     raise InputError(f"outside {fraction:g}: next to nothing there is a value the scene takes")
-
-
-def _admissible(scene: Scene, thetas: np.ndarray) -> np.ndarray:
-    """Return whether law, loads and regions admit every entry of each theta (c, p), (c,) bool."""
-    quantities = [scene.quantities[name] for name in scene.parameter_names]
-    return np.array(
-        [
-            all(q.value_fault(float(v)) is None for q, v in zip(quantities, theta, strict=True))
-            for theta in thetas
-        ]
-    )
 
 
 class Reference(NamedTuple):
@@ -159,13 +153,10 @@ def outside_reference(
         numbers=range(len(inside.thetas), len(thetas)),
         starts=Neighbours(scene, thetas, solutions),
     )
-    rows = []
     for row in counting(results, "FEM outside", total=cases, disable=not progress, unit="run"):
         if row.converged:
-            rows.append(row)
             solutions[row.number] = Field(row.solution.displacement)
-    displacement = jnp.zeros((0, *scene.held.shape))
-    if rows:
-        displacement = jnp.stack([row.solution.displacement for row in rows])
-    numbers = np.array([row.number for row in rows], int)
-    return Reference(thetas[numbers], displacement, "our FEM", cases - len(rows))
+    numbers = np.array(list(solutions)[len(inside.thetas) :], int)
+    found = [solutions[number].displacement for number in numbers]
+    displacement = jnp.stack(found) if found else jnp.zeros((0, *scene.held.shape))
+    return Reference(thetas[numbers], displacement, "our FEM", cases - len(found))

@@ -22,14 +22,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +46,6 @@ from emulator.scenes.scene import Scene
 _MISSING = -1
 _FORMAT = 1
 _CHUNK = 1024  # rows whose numbers are one file
-_NUMBERS = ("energy", "iterations", "seconds", "status")
 _ROUND_OFF = 1e-9  # relative; theta of one design differ by round-off between machines
 _WORDS = {_MISSING: "not_solved"} | {
     int(s): s.name.lower() for s in Status if s is not Status.RUNNING
@@ -93,14 +91,14 @@ class ZarrRows(Mapping[int, Field]):
     """
 
     def __init__(self, group: zarr.Group) -> None:
-        self._group = group
+        self._arrays: dict[str, Any] = dict(group.arrays())
         self.thetas = _read(group, "theta")
-        self._numbers = {name: _read(group, name) for name in _NUMBERS}
-        self._converged = np.flatnonzero(self._numbers["status"] == Status.CONVERGED).tolist()
+        self._status = _read(group, "status")
+        self._converged = np.flatnonzero(self._status == Status.CONVERGED).tolist()
 
     def missing(self) -> list[int]:
         """Return the numbers of the theta that have no row."""
-        return np.flatnonzero(self._numbers["status"] == _MISSING).tolist()
+        return np.flatnonzero(self._status == _MISSING).tolist()
 
     def __len__(self) -> int:
         return len(self._converged)
@@ -109,37 +107,30 @@ class ZarrRows(Mapping[int, Field]):
         return iter(self._converged)
 
     def __getitem__(self, number: int) -> Field:
-        if self._numbers["status"][number] != Status.CONVERGED:
+        if self._status[number] != Status.CONVERGED:
             raise KeyError(number)
         slopes = self._arrays.get("sensitivities")
-        return Field(
-            self._arrays["displacement"][number], None if slopes is None else slopes[number]
-        )
+        u = self._arrays["displacement"][number]
+        return Field(u, None if slopes is None else slopes[number])
 
     def write(self, row: Row) -> None:
         """Write a row, its status last."""
         row = row.as_numpy()
         number, solution = row.number, row.solution
-        self._arrays["displacement"][number] = solution.displacement if row.converged else np.nan
-        if row.sensitivities is not None:
-            self._arrays["sensitivities"][number] = row.sensitivities
-        self._set("energy", number, row.energy)
-        self._set("iterations", number, solution.iterations)
-        self._set("seconds", number, row.seconds)
-        self._set("status", number, solution.status)
+        values = {
+            "displacement": solution.displacement if row.converged else np.nan,
+            "sensitivities": row.sensitivities,
+            "energy": row.energy,
+            "iterations": solution.iterations,
+            "seconds": row.seconds,
+            "status": solution.status,
+        }
+        for name, value in values.items():
+            if value is not None:
+                self._arrays[name][number] = value
+        self._status[number] = solution.status
         if row.converged:
             self._converged.append(number)
-
-    def _set(self, name: str, number: int, value: Any) -> None:
-        """Write one number with all others of its file, so that nothing need be read first."""
-        self._numbers[name][number] = value
-        first = number - number % _CHUNK
-        part = slice(first, first + _CHUNK)
-        self._arrays[name][part] = self._numbers[name][part]
-
-    @cached_property
-    def _arrays(self) -> dict[str, Any]:
-        return dict(self._group.arrays())
 
 
 @contextmanager
@@ -155,8 +146,10 @@ def writing(path: str | Path, campaign: Campaign) -> Iterator[ZarrRows]:
     if path.is_symlink() or path.exists():
         _open_store(path)
     with exclusive(path, "campaign"):
-        if not path.exists():
-            _make_at(path, campaign)
+        if not path.exists():  # written completely or not at all
+            with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+                make_store(Path(folder) / "store", campaign)
+                (Path(folder) / "store").rename(path)
         group = zarr.open_group(path, mode="r+", use_consolidated=False)
         _check_campaign(path, group, campaign)
         yield ZarrRows(group)
@@ -210,35 +203,37 @@ def _short(value: Any) -> str:
     return "other solver options" if isinstance(value, dict) else str(value)
 
 
-def _make_at(path: Path, campaign: Campaign) -> None:
-    """Write a store without rows, completely or not at all."""
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
-    try:
-        make_store(temporary / "store", campaign)
-        (temporary / "store").rename(path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
 def make_store(store: Any, campaign: Campaign) -> zarr.Group:
     """Make a group without rows in ``store``, a path or a Zarr store."""
     scene, thetas = campaign.scene, campaign.thetas
-    group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=_attributes(campaign))
-    rows, nodes = len(thetas), len(scene.mesh.nodes)
-    by_row, field = ("theta_id",), ("node", "xyz")
+    attributes = {
+        "kind": "campaign",
+        "format": _FORMAT,
+        "scene": scene.name,
+        "fingerprint": scene.fingerprint,
+        "origin": json.loads(json.dumps(dict(scene.origin))),
+        "options": campaign.options,
+        **campaign.about,
+    }
+    group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
+    rows, by_row = len(thetas), ("theta_id",)
+    field = {"node": len(scene.mesh.nodes), "xyz": 3}
 
     def filled(name: str, values: Any, dimensions: tuple[str, ...], **attrs: Any) -> None:
         if isinstance(values, list):
             values = np.array(values, dtype=np.dtypes.StringDType())
         group.create_array(name, data=values, dimension_names=dimensions, attributes=attrs)
 
-    def empty(name: str, shape: tuple[int, ...], dimensions: tuple[str, ...], **attrs: Any) -> None:
+    def empty(
+        name: str, dtype: str = "float64", dimensions: Mapping[str, int] = {}, **attrs: Any
+    ) -> None:
+        shape = tuple(dimensions.values())
         group.create_array(
             name,
             shape=(rows, *shape),
             chunks=(1, *shape) if shape else (_CHUNK,),
-            dtype=attrs.pop("dtype", "float64"),
-            fill_value=attrs.pop("missing", np.nan),
+            dtype=dtype,
+            fill_value=np.nan if dtype == "float64" else _MISSING,
             dimension_names=(*by_row, *dimensions),
             attributes=attrs,
         )
@@ -248,43 +243,22 @@ def make_store(store: Any, campaign: Campaign) -> zarr.Group:
     filled("unit", [p.unit for p in scene.parameters], ("parameter",), long_name="of theta")
     filled("theta", thetas, (*by_row, "parameter"))
     filled("hash", campaign.hashes(thetas), by_row, long_name="SHA-256 of scene, theta and options")
-    filled("reference", np.asarray(scene.mesh.nodes), field, units="mm")
-    empty("displacement", (nodes, 3), field, units="mm")
+    filled("reference", np.asarray(scene.mesh.nodes), tuple(field), units="mm")
+    empty("displacement", dimensions=field, units="mm")
     if campaign.solver.sensitivities:
-        shape = (len(scene.parameters), nodes, 3)
+        by_parameter = {"parameter": len(scene.parameters), **field}
         about = "du/dtheta, mm per unit of each parameter"
-        empty("sensitivities", shape, ("parameter", *field), long_name=about)
-    empty("energy", (), (), units="mN mm")
-    empty("iterations", (), (), dtype="int32", missing=_MISSING)
-    empty("seconds", (), (), units="s")
-    empty(
-        "status",
-        (),
-        (),
-        dtype="int8",
-        missing=_MISSING,
-        flag_values=list(_WORDS),
-        flag_meanings=" ".join(_WORDS.values()),
-    )
+        empty("sensitivities", dimensions=by_parameter, long_name=about)
+    empty("energy", units="mN mm")
+    empty("iterations", "int32")
+    empty("seconds", units="s")
+    meanings = " ".join(_WORDS.values())
+    empty("status", "int8", flag_values=list(_WORDS), flag_meanings=meanings)
     with warnings.catch_warnings():
         # Zarr warns that the format's text does not have it yet; xarray warns where it is absent.
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(group.store)
     return group
-
-
-def _attributes(campaign: Campaign) -> dict[str, Any]:
-    """Return the attributes of the store, plain JSON."""
-    scene = campaign.scene
-    return {
-        "kind": "campaign",
-        "format": _FORMAT,
-        "scene": scene.name,
-        "fingerprint": scene.fingerprint,
-        "origin": json.loads(json.dumps(dict(scene.origin))),
-        "options": campaign.options,
-        **campaign.about,
-    }
 
 
 def count_statuses(path: str | Path) -> dict[str, int]:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any, NamedTuple
 
 import jax
@@ -100,21 +101,16 @@ class Solver:
         energy = jnp.asarray(jnp.nan)
         if self.energy and solution.converged:
             energy = self._energy(solution.displacement, theta)
-        solution, slopes = (
-            self._with_slopes(solution, theta) if self.sensitivities else (solution, None)
-        )
+        slopes = None
+        if self.sensitivities:
+            slopes = jnp.full((len(theta), *solution.displacement.shape), jnp.nan)
+            try:
+                if solution.converged:
+                    slopes = self.simulator.sensitivities(solution.displacement, theta)
+            except SolverError:  # a singular tangent is a failed solve
+                solution = solution._replace(status=jnp.asarray(Status.SINGULAR_TANGENT))
+            jax.block_until_ready(slopes)
         return Row(task.number, theta, solution, energy, slopes, time.perf_counter() - began)
-
-    def _with_slopes(self, solution: Solution, theta: jax.Array) -> tuple[Solution, jax.Array]:
-        """Return the solution and du/dtheta; a singular tangent is a failed solve."""
-        missing = jnp.full((len(theta), *solution.displacement.shape), jnp.nan)
-        if not solution.converged:
-            return solution, missing
-        try:
-            slopes = self.simulator.sensitivities(solution.displacement, theta)
-            return solution, jax.block_until_ready(slopes)
-        except SolverError:
-            return solution._replace(status=jnp.asarray(Status.SINGULAR_TANGENT)), missing
 
     def _start(self, starts: Sequence[Any], theta: jax.Array) -> jax.Array | None:
         """Return the start with the smallest residual; None for the start at rest.
@@ -181,9 +177,8 @@ def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int)
     as a start from earlier rows, does not depend on which thread was quicker. While the threads
     work, as many factors are kept as there are threads.
     """
-    for task in tasks:
+    for task in islice(tasks, 1):
         yield function(task)
-        break
     if workers == 1:
         yield from map(function, tasks)
         return
