@@ -9,7 +9,7 @@ exports is listed in ``__init__.pyi`` and imported when first used.
 
 import lazy_loader
 
-from emulator.core import precision  # noqa: F401 - before JAX makes its first array
+from emulator.core import machine  # noqa: F401 - float64, before JAX makes its first array
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

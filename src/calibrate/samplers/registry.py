@@ -13,7 +13,7 @@ from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS
 from calibrate.samplers.protocol import Sampler
 from calibrate.samplers.smc import SMC
 from emulator.core.errors import InputError, look_up
-from emulator.core.schema import parse, table_of
+from emulator.core.schema import Source, parse, table_of
 
 _ALL: tuple[Sampler, ...] = (NUTS, BLACKJAX_NUTS, MCLMC, DELAYED_ACCEPTANCE, SMC, LAPLACE)
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
@@ -53,5 +53,6 @@ def options_from(
         A name that the sampler has no option of, or a value of another type.
     """
     options = sampler.options.sized(warmup=warmup, draws=draws, chains=chains)
-    parse(table_of(sampler.options), dict(values), f"sampler '{sampler.name}'", toml=False)
+    source = Source(f"sampler '{sampler.name}'", dict(values), toml=False)
+    parse(table_of(sampler.options), source)
     return replace(options, **values)

@@ -6,7 +6,6 @@
 ``store``           files that are written whole or not at all; arrays as safetensors
 ``representation``  how objects show themselves in a terminal and in a notebook
 ``progress``        progress of long work
-``machine``         cores, memory and devices of this machine
-``precision``       float64, the project's one global switch
+``machine``         cores, memory and devices of this machine; the switch to float64
 ==================  ==========================================================================
 """

@@ -42,10 +42,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from emulator.core.minimise import minimise
 
 JITTER = 1e-9  # added to the variance 1 of each observation, because FEM has no noise
-_LOG_LOW, _LOG_HIGH = (
-    -6.0,
-    3.0,
-)  # bounds of the logarithms of inverse lengths; inputs are of order 1
+_LOG_LOW, _LOG_HIGH = -6.0, 3.0  # of the logarithms of inverse lengths; inputs are of order 1
 
 
 def squared_exponential(squared: Any) -> Any:

@@ -10,37 +10,14 @@ import json
 import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path as FilePath
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Discriminator,
-    GetCoreSchemaHandler,
-    GetJsonSchemaHandler,
-    Tag,
-    ValidationError,
-    ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    create_model,
-    field_validator,
-    model_validator,
-)
-from pydantic import Field as Entry
-from pydantic.json_schema import JsonSchemaValue
+import pydantic
+from pydantic import BaseModel, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
 
 from emulator.core.docstrings import documented, summary
@@ -62,7 +39,7 @@ _EXPECTED = {
 class Table(BaseModel):
     """A table of a file: no other keys than its fields, no value of another type."""
 
-    model_config = ConfigDict(
+    model_config = pydantic.ConfigDict(
         extra="forbid",
         strict=True,
         frozen=True,
@@ -70,7 +47,7 @@ class Table(BaseModel):
         use_attribute_docstrings=True,  # a text below a field describes it in the schema
     )
 
-    @model_validator(mode="before")
+    @pydantic.model_validator(mode="before")
     @classmethod
     def _check_keys(cls, data: Any) -> Any:
         if not isinstance(data, dict):
@@ -87,10 +64,13 @@ class Table(BaseModel):
                 raise _mistake(problem=f"key '{key}' is missing; expected {expected}")
         return data
 
-    @field_validator("*", mode="wrap")
+    @pydantic.field_validator("*", mode="wrap")
     @classmethod
     def _check_value(
-        cls, value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+        cls,
+        value: Any,
+        handler: pydantic.ValidatorFunctionWrapHandler,
+        info: pydantic.ValidationInfo,
     ) -> Any:
         annotation = cls.model_fields[str(info.field_name)].annotation
         if any(get_origin(kind) is tuple for kind in (annotation, *get_args(annotation))):
@@ -123,12 +103,16 @@ class OneOf:
         """Return a table of each choice, made once, so that a schema defines it once."""
         return tuple(table_of(choice, self.key, name) for name, choice in self.choices.items())
 
-    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, _: Any, handler: pydantic.GetCoreSchemaHandler
+    ) -> CoreSchema:
         members = tuple(
-            Annotated[table, AfterValidator(_builder(choice, self.key)), Tag(name)]
+            Annotated[
+                table, pydantic.AfterValidator(_builder(choice, self.key)), pydantic.Tag(name)
+            ]
             for table, (name, choice) in zip(self._tables, self.choices.items(), strict=True)
         )
-        tag = Discriminator(
+        tag = pydantic.Discriminator(
             self._tag,
             custom_error_type="choice",
             custom_error_message="choice",
@@ -137,8 +121,8 @@ class OneOf:
         return handler.generate_schema(Annotated[Union[members], tag])  # noqa: UP007
 
     def __get_pydantic_json_schema__(
-        self, core: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> JsonSchemaValue:
+        self, core: CoreSchema, handler: pydantic.GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         """Return the schema of the tables, each of which but the default's needs its ``key``."""
         schema = handler(core)
         for name, member in zip(self.choices, schema["oneOf"], strict=True):
@@ -196,24 +180,16 @@ class Source:
         return f"[{'.'.join(map(str, path))}]"
 
 
-def parse[Model: BaseModel](
-    model: type[Model],
-    mapping: Any,
-    where: str,
-    lines: Mapping[Path, int] | None = None,
-    *,
-    toml: bool = True,
-) -> Model:
-    """Return plain data of the file ``where`` as a model.
+def parse[Model: BaseModel](model: type[Model], source: Source) -> Model:
+    """Return plain data of a file as a model.
 
     Raises
     ------
     InputError
         The first mistake: file, line and key, what was found and what would be right.
     """
-    source = Source(where, mapping, lines or {}, toml)
     try:
-        return model.model_validate(mapping)
+        return model.model_validate(source.data)
     except ValidationError as caught:
         raise _first_mistake(source, caught.errors(include_url=False)[0]) from None
 
@@ -226,20 +202,16 @@ def read_json_as[Kind](kind: type[Kind], path: str | FilePath) -> Kind:
 
 
 def read_as[Kind](
-    kind: type[Kind],
-    mapping: Any,
-    where: str,
-    lines: Mapping[Path, int] | None = None,
-    *,
-    toml: bool = False,
+    kind: type[Kind], data: Any, where: str, lines: Mapping[Path, int] = {}, *, toml: bool = False
 ) -> Kind:
     """Return the dataclass ``kind`` from plain data of ``where``; errors as in :func:`parse`."""
-    table = parse(table_of(kind), mapping, where, lines, toml=toml)
+    source = Source(where, data, lines, toml)
+    table = parse(table_of(kind), source)
     try:
         return _builder(kind)(table)
     except InputError as error:
         first_word = str(error).split(" ", 1)[0]  # the message often begins with the field
-        raise Source(where, mapping, lines or {}, toml).error(str(error), (first_word,)) from error
+        raise source.error(str(error), (first_word,)) from error
 
 
 def describe(value: Any) -> dict[str, Any]:
@@ -281,15 +253,16 @@ def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:
     entries: dict[str, Any] = {key: (Literal[tag], tag)} if key else {}
     for entry in (each for each in fields(kind) if each.compare):
         required = entry.default is MISSING and entry.default_factory is MISSING
-        # np.ndarray stands for a vector in a file. Defaults are left to the dataclass.
+        # np.ndarray stands for a vector in a file. Defaults are left to the dataclass, and shown.
         hint = tuple[float, float, float] if hints[entry.name] is np.ndarray else hints[entry.name]
-        about = _shown_default(entry)
-        text = documented(kind).get(entry.name)
-        entries[entry.name] = (
-            hint,
-            Entry(... if required else None, description=text, json_schema_extra=about),
+        shown = None if entry.default is MISSING else json.loads(json.dumps(entry.default))
+        about = pydantic.Field(
+            ... if required else None,
+            description=documented(kind).get(entry.name),
+            json_schema_extra=None if shown is None else {"default": shown},
         )
-    return create_model(kind.__name__, __base__=Table, __doc__=summary(kind), **entries)
+        entries[entry.name] = (hint, about)
+    return pydantic.create_model(kind.__name__, __base__=Table, __doc__=summary(kind), **entries)
 
 
 def json_schema(model: type[Table]) -> dict[str, Any]:
@@ -299,13 +272,6 @@ def json_schema(model: type[Table]) -> dict[str, Any]:
     """
     schema = model.model_json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_for_files(schema)}
-
-
-def _shown_default(entry: Field[Any]) -> dict[str, Any] | None:
-    """Return the dataclass's default as the schema shows it."""
-    if entry.default is MISSING or entry.default is None:
-        return None
-    return {"default": json.loads(json.dumps(entry.default))}
 
 
 def _for_files(node: Any) -> Any:

@@ -20,8 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
-from emulator.core.machine import require_cpu
-from emulator.core.precision import require_float64
+from emulator.core.machine import require_cpu, require_float64
 from emulator.core.representation import TableRepr
 from emulator.fem.assembly import System
 from emulator.fem.compiled import scan

@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError, look_up
-from emulator.core.precision import require_float64
+from emulator.core.machine import require_float64
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, while_loop
 from emulator.fem.derivatives import (

@@ -54,7 +54,7 @@ def read_scene(path: str | Path) -> Scene:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"scene file {path} is not valid TOML: {error}") from error
     source = Source(f"scene file {path}", entries, toml_lines(text))
-    return _scene(path, parse(SceneFile, entries, source.name, source.lines), source)
+    return _scene(path, parse(SceneFile, source), source)
 
 
 def _scene(path: Path, file: SceneFile, source: Source) -> Scene:

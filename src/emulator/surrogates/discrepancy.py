@@ -25,7 +25,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import Features, fit_lengths, fit_weights, fold, mean
-from emulator.core.precision import require_float64
+from emulator.core.machine import require_float64
 from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
 from emulator.surrogates.part import ArrayPart, CachedPart

@@ -22,7 +22,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import squared_exponential
-from emulator.core.precision import require_float64
+from emulator.core.machine import require_float64
 from emulator.fem.campaign import Runs, run_campaign
 from emulator.fem.campaign.designs import sobol
 from emulator.scenes.scene import Scene, all_nodes

@@ -1,14 +1,21 @@
-"""Where JAX computes: FEM refuses an accelerator in one line, and threads compute where asked."""
+"""Where JAX computes: FEM refuses an accelerator in one line, and threads compute where asked.
+
+Where float64 has been switched off, what needs it says so; what does not, works.
+"""
 
 import os
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import emulator as em
 from emulator.core import machine
 from emulator.core.errors import InputError
+from emulator.surrogates.pod_gp import ReducedForward
 
 THREADS = """
 import jax
@@ -38,3 +45,40 @@ def test_threads_compute_where_the_one_that_asked_does():
         env=environment, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert told.returncode == 0, told.stderr
+
+
+def test_fem_needs_float64(beam):
+    with jax.enable_x64(False), pytest.raises(InputError, match="FEM needs float64"):
+        em.Simulator(beam).solve(np.asarray(beam.centre))
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_discrepancy_model_needs_float64(compiled):
+    """Its weights are large and cancel: the shipped ventricle was 9 mm off in float32."""
+    forward = em.load("once_clamped_beam").cache(np.array([3]))
+    call = jax.jit(forward) if compiled else forward
+    theta = np.asarray(forward.scene.centre)
+    with jax.enable_x64(False), pytest.raises(InputError, match="discrepancy model needs float64"):
+        call(jnp.asarray(theta, jnp.float32))
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_reduced_model_needs_float64(beam, compiled):
+    """As large: that of 30 runs of the shipped beam was 2 mm off, and 1e-5 mm in float64."""
+    inputs, ones = np.array([[0.2, 0.3], [0.6, 0.5], [0.8, 0.1]]), np.ones((1, 3))
+    forward = ReducedForward(beam, np.array([3]), np.zeros((1, 3)), ones[None], inputs, ones[:, :2],
+                             ones)  # fmt: skip
+    call = jax.jit(forward) if compiled else forward
+    with jax.enable_x64(False), pytest.raises(InputError, match="reduced model needs float64"):
+        call(jnp.asarray(beam.centre, jnp.float32))
+
+
+@pytest.mark.filterwarnings("ignore:Explicitly requested dtype")
+def test_a_network_alone_works_in_float32():
+    forward = em.load("once_clamped_beam_pignn").cache(np.array([3]))
+    theta = np.asarray(forward.scene.centre)
+    wide = np.asarray(forward(jnp.asarray(theta)))
+    with jax.enable_x64(False):
+        narrow = np.asarray(forward(jnp.asarray(theta, jnp.float32)))
+    assert narrow.dtype == np.float32
+    np.testing.assert_allclose(narrow, wide, rtol=1e-5, atol=1e-5)

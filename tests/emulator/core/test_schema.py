@@ -8,7 +8,7 @@ import pytest
 
 from emulator.core.errors import InputError
 from emulator.core.line_index import toml_lines
-from emulator.core.schema import OneOf, Table, expectation, parse, read_json_as
+from emulator.core.schema import OneOf, Source, Table, expectation, parse, read_json_as
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def test_json_that_is_no_table(tmp_path):
 
 def test_a_table_is_one_of_several_dataclasses():
     content = [{"radius": 1}, {"kind": "rod", "length": 2.0}, {"radius": 1, "centre": [1, 2, 3]}]
-    first, second, third = parse(Shapes, {"shapes": content}, "file").shapes
+    first, second, third = parse(Shapes, Source("file", {"shapes": content})).shapes
     assert isinstance(first, Ball)
     np.testing.assert_array_equal(first.centre, np.zeros(3))
     assert second == Rod(2.0)
@@ -144,13 +144,13 @@ def test_a_table_is_one_of_several_dataclasses():
 )
 def test_one_line_for_every_mistake_in_toml(text, message):
     with pytest.raises(InputError) as caught:
-        parse(Shapes, tomllib.loads(text), "file", toml_lines(text))
+        parse(Shapes, Source("file", tomllib.loads(text), toml_lines(text)))
     assert str(caught.value).endswith(message)
 
 
 def test_a_long_value_is_shortened():
     with pytest.raises(InputError) as caught:
-        parse(Shapes, {"name": list(range(1000))}, "file")
+        parse(Shapes, Source("file", {"name": list(range(1000))}))
     assert len(str(caught.value)) < 120
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from cli_support import SCENE, write_block
 from emulator.core.errors import InputError
-from emulator.core.schema import expectation, parse, table_of
+from emulator.core.schema import Source, expectation, parse, table_of
 from emulator.mechanics.laws import LAWS
 from emulator.scenes.draft import draft_scene
 from emulator.scenes.fibre_rules import FIBRE_RULES
@@ -49,7 +49,7 @@ def written():
 @pytest.mark.parametrize("text", written())
 def test_what_the_reader_admits_the_schema_admits(validator, text):
     scene = tomllib.loads(text)
-    parse(SceneFile, scene, "scene.toml")
+    parse(SceneFile, Source("scene.toml", scene))
     assert not [error.message for error in validator.iter_errors(scene)]
 
 
@@ -79,7 +79,7 @@ def test_what_both_refuse(validator, old, new):
     assert old in SCENE
     scene = tomllib.loads(SCENE.replace(old, new))
     with pytest.raises(InputError, match=r"scene\.toml"):
-        parse(SceneFile, scene, "scene.toml")
+        parse(SceneFile, Source("scene.toml", scene))
     assert not validator.is_valid(scene)
 
 
