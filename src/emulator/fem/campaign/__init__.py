@@ -17,15 +17,7 @@ from emulator.fem.campaign.campaign import (
     solve_rows,
     solve_together,
 )
-from emulator.fem.campaign.workers import (
-    Executor,
-    Row,
-    Solver,
-    Task,
-    at_once,
-    in_order,
-    in_process,
-)
+from emulator.fem.campaign.workers import Executor, Row, Solver, Task, at_once, in_order, in_process
 
 __all__ = [
     "Executor",

@@ -131,12 +131,7 @@ def fem_reference(simulator: Simulator, cases: int, *, progress: bool = False) -
 
 
 def outside_reference(
-    simulator: Simulator,
-    cases: int,
-    fraction: float,
-    inside: Reference,
-    *,
-    progress: bool = False,
+    simulator: Simulator, cases: int, fraction: float, inside: Reference, *, progress: bool = False
 ) -> Reference:
     """Solve outside the box, each run started from the nearest solution, or else from rest.
 

@@ -78,10 +78,7 @@ class Pattern:
         if x.ndim == 2:
             return jax.vmap(lambda column: self.product(values, column), 1, 1)(x)
         stored_part = jax.ops.segment_sum(
-            values * x[self.columns],
-            self.rows,
-            num_segments=self.size,
-            indices_are_sorted=True,
+            values * x[self.columns], self.rows, num_segments=self.size, indices_are_sorted=True
         )
         if not self.upper:
             return stored_part
