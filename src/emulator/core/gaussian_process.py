@@ -32,6 +32,7 @@ as differentiation rules: differentiating the root itself would lose four digits
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -71,47 +72,29 @@ CORRELATIONS: dict[str, Callable[[Any], Any]] = {
 """Correlation functions that options call by name."""
 
 
-class Matern72(NamedTuple):
-    """Matern's correlation of smoothness 7/2 and its first two derivatives in the squared distance.
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def matern72(squared: jax.Array, order: int = 0) -> jax.Array:
+    """Return Matern 7/2, or its first or second derivative, at squared scaled distances.
 
-    The three arrays have the shape of the distances.
+    It is smooth where they are zero.
     """
+    a = _root(squared)
+    if order == 0:
+        return (1.0 + a + 0.4 * a**2 + a**3 / 15.0) * jnp.exp(-a)
+    if order == 1:
+        return -0.7 * (1.0 + a + a**2 / 3.0) * jnp.exp(-a)
+    return 49.0 / 60.0 * (1.0 + a) * jnp.exp(-a)
 
-    value: jax.Array
-    first: jax.Array
-    second: jax.Array
 
-
-def matern72(squared: jax.Array) -> Matern72:
-    """Return Matern 7/2 at squared scaled distances of any shape; smooth where they are zero."""
-    return Matern72(_value(squared), _first(squared), _second(squared))
+@matern72.defjvp
+def _matern72_slope(order: int, squared: Any, change: Any) -> tuple[jax.Array, jax.Array]:
+    third = lambda s, _: -343.0 / 120.0 * jnp.exp(-_root(s))  # noqa: E731
+    derivative = (third if order == 2 else matern72)(squared[0], order + 1)
+    return matern72(squared[0], order), derivative * change[0]
 
 
 def _root(squared: jax.Array) -> jax.Array:
     return jnp.sqrt(7.0 * squared + 1e-24)  # the root's own derivative is infinite at zero
-
-
-@jax.custom_jvp
-def _value(squared: jax.Array) -> jax.Array:
-    a = _root(squared)
-    return (1.0 + a + 0.4 * a**2 + a**3 / 15.0) * jnp.exp(-a)
-
-
-@jax.custom_jvp
-def _first(squared: jax.Array) -> jax.Array:
-    a = _root(squared)
-    return -0.7 * (1.0 + a + a**2 / 3.0) * jnp.exp(-a)
-
-
-@jax.custom_jvp
-def _second(squared: jax.Array) -> jax.Array:
-    a = _root(squared)
-    return 49.0 / 60.0 * (1.0 + a) * jnp.exp(-a)
-
-
-_value.defjvps(lambda change, _, squared: _first(squared) * change)
-_first.defjvps(lambda change, _, squared: _second(squared) * change)
-_second.defjvps(lambda change, _, squared: -343.0 / 120.0 * jnp.exp(-_root(squared)) * change)
 
 
 class Features(NamedTuple):
@@ -130,13 +113,13 @@ def covariance(features: Features) -> jax.Array:
     psi, J = features
     count, parameters = len(psi), J.shape[2]
     gap = psi[:, None] - psi[None]
-    k = matern72(jnp.sum(gap**2, axis=-1))
+    value, first, second = (matern72(jnp.sum(gap**2, axis=-1), order) for order in range(3))
     left = jnp.einsum("ijq,iqa->ija", gap, J)  # delta J_x
     right = jnp.einsum("ijq,jqb->ijb", gap, J)
-    crossed = -4.0 * k.second[..., None, None] * left[..., :, None] * right[..., None, :]
-    crossed += -2.0 * k.first[..., None, None] * jnp.einsum("iqa,jqb->ijab", J, J)
-    top = jnp.concatenate([k.value[..., None], -2.0 * k.first[..., None] * right], axis=-1)
-    rest = jnp.concatenate([2.0 * k.first[..., None, None] * left[..., None], crossed], axis=-1)
+    crossed = -4.0 * second[..., None, None] * left[..., :, None] * right[..., None, :]
+    crossed += -2.0 * first[..., None, None] * jnp.einsum("iqa,jqb->ijab", J, J)
+    top = jnp.concatenate([value[..., None], -2.0 * first[..., None] * right], axis=-1)
+    rest = jnp.concatenate([2.0 * first[..., None, None] * left[..., None], crossed], axis=-1)
     blocks = jnp.concatenate([top[:, :, None], rest], axis=2)
     return blocks.transpose(0, 2, 1, 3).reshape([count * (1 + parameters)] * 2)
 
@@ -206,7 +189,9 @@ def mean(
     value_weights, derivative_weights : the weights (c, r) and (c, q, r) from :func:`fold`.
     """
     gap = at - known
-    k = matern72(jnp.sum(gap**2, axis=-1))
+    squared = jnp.sum(gap**2, axis=-1)
     count, width, outputs = derivative_weights.shape
-    along = (-2.0 * k.first[:, None] * gap).reshape(count * width)
-    return k.value @ value_weights + along @ derivative_weights.reshape(count * width, outputs)
+    along = (-2.0 * matern72(squared, 1)[:, None] * gap).reshape(count * width)
+    return matern72(squared) @ value_weights + along @ derivative_weights.reshape(
+        count * width, outputs
+    )

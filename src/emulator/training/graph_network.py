@@ -21,10 +21,8 @@ from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
 from emulator.fem.campaign.designs import uniform
 from emulator.surrogates.emulator import Emulator
-from emulator.surrogates.network.graph import augment
-from emulator.surrogates.network.part import fresh
 from emulator.surrogates.taylor import constant
-from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, with_network_of
+from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, untrained
 from emulator.training.objectives import (
     Batch,
     Objective,
@@ -115,8 +113,7 @@ class GraphNetwork(BatchPlan):
         else:
             series = None
             scale = np.full(3, np.sqrt(np.mean(np.asarray(runs.displacement[0]) ** 2)))
-        network = fresh(scene, augment(scene), architecture, scale, self.seed)
-        emulator = with_network_of(Emulator(scene, taylor=series, network=network), job.start)
+        emulator = untrained(plan, job, series, architecture, scale)
         training = batch_training(emulator, plan, self.rate, runs)
         return Problem(plan, emulator, runs, training)
 

@@ -19,13 +19,11 @@ import numpy as np
 
 from emulator.fem import Simulator
 from emulator.surrogates.emulator import Emulator
-from emulator.surrogates.network.graph import augment
-from emulator.surrogates.network.part import fresh
 from emulator.surrogates.taylor import Expansion
 from emulator.training.checkpoint import Record
 from emulator.training.graph_network import BatchPlan, batch_training
 from emulator.training.mechanics import add_discrepancy, series_and_runs
-from emulator.training.network_plan import Problem, architecture_of, with_network_of
+from emulator.training.network_plan import Problem, architecture_of, untrained
 from emulator.training.objectives import Objective, component_scales
 from emulator.training.optimiser import cosine
 from emulator.training.plan import Job, check_order
@@ -79,8 +77,7 @@ class Hybrid(BatchPlan):
         plan = self.with_counts(simulations=len(runs.theta) - 1)
         scale = component_scales(scene, runs, from_runs=self.learns_from_runs)
         basis = (mechanical_modes(simulator, series, self.modes) / scale).astype(np.float32)
-        network = fresh(scene, augment(scene), architecture, scale, self.seed, basis)
-        emulator = with_network_of(Emulator(scene, taylor=series, network=network), job.start)
+        emulator = untrained(plan, job, series, architecture, scale, basis)
         training = batch_training(emulator, plan, cosine(self.learning_rate), runs, self.freeze)
         return Problem(plan, emulator, runs, training)
 

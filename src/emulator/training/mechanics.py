@@ -32,23 +32,48 @@ FEM_SHARE = 0.3
 
 
 @dataclass(frozen=True)
-class Mechanics(Plan):
-    """A Taylor series and a discrepancy model.
+class DiscrepancyPlan(Plan):
+    """The options of recipes that fit a discrepancy model and train no network.
 
     Parameters
     ----------
-    simulations : the number of FEM runs, with their sensitivities.
-    order : the order of the series; 0 is the FEM solution at the centre of the box.
+    simulations : the number of FEM runs on the scene's own mesh, with their sensitivities.
     """
 
-    recipe: str = "mechanics"
     simulations: int = 60
-    order: int = 3
     needs_slopes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_runs()
+
+    def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion | None]:
+        """Return the emulator without its discrepancy model, the FEM runs, and FEM's series."""
+        raise NotImplementedError
+
+    def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
+        """Return the emulator and its record."""
+        emulator, runs, series = self.prepare(job)
+        plan = self.with_counts(simulations=len(runs.theta) - 1)
+        session.write_plan(plan)
+        emulator, choice = add_discrepancy(emulator, runs, series)
+        return emulator, {**plan.record(), "discrepancy": choice}
+
+
+@dataclass(frozen=True)
+class Mechanics(DiscrepancyPlan):
+    """A Taylor series and a discrepancy model.
+
+    Parameters
+    ----------
+    order : the order of the series; 0 is the FEM solution at the centre of the box.
+    """
+
+    recipe: str = "mechanics"
+    order: int = 3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         check_order(self.order)
 
     def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion]:
@@ -63,14 +88,6 @@ class Mechanics(Plan):
         series, runs = series_and_runs(job, Simulator(scene), self, self.order)
         rest = series if family is None else series.less(family.cache(all_nodes(scene))).rounded()
         return Emulator(scene, taylor=rest, family=family), runs, series
-
-    def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
-        """Return the emulator and its record."""
-        emulator, runs, series = self.prepare(job)
-        plan = self.with_counts(simulations=len(runs.theta) - 1)
-        session.write_plan(plan)
-        emulator, choice = add_discrepancy(emulator, runs, series)
-        return emulator, {**plan.record(), "discrepancy": choice}
 
 
 def series_and_runs(
@@ -124,8 +141,8 @@ def add_discrepancy(
     )
 
     def fitted(bare: Emulator, some: Runs) -> Emulator:
-        model = fit_discrepancy(bare.scene, some, series, _mean(bare)).rounded()
-        return replace(bare, discrepancy=model)
+        mean = of_position(bare) if bare.parts else None
+        return replace(bare, discrepancy=fit_discrepancy(bare.scene, some, series, mean).rounded())
 
     sums = _sums(emulator, series)
     errors: dict[str, float] = {}
@@ -156,10 +173,8 @@ def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:
     return {" + ".join(sum_.parts) or "nothing": sum_ for sum_ in candidates}
 
 
-def _mean(emulator: Emulator) -> Callable[[jax.Array], jax.Array] | None:
-    """Return the displacement of all parts as a function of position; None without parts."""
-    if not emulator.parts:
-        return None
+def of_position(emulator: Emulator) -> Callable[[jax.Array], jax.Array]:
+    """Return the cached ``emulator`` as a function of the position in the unit box."""
     cached = emulator.cache()
     return lambda position: cached(emulator.scene.from_unit(position))
 

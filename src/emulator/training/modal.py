@@ -18,15 +18,13 @@ from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
 from emulator.fem.campaign.designs import design
 from emulator.surrogates.emulator import Emulator
-from emulator.surrogates.network.graph import augment
-from emulator.surrogates.network.part import fresh
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.taylor import constant
 from emulator.training.box_sweeps import check_sweeps, runs_of, sweep_box
 from emulator.training.checkpoint import Record, Session
 from emulator.training.mechanics import FEM_SHARE
 from emulator.training.mode_fit import ModeFit
-from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, with_network_of
+from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, untrained
 from emulator.training.objectives import loss_scales
 from emulator.training.optimiser import (
     NetworkTraining,
@@ -92,8 +90,7 @@ class Modal(NetworkPlan):
         series = constant(np.asarray(scene.to_unit(scene.centre)), runs.displacement[0])
         scales = loss_scales(scene, runs, from_runs=True)
         scale = np.full(3, scales.displacement)  # products of modes are the same in all directions
-        network = fresh(scene, augment(scene), architecture, scale, self.seed)
-        emulator = with_network_of(Emulator(scene, taylor=series, network=network), job.start)
+        emulator = untrained(plan, job, series, architecture, scale)
         assert emulator.network is not None, "it was made above"
         fit = ModeFit(scene, emulator.network, runs, scales)
         return Problem(plan, emulator, runs, mode_training(plan, fit))

@@ -20,8 +20,10 @@ from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.fem.energy import require_rest
 from emulator.surrogates.emulator import Emulator
-from emulator.surrogates.network.graph import node_inputs
+from emulator.surrogates.network.graph import augment, node_inputs
+from emulator.surrogates.network.part import fresh
 from emulator.surrogates.network.pignn import Architecture
+from emulator.surrogates.taylor import Expansion
 from emulator.training.checkpoint import Record, Session
 from emulator.training.optimiser import NetworkTraining, StepLimit, Steps, run
 from emulator.training.plan import Job, Plan
@@ -120,6 +122,23 @@ def with_network_of(emulator: Emulator, start: Emulator | None) -> Emulator:
     copies = jax.tree.map(jnp.copy, jax.tree.leaves(start.network.weights))
     structure = jax.tree.structure(emulator.network.weights)
     return with_weights(emulator, jax.tree.unflatten(structure, copies))
+
+
+def untrained(
+    plan: Plan,
+    job: Job,
+    series: Expansion | None,
+    architecture: Architecture,
+    scale: np.ndarray,
+    basis: np.ndarray | None = None,
+) -> Emulator:
+    """Return the emulator of ``series`` and of a network, with the weights of the start's, if any.
+
+    scale, basis : as in :class:`~emulator.surrogates.network.part.Network`.
+    """
+    scene = job.scene
+    network = fresh(scene, augment(scene), architecture, scale, plan.seed, basis)
+    return with_network_of(Emulator(scene, taylor=series, network=network), job.start)
 
 
 def architecture_of(

@@ -16,8 +16,9 @@ from emulator.surrogates.taylor import expand
 from emulator.training.box_sweeps import Map, check_sweeps, polynomial_part, sweep_box
 from emulator.training.checkpoint import Record, Session
 from emulator.training.family import family_on
+from emulator.training.mechanics import of_position
 from emulator.training.plan import Job, Plan, check_order
-from emulator.training.two_meshes import of_position, on_finer
+from emulator.training.two_meshes import on_finer
 
 
 @dataclass(frozen=True)

@@ -7,39 +7,27 @@ adds what the coarser mesh gets wrong.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
-
-import jax
 
 from emulator.catalogue import finer_of
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
+from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
 from emulator.surrogates.coarse import carried
 from emulator.surrogates.emulator import Emulator, load, save_emulator
-from emulator.training.checkpoint import CHECKPOINT, Record, Session, remove_checkpoint
-from emulator.training.mechanics import FEM_SHARE, Mechanics, add_discrepancy
+from emulator.surrogates.taylor import Expansion
+from emulator.training.checkpoint import CHECKPOINT, Session, remove_checkpoint
+from emulator.training.mechanics import FEM_SHARE, DiscrepancyPlan, Mechanics, of_position
 from emulator.training.plan import Job, Plan
 
 
 @dataclass(frozen=True)
-class TwoMeshes(Plan):
-    """An emulator on a coarser mesh, and a discrepancy model.
-
-    Parameters
-    ----------
-    simulations : the number of FEM runs on the scene's own mesh, with their sensitivities.
-    """
+class TwoMeshes(DiscrepancyPlan):
+    """An emulator on a coarser mesh, and a discrepancy model."""
 
     recipe: str = "two_meshes"
     simulations: int = 10
-    needs_slopes: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require_runs()
 
     def default_start(self, job: Job, *, resume: bool) -> Emulator:
         """Return an emulator on the mesh that the scene's is finer than, kept beside the rest."""
@@ -54,16 +42,13 @@ class TwoMeshes(Plan):
         remove_checkpoint(folder)
         return emulator
 
-    def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
-        """Return the emulator and its record."""
+    def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion | None]:
+        """Return the coarser mesh's emulator on this one, the FEM runs, and FEM's coarse series."""
         emulator = on_finer(job.start, job.scene, self)
         predictor, deadline = of_position(emulator), job.deadline(FEM_SHARE)
         runs = job.fem_runs(Simulator(job.scene), self, predictor, deadline)
-        plan = self.with_counts(simulations=len(runs.theta) - 1)
-        session.write_plan(plan)
         assert job.start is not None, "checked by on_finer"
-        emulator, choice = add_discrepancy(emulator, runs, job.start.taylor)
-        return emulator, {**plan.record(), "discrepancy": choice}
+        return emulator, runs, job.start.taylor
 
 
 def on_finer(start: Emulator | None, scene: Scene, plan: Plan) -> Emulator:
@@ -86,9 +71,3 @@ def on_finer(start: Emulator | None, scene: Scene, plan: Plan) -> Emulator:
             f"expected one of the mesh that finer:{scene.name} refines"
         )
     return Emulator(scene, coarse=carried(start.parts, body))
-
-
-def of_position(emulator: Emulator) -> Callable[[jax.Array], jax.Array]:
-    """Return the cached ``emulator`` as a function of the position in the unit box."""
-    cached = emulator.cache()
-    return lambda position: cached(emulator.scene.from_unit(position))

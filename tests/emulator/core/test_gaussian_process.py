@@ -61,19 +61,19 @@ def test_the_kernel_is_materns(features):
     distance = np.array([0.03, 0.4, 1.0, 2.7])
     z = np.sqrt(7.0) * distance
     expected = 2.0 ** (1.0 - 3.5) / gamma(3.5) * z**3.5 * kv(3.5, z)
-    np.testing.assert_allclose(kernel.matern72(distance**2).value, expected, rtol=1e-12)
+    np.testing.assert_allclose(kernel.matern72(distance**2), expected, rtol=1e-12)
 
 
 def test_radial_derivatives_by_differences_and_at_zero():
     squared, h = jnp.array([0.02, 0.5, 3.0]), 1e-6
-    ahead, behind = kernel.matern72(squared + h), kernel.matern72(squared - h)
-    at = kernel.matern72(squared)
-    np.testing.assert_allclose(at.first, (ahead.value - behind.value) / (2 * h), rtol=1e-7)
-    np.testing.assert_allclose(at.second, (ahead.first - behind.first) / (2 * h), rtol=1e-7)
-    third = jax.vmap(jax.grad(lambda s: kernel.matern72(s).second))(squared)
-    np.testing.assert_allclose(third, (ahead.second - behind.second) / (2 * h), rtol=1e-7)
+    for order in range(3):
+        k = lambda s, order=order: kernel.matern72(s, order)
+        expected = (k(squared + h) - k(squared - h)) / (2 * h)
+        np.testing.assert_allclose(jax.vmap(jax.grad(k))(squared), expected, rtol=1e-7)
+        if order < 2:
+            np.testing.assert_allclose(kernel.matern72(squared, order + 1), expected, rtol=1e-7)
     # To all digits where two inputs meet, not only finite.
-    chain = [lambda s: kernel.matern72(s).value]
+    chain = [kernel.matern72]
     for _ in range(3):
         chain.append(jax.grad(chain[-1]))
     expected = [1.0, -0.7, 49.0 / 60.0, -343.0 / 120.0]
