@@ -13,12 +13,12 @@ from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path as FilePath
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pydantic
 from pydantic import BaseModel, ValidationError
-from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from emulator.core.docstrings import documented, summary
 from emulator.core.errors import InputError, closest, look_up
@@ -99,43 +99,41 @@ class OneOf:
     default: str | None = None
 
     @cached_property
-    def _tables(self) -> tuple[type[Table], ...]:
+    def _tables(self) -> dict[str, type[Table]]:
         """Return a table of each choice, made once, so that a schema defines it once."""
-        return tuple(table_of(choice, self.key, name) for name, choice in self.choices.items())
+        return {name: table_of(choice, self.key, name) for name, choice in self.choices.items()}
 
     def __get_pydantic_core_schema__(
         self, _: Any, handler: pydantic.GetCoreSchemaHandler
     ) -> CoreSchema:
-        members = tuple(
-            Annotated[
-                table, pydantic.AfterValidator(_builder(choice, self.key)), pydantic.Tag(name)
-            ]
-            for table, (name, choice) in zip(self._tables, self.choices.items(), strict=True)
-        )
-        tag = pydantic.Discriminator(
-            self._tag,
-            custom_error_type="choice",
-            custom_error_message="choice",
-            custom_error_context={"key": self.key, "choices": json.dumps(list(self.choices))},
-        )
-        return handler.generate_schema(Annotated[Union[members], tag])  # noqa: UP007
+        tables = handler.generate_schema(Union[tuple(self._tables.values())])  # noqa: UP007
+        return core_schema.no_info_wrap_validator_function(self._read, tables)
+
+    def _read(self, data: Any, _: Any) -> Any:
+        """Return the dataclass that a table describes."""
+        if not isinstance(data, dict):
+            raise _mistake("a table")
+        expected = " or ".join(map(json.dumps, self.choices))
+        if self.key not in data and self.default is None:
+            raise _mistake(problem=f"key '{self.key}' is missing; expected {expected}")
+        tag = data.get(self.key, self.default)
+        if not isinstance(tag, str) or tag not in self.choices:
+            expected += closest(tag, self.choices)
+            raise _mistake(problem=f"{self.key} = {_shown(tag)}; expected {expected}", key=self.key)
+        return _built(self.choices[tag], self._tables[tag].model_validate(data), self.key)
 
     def __get_pydantic_json_schema__(
         self, core: CoreSchema, handler: pydantic.GetJsonSchemaHandler
     ) -> dict[str, Any]:
         """Return the schema of the tables, each of which but the default's needs its ``key``."""
-        schema = handler(core)
-        for name, member in zip(self.choices, schema["oneOf"], strict=True):
+        members = handler(core)["anyOf"]
+        for name, member in zip(self.choices, members, strict=True):
             table = handler.resolve_ref_schema(member)
             table["properties"][self.key] = {"const": name, "description": table["description"]}
             if name != self.default:
                 # A table that occurs in several places is visited several times.
                 table["required"] = list(dict.fromkeys([self.key, *table.get("required", ())]))
-        return schema
-
-    def _tag(self, data: Any) -> str | None:
-        tag = data.get(self.key, self.default) if isinstance(data, dict) else None
-        return tag if isinstance(tag, str) else None
+        return {"oneOf": members}
 
 
 @dataclass(frozen=True)
@@ -208,7 +206,7 @@ def read_as[Kind](
     source = Source(where, data, lines, toml)
     table = parse(table_of(kind), source)
     try:
-        return _builder(kind)(table)
+        return _built(kind, table)
     except InputError as error:
         first_word = str(error).split(" ", 1)[0]  # the message often begins with the field
         raise source.error(str(error), (first_word,)) from error
@@ -308,11 +306,9 @@ def expectation(annotation: Any) -> str | None:
     return None
 
 
-def _builder(kind: type, key: str = "") -> Any:
-    """Return the function that builds the dataclass from its table."""
-    return lambda table: kind(
-        **{name: getattr(table, name) for name in table.model_fields_set if name != key}
-    )
+def _built(kind: type, table: Table, key: str = "") -> Any:
+    """Return the dataclass of a table, whose ``key`` names the class."""
+    return kind(**{name: getattr(table, name) for name in table.model_fields_set if name != key})
 
 
 def _mistake(expected: str = "", *, problem: str = "", key: str = "") -> PydanticCustomError:
@@ -331,16 +327,9 @@ def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
         key = context["key"]
         return source.error(context["problem"], (*path, key) if key else path, path)
     expected = context.get("expected") or _EXPECTED.get(error["type"], "a table")
-    if error["type"] == "choice" and isinstance(value_found, dict):
-        choices, key = json.loads(context["choices"]), context["key"]
-        expected = " or ".join(map(json.dumps, choices))
-        if key not in value_found:
-            return source.error(f"key '{key}' is missing; expected {expected}", path, path)
-        path, value_found = (*path, key), value_found[key]
-        expected += closest(value_found, choices)
     if source.toml and expected == "a list":
         expected = f"tables [[{path[-1]}]]"
-    value = _shorten(json.dumps(value_found, default=str, ensure_ascii=False))
+    value = _shown(value_found)
     if expected == "a table" and path:
         return source.error(f"{source.written(path)} is {value}; expected a table", path)
     table, key = path[:-1], path[-1] if path else "content"
@@ -361,5 +350,6 @@ def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
 
 
-def _shorten(text: str) -> str:
+def _shown(value: Any) -> str:
+    text = json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."
