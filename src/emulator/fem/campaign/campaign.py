@@ -52,7 +52,12 @@ def solve_rows(
 def solve_together(simulator: Simulator, thetas: jax.Array) -> Solution:
     """Return solutions at every theta (c, p), converged or not; fields gain a leading axis."""
     rows = solve_rows(Solver(simulator), np.asarray(thetas))
-    return jax.tree.map(lambda *fields: jnp.stack(fields), *(row.solution for row in rows))
+    return _stacked([row.solution for row in rows])
+
+
+def _stacked[Fields](each: Sequence[Fields]) -> Fields:
+    stacked: Fields = jax.tree.map(lambda *fields: jnp.stack(fields), *each)
+    return stacked
 
 
 def executor(scheduler: str | None) -> AbstractContextManager[Executor]:
@@ -151,7 +156,6 @@ def run_campaign(
     deadline: float = np.inf,
     at_least: int = 1,
     progress: bool = False,
-    execute: Executor = in_process,
 ) -> Runs:
     """Solve at every theta (c, p).
 
@@ -178,22 +182,12 @@ def run_campaign(
     def begins(number: int) -> bool:
         return number < at_least or time.perf_counter() <= deadline
 
-    results = solve_rows(
-        solver,
-        thetas,
-        numbers=takewhile(begins, range(len(thetas))),
-        starts=Neighbours(simulator.scene, thetas, solutions, predictor),
-        execute=execute,
-    )
-    rows = list[Row]()
+    starts = Neighbours(simulator.scene, thetas, solutions, predictor)
+    numbers = takewhile(begins, range(len(thetas)))
+    results = solve_rows(solver, thetas, numbers=numbers, starts=starts)
+    runs = list[Runs]()
     for row in counting(results, "FEM", total=len(thetas), disable=not progress, unit="run"):
-        row.solution.require_converged(f"FEM run {row.number}")
-        rows.append(row)
-        solutions[row.number] = Field(row.solution.displacement, row.sensitivities)
-    rows.sort(key=lambda row: row.number)
-    return Runs(
-        jnp.stack([jnp.asarray(row.theta) for row in rows]),
-        jnp.stack([row.solution.displacement for row in rows]),
-        jnp.stack([row.energy for row in rows]),
-        jnp.stack([row.sensitivities for row in rows]) if sensitivities else None,
-    )
+        u = row.solution.require_converged(f"FEM run {row.number}").displacement
+        runs.append(Runs(row.theta, u, row.energy, row.sensitivities))
+        solutions[row.number] = Field(u, row.sensitivities)
+    return _stacked(runs)

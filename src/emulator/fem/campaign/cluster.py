@@ -143,21 +143,20 @@ class Cluster:
 
 
 @contextmanager
-def connected(address: str, *, within: float | None = None) -> Iterator[Cluster]:
+def connected(address: str) -> Iterator[Cluster]:
     """Yield a cluster whose scheduler is at ``address``.
 
     Raises
     ------
     InputError
-        The address is malformed, or nobody answers there in ``within`` seconds (10).
+        The address is malformed, or nobody answers there in 10 seconds.
     """
-    within = CONNECT_S if within is None else within
     check_address(address)
     try:
-        client = Client(address, timeout=within, set_as_default=False)
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"scheduler {address} does not answer within {within:g} s; is it running?"
+            f"scheduler {address} does not answer within {CONNECT_S:g} s; is it running?"
         ) from error
     cluster = Cluster(client, address)
     try:

@@ -22,7 +22,9 @@ import numpy as np
 
 from emulator.core.errors import SolverError
 from emulator.core.machine import cores, inherited, memory
-from emulator.fem.energy import potential_energy, volume_ratio
+from emulator.fem.assembly import System
+from emulator.fem.compiled import compiled
+from emulator.fem.energy import potential_energy
 from emulator.fem.linear.suitesparse import keeping_factors
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
@@ -120,28 +122,25 @@ class Solver:
         if self.simulator.scene.loaded_by:
             starts = starts[-1:]
         if len(starts) > 1:
-            return self._best(jnp.stack([jnp.asarray(start) for start in starts]), theta)
+            stacked = jnp.stack([jnp.asarray(start) for start in starts])
+            return _best(self.simulator.system, stacked, theta)
         return jnp.asarray(starts[0]) if starts else None
 
     @cached_property
     def _energy(self):  # noqa: ANN202 - a compiled program, private
         return jax.jit(potential_energy(self.simulator.scene))
 
-    @cached_property
-    def _best(self):  # noqa: ANN202
-        """Program that picks the start with the smallest residual among several (s, n, 3)."""
-        simulator = self.simulator
 
-        @jax.jit
-        def choose(starts: jax.Array, theta: jax.Array) -> jax.Array:
-            def residual(u: jax.Array) -> jax.Array:
-                error = simulator.system.relative_residual(u, theta)
-                valid = jnp.isfinite(error) & (jnp.min(volume_ratio(simulator.scene, u)) > 0.0)
-                return jnp.where(valid, error, jnp.inf)
+@compiled
+def _best(system: System, starts: jax.Array, theta: jax.Array) -> jax.Array:
+    """Return the start with the smallest residual among several (s, n, 3)."""
 
-            return starts[jnp.argmin(jax.lax.map(residual, starts))]
+    def residual(u: jax.Array) -> jax.Array:
+        error = system.relative_residual(u, theta)
+        valid = jnp.isfinite(error) & (system.least_volume_ratio(u) > 0.0)
+        return jnp.where(valid, error, jnp.inf)
 
-        return choose
+    return starts[jnp.argmin(jax.lax.map(residual, starts))]
 
 
 # ---- many solves ---------------------------------------------------------------------------------
