@@ -319,7 +319,12 @@ def _mistake(expected: str = "", *, problem: str = "", key: str = "") -> Pydanti
 
 def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
     """Return the line about one of pydantic's errors."""
-    path, value_found = _locate(source.data, error["loc"])
+    path: Path = ()
+    value_found = source.data
+    for step in error["loc"]:  # which also names the members of a union
+        inside = isinstance(value_found, dict) and step in value_found
+        if inside or (isinstance(value_found, list) and isinstance(step, int)):
+            path, value_found = (*path, step), value_found[step]
     context: dict[str, Any] = error.get("ctx", {})
     if error["type"] == "value_error":  # the dataclass refused its values
         return source.error(str(context["error"]), path, path)
@@ -334,16 +339,6 @@ def _first_mistake(source: Source, error: ErrorDetails) -> InputError:
         return source.error(f"{source.written(path)} is {value}; expected a table", path)
     table, key = path[:-1], path[-1] if path else "content"
     return source.error(f"{key} = {value}; expected {expected}", path, table)
-
-
-def _locate(data: Any, loc: Path) -> tuple[Path, Any]:
-    """Return the path and the value of an error; ``loc`` also names the members of a union."""
-    path: Path = ()
-    for step in loc:
-        inside = isinstance(data, dict) and step in data
-        if inside or (isinstance(data, list) and isinstance(step, int)):
-            path, data = (*path, step), data[step]
-    return path, data
 
 
 def _as_tuples(value: Any) -> Any:

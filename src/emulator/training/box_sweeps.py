@@ -252,16 +252,16 @@ def _sweep(
     usable_share = float(np.mean(usable & (steps.fraction >= _LEAST_FRACTION)))
     display = {"load": f"{level:.2f}", "taken": f"{usable_share:.2f}"}
     if not usable.any() or (state.rises and usable_share < _LEAST_SHARE):
-        after = _with_smaller_rise(state)
+        if state.rise > _LEAST_RISE:
+            after = state._replace(rise=state.rise / 2.0)
+        else:  # more sweeps at the level that is known
+            after = state._replace(rise=1.0 / _LEVELS, here=0, error=np.inf)
     else:
         new = Samples(position, steps.fields - below, steps.error).take(usable)
-        error = float(np.median(steps.step[usable]))
-        if state.rises:
-            after = _at_level(state, level, new, error)
-        else:
-            after = _with_targets(state, new, error)
-            display["energy gap"] = f"{np.median(steps.gap[usable]):.0e}"
+        after = _fitted(state, level, new, float(np.median(steps.step[usable])))
         after = after._replace(largest_error=steps.step[usable].max())
+        if not state.rises:
+            display["energy gap"] = f"{np.median(steps.gap[usable]):.0e}"
     display |= {"degree": f"{after.polynomial.degree}", "error_mm": f"{after.error:.1e}"}
     return after._replace(number=state.number + 1, taken=usable_share), display
 
@@ -275,47 +275,30 @@ def _next_level(state: SweepState) -> tuple[float, PolynomialFit]:
     return level, now._replace(coefficients=now.coefficients + reach * (now.coefficients - before))
 
 
-def _with_smaller_rise(state: SweepState) -> SweepState:
-    """Return the state after a level that was not reached: a lower one next, or more sweeps."""
-    if state.rise > _LEAST_RISE:
-        return state._replace(rise=state.rise / 2.0)
-    return state._replace(rise=1.0 / _LEVELS, here=0, error=np.inf)
+def _fitted(state: SweepState, level: float, new: Samples, error: float) -> SweepState:
+    """Return the state after targets ``new``, to which the median step is ``error``.
 
-
-def _at_level(state: SweepState, level: float, new: Samples, error: float) -> SweepState:
-    """Return the state at another ``level``, where the targets ``new`` are all that is known."""
-    polynomial = fit(new, state.polynomial.degree, error)
-    return state._replace(
-        polynomial=polynomial,
-        before=_pad(state.polynomial.coefficients, polynomial),
-        values=new,
-        here=1,
-        level=level,
-        rise=min(1.5 * state.rise, 1.0 / _LEVELS),
-        gap=level - state.level,
-        error=error,
-    )
-
-
-def _with_targets(state: SweepState, new: Samples, error: float) -> SweepState:
-    """Return the state after targets ``new`` at its level; ``error`` is the median step to them."""
-    degree = best_degree(state.values, new, state.polynomial.degree, error)
-    parameters = new.position.shape[1]
-    most = _TARGETS_PER_TERM * min(terms(parameters, degree + 1), MOST_TERMS)
-    known = state.values.followed_by(new).take(slice(-max(most, 4 * len(new.position)), None))
+    level : the level of the targets: a higher one, of which nothing else is known, or the state's.
+    """
+    if level != state.level:
+        known, degree, before = new, state.polynomial.degree, state.polynomial.coefficients
+        rise, gap = min(1.5 * state.rise, 1.0 / _LEVELS), level - state.level
+        state = state._replace(here=0, level=level, rise=rise, gap=gap)
+    else:
+        degree, before = (
+            best_degree(state.values, new, state.polynomial.degree, error),
+            state.before,
+        )
+        most = _TARGETS_PER_TERM * min(terms(new.position.shape[1], degree + 1), MOST_TERMS)
+        known = state.values.followed_by(new).take(slice(-max(most, 4 * len(new.position)), None))
     polynomial = fit(known, degree, error)
-    before, here = _pad(state.before, polynomial), state.here + 1
+    padded = np.zeros_like(polynomial.coefficients)  # terms of low degree come first
+    shared = min(len(padded), len(before))
+    padded[:shared] = before[:shared]
+    here = state.here + 1
     return state._replace(
-        polynomial=polynomial, before=before, values=known, here=here, error=error
+        polynomial=polynomial, before=padded, values=known, here=here, error=error
     )
-
-
-def _pad(coefficients: np.ndarray, polynomial: PolynomialFit) -> np.ndarray:
-    """Return ``coefficients`` for the terms of ``polynomial``: terms of low degree come first."""
-    padded = np.zeros_like(polynomial.coefficients)
-    shared = min(len(padded), len(coefficients))
-    padded[:shared] = coefficients[:shared]
-    return padded
 
 
 def polynomial_part(simulator: Simulator, state: SweepState) -> Polynomial:

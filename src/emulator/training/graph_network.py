@@ -24,9 +24,9 @@ from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import constant
 from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, untrained
 from emulator.training.objectives import (
+    OBJECTIVES,
     Batch,
     Objective,
-    check_objective,
     component_scales,
     loss_scales,
     make_loss,
@@ -62,7 +62,9 @@ class BatchPlan(NetworkPlan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_objective(self.objective)
+        if self.objective not in OBJECTIVES:
+            *first, last = OBJECTIVES
+            raise InputError(f"objective '{self.objective}': use {', '.join(first)} or {last}")
         self.require_at_least(1, "batch")
         if self.learns_from_runs and self.simulations < self.batch:
             raise InputError(

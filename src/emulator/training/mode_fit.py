@@ -114,11 +114,9 @@ class ModeFit:
     def _snapshots(self) -> tuple[np.ndarray, np.ndarray]:
         """Deviations (c, n, 3) and slopes (c, p, n, 3) in position, in units of the scale."""
         scene, runs, s = self.scene, self.runs, self.scales.displacement
-        position = jax.vmap(scene.to_unit)(runs.theta)
-        jacobian = np.asarray(jax.vmap(jax.jacfwd(scene.from_unit))(position))
         free = ~scene.held
         deviations = np.where(free, np.asarray(runs.displacement - runs.displacement[0]), 0.0)
-        slopes = np.einsum("cpna,cpq->cqna", np.asarray(runs.sensitivities), jacobian)
+        slopes = np.asarray(scene.space.unit_sensitivities(runs.theta, runs.sensitivities))
         return deviations / s, np.where(free, slopes, 0.0) / s
 
     @cached_property

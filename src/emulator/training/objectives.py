@@ -24,7 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.fem.energy import displacement_gradient, potential_energy
 from emulator.mechanics.kinematics import Barriers
@@ -35,13 +34,6 @@ OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
 # Standard deviation of the displacements, as a fraction of the centre's, where no FEM run shows it.
 _GUESSED_SD = 0.2
-
-
-def check_objective(name: str) -> None:
-    """Raise :class:`InputError` for an objective that does not exist."""
-    if name not in OBJECTIVES:
-        *first, last = OBJECTIVES
-        raise InputError(f"objective '{name}': use {', '.join(first)} or {last}")
 
 
 class Batch(NamedTuple):

@@ -181,11 +181,9 @@ class Job:
             at_least=FEWEST + 1,
             progress=self.progress,
         )
-        return runs if stored is None else jax.tree.map(_join, runs, stored)
-
-
-def _join(first: jax.Array, later: jax.Array) -> jax.Array:
-    return jnp.concatenate([first, later])
+        if stored is None:
+            return runs
+        return jax.tree.map(lambda *both: jnp.concatenate(both), runs, stored)
 
 
 def _first_runs(stored: Runs, plan: Plan) -> Runs:

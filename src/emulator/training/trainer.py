@@ -102,7 +102,11 @@ def train(
     job = Job(scene, sizes, start, campaign, folder, seconds, session.began, progress)
     if start is None:
         job = replace(job, start=session.plan.default_start(job, resume=resume))
-    source = {} if job.start is None else _description(job.start)
+    source = {}
+    if job.start is not None:
+        of = job.start.scene
+        source = {"scene": of.name, "scene_fingerprint": of.fingerprint}
+        source |= {"fingerprint": job.start.fingerprint}
     digest = "" if campaign is None else campaign.digest
     if resume:
         _check_same(session, digest, source)
@@ -110,15 +114,6 @@ def train(
         session = replace(session, plan=replace(plan, campaign=digest), start=source)
         (folder / SWEEPS).unlink(missing_ok=True)
     return session.finished(*session.plan.train(job, session))
-
-
-def _description(start: Emulator) -> dict[str, Any]:
-    """Return name and fingerprints of the emulator that training starts from."""
-    return {
-        "scene": start.scene.name,
-        "scene_fingerprint": start.scene.fingerprint,
-        "fingerprint": start.fingerprint,
-    }
 
 
 def _check_same(session: Session, digest: str, start: Mapping[str, Any]) -> None:

@@ -40,18 +40,12 @@ class Gradients(NamedTuple):
 
 
 class _State(NamedTuple):
-    """State of conjugate gradients.
-
-    x, residual, direction : (f,). size : () residual . preconditioned residual.
-    convex : whether the last direction had positive curvature, ().
-    """
-
     k: jax.Array
     x: jax.Array
     residual: jax.Array
     direction: jax.Array
-    size: jax.Array
-    convex: jax.Array
+    size: jax.Array  # residual . preconditioned residual
+    convex: jax.Array  # whether the last direction had positive curvature
 
 
 def conjugate_gradients(
