@@ -15,6 +15,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +33,11 @@ from emulator.scenes import Scene
 from emulator.surrogates import Architecture, Emulator, load, shipped
 from emulator.training import recipe
 from emulator.training.graph_network import GraphNetwork
-from emulator.training.modal import ARCHITECTURE, Modal, mode_training
+from emulator.training.modal import ARCHITECTURE, Modal
 from emulator.training.mode_fit import ModeFit
 from emulator.training.network_plan import Problem, with_weights
 from emulator.training.objectives import loss_scales
-from emulator.training.optimiser import NetworkTraining, Steps
+from emulator.training.optimiser import NetworkTraining, Steps, make_step, two_cosines
 from emulator.training.plan import Job
 
 HERE = Path(__file__).parent
@@ -143,8 +144,16 @@ def _with(idea: Idea, problem: Problem) -> NetworkTraining:
         return problem.training
     scene, runs = problem.emulator.scene, problem.runs
     scales = loss_scales(scene, runs, from_runs=True)
-    fit = idea.modal(ModeFit(scene, problem.training.network, runs, scales))
-    return mode_training(problem.plan, fit, idea.optimiser)
+    fit, plan = idea.modal(ModeFit(scene, problem.training.network, runs, scales)), problem.plan
+    optimiser = idea.optimiser or problem.training.optimiser
+    step = make_step(two_cosines(plan.learning_rate, plan.freeze), fit.descend, optimiser)
+    return replace(
+        problem.training,
+        optimiser=optimiser,
+        step=step,
+        frozen=fit.branch_targets,
+        finish=partial(fit.finish, plan.polish),
+    )
 
 
 def errors_of(emulator: Emulator, known: Any) -> dict[str, Any]:

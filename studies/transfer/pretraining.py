@@ -65,7 +65,7 @@ def pretrain(
         return problems[state.done % len(problems)].training.advance(state, total)
 
     initial = first.training.initial()
-    state = run(session, initial, plan.steps, advance, progress=progress, name="pretrain")
+    state = run(session, initial, plan.steps, advance, progress=progress)
     record = {
         **plan.record(state.loss),
         "family": [scene.fingerprint for scene in scenes],

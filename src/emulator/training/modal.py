@@ -8,11 +8,11 @@ that sweeps over the box have fitted to the energy, without any FEM run (``physi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
@@ -28,7 +28,6 @@ from emulator.training.network_plan import NetworkPlan, Problem, architecture_of
 from emulator.training.objectives import loss_scales
 from emulator.training.optimiser import (
     NetworkTraining,
-    Weights,
     make_step,
     orthogonal_steps,
     two_cosines,
@@ -91,9 +90,18 @@ class Modal(NetworkPlan):
         scales = loss_scales(scene, runs, from_runs=True)
         scale = np.full(3, scales.displacement)  # products of modes are the same in all directions
         emulator = untrained(plan, job, series, architecture, scale)
-        assert emulator.network is not None, "it was made above"
-        fit = ModeFit(scene, emulator.network, runs, scales)
-        return Problem(plan, emulator, runs, mode_training(plan, fit))
+        network, optimiser = emulator.network, orthogonal_steps()
+        assert network is not None, "it was made above"
+        fit = ModeFit(scene, network, runs, scales)
+        rate, finish = (
+            two_cosines(plan.learning_rate, plan.freeze),
+            partial(fit.finish, plan.polish),
+        )
+        step = make_step(rate, fit.descend, optimiser)
+        training = NetworkTraining(
+            network, optimiser, step, plan.freeze, fit.branch_targets, finish
+        )
+        return Problem(plan, emulator, runs, training)
 
 
 @dataclass(frozen=True)
@@ -142,25 +150,3 @@ class Physics(Modal):
         job.require_time(f"{state.number} sweeps")
         problem = self.with_counts(sweeps=state.number).fitted_to(runs, job, architecture)
         return replace(problem, record={"sweeps": state.record})
-
-
-def mode_training(
-    plan: Modal, fit: ModeFit, optimiser: optax.GradientTransformation | None = None
-) -> NetworkTraining:
-    """Return the training of modes up to step ``plan.freeze``, then of their coefficients.
-
-    optimiser : by default :func:`~emulator.training.optimiser.orthogonal_steps`.
-    """
-    optimiser = optimiser or orthogonal_steps()
-
-    def finish(weights: Weights, progress: bool) -> Weights:
-        return fit.finish(weights, plan.polish, progress=progress)
-
-    return NetworkTraining(
-        fit.network,
-        optimiser,
-        make_step(two_cosines(plan.learning_rate, plan.freeze), fit.descend, optimiser),
-        plan.freeze,
-        lambda weights: tuple(fit.branch_targets(weights)),
-        finish,
-    )

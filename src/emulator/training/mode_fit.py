@@ -237,7 +237,7 @@ class ModeFit:
         misfit += self.slopes * squares(slope_error)
         return misfit / (squares(targets.values) + self.slopes * squares(targets.slopes))
 
-    def finish(self, weights: Weights, iterations: int, *, progress: bool = False) -> Weights:
+    def finish(self, iterations: int, weights: Weights, progress: bool) -> Weights:
         """Return ``weights`` with the last layer solved for and the branch fitted by L-BFGS.
 
         It ends where the misfit no longer falls, by round-off or by a line search that failed.

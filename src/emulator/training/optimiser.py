@@ -194,7 +194,6 @@ def run(
     limit: StepLimit | None = None,
     *,
     progress: bool,
-    name: str = "train",
 ) -> State:
     """Return the state after all steps, from ``state`` or the checkpoint, and write checkpoints.
 
@@ -206,7 +205,7 @@ def run(
         The last loss is not finite.
     """
     state, every = session.first(state, total), session.plan.checkpoint_every
-    with counting(desc=name, initial=state.done, total=total, disable=not progress) as bar:
+    with counting(desc="train", initial=state.done, total=total, disable=not progress) as bar:
         while state.done < total:
             state = advance(state, total)
             bar.total = total = total if limit is None else limit(state, total)
