@@ -23,8 +23,6 @@ def closest(name: object, known: Iterable[str]) -> str:
 def check_known(name: object, known: Iterable[str], noun: str) -> None:
     """Raise :class:`InputError` unless ``name`` is ``known``: the one wording of an unknown name.
 
-    Parameters
-    ----------
     name : the name that the user gave.
     known : the names there are.
     noun : the word for one of them, such as ``sampler``; it begins the message.
@@ -38,8 +36,6 @@ def check_known(name: object, known: Iterable[str], noun: str) -> None:
 def look_up[T](entries: Mapping[str, T], name: object, noun: str) -> T:
     """Return the entry called ``name``.
 
-    Parameters
-    ----------
     entries : the registry, or any other mapping from names to things of one kind.
     name : the name that the user gave.
     noun : the word for one entry, such as ``sampler``; it begins the message.

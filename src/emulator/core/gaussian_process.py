@@ -135,8 +135,6 @@ def _factor(features: Features) -> tuple[jax.Array, jax.Array]:
 def negative_log_likelihood(features: Features, observations: jax.Array) -> jax.Array:
     """Return the negative log likelihood per observed number, up to a constant.
 
-    Parameters
-    ----------
     features : the scaled features of c inputs.
     observations : values and derivatives of r outputs, input by input, (c (1 + p), r). The variance
         of each output is its most likely one, the mean square of its whitened observations.

@@ -43,8 +43,6 @@ def minimise(
 ) -> Minimum:
     """Return the minimum of ``function`` that L-BFGS-B descends to from ``start``.
 
-    Parameters
-    ----------
     function : value and gradient at a point; either may be infinite or NaN.
     start : the first point, (q,); it may have no entry.
     low, high : bounds of the point, () or (q,), which ``start`` satisfies; ``None`` for none.

@@ -87,8 +87,6 @@ class Table(BaseModel):
 class OneOf:
     """Annotation of a table whose ``key`` names one of several dataclasses.
 
-    Parameters
-    ----------
     key : e.g. ``kind``.
     choices : the dataclasses by the value of ``key``; their fields are the table's other keys.
     default : value of ``key`` in a table without it.
@@ -140,8 +138,6 @@ class OneOf:
 class Source:
     """Data of a file, with the line numbers by which messages point at it.
 
-    Parameters
-    ----------
     name : how messages call the file.
     data : its content.
     lines : line of each path, as far as known.
@@ -226,8 +222,6 @@ def restore[Kind](
 ) -> Kind:
     """Return the dataclass that :func:`describe` described.
 
-    Parameters
-    ----------
     kinds : the registry, from ``kind`` to dataclass.
     description : plain data, of which ``kind`` names the class and all else are its fields.
     noun : the word for one entry of the registry, such as ``noise``; it begins messages.

@@ -18,8 +18,6 @@ import jax.numpy as jnp
 def eliminated(matrix: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the pivots p (r,) and the reduced rows R (r, m), by elimination without exchanges.
 
-    Parameters
-    ----------
     matrix : the positive definite matrix M, (r, r).
     rows : A, (r, m).
     """

@@ -136,8 +136,6 @@ def sweep_box(
 ) -> SweepState:
     """Sweep over the box of a scene until the error bar is round-off.
 
-    Parameters
-    ----------
     simulator : the simulator of the scene.
     sweeps : the largest number of sweeps.
     seed : the seed from which the theta are drawn.

@@ -65,8 +65,6 @@ class Session:
     def resumed(self, name: str, plan_kinds: Mapping[str, type]) -> Session:
         """Return the training whose checkpoint is at ``path``, with its own plan and sizes.
 
-        Parameters
-        ----------
         name : the name of the emulated scene, for messages.
         plan_kinds : the classes of plans by the name of their recipe, to read a checkpoint's.
 

@@ -47,8 +47,6 @@ from emulator.training.plan import Job
 class BatchPlan(NetworkPlan):
     """The options of recipes that minimise an objective over batches of theta.
 
-    Parameters
-    ----------
     objective : what is minimised (:mod:`~emulator.training.objectives`).
     simulations : the number of FEM runs.
     batch : the number of theta a step.
@@ -81,8 +79,6 @@ class BatchPlan(NetworkPlan):
 class GraphNetwork(BatchPlan):
     """A graph network about the FEM solution at the centre, or from zero.
 
-    Parameters
-    ----------
     centred : whether the network is added to the FEM solution at the centre, or to zero.
     schedule : ``cosine`` to zero after a warm-up, or ``halves``: the rate, then a tenth of it.
     decoder : ``pointwise``, or ``separable`` without mechanical modes.

@@ -37,8 +37,6 @@ _STEP = 0.1  # unit of the network's output, over the rms of a mode's coefficien
 class Hybrid(BatchPlan):
     """A Taylor series, a network in mechanical modes, and a discrepancy model.
 
-    Parameters
-    ----------
     order : the order of the series.
     modes : the largest number of mechanical modes given to the decoder.
     freeze : the step at which the modes are frozen.

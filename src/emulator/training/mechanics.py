@@ -35,8 +35,6 @@ FEM_SHARE = 0.3
 class DiscrepancyPlan(Plan):
     """The options of recipes that fit a discrepancy model and train no network.
 
-    Parameters
-    ----------
     simulations : the number of FEM runs on the scene's own mesh, with their sensitivities.
     """
 
@@ -64,8 +62,6 @@ class DiscrepancyPlan(Plan):
 class Mechanics(DiscrepancyPlan):
     """A Taylor series and a discrepancy model.
 
-    Parameters
-    ----------
     order : the order of the series; 0 is the FEM solution at the centre of the box.
     """
 
@@ -116,8 +112,6 @@ def add_discrepancy(
     sum with the least error at held-out runs is taken, then fitted to all runs: a network helps
     where runs are few and harms where they are many. Parts that are not in that sum are dropped.
 
-    Parameters
-    ----------
     emulator : the emulator without a discrepancy model.
     runs : FEM runs with sensitivities.
     series : the series of FEM, where that in ``emulator`` is of what a family's network leaves.

@@ -51,8 +51,6 @@ solve, and a deep branch (docs/experiments.md, "A network alone")."""
 class Modal(NetworkPlan):
     """A separable network that is fitted to values and slopes of FEM runs.
 
-    Parameters
-    ----------
     simulations : the number of runs that the network is fitted to.
     freeze : the step at which the modes are frozen; half of the steps where it is not below them.
     polish : the number of iterations of L-BFGS on the branch after the steps.
@@ -108,8 +106,6 @@ class Modal(NetworkPlan):
 class Physics(Modal):
     """A separable network that is fitted to values and slopes of a polynomial of sweeps.
 
-    Parameters
-    ----------
     simulations : the number of theta at which the network is fitted to the polynomial.
     sweeps : the largest number of sweeps over the box.
     """

@@ -81,8 +81,6 @@ class BranchTargets(NamedTuple):
 class ModeFit:
     """The fit of a network's modes and coefficients to runs with sensitivities.
 
-    Parameters
-    ----------
     scene, network : the scene, and its untrained network.
     runs : the runs that the network is fitted to, the one at the centre first.
     scales : the scales s and s_F of the inner product; s is the network's scale, too.

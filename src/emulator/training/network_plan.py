@@ -51,8 +51,6 @@ class Problem:
 class NetworkPlan(Plan):
     """The options of all recipes that train a network.
 
-    Parameters
-    ----------
     steps : the number of optimiser steps.
     learning_rate : the largest learning rate.
     checkpoint_every : the number of steps between two checkpoints.
@@ -146,8 +144,6 @@ def architecture_of(
 ) -> Architecture:
     """Return the sizes of the network to train: those of the start's network, if there is one.
 
-    Parameters
-    ----------
     decoder : the decoder that the recipe prescribes.
     usual : the sizes where the job names none.
     modes : the number of mechanical modes that the decoder is given.

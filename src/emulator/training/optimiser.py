@@ -226,8 +226,6 @@ class StepLimit:
     A machine becomes busier or less so, and steps become cheaper once the modes are frozen, so the
     number is estimated again and again.
 
-    Parameters
-    ----------
     deadline : the time, on the performance counter, at which the last step should end.
     most : the largest number of steps; ``None`` for no limit.
     freeze : the step at which modes are frozen; ``None`` for never.

@@ -107,8 +107,6 @@ def check_order(order: int) -> None:
 class Job:
     """One training.
 
-    Parameters
-    ----------
     scene : the scene to emulate.
     architecture : the sizes of the network; ``None`` for the recipe's sizes.
     start : the emulator to begin from, or ``None``.
@@ -161,8 +159,6 @@ class Job:
     ) -> Runs:
         """Return the FEM solutions of ``plan``, the one at the centre first.
 
-        Parameters
-        ----------
         predictor : the function that predicts the start of Newton's method.
         deadline : the time after which no further run begins, except the fewest by which a
             discrepancy model can be judged.

@@ -25,8 +25,6 @@ from emulator.training.two_meshes import on_finer
 class Sweeps(Plan):
     """A polynomial fitted by sweeps over the box.
 
-    Parameters
-    ----------
     sweeps : the largest number of sweeps.
     order : the order of the series at which they begin; 0 for a body at rest.
     """

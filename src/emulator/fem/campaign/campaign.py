@@ -39,8 +39,6 @@ def solve_rows(
 
     Every loop over FEM solves in this package is this one.
 
-    Parameters
-    ----------
     numbers : the positions of the theta to solve at, in order; all by default.
     starts : the function that proposes starts; it is called only when a task begins.
     """

@@ -77,8 +77,6 @@ class Row(NamedTuple):
 class Solver:
     """Solves the tasks of a campaign; compiled programs and the last factors are kept between them.
 
-    Parameters
-    ----------
     sensitivities : compute du/dtheta too, from each solve's own factor: a tenth of its time on a
         ventricle with five parameters.
     energy : compute the potential energy; :class:`InputError` for a scene without one.

@@ -144,8 +144,6 @@ def upper_blocks(nodes: np.ndarray) -> Entries:
 def block_pattern(groups: Sequence[Entries], free_index: np.ndarray, *, symmetric: bool) -> Pattern:
     """Return the pattern into which groups of dense blocks are assembled.
 
-    Parameters
-    ----------
     groups : the entries of each group of blocks, in the order in which they are flattened.
     free_index : the position (n_dofs,) among the free degrees of freedom, -1 where prescribed.
     symmetric : whether to store only the upper triangle.

@@ -58,8 +58,6 @@ def conjugate_gradients(
 ) -> Gradients:
     """Solve ``product(x) = b`` for ``x`` (f,).
 
-    Parameters
-    ----------
     steps : the largest number of iterations.
     tolerance : the largest residual relative to ``b``, both in the norm of ``precondition``.
     patience : the number of iterations after which they end as soon as the residual is larger than
