@@ -37,7 +37,7 @@ from emulator.training.modal import ARCHITECTURE, Modal
 from emulator.training.mode_fit import ModeFit
 from emulator.training.network_plan import Problem, with_weights
 from emulator.training.objectives import loss_scales
-from emulator.training.optimiser import NetworkTraining, Steps, make_step, two_cosines
+from emulator.training.optimiser import NetworkTraining, Steps
 from emulator.training.plan import Job
 
 HERE = Path(__file__).parent
@@ -145,12 +145,10 @@ def _with(idea: Idea, problem: Problem) -> NetworkTraining:
     scene, runs = problem.emulator.scene, problem.runs
     scales = loss_scales(scene, runs, from_runs=True)
     fit, plan = idea.modal(ModeFit(scene, problem.training.network, runs, scales)), problem.plan
-    optimiser = idea.optimiser or problem.training.optimiser
-    step = make_step(two_cosines(plan.learning_rate, plan.freeze), fit.descend, optimiser)
     return replace(
         problem.training,
-        optimiser=optimiser,
-        step=step,
+        optimiser=idea.optimiser or problem.training.optimiser,
+        descend=fit.descend,
         frozen=fit.branch_targets,
         finish=partial(fit.finish, plan.polish),
     )

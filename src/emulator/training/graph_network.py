@@ -38,7 +38,6 @@ from emulator.training.optimiser import (
     clipped_adam,
     cosine,
     halves,
-    make_step,
 )
 from emulator.training.plan import Job
 
@@ -135,7 +134,7 @@ def batch_training(
 
     freeze : the step at which the modes of a separable decoder are frozen; ``None`` for never.
     """
-    scene, network, optimiser = emulator.scene, emulator.network, clipped_adam()
+    scene, network = emulator.scene, emulator.network
     assert network is not None, "an emulator in training has a network"
     predict = predictor(emulator)
     scales = loss_scales(scene, runs, from_runs=plan.learns_from_runs)
@@ -160,7 +159,7 @@ def batch_training(
     def frozen(weights: Weights) -> tuple[jax.Array, ...]:
         return (jax.jit(lambda w: network.prepare(w)[1])(weights),)
 
-    return NetworkTraining(network, optimiser, make_step(rate, descend, optimiser), freeze, frozen)
+    return NetworkTraining(network, clipped_adam(), rate, descend, freeze, frozen)
 
 
 def predictor(emulator: Emulator) -> Callable[..., jax.Array]:

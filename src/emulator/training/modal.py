@@ -26,12 +26,7 @@ from emulator.training.mechanics import FEM_SHARE
 from emulator.training.mode_fit import ModeFit
 from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, untrained
 from emulator.training.objectives import loss_scales
-from emulator.training.optimiser import (
-    NetworkTraining,
-    make_step,
-    orthogonal_steps,
-    two_cosines,
-)
+from emulator.training.optimiser import NetworkTraining, orthogonal_steps, two_cosines
 from emulator.training.plan import Job
 
 ARCHITECTURE = Architecture(
@@ -88,16 +83,16 @@ class Modal(NetworkPlan):
         scales = loss_scales(scene, runs, from_runs=True)
         scale = np.full(3, scales.displacement)  # products of modes are the same in all directions
         emulator = untrained(plan, job, series, architecture, scale)
-        network, optimiser = emulator.network, orthogonal_steps()
-        assert network is not None, "it was made above"
-        fit = ModeFit(scene, network, runs, scales)
-        rate, finish = (
-            two_cosines(plan.learning_rate, plan.freeze),
-            partial(fit.finish, plan.polish),
-        )
-        step = make_step(rate, fit.descend, optimiser)
+        assert emulator.network is not None, "it was made above"
+        fit = ModeFit(scene, emulator.network, runs, scales)
         training = NetworkTraining(
-            network, optimiser, step, plan.freeze, fit.branch_targets, finish
+            fit.network,
+            orthogonal_steps(),
+            two_cosines(plan.learning_rate, plan.freeze),
+            fit.descend,
+            plan.freeze,
+            fit.branch_targets,
+            partial(fit.finish, plan.polish),
         )
         return Problem(plan, emulator, runs, training)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -144,7 +145,7 @@ class NetworkTraining:
     """How a network is trained.
 
     network : the untrained network.
-    optimiser, step : the optimiser and its step (:func:`make_step`).
+    optimiser, rate, descend : what its steps are made of (:func:`make_step`).
     freeze : the step at which the modes of a separable decoder are frozen, so that only its branch
         is trained from there on; ``None`` for never.
     frozen : the function from weights to the arrays that later steps take, the modes first.
@@ -154,10 +155,16 @@ class NetworkTraining:
 
     network: Network
     optimiser: optax.GradientTransformation
-    step: Step
+    rate: Rate
+    descend: Descent
     freeze: int | None = None
     frozen: Callable[[Weights], tuple[jax.Array, ...]] = lambda _: ()
     finish: Callable[[Weights, bool], Weights] = lambda weights, _: weights
+
+    @cached_property
+    def step(self) -> Step:
+        """The compiled step."""
+        return make_step(self.rate, self.descend, self.optimiser)
 
     def initial(self) -> State:
         """Return the state before the first step, with copies of the untrained weights."""
