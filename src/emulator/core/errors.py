@@ -40,10 +40,7 @@ def look_up[T](entries: Mapping[str, T], name: object, noun: str) -> T:
     name : the name that the user gave.
     noun : the word for one entry, such as ``sampler``; it begins the message.
 
-    Raises
-    ------
-    InputError
-        No entry is called ``name``; the message lists the known names.
+    Raises :class:`InputError`: no entry is called ``name``; the message lists the known names.
     """
     check_known(name, entries, noun)
     return entries[str(name)]

@@ -177,10 +177,8 @@ class Source:
 def parse[Model: BaseModel](model: type[Model], source: Source) -> Model:
     """Return plain data of a file as a model.
 
-    Raises
-    ------
-    InputError
-        The first mistake: file, line and key, what was found and what would be right.
+    Raises :class:`InputError` of the first mistake: file, line and key, what was found and what
+    would be right.
     """
     try:
         return model.model_validate(source.data)
@@ -226,10 +224,8 @@ def restore[Kind](
     description : plain data, of which ``kind`` names the class and all else are its fields.
     noun : the word for one entry of the registry, such as ``noise``; it begins messages.
 
-    Raises
-    ------
-    InputError
-        The kind is unknown, or a field is unknown, missing or of the wrong type.
+    Raises :class:`InputError`: the kind is unknown, or a field is unknown, missing or of the wrong
+    type.
     """
     kind = look_up(kinds, description.get("kind"), noun)
     options = {name: value for name, value in description.items() if name != "kind"}

@@ -100,10 +100,7 @@ def exclusive(path: str | Path, what: str) -> Iterator[Path]:
 
     Its folder is made, and goes again if it stays empty.
 
-    Raises
-    ------
-    InputError
-        Another ``what`` is writing there.
+    Raises :class:`InputError`: another ``what`` is writing there.
     """
     path = Path(path)
     check_folder(path.parent)

@@ -148,10 +148,8 @@ def sweep_box(
         at their whole level.
     progress : whether a progress bar is shown.
 
-    Raises
-    ------
-    SolverError
-        Equilibria were not followed up to the loads, or not over the whole box.
+    Raises :class:`SolverError`: equilibria were not followed up to the loads, or not over the whole
+    box.
     """
     state = _restore(folder) or _initial_state(simulator, start, beneath)
     last_write = time.perf_counter()

@@ -68,10 +68,7 @@ class Session:
         name : the name of the emulated scene, for messages.
         plan_kinds : the classes of plans by the name of their recipe, to read a checkpoint's.
 
-        Raises
-        ------
-        InputError
-            No checkpoint to resume, a damaged one, or one of another scene.
+        Raises :class:`InputError`: no checkpoint to resume, a damaged one, or one of another scene.
         """
         path = self.path
         if not path.is_file():

@@ -116,10 +116,7 @@ def add_discrepancy(
     runs : FEM runs with sensitivities.
     series : the series of FEM, where that in ``emulator`` is of what a family's network leaves.
 
-    Raises
-    ------
-    InputError
-        No run besides the centre's.
+    Raises :class:`InputError`: no run besides the centre's.
     """
     most = _OBSERVATIONS // (1 + runs.theta.shape[1])
     runs = runs.take(slice(0, most))

@@ -114,7 +114,9 @@ class ModeFit:
         scene, runs, s = self.scene, self.runs, self.scales.displacement
         free = ~scene.held
         deviations = np.where(free, np.asarray(runs.displacement - runs.displacement[0]), 0.0)
-        slopes = np.asarray(scene.space.unit_sensitivities(runs.theta, runs.sensitivities))
+        slopes = np.asarray(
+            scene.space.unit_sensitivities(runs.theta, jnp.asarray(runs.sensitivities))
+        )
         return deviations / s, np.where(free, slopes, 0.0) / s
 
     @cached_property

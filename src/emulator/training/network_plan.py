@@ -148,11 +148,8 @@ def architecture_of(
     usual : the sizes where the job names none.
     modes : the number of mechanical modes that the decoder is given.
 
-    Raises
-    ------
-    InputError
-        The start has no network or another architecture, theta or the node features differ, or a
-        decoder's coefficients belong to the mechanical modes of one mesh.
+    Raises :class:`InputError`: the start has no network or another architecture, theta or the node
+    features differ, or a decoder's coefficients belong to the mechanical modes of one mesh.
     """
     start, scene = job.start, job.scene
     if start is None:

@@ -206,10 +206,7 @@ def run(
 
     They are written as often as the plan says, and after the last step.
 
-    Raises
-    ------
-    SolverError
-        The last loss is not finite.
+    Raises :class:`SolverError`: the last loss is not finite.
     """
     state, every = session.first(state, total), session.plan.checkpoint_every
     with counting(desc="train", initial=state.done, total=total, disable=not progress) as bar:

@@ -115,10 +115,8 @@ class Job:
     budget : the seconds for everything, from ``began`` of the performance counter on.
     progress : whether progress bars are shown.
 
-    Raises
-    ------
-    InputError
-        A budget of fewer than 5 seconds, in which nothing can be compiled and solved.
+    Raises :class:`InputError`: a budget of fewer than 5 seconds, in which nothing can be compiled
+    and solved.
     """
 
     scene: Scene

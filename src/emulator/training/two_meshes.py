@@ -54,10 +54,8 @@ class TwoMeshes(DiscrepancyPlan):
 def on_finer(start: Emulator | None, scene: Scene, plan: Plan) -> Emulator:
     """Return ``start``, an emulator on the mesh that the scene's is finer than, on ``scene``.
 
-    Raises
-    ------
-    InputError
-        No such emulator, a scene that is not on a finer mesh, or one of another body.
+    Raises :class:`InputError`: no such emulator, a scene that is not on a finer mesh, or one of
+    another body.
     """
     body = finer_of(scene)
     if start is None:

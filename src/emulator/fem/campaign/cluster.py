@@ -58,11 +58,8 @@ class Cluster:
     def __call__(self, solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
         """Yield rows in the order in which they come back.
 
-        Raises
-        ------
-        SolverError
-            No workers for a minute, the scheduler has gone, or a theta that killed each worker it
-            was given to; all other rows come first.
+        Raises :class:`SolverError`: no workers for a minute, the scheduler has gone, or a theta
+        that killed each worker it was given to; all other rows come first.
         """
         try:
             yield from self._rows(self._name(solver), tasks)
@@ -146,10 +143,7 @@ class Cluster:
 def connected(address: str) -> Iterator[Cluster]:
     """Yield a cluster whose scheduler is at ``address``.
 
-    Raises
-    ------
-    InputError
-        The address is malformed, or nobody answers there in 10 seconds.
+    Raises :class:`InputError`: the address is malformed, or nobody answers there in 10 seconds.
     """
     check_address(address)
     try:

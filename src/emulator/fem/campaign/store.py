@@ -137,10 +137,7 @@ class ZarrRows(Mapping[int, Field]):
 def writing(path: str | Path, campaign: Campaign) -> Iterator[ZarrRows]:
     """Yield the store at ``path``, made if it is not there, and keep other processes from writing.
 
-    Raises
-    ------
-    InputError
-        Something else is there, another campaign, or one that is being run.
+    Raises :class:`InputError`: something else is there, another campaign, or one that is being run.
     """
     path = Path(path)
     if path.is_symlink() or path.exists():

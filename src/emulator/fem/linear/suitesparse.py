@@ -237,10 +237,8 @@ def register(target: str, capsule: Any, classify: Classify) -> None:
 
     The function has one result, of float64. The other is 0, or what ``classify`` says of the error.
 
-    Raises
-    ------
-    InputError
-        XLA's C interface is another than the one this binding was written for.
+    Raises :class:`InputError`: XLA's C interface is another than the one this binding was written
+    for.
     """
     check_api()
     inner = _Handler(_capsule_pointer(capsule, _capsule_name(capsule)))
@@ -249,7 +247,8 @@ def register(target: str, capsule: Any, classify: Classify) -> None:
         frame = CallFrame.from_address(address)
         if frame.extension or frame.results_count != 2:  # XLA asks about the function itself
             return inner(address)
-        frame.results_count, number = 1, INTERRUPTED
+        frame.results_count = 1
+        number: int | None = INTERRUPTED
         try:
             error = inner(address)
             number = _number_of(error, Api.from_address(frame.api), classify) if error else 0
