@@ -113,7 +113,8 @@ def covariance(features: Features) -> jax.Array:
     psi, J = features
     count, parameters = len(psi), J.shape[2]
     gap = psi[:, None] - psi[None]
-    value, first, second = (matern72(jnp.sum(gap**2, axis=-1), order) for order in range(3))
+    squared = jnp.sum(gap**2, axis=-1)
+    value, first, second = (matern72(squared, order) for order in range(3))
     left = jnp.einsum("ijq,iqa->ija", gap, J)  # delta J_x
     right = jnp.einsum("ijq,jqb->ijb", gap, J)
     crossed = -4.0 * second[..., None, None] * left[..., :, None] * right[..., None, :]

@@ -114,9 +114,8 @@ class ModeFit:
         scene, runs, s = self.scene, self.runs, self.scales.displacement
         free = ~scene.held
         deviations = np.where(free, np.asarray(runs.displacement - runs.displacement[0]), 0.0)
-        slopes = np.asarray(
-            scene.space.unit_sensitivities(runs.theta, jnp.asarray(runs.sensitivities))
-        )
+        jacobian = np.asarray(jax.vmap(jax.jacfwd(scene.from_unit))(scene.to_unit(runs.theta)))
+        slopes = np.einsum("cpna,cpq->cqna", np.asarray(runs.sensitivities), jacobian)
         return deviations / s, np.where(free, slopes, 0.0) / s
 
     @cached_property
